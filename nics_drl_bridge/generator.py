@@ -139,6 +139,7 @@ def generate(
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
+    robot = identified.drive.spec  # the state of a textbook that was written may be another
     # The usual period [s], or that of a slower lidar: nothing new is seen before its next scan.
     steps, dt = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / identified.model.dt, identified.model.dt
     model = SimulatorModel(

@@ -139,7 +139,7 @@ def test_a_recording_too_coarse_for_a_useful_model_is_one_sentence(tmp_path):
     assert names(tmp_path) == {"slow.npz"}
     wanted = nics(*words, "--anyway", cwd=tmp_path)
     assert wanted.returncode == 0, wanted.stderr
-    assert "do not train with this model" in " ".join(wanted.stdout.split())
+    assert "Verdict: do not train." in " ".join(wanted.stdout.split())
     assert names(tmp_path / "car") == MODEL_FILES
     assert load_model(tmp_path / "car").robot == spec
 

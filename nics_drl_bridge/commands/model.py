@@ -225,7 +225,8 @@ def generate(
     sensor: Annotated[list[Path] | None,
         Option(help="YAML of an additional sensor, docs/sensors.md; repeatable.")] = None,
     order: Annotated[str, Option(help="Order of the Taylor model, 1 to 4, or auto.")] = "auto",
-    alpha: Annotated[str, Option(help="Pruning of Eq. 2, 0 to 1, or auto for the knee.")] = "auto",
+    alpha: Annotated[str, Option(help="Pruning of Eq. 2, 0 to 1, or auto for the knee; "
+            "no effect where the motion is the state.")] = "auto",
     assume_textbook: Annotated[bool,
         Option(help="Fill in from the textbook what the drive did not show.")] = False,
     strict: Annotated[bool, Option(help="Refuse if an input was not moved on its own.")] = False,

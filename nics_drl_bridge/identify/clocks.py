@@ -37,6 +37,12 @@ WITHIN_TICK = 12.0**-0.5
 MIN_TIME_S = 5e-4
 CERTAIN = 3.0  # a correction below this many standard uncertainties is not made
 CLUSTER_S = 2.5  # residuals further apart are independent
+NO_LAG_S = 0.005
+MOST_UNEXPLAINED = 0.5  # share of a motion's variance, beyond which no delay is believed
+EARLY_WORTH = 0.8  # a motion precedes its commands if that takes what is left to this share
+# The delay is sought in so many parts of a drive, this far around that of the whole. It drifts if
+# it grows by more than the least, and the parts lie on a line to this share of its growth.
+DRIFT_PARTS, DRIFT_REACH_S, DRIFT_STEP_S, LEAST_DRIFT_S, DRIFT_OFF = 4, 0.6, 0.03, 0.12, 0.25
 MIN_EARLY_S = 0.03  # smaller ones may be a lag of another form
 TOLD_S = 0.005  # a latency that is less certain can't be told from a lag
 
@@ -161,6 +167,7 @@ class TimingEstimate:
     lag_sigma: Array  # (S,) [s]; NaN for a nominal lag
     separated: bool  # True if offset and latency could be separated
     early: float = 0.0  # by which motion on the commands' clock precedes them: no clock of it [s]
+    drift: float = 0.0  # by which the pose's clock gains on the commands' [s/s]; 0 if none shows
     # (S,) by which inferred states follow their commands after the latency, beside lags [s]
     delays: Array = field(default_factory=lambda: np.zeros(1))
     motors: Motors | None = None  # of inferred states; None if nothing holds them back
@@ -192,7 +199,41 @@ def timing_of(drive: Drive) -> TimingEstimate:
     latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
     sigma = {"command_latency_s": delay.sigma}
     early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
-    return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early)
+    left_over = response_residual(command, spec, target)
+    if early and not _explains(left_over, delay):
+        early = 0.0
+    drift = 0.0 if recording.episodes else _drift(command, spec, target, delay)
+    return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early, drift)
+
+
+def _explains(left_over: Left, delay: DelayEstimate) -> bool:
+    """True if a delay explains a motion that no delay leaves unexplained."""
+    quick = np.minimum(delay.lags, NO_LAG_S)
+    at_once = min(float((left_over(lags, 0.0) ** 2).mean()) for lags in (delay.lags, quick))
+    left = 1.0 - delay.explained
+    return left < MOST_UNEXPLAINED and left < EARLY_WORTH * at_once
+
+
+def _drift(command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimate) -> float:
+    """Returns the rate [s/s] at which a delay grows over a drive; 0 if it does not steadily."""
+    start, end, signal = target
+    tries = delay.value + np.arange(-DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S)
+    middles, found = [], []
+    for part in np.array_split(np.arange(len(start)), DRIFT_PARTS):
+        if len(part) < FEW_ROWS // 10:
+            return 0.0
+        rows = start[part], end[part], signal[part]
+        left_over = response_residual(command, spec, rows)
+        left = [float((left_over(delay.lags, each) ** 2).mean()) for each in tries]
+        if min(left) > MOST_UNEXPLAINED:
+            return 0.0
+        middles.append(float(start[part].mean()))
+        found.append(float(tries[int(np.argmin(left))]))
+    rate, begin = np.polyfit(middles, found, 1)
+    off = np.abs(np.array(found) - rate * np.array(middles) - begin).max()
+    grown = abs(found[-1] - found[0])
+    steady = grown > LEAST_DRIFT_S and off < DRIFT_OFF * grown
+    return float(rate) if steady else 0.0
 
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:

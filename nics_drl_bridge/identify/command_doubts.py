@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
+from nics_drl_bridge.identify.acceptance import usual
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.judgement import usual
 from nics_drl_bridge.robot.taylor import HorizonErrors
 
 HARDLY = 0.8  # share of the errors of a constant twist from which on commands hardly help

@@ -3,17 +3,18 @@
 from math import isfinite
 from typing import NamedTuple
 
+from nics_drl_bridge.identify.acceptance import Verdict, usual
 from nics_drl_bridge.identify.by_recording import Alone
 from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.gyro import relative_to
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.judgement import shortfall, usual
-from nics_drl_bridge.identify.verdict import Mistake, doubts, missed
+from nics_drl_bridge.identify.verdict import Doubt, Mistake, missed
 from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.taylor import EndErrors
 
 OF_PATH = " of the path"
+ENOUGH_S = 60.0  # of a drive; the errors of a longer one have other causes than its length
 UNSEEN = "otherwise a policy would rely on motion the model never saw"
 UNTRIED = "The drive was too short to test the model on unseen data."
 
@@ -21,6 +22,7 @@ UNTRIED = "The drive was too short to test the model on unseen data."
 class Conclusion(NamedTuple):
     """Sentences on a fit."""
 
+    verdict: Verdict
     accuracy: str
     doubts: tuple[str, ...]  # reasons not to trust it
     gaps: tuple[str, ...]  # what the drive could not teach
@@ -30,33 +32,53 @@ class Conclusion(NamedTuple):
     @property
     def lines(self) -> tuple[str, ...]:
         """All sentences, in the order in which they are to be read."""
-        return (self.accuracy, *self.doubts, *self.gaps, self.advice)
+        first = f"Verdict: {self.verdict}. {self.accuracy}"
+        return (first, *self.doubts, *self.gaps, self.advice)
 
 
 def conclude(identified: Identified) -> Conclusion:
     """Draws the conclusion of a fit."""
-    spec, ready = identified.drive.spec, False
+    spec, assessment = identified.drive.spec, identified.assessment
     wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
+    strange = tuple(str(note) for note in identified.notes if isinstance(note, Doubt))
+    replaced = identified.findings.replaced
     about = (
         *wrong,
+        *strange,
         *(str(note) for note in identified.notes if isinstance(note, Alone)),
+        *((replaced,) if replaced else ()),
         *doubts_of_commands(identified.judgement, identified.calibration),
-        *shortfall(identified.judgement),
-        *doubts(identified.held_out),
+        *assessment.reasons,
     )
     beyond = *narrow(identified.recording, spec), overdriven(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)
-    if wrong:
-        advice = "fix the mapping as described above, or the robot's own driver, and generate again"
-    elif about or not identified.judgement:
-        advice = "record another drive, 60 s or longer, and generate again before training a policy"
-    elif missed(identified.fit, spec) or identified.model.assumed:
-        advice = f"record another drive as described above; {UNSEEN}"
-    else:
-        first = ", or first fix the points above" if gaps else ""
-        advice, ready = f"train a policy in the simulator{first}", True
+    ready = assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed
+    advice = f"Next: {_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
     told = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
-    return Conclusion(told, about, gaps, f"Next: {advice}.", ready)
+    return Conclusion(assessment.verdict, told, about, gaps, advice, ready)
+
+
+def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -> str:
+    """Returns the next step, by the first condition that does not hold."""
+    duration = identified.drive.duration_s
+    if mistaken:
+        return "fix the mapping as described above, or the robot's own driver, and generate again"
+    if missed(identified.fit, identified.drive.spec) or identified.model.assumed:
+        return f"record another drive as described above; {UNSEEN}"
+    if not identified.judgement:
+        return f"record a longer drive than these {duration:.0f} s, best 60 s, and generate again"
+    if strange and identified.verdict is Verdict.WITH_CARE:
+        return "check what looks mistaken above; if it is the robot's own way, train a policy"
+    first = ", or first fix the points above" if gaps else ""
+    if identified.verdict is Verdict.GOOD:
+        return f"train a policy in the simulator{first}"
+    if identified.verdict is Verdict.WITH_CARE:
+        wide = "under a randomisation as wide as this error, and drive it slowly at first"
+        return f"train a policy {wide}{first}"
+    if duration < ENOUGH_S:
+        return f"record another drive, longer than these {duration:.0f} s, and generate again"
+    look = "see in report.html where the predicted paths leave the measured ones"
+    return f"{look}, mend the cause or record another drive, and generate again before training"
 
 
 def accuracy(identified: Identified) -> str:

@@ -13,7 +13,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import unmoved_variables
 from nics_drl_bridge.identify.fit import Order
-from nics_drl_bridge.identify.statistics import clustered_errors
+from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -26,6 +26,7 @@ FOLDS = 3
 SPACING_S, EVALUATIONS = 0.5, 25  # of trials
 BASE_ORDER, BASE_EVALUATIONS = 3, 100
 HORIZON_S = 5.0
+NOTHING = 1e-4  # m, rad: what is left of a part of a mounting that was left out
 LONGEST_LAG_S = 2.0  # a state that takes longer is rolling on: it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 
@@ -210,10 +211,11 @@ def hypotheses(order: Order) -> tuple[Hypothesis, ...]:
     return (TEXTBOOK, *((o, pull) for o in orders for pull in PULLS))
 
 
-def chosen(trials: Sequence[Trial]) -> Trial:
-    """Returns the first trial that none clearly improves on."""
-    best = trials[0]
-    for trial in trials[1:]:
+def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
+    """Returns the first trial that none clearly improves on; of an order that was asked for."""
+    asked = [trial for trial in trials if order in ("auto", trial.order)] or list(trials)
+    best = asked[0]
+    for trial in asked[1:]:
         if trial.error < WORTH * best.error:
             best = trial
     return best
@@ -246,6 +248,33 @@ def standard_errors(found: shooting.Predictive) -> Array:
     return errors
 
 
+def with_certain_mounting(
+    draft: Draft, calibration: Calibration, found: shooting.Predictive
+) -> Draft | None:
+    """Returns a draft whose mounting lacks what is below three standard errors; None if nothing is.
+
+    What is left out is zero in the calibration that `remounted` returns.
+    """
+    sigma = found.value_errors[-3:]
+    total = geometry.compose(found.values[-3:], calibration.mounting)
+    doubtful = (np.abs(total) < CERTAIN * sigma) & (total != 0.0)
+    if not doubtful.any():
+        return None
+    known = calibration.mounting
+    rest = found.values[-3:].copy()
+    if doubtful[2]:
+        rest[2] = -known[2]
+    aside = geometry.rotate(known[:2], float(rest[2]))
+    rest[:2] = np.where(doubtful[:2], -aside, rest[:2])
+    inputs = draft.inputs
+    start, low, high = inputs.start.copy(), inputs.low.copy(), inputs.high.copy()
+    start[-3:] = rest
+    places = np.flatnonzero(doubtful) + len(start) - 3
+    low[places] = start[places]
+    high[places] = start[places]
+    return replace(draft, inputs=replace(inputs, start=start, low=low, high=high))
+
+
 def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
     """Adds the mounting that predictions show to what the calibration has."""
     x, y, heading = map(float, geometry.compose(found.values[-3:], calibration.mounting))
@@ -253,6 +282,7 @@ def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibrati
     errors = zip(names, map(float, found.value_errors[-3:]), strict=True)
     sigma = {name: error for name, error in errors if not np.isnan(error)}
     y = y if "lever_arm_y_m" in sigma else calibration.lever_arm_m[1]
+    x, y, heading = (0.0 if abs(each) < NOTHING else each for each in (x, y, heading))
     return replace(
         calibration, rotation_rad=-heading, lever_arm_m=(x, y),
         uncertainty={**calibration.uncertainty, **sigma},
@@ -268,9 +298,9 @@ def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
         yield f"{finding}: {unseen} end {errors} of the path away."
 
 
-def about_forms(base: Base, trials: Sequence[Trial]) -> Iterator[str]:
+def about_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
     """Names what a model of a motion has beside the textbook's terms, and what it gains by it."""
-    form, best = base.draft.form, chosen(trials)
+    form, best = base.draft.form, chosen(trials, order)
     parts = [f"an input curve of {curve.command}" for curve in form.curves if curve.bends]
     parts += ["a delay of each command"] * bool(form.delays)
     words = (

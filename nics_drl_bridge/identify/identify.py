@@ -1,6 +1,6 @@
 """Identification of a model from a recording: the row of stages `STAGES` over a prepared drive."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -9,24 +9,40 @@ import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import acceptance, followers, hypotheses, open_loop, shooting, verdict
 from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import fit as fitting
-from nics_drl_bridge.identify import followers, hypotheses, open_loop, shooting, verdict
 from nics_drl_bridge.identify import motion as motions
+from nics_drl_bridge.identify.acceptance import shortfall
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.by_recording import about_recordings
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
 from nics_drl_bridge.identify.gyro import turned_by_gyro
-from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
+from nics_drl_bridge.identify.judgement import bands_of, bands_of_fixed, judged, textbook_of
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.refine import refined
-from nics_drl_bridge.identify.repair import check_axes, check_commands, check_units, repaired
+from nics_drl_bridge.identify.repair import (
+    check_axes,
+    check_commands,
+    check_encoders,
+    check_pose_moves,
+    check_units,
+    repaired,
+)
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.identify.terms import linear_fit, shared, through_state
+from nics_drl_bridge.identify.textbook_model import (
+    actuated_spec,
+    needs_actuators,
+    textbook_calibration,
+    textbook_model,
+    with_actuators,
+)
+from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick
 from nics_drl_bridge.recording.joining import LEARNT_SHARE
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.curve import InputCurve
@@ -68,6 +84,8 @@ class Findings:
     held_out: open_loop.OpenLoop | None = None  # open-loop errors on that part, of `judge`
     structure: tuple[str, ...] = ()  # sentences on residuals that depend on X, of `judge`
     judgement: tuple[HorizonErrors, ...] = ()  # on that part, beside yardsticks, of `judge`
+    yardstick: Yardstick | None = None  # the textbook fitted to the training part, of `judge`
+    replaced: str = ""  # sentence on the model in whose place the textbook was put, of `settle`
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
     refit: "Findings | None" = None  # on all data, of `refit`; None if the trial's model is kept
 
@@ -89,11 +107,13 @@ def _fitted(findings: Findings) -> tuple[fitting.Fit, TaylorModel]:
 
 def repair(drive: Drive, findings: Findings) -> Findings:
     """Refuses other units, axes and orders; drops repeated rows and jumps, clips commands."""
+    check_pose_moves(findings.training)
     training, _ = repaired(findings.training)
     whole, repairs = repaired(findings.whole)
     repairs += check_commands(training, findings.training.recording.command)
     check_units(drive)
     check_axes(training)
+    repairs += check_encoders(training)
     check(training.recording, drive.spec)
     return replace(findings, training=training, whole=whole, repairs=repairs)
 
@@ -199,7 +219,7 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
         trials = trials or base.draft.tried(hypotheses.hypotheses(order))
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
-    best = hypotheses.chosen(trials).order
+    best = hypotheses.chosen(trials, order).order
     curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
     findings = replace(findings, calibration=replace(findings.calibration, inputs=curves))
     samples = aligned(training, findings)
@@ -282,11 +302,24 @@ def refine(drive: Drive, findings: Findings) -> Findings:
 def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     linear, _ = _fitted(findings)
     calibration, spec = findings.calibration, drive.spec
-    base, best = known(findings.base, "the base", "fit"), hypotheses.chosen(findings.trials)
+    base = known(findings.base, "the base", "fit")
+    best = hypotheses.chosen(findings.trials, drive.settings.order)
     draft, book = base.draft, base.found.model
-    found = draft.refined(book, linear.model, pull=best.pull) if best.order else None
-    if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(base.found):
-        found = draft.base(other=book)  # a search may go astray
+
+    def refined_by(draft: hypotheses.Draft) -> tuple[shooting.Predictive, bool]:
+        found = draft.refined(book, linear.model, pull=best.pull) if best.order else None
+        if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(base.found):
+            return draft.base(other=book), best.order == 0  # a search may go astray
+        return found, True
+
+    found, kept_order = refined_by(draft)
+    if draft.problem.mounted:
+        certain = hypotheses.with_certain_mounting(draft, calibration, found)
+        if certain is not None:
+            sigmas = hypotheses.remounted(calibration, found).uncertainty
+            calibration = replace(calibration, uncertainty=sigmas)
+            draft = certain
+            found, kept_order = refined_by(certain)
     calibration = replace(
         calibration, command_latency_s=draft.form.latency_at(draft.inputs, found.values),
         inputs=draft.form.curves_at(draft.inputs, found.values),
@@ -312,8 +345,20 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         findings, calibration=calibration, model=model, base=base,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
                     f"{max(shooting.HORIZONS_S):g} s.", *sums,
-                    *hypotheses.about_forms(base, findings.trials)),
+                    *hypotheses.about_forms(base, findings.trials, drive.settings.order),
+                    *about_options(drive, best.order, kept_order)),
     )  # fmt: skip
+
+
+def about_options(drive: Drive, order: int, kept_order: bool) -> Iterator[str]:
+    """Says which options had no effect on a model whose state is the motion."""
+    settings = drive.settings
+    if settings.alpha != "auto":
+        why = "where the state is the motion, predictions of parts of the drive weigh the terms"
+        yield f"alpha = {settings.alpha:g} was not used: {why}."
+    if settings.order != "auto" and not kept_order:
+        why = "predictions with its terms went astray, so the textbook's terms were kept alone"
+        yield f"order = {order} was not used: {why}."
 
 
 def complete(drive: Drive, findings: Findings) -> Findings:
@@ -335,15 +380,19 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
     held_out = verdict.tried(model, calibration, whole, drive.settings.train_until_s)
     bands: dict[float, float] = {}
-    if not calibration.is_exact and drive.duration_s > drive.settings.train_until_s:
+    yardstick = findings.yardstick or textbook_of(whole, calibration)
+    if findings.replaced:
+        bands = bands_of_fixed(model, calibration, findings.training)
+    elif not calibration.is_exact and drive.duration_s > drive.settings.train_until_s:
         derived = None
         if findings.base is not None:
             derived = aligned(findings.training, findings), findings.base
         bands = bands_of(model, calibration, findings.training, derived)
-    judgement = judged(model, calibration, whole, bands)
+    judgement = judged(model, calibration, whole, bands, yardstick)
     rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
     findings = replace(
         findings, model=rated, unseen=unseen, held_out=held_out, judgement=judgement,
+        yardstick=yardstick,
         calibration=replace(calibration, notes=_plain(findings)),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
         linear=replace(linear, model=rated) if model is linear.model else linear,
@@ -352,18 +401,77 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     return replace(findings, notes=_notes(drive, findings))
 
 
+def _with_actuators(
+    drive: Drive, findings: Findings, yardstick: Yardstick
+) -> tuple[Drive, Findings]:
+    """Returns a drive of a steered robot, and its findings, whose state is speed and angle."""
+    calibration = findings.calibration
+    spec = actuated_spec(yardstick, findings.whole)
+    parts = [
+        with_actuators(part, spec, yardstick, calibration)
+        for part in (findings.training, findings.whole)
+    ]
+    actuated = replace(findings, training=parts[0], whole=parts[1], width=None)
+    return replace(drive, spec=spec), actuated
+
+
+def settle(drive: Drive, findings: Findings) -> Findings:
+    """Puts the fitted textbook in the place of a model that predicts unseen data worse."""
+    if findings.yardstick is None or not acceptance.loses_to_textbook(findings.judgement):
+        return findings
+    _, model = _fitted(findings)
+    spec, until = drive.spec, drive.settings.train_until_s
+    try:
+        yardstick = fit_yardstick(
+            findings.whole, until, findings.calibration.clock_offset_s, one_limit=True
+        )
+        calibration = textbook_calibration(yardstick, findings.calibration, spec)
+        start = motion(drive, replace(findings, calibration=calibration))
+        if needs_actuators(yardstick, spec):
+            drive, start = _with_actuators(drive, start, yardstick)
+            spec = drive.spec
+        samples = aligned(start.training, start)
+        book = textbook_model(yardstick, model, samples, spec)
+        if book is None:
+            return findings
+        (lost,) = acceptance.usual(findings.judgement)
+        tried = replace(
+            start,
+            model=book,
+            samples=samples,
+            refinement=(),
+            trials=(),
+            assumptions=(),
+            replaced=verdict.replaced_by_textbook(lost),
+        )
+        tried = judge(drive, tried)
+    except (FitError, RecordingError):
+        return findings
+    won = acceptance.usual(tried.judgement)
+    if won and won[0].model.position_m < lost.model.position_m:
+        return tried
+    return findings
+
+
 def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     """All that is to be told of a model, the gravest first."""
     linear, _ = _fitted(findings)
     spec, calibration = drive.spec, findings.calibration
+    beaten = (findings.replaced,) if findings.replaced else shortfall(findings.judgement)
     return (
         *about_recordings(_fitted(findings)[1], calibration, findings.whole),
-        *shortfall(findings.judgement), *drive.recording.repairs, *findings.repairs,
+        *beaten, *drive.recording.repairs, *findings.repairs, *verdict.about_gaps(drive),
         *_sentences(findings), *findings.refinement,
-        *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
-        *verdict.unlearnt(linear, calibration, spec), *findings.structure,
+        *verdict.mirror_note(
+            known(findings.samples, "the training part", "fit"), spec, calibration
+        ),
+        *verdict.unlearnt(
+            linear, calibration, spec,
+            verdict.levels_of(findings.training.recording.command, spec),
+        ),
+        *findings.structure,
         *(verdict.doubts_of_fit(linear, calibration.is_exact) if findings.width is None else ()),
-        *verdict.doubts(findings.held_out), *verdict.untried(drive, findings.held_out),
+        *verdict.untried(drive, findings.held_out, findings.judgement),
         *findings.assumptions,
     )  # fmt: skip
 
@@ -407,7 +515,7 @@ def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dic
 def refit(drive: Drive, findings: Findings) -> Findings:
     """Fits the judged model anew to all data, unless it then predicts what it knew worse."""
     until = drive.settings.train_until_s
-    if findings.calibration.is_exact or until >= drive.duration_s:
+    if findings.calibration.is_exact or until >= drive.duration_s or findings.replaced:
         return findings
     settings = replace(drive.settings, train_until_s=np.inf)
     try:
@@ -440,6 +548,11 @@ def _plain(found: Findings) -> tuple[str, ...]:
 
 def _sentences(found: Findings) -> tuple[str, ...]:
     drive, calibration = found.training, found.calibration
+    if found.replaced:  # latency, lags and mounting are those of the fitted textbook
+        return (
+            *verdict.about_stamps(drive),
+            *verdict.about_clocks(drive, calibration, found.timing),
+        )
     return (
         *verdict.about_stamps(drive), *verdict.about_clocks(drive, calibration, found.timing),
         *followers.about_sums(calibration),
@@ -450,7 +563,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
 
 STAGES: tuple[Stage, ...] = (
     repair, clocks, mounting, responses, noise, motion, inputs, fit, prune, refine, complete, judge,
-    refit,
+    settle, refit,
 )  # fmt: skip
 """In order; each builds on what the stages before it found."""
 
@@ -516,6 +629,29 @@ class Identified:
     def judgement(self) -> tuple[HorizonErrors, ...]:
         """Errors on data held out, beside those of yardsticks, by horizon."""
         return self.findings.judgement
+
+    @property
+    def assessment(self) -> acceptance.Assessment:
+        """What the model is fit for, and the reasons."""
+        spec, findings = self.drive.spec, self.findings
+        mistaken = any(isinstance(note, verdict.Mistake) for note in self.notes)
+        unfit = mistaken or bool(verdict.missed(self.fit, spec))
+        textbook = bool(findings.replaced)
+        ratings = [
+            acceptance.rate(self.judgement, spec.footprint_radius, textbook),
+            acceptance.rate_unseen(verdict.time_without_pose(self.drive), self.drive.duration_s),
+        ]
+        if unfit:
+            ratings.append(acceptance.Assessment(acceptance.Verdict.DO_NOT_TRAIN, ()))
+        doubtful = any(isinstance(note, verdict.Doubt) for note in self.notes)
+        if self.model.assumed or doubtful:
+            ratings.append(acceptance.Assessment(acceptance.Verdict.WITH_CARE, ()))
+        return acceptance.combined(ratings)
+
+    @property
+    def verdict(self) -> acceptance.Verdict:
+        """What the model is fit for, in one of three words."""
+        return self.assessment.verdict
 
     @property
     def dead_zone(self) -> float:

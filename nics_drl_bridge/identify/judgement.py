@@ -1,6 +1,5 @@
 """Judgement of a model: its predictions of unseen data, their band, and those of yardsticks."""
 
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import hypotheses, shooting
+from nics_drl_bridge.identify.acceptance import comparison_noise
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.forms import problem_of
@@ -28,33 +28,64 @@ EVALUATIONS = 8  # of the fit to all but one part, which starts at the fit to al
 WITHIN, FEWEST = 95.0, 20  # percentage of the ends within a band, of so many at least
 
 
+def textbook_of(drive: Drive, calibration: Calibration) -> Yardstick | None:
+    """Fits the textbook to the training part; None for an exact drive, or one that is too short."""
+    if calibration.is_exact:
+        return None
+    with suppress(RecordingError):  # the training part is too short
+        return fit_yardstick(drive, drive.settings.train_until_s, calibration.clock_offset_s)
+    return None
+
+
 def judged(
-    model: TaylorModel, calibration: Calibration, drive: Drive, bands: dict[float, float]
-) -> tuple[HorizonErrors, ...]:
+    model: TaylorModel, calibration: Calibration, drive: Drive, bands: dict[float, float],
+    textbook: Yardstick | None,
+) -> tuple[HorizonErrors, ...]:  # fmt: skip
     """Compares predictions of the held-out part, by the horizons that fit into it.
 
     `bands` are distances within which 95 % of the ends are expected [m], by horizon [s].
     """
     begin, told = drive.settings.train_until_s, []
-    textbook: Yardstick | None = None
-    if not calibration.is_exact:
-        with suppress(RecordingError):  # the training part is too short
-            textbook = fit_yardstick(drive, begin, calibration.clock_offset_s)
     for horizon in HORIZONS_S:
         chosen = windows(drive, calibration, begin, drive.duration_s, horizon, SPACING_S)
         if not len(chosen.start_t):
             break
         ends = predict(model, calibration, drive, chosen)
         twist = twists_before(drive, chosen.start_t)
-        band, far = bands.get(horizon), np.hypot(*(ends - chosen.end)[:, :2].T)
-        told.append(HorizonErrors(
-            horizon, len(far), float(chosen.path.mean()), errors_of_ends(ends, chosen),
-            errors_of_ends(kept_twist(drive, chosen, twist), chosen),
-            None if textbook is None
-            else errors_of_ends(textbook.predict(drive, chosen, twist), chosen),
-            band, None if band is None else float((far <= band).mean()),
-        ))  # fmt: skip
+        kept = kept_twist(drive, chosen, twist)
+        by_textbook = None if textbook is None else textbook.predict(drive, chosen, twist)
+        far = distances(ends, chosen)
+        band = bands.get(horizon)
+        told.append(
+            HorizonErrors(
+                horizon_s=horizon,
+                windows=len(far),
+                path_m=float(chosen.path.mean()),
+                model=errors_of_ends(ends, chosen),
+                kept_twist=errors_of_ends(kept, chosen),
+                textbook=None if by_textbook is None else errors_of_ends(by_textbook, chosen),
+                band_m=band,
+                coverage=None if band is None else float((far <= band).mean()),
+                kept_twist_noise_m=noise_beside(ends, kept, chosen, horizon),
+                textbook_noise_m=noise_beside(ends, by_textbook, chosen, horizon),
+            )
+        )
     return tuple(told)
+
+
+def distances(ends: Array, chosen: Windows) -> Array:
+    """Returns the distances (W,) of predicted ends (W, 3) from the measured ones [m]."""
+    return np.asarray(np.hypot(*(ends - chosen.end)[:, :2].T))
+
+
+def noise_beside(ends: Array, other: Array | None, chosen: Windows, horizon: float) -> float | None:
+    """Returns the noise [m] of a comparison of two predictions (W, 3) of the same ends."""
+    if other is None:
+        return None
+    difference = distances(ends, chosen) - distances(other, chosen)
+    if not np.isfinite(difference).all():  # one of them runs away: there is no doubt about it
+        return 0.0
+    return comparison_noise(difference, chosen.start_t, horizon)
 
 
 def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
@@ -64,22 +95,17 @@ def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
     return EndErrors(float(np.hypot(*apart[:, :2].T).mean()), float(heading))
 
 
-def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
-    """Returns the errors after 5 s, or the most that was held out; none if nothing was."""
-    return [each for each in judgement if each.horizon_s <= HORIZON_S][-1:]
-
-
-def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
-    """Says which yardsticks a model does not beat after 5 s, or the most that was held out."""
-    for at in usual(judgement):
-        named = {"the fitted textbook": at.textbook, "a constant twist": at.kept_twist}
-        better = {name: errors.position_m for name, errors in named.items() if errors is not None}
-        better = {name: m for name, m in better.items() if not at.model.position_m < m}
-        if better:
-            off = f"end {at.model.position_m:.3g} m off after {at.horizon_s:g} s"
-            those = " and ".join(f"those of {name} {error:.3g} m" for name, error in better.items())
-            finding = f"The model does not beat {' and '.join(better)}"
-            yield f"{finding}: on unseen data its predictions {off}, {those}."
+def bands_of_fixed(
+    model: TaylorModel, calibration: Calibration, training: Drive
+) -> dict[float, float]:
+    """Returns the bands [m] by horizon of a model that is not adjusted to any part of a drive."""
+    bands = dict[float, float]()
+    for horizon in BANDED_S:
+        chosen = windows(training, calibration, 0.0, training.duration_s, horizon, SPACING_S)
+        if len(chosen.start_t) >= FEWEST:
+            far = distances(predict(model, calibration, training, chosen), chosen)
+            bands[horizon] = float(np.percentile(far, WITHIN))
+    return bands
 
 
 def bands_of(

@@ -14,7 +14,7 @@ from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.clocks import TOLD_S
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import speed_index
-from nics_drl_bridge.identify.statistics import clustered_errors, minimise, uncertainty
+from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors, minimise, uncertainty
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -50,6 +50,7 @@ def refined(
     if problem is not None:
         try:
             best = simplify(problem, refine(problem, model, calibration))
+            best = without_doubtful_rotation(problem, best, calibration)
             errors = replace(best.model, std_errors=best.std_errors).named_errors
             by = "Coefficients and calibration were refined by the open-loop errors over up to 5 s"
             note = f"{by}: {best.error:.4f} m (root mean square) is left on the training part."
@@ -58,6 +59,22 @@ def refined(
             why = "The predictions of the fitted model run away on the training part"
             note = f"{why}, so that it could not be refined."
     return merged(model, linear, {}), calibration, note
+
+
+def without_doubtful_rotation(
+    problem: "Problem", best: "Refined", before: Calibration
+) -> "Refined":
+    """Refines anew without a rotation that is below three standard errors."""
+    calibration = best.calibration
+    sigma = calibration.uncertainty.get("rotation_rad", 0.0)
+    turned = calibration.rotation_rad
+    if turned in (0.0, before.rotation_rad) or abs(turned) >= CERTAIN * sigma:
+        return best
+    others = {k: v for k, v in calibration.uncertainty.items() if k != "rotation_rad"}
+    straight = replace(calibration, rotation_rad=0.0, uncertainty=others)
+    found = refine(problem, best.model, straight)
+    told = found.calibration.uncertainty | {"rotation_rad": sigma}
+    return replace(found, calibration=replace(found.calibration, uncertainty=told))
 
 
 def readjusted(

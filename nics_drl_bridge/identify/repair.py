@@ -8,12 +8,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import held, interval_means, unwrapped
+from nics_drl_bridge.identify.signals import held, interval_means, moved_commands, unwrapped
 from nics_drl_bridge.identify.statistics import unexplained
-from nics_drl_bridge.identify.verdict import Mistake
+from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.stamping import not_repeated
@@ -40,6 +40,9 @@ UNIT_PERCENTILE, STEERED_PERCENTILE = 75.0, 95.0
 # Commands are compared with the motion over this time [s], that many times or more, at any delay
 DELAYS_S, COMPARED_S, MIN_COMPARED = np.linspace(-1.0, 1.5, 26), 1.0, 20  # and offset of clocks;
 ALIKE, NEAR = 0.85, 1.2  # from this correlation on, another unit explains sizes by up to this ratio
+SCALED = 1.5  # times that a robot drives otherwise than told: less is slip, or a worn wheel
+STANDING_M, STANDING_RAD, FROZEN = 1e-3, 2e-3, 12.0  # a pose that stays within this, or this
+# many times its noise, never moved
 SWAPPED = 0.6  # least correlation of each of two commands with what the other should move
 PLACES = {"linear.x": 0, "angular.z": 1, "throttle": 0, "steering": 1}  # in speed and turn rate
 SIDEWAYS = ("linear.x", "linear.y", "angular.z")  # commands of a robot that moves sideways
@@ -133,7 +136,8 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
         told.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
     some = ", ".join(told[:TOLD]) + (f" and {len(told) - TOLD} more" if len(told) > TOLD else "")
     finding = f"jumps {some} as no speed of this robot explains"
-    notes.append(f"pose: {finding}; the drive is split there: it goes on from where it was before.")
+    split = "the drive is split there: it goes on from where it was before"
+    notes.append(Gap(f"pose: {finding}; {split}."))
     return replace(recording, pose=replace(recording.pose, values=place))
 
 
@@ -254,7 +258,63 @@ def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tu
                 finding = f"The commands ask for {times:.3g} times the {name} that was driven"
                 advice = f"write `unit: {other}` beside `from:`"
                 notes.append(Mistake(f"{finding}: if they are in {other}, {advice}."))
+                break
+        else:
+            same_quantity = unit in CONFUSED  # a steering angle is no turn rate
+            differs = not 1.0 / SCALED < times < SCALED
+            if same_quantity and differs and alike[place, place] > ALIKE:
+                notes.append(Doubt(_about_scale(name, times)))
     return tuple(notes)
+
+
+def _about_scale(name: str, times: float) -> str:
+    """Says that a robot drives by another speed, or turn rate, than its commands ask for."""
+    finding = f"The commands ask for {times:.3g} times the {name} that was driven, steadily"
+    causes = "the scale of this command, or that of the pose, is wrong"
+    return f"{finding}: {causes}, or the robot's own driver scales it."
+
+
+def check_pose_moves(drive: Drive) -> None:
+    """Refuses poses that stay where they are while commands change (RecordingError)."""
+    recording, values = drive.recording, unwrapped(drive.recording.pose.values)
+    if not moved_commands(recording.command).any():
+        return
+    position, heading = drive.pose_noise or (0.0, 0.0)
+    reach = float(np.ptp(values[:, :2], axis=0).max())
+    turn = float(np.ptp(values[:, 2]))
+    if reach <= max(STANDING_M, FROZEN * position) and turn <= max(STANDING_RAD, FROZEN * heading):
+        fault = f"stays within {reach:.2g} m and {turn:.2g} rad while the commands change"
+        advice = "check that it is this robot's, that it is alive, and that nothing held the robot"
+        raise RecordingError(f"{recording.source}: pose: {fault}; {advice}.")
+
+
+def check_encoders(drive: Drive) -> tuple[str, ...]:
+    """Tells of measured wheels that turn against the motion that they make by the textbook."""
+    recording, spec = drive.recording, drive.spec
+    state = recording.state
+    wheels = bool(spec.state) and all(v.unit == "rad/s" and not v.twist for v in spec.state)
+    if state is None or state.clock != recording.pose.clock or not (wheels and has_textbook(spec)):
+        return ()
+    try:
+        per_wheel = textbook(spec).twist(np.eye(len(spec.state)))  # (S, 3)
+    except ConfigError:
+        return ()
+    start, end, driven = _driven(drive)
+    inside = (start >= state.t[0]) & (end <= state.t[-1])
+    if inside.sum() < MIN_COMPARED:
+        return ()
+    turned = interval_means(state.t, state.values, start[inside], end[inside])
+    found = np.linalg.lstsq(turned, driven[inside], rcond=1e-3)[0]  # (S, 3)
+    rest = driven[inside] - turned @ found
+    parts = [d for d in (0, 2) if np.abs(per_wheel[:, d]).min() > 0.0]
+    explained = 1.0 - (rest**2).mean(axis=0) / np.maximum((driven[inside] ** 2).mean(axis=0), 1e-12)
+    if not parts or explained[parts].min() < SWAPPED:
+        return ()
+    against = (found[:, parts] * per_wheel[:, parts] < 0.0).all(axis=1)
+    names = [v.name for v, wrong in zip(spec.state, against, strict=True) if wrong]
+    finding = "turns backwards where the robot drives ahead"
+    advice = "its encoder counts backwards; write `scale: -1` for it"
+    return tuple(Mistake(f"{name} {finding}: {advice}.") for name in names)
 
 
 def _check_swapped(drive: Drive, pair: list[int], crosswise: float, straight: float) -> None:

@@ -10,13 +10,16 @@ import numpy as np
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import Curve
-from nics_drl_bridge.identify.verdict import EARLY, FAR_OFF
+from nics_drl_bridge.identify.verdict import FAR_OFF, Doubt, Mistake
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
 WIDTH = 96
 CURVE_POINTS = 8
+TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_arm_y_m"
+LEAST_DIGITS = 3  # of a coefficient: the printed equations predict as the model does
 MOST_LEFT = 0.5  # share of the error of standing still above which a model is hardly better
 COARSE = 2.0 / 3.0  # share of a state's range between two rows that is sampled too coarsely
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
@@ -32,7 +35,8 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     ranges = zip(model.variables, model.low, model.high, strict=True)
     around = list(stages(spec, identified))
     notes = identified.notes or ("Nothing had to be corrected.",)
-    of = "" if identified.findings.width else f" of {identified.fit.regression.terms_total}"
+    linear = not identified.findings.width and not identified.findings.replaced
+    of = f" of {identified.fit.regression.terms_total}" if linear else ""
     listed = partial(fill, width=WIDTH - 2, initial_indent="- ", subsequent_indent="    ")
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": map(listed, conclude(identified).lines),
@@ -128,18 +132,25 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Formats a number to the digits that its standard error leaves: `(4.63 +- 0.02)`."""
+    """Formats a number so that it can be used, with its standard error: `(4.63 +- 0.02)`.
+
+    To the digits that the error leaves, but never to fewer than `LEAST_DIGITS`.
+    """
     if error is None or error <= 1e-6 * value:
         return f"{value:.5g}"
     exponent = int(np.floor(np.log10(error)))
     leading = error / 10.0**exponent
-    digits = max(0, -exponent + (leading < 1.95 or leading >= 9.5))
+    by_error = -exponent + (leading < 1.95 or leading >= 9.5)
+    by_value = LEAST_DIGITS - 1 - int(np.floor(np.log10(value))) if value > 0.0 else 0
+    if by_value > max(0, by_error):
+        return f"({value:.{LEAST_DIGITS}g} +- {error:.2g})"
+    digits = max(0, by_error)
     return f"({value:.{digits}f} +- {error:.{digits}f})"
 
 
 def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
     """Tells of the pruned linear fit, where it gave the terms: not those of a motion."""
-    if identified.findings.width is not None:
+    if identified.findings.width is not None or identified.findings.replaced:
         return {}
     fit, model = identified.fit, identified.model
     rows = zip(model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True)
@@ -248,9 +259,11 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     recording, found = identified.recording, identified.calibration
     sigma, mounting = found.uncertainty, identified.findings.mounting
     one_clock = recording.pose.clock == recording.command.clock
-    clocks = "pose and commands are on one clock" if one_clock else "no command changed"
+    changed = bool(moved_commands(recording.command).any())
+    untold = "the motion does not show it" if changed else "no command changed"
+    clocks = "pose and commands are on one clock" if one_clock else untold
     both = "clock_offset_s" in sigma
-    latency = "only its sum with the clock offset is known" if both else "no command changed"
+    latency = "only its sum with the clock offset is known" if both else untold
     if identified.findings.width is not None and not both:
         latency = "it can't be told from the lags"
     few = "the drive shows too few directions of motion"
@@ -274,6 +287,10 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
             zero = value == 0.0 and key in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
             remark = "below its uncertainty: taken as zero" if zero else ""
             values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
+    if identified.findings.replaced:
+        for key in TEXTBOOK_VALUES:
+            name, value, unit, _ = rows[key]
+            values[key] = CalibratedValue(name, value, None, unit, "by the fitted textbook")
     if (period := found.burst_period_s) > 0.0:
         values["burst_period_s"] = CalibratedValue("period of bursts", period, None, "s")
     swapped = found.wheels_swapped
@@ -327,10 +344,8 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
         return "it may lack terms, so leave order and alpha at `auto`"
     for note in identified.notes:
-        if note.startswith(EARLY):
+        if isinstance(note, Mistake | Doubt):
             return f"{note[0].lower()}{note[1:].rstrip('.')}"
-        if note.startswith("pose: jumps "):
-            return f"its pose {note.removeprefix('pose: ').partition(';')[0]}, so record anew"
-    got = "that nothing held the robot up, that it got each command, that its pose did not jump"
+    got = "that nothing held the robot up, that it got each command"
     shown = f"{got} and that rows {apart} show how it responds"
     return f"the recording does not show why, so make sure {shown}, and record anew"

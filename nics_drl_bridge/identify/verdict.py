@@ -2,23 +2,23 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from math import isfinite
 from typing import Any
 
 import numpy as np
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import CERTAIN, TimingEstimate
-from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
 from nics_drl_bridge.identify.excitation import Excitation, plausible
 from nics_drl_bridge.identify.fit import Fit
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import errors_of
-from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.recording.recording import Samples, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
 
@@ -29,6 +29,9 @@ FAR_OFF = 0.25  # predictions whose mean error exceeds this share of the path ar
 UNEXPLAINED = 0.5
 WORSE = 1.25  # times the trial's error on the part that both know; a refit beyond is not believed
 MANY_OUTLIERS = 0.001
+BACKWARDS = 0.3  # angle [rad] from half a turn below which a body faces backwards
+GAP_STEPS = 3.0  # a pause of the pose longer than so many usual steps, and MAX_GAP_S, is a gap
+GAPS_TOLD = 4  # one by one
 LINEAR = "Predictions by terms of a higher order ran away, so the model has those of order 1 alone."
 EARLY = "The robot moves"  # begins a note on motion before its commands
 MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
@@ -36,6 +39,10 @@ MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot tu
 
 class Gap(str):
     """A sentence on something that a drive could not teach."""
+
+
+class Doubt(str):
+    """A sentence on something that looks mistaken, but may be the robot's own way."""
 
 
 class Mistake(str):
@@ -53,6 +60,41 @@ def about_stamps(drive: Drive) -> Iterator[str]:
         yield Gap(f"The noise of the pose was not measured; {fix}.")
 
 
+def time_without_pose(drive: Drive) -> float:
+    """Returns the time in gaps of the pose [s]."""
+    t = drive.dated.t
+    return float(sum(t[row + 1] - t[row] for row in _gap_rows(drive)))
+
+
+def _gap_rows(drive: Drive) -> list[int]:
+    """Returns the poses after which there is a gap, that of the longest first."""
+    t = drive.dated.t
+    span = np.diff(t)
+    usual = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
+    wide = span > max(MAX_GAP_S, GAP_STEPS * usual)
+    if drive.recording.episodes:  # between two of them there is no drive
+        wide &= np.diff(drive.recording.episode_at(t)) == 0
+    rows = np.flatnonzero(wide)
+    return [int(row) for row in rows[np.argsort(-span[rows], kind="stable")]]
+
+
+def about_gaps(drive: Drive) -> Iterator[str]:
+    """Tells each gap in the pose: when, how long, and how far the pose moved across it."""
+    t, pose, rows = drive.dated.t, drive.dated.values, _gap_rows(drive)
+    for row in rows[:GAPS_TOLD]:
+        moved = geometry.between(pose[row], pose[row + 1])
+        span, begin = t[row + 1] - t[row], t[row] - t[0]
+        finding = f"The pose has a gap of {span:.1f} s, from {begin:.1f} s to {begin + span:.1f} s"
+        across = f"{np.hypot(*moved[:2]):.2f} m and turns {abs(moved[2]):.2f} rad"
+        yield Gap(f"{finding}, across which it moves {across}: what happened there is not known.")
+    if len(rows) > GAPS_TOLD:
+        rest = [t[row + 1] - t[row] for row in rows[GAPS_TOLD:]]
+        yield Gap(
+            f"The pose has {len(rest)} more gaps, of up to {max(rest):.2f} s "
+            f"and of {sum(rest):.1f} s in all."
+        )
+
+
 def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> Iterator[str]:
     """Tells of clock offset and latency."""
     sigma, recording = calibration.uncertainty, drive.recording
@@ -66,7 +108,11 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
         if recording.state is not None:
             cause = "its state is stamped by another clock; stamp both by one, and record anew"
-        yield f"{finding}: {cause}."
+        yield Mistake(f"{finding}: {cause}.")
+    if timing.drift != 0.0:
+        rate = f"{abs(timing.drift) * 1e3:.1f} ms in every second"
+        finding = f"The clocks of pose and commands drift apart by {rate}"
+        yield Mistake(f"{finding}: stamp both by one clock, or correct the rate of the slower one.")
     if not moved_commands(recording.command).any():
         yield Gap("No command ever changed, so clock offset and latency could not be learnt.")
     elif not timing.separated and clocks_differ:
@@ -93,7 +139,14 @@ def about_mounting(
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
-        yield f"The direction of travel lies {turned} from the tracked body's heading."
+        finding = f"The direction of travel lies {turned} from the tracked body's heading"
+        if faces_backwards(calibration) and not drive.spec.steers:
+            yield Doubt(
+                f"{finding}: the body faces backwards, or the speed that is commanded has the "
+                "wrong sign (it can't be told which)."
+            )
+        else:
+            yield f"{finding}."
     if x_hidden:
         finding = f"Where the tracked point lies on the robot could not be learnt, since {x_hidden}"
         advice = "it is taken as base_link, and the rotation holds for this curvature"
@@ -104,6 +157,11 @@ def about_mounting(
     if y_hidden and not x_hidden and not drive.spec.moves_sideways:
         why = f"since {y_hidden}; it is taken as zero"
         yield f"The tracked point's place along y could not be learnt, {why}."
+
+
+def faces_backwards(calibration: Calibration) -> bool:
+    """True if the robot travels where the back of the tracked body points."""
+    return abs(geometry.wrap_angle(calibration.rotation_rad - np.pi)) < BACKWARDS
 
 
 def about_responses(
@@ -152,8 +210,20 @@ def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
     return [c.name for c in spec.command if c.name in names]
 
 
-def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator[str]:
-    """Tells of inputs that were not moved, alone or at many levels, and of dependent states."""
+def levels_of(command: Stream, spec: RobotSpec) -> dict[str, int]:
+    """Returns the number of different values of each command as it was recorded."""
+    columns = zip(spec.command, command.values.T, strict=True)
+    return {c.name: len(np.unique(np.round(values, 9))) for c, values in columns}
+
+
+def unlearnt(
+    linear: Fit, calibration: Calibration, spec: RobotSpec, levels: dict[str, int]
+) -> Iterator[str]:
+    """Tells of inputs that were not moved, alone or at many levels, and of dependent states.
+
+    `levels` are the numbers of different values of the commands as they were recorded: a motor
+    that saturates makes two of many.
+    """
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
     if unmoved := ", ".join(missed(linear, spec)):
@@ -171,8 +241,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
         why = "always depended on the other variables, so their effects can't be separated"
         yield Gap(f"{copies} {why}: the model omits them, and is valid only while that is so.")
-    levels = {n: v for n, v in excitation.levels.items() if n not in excitation.unmoved}
-    if coarse := _list([name for name, count in levels.items() if count == FEW_LEVELS]):
+    moved = {name: count for name, count in levels.items() if name not in excitation.unmoved}
+    if coarse := _list([name for name, count in moved.items() if count == FEW_LEVELS]):
         finding = "between them the model is a straight line, whatever the robot does"
         yield Gap(f"{coarse} took two values only: {finding}; drive with values in between.")
 
@@ -195,35 +265,30 @@ def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
         yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
 
 
-def doubts(held_out: OpenLoop | None) -> Iterator[str]:
-    """Tells each reason to doubt the predictions."""
-    if held_out is None or not held_out.mean_path_m > 0.0:
-        return
-    share = held_out.mean_position_error_m / held_out.mean_path_m
-    if not share <= FAR_OFF:
-        end = f"end {share:.0%} of their path away" if isfinite(share) else "run away"
-        finding = "the response does not follow the commands as modelled"
-        yield f"On unseen data the predictions {end}: {finding}; do not train with this model."
-
-
 def _list(names: Sequence[str]) -> str:
     """Joins names: `a`, `a and b`, `a, b and c`."""
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
-def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
-    """Tells if the robot turns right when commanded to turn left."""
+def mirror_note(samples: Samples, spec: RobotSpec, calibration: Calibration) -> Iterator[str]:
+    """Tells if the robot turns right when commanded to turn left, and which sign explains it."""
     for i, command in enumerate(spec.command, start=len(spec.state)):
         if not command.turns:
             continue
         turn, wanted = samples.dq[:, 2], samples.x[:, i]
         if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
-        if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
-            finding = f"The robot turns right where {command.name} is positive"
-            cause = "the recording is a mirror image (y and heading reversed), or the sign of"
-            yield Mistake(f"{finding}: {cause} the command is; the model moves as recorded.")
+        if min(turn.std(), wanted.std()) < 1e-3 or np.corrcoef(turn, wanted)[0, 1] > MIRRORED:
+            continue
+        if command.steers and faces_backwards(calibration):
+            speed = next((c.name for c in spec.command if not c.turns), "the speed")
+            finding = f"The robot drives backwards where {speed} is positive"
+            yield Mistake(f"{finding}: the sign of {speed} is reversed; write `scale: -1` for it.")
             return
+        finding = f"The robot turns right where {command.name} is positive"
+        cause = "the recording is a mirror image (y and heading reversed), or the sign of"
+        yield Mistake(f"{finding}: {cause} the command is; the model moves as recorded.")
+        return
 
 
 def tried(model: TaylorModel, calibration: Calibration, drive: Drive, t: float) -> OpenLoop | None:
@@ -239,13 +304,18 @@ def ran_away(tried: OpenLoop | None) -> bool:
     return tried is not None and not tried.mean_position_error_m <= tried.mean_path_m
 
 
-def untried(drive: Drive, held_out: OpenLoop | None) -> Iterator[str]:
-    """Tells of a drive too short to try a model on unseen data."""
+def untried(
+    drive: Drive, held_out: OpenLoop | None, judgement: tuple[HorizonErrors, ...]
+) -> Iterator[str]:
+    """Tells of a drive too short to try a model on unseen data, or over 5 s of it."""
     if held_out is None:
+        shown = "the model was not tried on unseen data"
+        if judgement:
+            shown = f"the model was tried over {judgement[-1].horizon_s:g} s only"
         left = max(drive.duration_s - drive.settings.train_until_s, 0.0)
         yield Gap(
             f"The last {left:.1f} s, held out of the fit, are too short for a prediction over "
-            f"{HORIZON_S:g} s: the model was not tried on unseen data; record 20 s or more."
+            f"{HORIZON_S:g} s: {shown}; record 20 s or more."
         )
 
 
@@ -272,6 +342,16 @@ def with_quality(
     measures = ("outliers", "condition", "rmse", "r2")
     figures |= {name: by_dof(getattr(linear, name)) for name in measures}
     return replace(model, quality=Quality(samples=len(linear.regression.samples.t), **figures))
+
+
+def replaced_by_textbook(lost: HorizonErrors) -> str:
+    """Says that a model lost to its textbook, which was put in its place."""
+    if lost.textbook is None:
+        return ""
+    off = f"{lost.model.position_m:.3g} m off after {lost.horizon_s:g} s"
+    finding = f"The model that was learnt ends {off}, the fitted textbook "
+    finding += f"{lost.textbook.position_m:.3g} m, on the same unseen data"
+    return f"{finding}: the model that was written is the textbook, fitted to the training part."
 
 
 def refitted(until: float, duration: float, worse: bool) -> str:

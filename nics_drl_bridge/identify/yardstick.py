@@ -1,6 +1,6 @@
 """Yardsticks of a model: a robot that keeps its twist, and its fitted textbook kinematics."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -163,6 +163,7 @@ class _Form:
     start: TextbookResponse
     moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
     mounted: NDArray[np.bool_]  # (3,) of the mounting
+    one_limit: bool = False  # True if it speeds up and slows down by the same acceleration
 
     @property
     def slips(self) -> bool:
@@ -186,6 +187,8 @@ class _Form:
         gain[self.moves], offset[rows], mounting[self.mounted] = gains, offsets, place
         lag[rows] = np.exp(np.clip(lags, *np.log(LAG_RANGE_S)))
         limit = np.exp(np.clip(limits, *np.log(LIMIT_RANGE)))
+        if self.one_limit:
+            limit = np.full(2, limit[0])
         bicycle = r.bicycle._replace(understeer=float(understeer.sum()))
         return TextbookResponse(float(delay[0]), gain, offset, lag, limit, bicycle, mounting)
 
@@ -265,10 +268,13 @@ def _regressed(
 
 
 @one_blas_thread
-def fit_yardstick(drive: Drive, until_s: float, clock_offset_s: float = 0.0) -> Yardstick:
+def fit_yardstick(
+    drive: Drive, until_s: float, clock_offset_s: float = 0.0, one_limit: bool = False
+) -> Yardstick:
     """Fits the textbook of a drive's robot, as a fair hand-made model of it, up to `until_s` [s].
 
-    To open-loop errors after `HORIZONS_S`. Raises RecordingError if the part is too short for them.
+    To open-loop errors after `HORIZONS_S`. With `one_limit` it speeds up and slows down by the same
+    acceleration. Raises RecordingError if the part is too short for them.
     """
     spacing = max(SPACING_S, (until_s - HORIZONS_S[-1]) / MOST_WINDOWS)
     chosen, twist = _without_jumps(drive, until_s, HORIZONS_S[-1], spacing)
@@ -298,5 +304,6 @@ def fit_yardstick(drive: Drive, until_s: float, clock_offset_s: float = 0.0) -> 
         return float(found.cost), form.unpack(found.x)
 
     guesses = [_first_guess(drive, until_s, clock_offset_s, offsets) for offsets in (True, False)]
+    guesses = [replace(guess, one_limit=one_limit) for guess in guesses]
     best = min((fitted(guess) for guess in guesses), key=lambda pair: pair[0])
     return Yardstick(best[1], clock_offset_s)

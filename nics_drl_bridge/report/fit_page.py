@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nics_drl_bridge.files import write_text
+from nics_drl_bridge.identify.acceptance import Verdict, usual
 from nics_drl_bridge.identify.conclusion import OF_PATH, Conclusion, conclude, end_of
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.judgement import usual
 from nics_drl_bridge.identify.report import COMPARED, HEADS, equations_with_errors, judgement_rows
 from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -30,12 +30,12 @@ def fit_tile(identified: Identified) -> Tile:
 
 def verdict_blocks(tiles: Sequence[Tile], conclusion: Conclusion, *commands: str) -> Blocks:
     """Figures in large type, doubts, what could not be learnt, and what to do next."""
-    blocks = [html.tiles(tiles)]
+    blocks = [html.paragraph(f"This model is: {conclusion.verdict}."), html.tiles(tiles)]
     if conclusion.doubts:
         blocks.append(html.bullets(conclusion.doubts))
     if conclusion.gaps:
         blocks += [html.paragraph("What the drive could not teach:"), html.bullets(conclusion.gaps)]
-    else:
+    elif conclusion.verdict is Verdict.GOOD:
         blocks.append(html.paragraph("The drive taught everything the model needs."))
     blocks.append(html.paragraph(conclusion.advice))
     return [*blocks, html.code("\n".join(commands))] if commands else blocks

@@ -18,7 +18,8 @@ class InputCurve(Schema):
     """A dead zone about zero, unequal gains, and saturation: a monotone curve of one command."""
 
     command: str
-    dead: float = Field(default=0.0, ge=0.0)  # a smaller command moves nothing, in its unit
+    # a smaller command moves nothing, in its unit; below 0, any command does so much more
+    dead: float = Field(default=0.0, allow_inf_nan=False)
     # smaller and greater commands do no more than these, in its unit; 0 never does anything
     least: End = -np.inf
     most: End = np.inf
@@ -34,8 +35,9 @@ class InputCurve(Schema):
     @property
     def equation(self) -> str:
         """The curve as text: `throttle' = 0 within +-0.12, else throttle -+ 0.12`."""
-        name, dead = self.command, f"{self.dead:.4g}"
-        text = f"0 within +-{dead}, else {name} -+ {dead}" if self.dead else name
+        name, dead = self.command, f"{abs(self.dead):.4g}"
+        text = f"0 within +-{dead}, else {name} -+ {dead}" if self.dead > 0.0 else name
+        text += f" +- {dead}, 0 at 0" * (self.dead < 0.0)
         text += ends(self.least, self.most, name)
         text += f", backwards times {self.back:.4g}" * (self.back != 1.0)
         return f"{name}' = {text}" + f", {self.delay:.3f} s later" * (self.delay > 0.0)
@@ -50,7 +52,7 @@ class InputCurve(Schema):
         """Returns the commands (...) of effects; infinite where greater ones do no more."""
         effect = np.asarray(effect, dtype=np.float64)
         gain = np.where((effect < 0.0) & (self.back > 0.0), self.back, 1.0)
-        command = effect / gain + np.sign(effect) * self.dead
+        command = np.sign(effect) * np.maximum(np.abs(effect) / gain + self.dead, 0.0)
         command = np.where(effect <= self.of(-np.inf), -np.inf, command)
         return np.where(effect >= self.of(np.inf), np.inf, command)
 

@@ -97,9 +97,9 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
 def bend(command, curve):  # type: ignore[no-untyped-def]
     """Returns the effect of a command by its curve (4,); see `InputCurve`."""
     held = min(max(command, curve[LEAST]), curve[MOST])
-    if held < -curve[DEAD]:
+    if held < -curve[DEAD] and held < 0.0:
         return curve[BACK] * (held + curve[DEAD])
-    return 0.0 if held <= curve[DEAD] else held - curve[DEAD]
+    return 0.0 if held <= max(curve[DEAD], 0.0) else held - curve[DEAD]
 
 
 @kernel

@@ -302,6 +302,9 @@ class HorizonErrors:
     textbook: EndErrors | None = None  # of the textbook, fitted to the same part; None: not fitted
     band_m: float | None = None  # distance within which 95 % of the ends are expected
     coverage: float | None = None  # share of the ends within it
+    # Noise of the differences between the model's errors and those of the yardsticks [m]
+    kept_twist_noise_m: float | None = None
+    textbook_noise_m: float | None = None
 
 
 @dataclass(frozen=True)

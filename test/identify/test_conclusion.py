@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nics_drl_bridge.identify.acceptance import Verdict
 from nics_drl_bridge.identify.conclusion import UNTRIED, accuracy, conclude, end_of
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import fit_report, opening
@@ -54,7 +55,8 @@ def test_a_model_that_is_beaten_is_not_to_be_trained_with(found):
     assert conclude(found).doubts == ()
     beaten = conclude(judged(found, 2.0))
     assert any("does not beat" in doubt for doubt in beaten.doubts)
-    assert "before training a policy" in beaten.advice
+    assert beaten.verdict is Verdict.DO_NOT_TRAIN
+    assert "longer than these 30 s" in beaten.advice
 
 
 def test_the_report_opens_with_the_conclusion_and_the_model(found):
@@ -62,6 +64,7 @@ def test_the_report_opens_with_the_conclusion_and_the_model(found):
     first = opening(report)
     assert report.startswith(first)
     assert conclude(found).advice in " ".join(first.split())
+    assert "Verdict: good. On unseen data" in first.split("\n\n")[0]
     assert "d_speed = " in first
     assert len(first.splitlines()) < 20 < len(report.splitlines())
 

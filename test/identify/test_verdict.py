@@ -31,7 +31,7 @@ def throttled():
 
 def told(spec, *unmoved: str) -> str:
     regression = SimpleNamespace(excitation=Excitation(unmoved, (), {}), dependent=())
-    return " ".join(unlearnt(SimpleNamespace(regression=regression), Calibration(), spec))
+    return " ".join(unlearnt(SimpleNamespace(regression=regression), Calibration(), spec, {}))
 
 
 def test_a_driver_is_asked_to_move_commands_and_no_states(throttled):

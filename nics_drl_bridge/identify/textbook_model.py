@@ -1,0 +1,367 @@
+"""A fitted textbook as a Taylor model: written in the place of a model that loses to it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.calibration import Calibration, Response
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.motion import known_state
+from nics_drl_bridge.identify.signals import inferred_states
+from nics_drl_bridge.identify.yardstick import LIMIT_RANGE, TextbookResponse, Yardstick
+from nics_drl_bridge.recording.recording import Samples, Stream
+from nics_drl_bridge.robot.curve import InputCurve
+from nics_drl_bridge.robot.kinds import has_textbook, textbook
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel, evaluate
+
+Powers = NDArray[np.int64]
+
+MARGIN = 1.25  # times the greatest value of an actuator on a drive that its range reaches
+LEAST_COSINE = 0.1  # of a steering angle
+NEGLIGIBLE = 1e-3  # share of a rate below which a term of the expansion is left out
+UNLIMITED = 0.5  # share of the widest range that is searched: a limit beyond it was not found
+
+
+def textbook_calibration(
+    yardstick: Yardstick, calibration: Calibration, spec: RobotSpec
+) -> Calibration:
+    """Returns the calibration of a drive as the fitted textbook sees it."""
+    response = yardstick.response
+    x, y, heading = map(float, response.mounting)
+    latency = max(response.delay_s, 0.0)
+    early = max(-response.delay_s, 0.0)  # motion before its commands is of another clock
+    if not spec.state:  # a lag without a state acts as a delay
+        used = response.gain.any(axis=1)
+        latency += float(response.lag_s[used].mean())
+    kept = ("clock_offset_s", "wheel_scale", "turn_scale")
+    return replace(
+        calibration,
+        clock_offset_s=yardstick.clock_offset_s + early,
+        command_latency_s=latency,
+        rotation_rad=-heading,
+        lever_arm_m=(x, y),
+        responses=tuple(_responses(response, calibration, spec)),
+        inputs=tuple(_dead_zones(response, spec)),
+        limits={},
+        uncertainty={k: v for k, v in calibration.uncertainty.items() if k in kept},
+    )
+
+
+def textbook_model(
+    yardstick: Yardstick, model: TaylorModel, samples: Samples, spec: RobotSpec
+) -> TaylorModel | None:
+    """Returns the fitted textbook by terms, in the step and the range of a model of the same drive.
+
+    Trigonometric functions are expanded over the rows of the samples. None for a state whose
+    relation to the twist no textbook tells.
+    """
+    response = yardstick.response
+    book = _Expansion(response, samples, spec, model)
+    if not spec.state:
+        book.add_twist_of_commands()
+    elif [v.name for v in spec.state] == ["wheel_speed", "wheel_angle"]:
+        book.add_actuators()
+    elif any(v.twist for v in spec.state):
+        book.add_twist_as_state()
+    elif all(v.follows for v in spec.state):
+        book.add_followers()
+    elif has_textbook(spec) and not response.bicycle.used:
+        book.add_wheels()
+    else:
+        return None
+    return book.made()
+
+
+def needs_actuators(yardstick: Yardstick, spec: RobotSpec) -> bool:
+    """True for a steered robot whose state is its twist: its steering lags, not its turn rate."""
+    return yardstick.response.bicycle.used and any(v.twist for v in spec.state)
+
+
+def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
+    """Returns a steered robot whose state is its speed and its steering angle."""
+    response, spec = yardstick.response, drive.spec
+    speed, steering = _places_of_bicycle(response)
+    forward = [v.twist for v in spec.state].index("vx")
+    fastest = float(np.abs(known_state(drive).values[:, forward]).max())
+    told = np.abs(drive.recording.command.values[:, steering]).max()
+    widest = float(np.abs(response.gain[2, steering]) * told + abs(response.offset[2]))
+    reach = {"wheel_speed": MARGIN * fastest, "wheel_angle": MARGIN * widest}
+    states = (("wheel_speed", "m/s", speed), ("wheel_angle", "rad", steering))
+    data = spec.model_dump()
+    data["state"] = [
+        {
+            "name": name,
+            "unit": unit,
+            "min": -reach[name],
+            "max": reach[name],
+            "follows": spec.command[place].name,
+        }
+        for name, unit, place in states
+    ]
+    lags = {"speed_lag": response.lag_s[0], "steering_lag": response.lag_s[2]}
+    data["parameters"] = spec.parameters | {name: float(lag) for name, lag in lags.items()}
+    return RobotSpec.model_validate(data)
+
+
+def with_actuators(
+    drive: Drive, spec: RobotSpec, yardstick: Yardstick, calibration: Calibration
+) -> Drive:
+    """Returns a drive, whose motion is known, of a robot whose state is speed and steering angle.
+
+    The speed is that of the motion, the angle that of the textbook for the commands.
+    """
+    response, state = yardstick.response, known_state(drive)
+    forward = [v.twist for v in drive.spec.state].index("vx")
+    _, steering = _places_of_bicycle(response)
+    alone = spec.model_copy(update={"state": spec.state[1:]})
+    command, lag = drive.recording.command, response.lag_s[2:]
+    latency = calibration.command_latency_s
+    angle = inferred_states(command, alone, lag, latency, state.t)[:, 0]
+    angle = response.gain[2, steering] * angle + response.offset[2]
+    speed = state.values[:, forward]
+    if response.bicycle.front_drive:
+        speed = speed / np.maximum(np.cos(angle), LEAST_COSINE)
+    values = np.stack([speed, angle], axis=1)
+    recording = replace(drive.recording, state=Stream(state.t, values, state.clock))
+    return replace(drive.part(recording), spec=spec)
+
+
+def _places_of_bicycle(response: TextbookResponse) -> tuple[int, int]:
+    """Returns the places of speed and steering among the commands of a bicycle."""
+    speed = int(np.argmax(np.abs(response.gain[0])))
+    return speed, 1 - speed
+
+
+def _actuator_of(response: TextbookResponse, spec: RobotSpec, command: str) -> int:
+    """Returns the row of the actuator that a command moves most."""
+    place = [c.name for c in spec.command].index(command)
+    return int(np.argmax(np.abs(response.gain[:, place])))
+
+
+def _responses(
+    response: TextbookResponse, calibration: Calibration, spec: RobotSpec
+) -> Iterator[Response]:
+    for known in calibration.responses:
+        actuator = _actuator_of(response, spec, known.command)
+        place = [c.name for c in spec.command].index(known.command)
+        turns = response.bicycle.used and actuator == 2
+        gain = 1.0 if turns else float(response.gain[actuator, place])
+        yield replace(known, lag_s=float(response.lag_s[actuator]), gain=gain)
+
+
+def _dead_zones(response: TextbookResponse, spec: RobotSpec) -> Iterator[InputCurve]:
+    """Yields the dead zone of a speed command whose effect is less, or more, than in proportion."""
+    if not response.bicycle.used or response.offset[0] == 0.0:
+        return
+    place = int(np.argmax(np.abs(response.gain[0])))
+    dead = float(-response.offset[0] / max(abs(response.gain[0, place]), 1e-9))
+    yield InputCurve(command=spec.command[place].name, dead=dead)
+
+
+class _Expansion:
+    """Terms of a textbook, degree of freedom by degree of freedom."""
+
+    def __init__(
+        self, response: TextbookResponse, samples: Samples, spec: RobotSpec, like: TaylorModel
+    ) -> None:
+        self.response = response
+        self.spec = spec
+        self.like = like
+        self.x = samples.x
+        self.states = len(spec.state)
+        self.terms: dict[int, dict[tuple[int, ...], float]] = {
+            d: {} for d in range(len(spec.dof_names))
+        }
+        self.limits = np.tile([-np.inf, np.inf], (self.states, 1))
+
+    def rate_of(self, actuator: int) -> float:
+        """Returns the rate [1/s] by which a step of the model brings an actuator to its target."""
+        lag, dt = float(self.response.lag_s[actuator]), self.like.dt
+        return (1.0 - float(np.exp(-dt / lag))) / dt
+
+    def unit(self, place: int, power: int = 1) -> NDArray[np.int64]:
+        """Returns the exponents (V,) of a variable's power."""
+        row = np.zeros(self.x.shape[1], dtype=np.int64)
+        row[place] = power
+        return row
+
+    def command_place(self, command: int) -> int:
+        """Returns the place of a command among the variables."""
+        return self.states + command
+
+    def add(self, dof: int, row: NDArray[np.int64], value: float) -> None:
+        """Adds a term to a degree of freedom."""
+        key = tuple(row.tolist())
+        self.terms[dof][key] = self.terms[dof].get(key, 0.0) + value
+
+    def add_expanded(
+        self,
+        dof: int,
+        target: Array,
+        rows: Sequence[NDArray[np.int64]],
+        factor: float = 1.0,
+    ) -> None:
+        """Adds the terms that come nearest to a target (T,) over the samples, times a factor."""
+        powers = np.array(rows, dtype=np.int64).reshape(len(rows), self.x.shape[1])
+        chi = evaluate(self.x, powers)
+        size = np.maximum(np.linalg.norm(chi, axis=0), 1e-12)
+        beta = np.linalg.lstsq(chi / size, target, rcond=1e-9)[0]
+        shown = np.abs(beta) > NEGLIGIBLE * max(float(np.linalg.norm(target)), 1e-12)
+        beta = np.linalg.lstsq((chi / size)[:, shown], target, rcond=1e-9)[0]
+        for row, value in zip(powers[shown], beta / size[shown], strict=True):
+            self.add(dof, row, factor * float(value))
+
+    def steering_rows(self, speed: int, angle: int) -> list[NDArray[np.int64]]:
+        """Returns the terms of a turn rate by speed and steering angle."""
+        v, steer = self.unit(speed), self.unit(angle)
+        return [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
+
+    def turn_rate(self, speed: Array, steering: Array) -> Array:
+        """Returns the turn rate (T,) of a bicycle for its speed and what its steering is told."""
+        bicycle = self.response.bicycle
+        gain = self.response.gain[2, int(np.argmax(np.abs(self.response.gain[2])))]
+        angle = np.clip(gain * steering + self.response.offset[2], -1.4, 1.4)
+        length = bicycle.wheelbase * (1.0 + bicycle.understeer * speed * speed)
+        return np.asarray(speed * np.tan(angle) / length)
+
+    def along(self, speed: Array, steering: Array) -> Array:
+        """Returns the speed (T,) along the body for that of the driven wheel."""
+        if not self.response.bicycle.front_drive:
+            return speed
+        gain = self.response.gain[2, int(np.argmax(np.abs(self.response.gain[2])))]
+        angle = np.clip(gain * steering + self.response.offset[2], -1.4, 1.4)
+        return np.asarray(speed * np.cos(angle))
+
+    def speed_target(self) -> Array:
+        """Returns the speeds (T,) that the drive's commands in effect ask for."""
+        place = int(np.argmax(np.abs(self.response.gain[0])))
+        effect = self.x[:, self.command_place(place)]
+        return np.asarray(self.response.gain[0, place] * effect)
+
+    def add_bicycle(self, dofs: tuple[int, int], speed: int, steering: int, ask: Array) -> None:
+        """Adds the twist of a bicycle by the variables of its speed and of its steering."""
+        v, steer = self.unit(speed), self.unit(steering)
+        told = self.x[:, steering]
+        rows = [v, v + 2 * steer] if self.response.bicycle.front_drive else [v]
+        self.add_expanded(dofs[0], self.along(ask, told), rows)
+        self.add_expanded(dofs[1], self.turn_rate(ask, told), self.steering_rows(speed, steering))
+
+    def add_twist_of_commands(self) -> None:
+        """Adds the twist of a robot without a state."""
+        if self.response.bicycle.used:
+            speed, steering = (self.command_place(c) for c in _places_of_bicycle(self.response))
+            self.add_bicycle((0, 2), speed, steering, self.speed_target())
+            return
+        for dof in range(3):
+            for command in np.flatnonzero(self.response.gain[dof]):
+                row = self.unit(self.command_place(int(command)))
+                self.add(dof, row, float(self.response.gain[dof, command]))
+
+    def add_twist_as_state(self) -> None:
+        """Adds the rates of a robot whose state is its twist."""
+        for i, variable in enumerate(self.spec.state):
+            if variable.twist is None:
+                continue
+            part = POSE_RATES.index(variable.twist)
+            if part == 1 and not self.spec.moves_sideways:
+                continue
+            self.add(part, self.unit(i), 1.0)
+            rate, dof = self.rate_of(part), 3 + i
+            self.add(dof, self.unit(i), -rate)
+            for command in np.flatnonzero(self.response.gain[part]):
+                row = self.unit(self.command_place(int(command)))
+                self.add(dof, row, rate * float(self.response.gain[part, command]))
+            if part == 0:
+                self.limits[i] = self.speed_limits()
+
+    def add_actuators(self) -> None:
+        """Adds the rates of a speed and a steering angle, and the twist by them."""
+        speed, steering = (self.command_place(c) for c in _places_of_bicycle(self.response))
+        self.add(3, self.unit(0), -self.rate_of(0))
+        drives = self.rate_of(0) * float(self.response.gain[0, speed - self.states])
+        self.add(3, self.unit(speed), drives)
+        self.limits[0] = self.speed_limits()
+        gain = float(self.response.gain[2, steering - self.states])
+        self.add(4, self.unit(1), -self.rate_of(2))
+        self.add(4, self.unit(steering), self.rate_of(2) * gain)
+        self.add(4, self.unit(steering, 0), self.rate_of(2) * float(self.response.offset[2]))
+        v, angle = self.unit(0), self.unit(1)
+        bicycle, told = self.response.bicycle, self.x[:, 1]
+        turning = np.sin(told) if bicycle.front_drive else np.tan(told)
+        along = np.cos(told) if bicycle.front_drive else np.ones(len(told))
+        length = bicycle.wheelbase * (1.0 + bicycle.understeer * self.x[:, 0] ** 2)
+        rows = [v + angle, 2 * v + angle, 3 * v + angle, v + 3 * angle]
+        self.add_expanded(0, self.x[:, 0] * along, [v, v + 2 * angle])
+        self.add_expanded(2, self.x[:, 0] * turning / length, rows)
+
+    def add_followers(self) -> None:
+        """Adds the rates of states that follow commands one by one, and the twist by them."""
+        names = [c.name for c in self.spec.command]
+        for i, variable in enumerate(self.spec.state):
+            command = names.index(str(variable.follows))
+            actuator = _actuator_of(self.response, self.spec, names[command])
+            rate = self.rate_of(actuator)
+            turns = self.response.bicycle.used and actuator == 2
+            gain = 1.0 if turns else float(self.response.gain[actuator, command])
+            self.add(3 + i, self.unit(i), -rate)
+            self.add(3 + i, self.unit(self.command_place(command)), rate * gain)
+            if actuator == 0:
+                self.limits[i] = self.speed_limits()
+            if not self.response.bicycle.used:
+                self.add(actuator, self.unit(i), 1.0)
+        if self.response.bicycle.used:
+            follow = [names.index(str(v.follows)) for v in self.spec.state]
+            speed, steering = (follow.index(c) for c in _places_of_bicycle(self.response))
+            self.add_bicycle((0, 2), speed, steering, self.x[:, speed])
+
+    def add_wheels(self) -> None:
+        """Adds the rates of wheels, and the twist by them."""
+        book = textbook(self.spec)
+        per_command = book.target(np.eye(len(self.spec.command)))  # (C, S)
+        per_wheel = book.twist(np.eye(self.states))  # (S, 3)
+        steady = (per_command @ per_wheel).T  # (3, C)
+        lag = [float(self.response.lag_s[d]) for d in range(3) if self.response.gain[d].any()]
+        rate = (1.0 - float(np.exp(-self.like.dt / np.mean(lag)))) / self.like.dt
+        for wheel in range(self.states):
+            self.add(3 + wheel, self.unit(wheel), -rate)
+            for command in np.flatnonzero(per_command[:, wheel]):
+                row = self.unit(self.command_place(int(command)))
+                self.add(3 + wheel, row, rate * float(per_command[command, wheel]))
+        for dof in range(3):
+            power = float(steady[dof] @ steady[dof])
+            if power > 0.0:
+                times = float(self.response.gain[dof] @ steady[dof]) / power
+                for wheel in np.flatnonzero(per_wheel[:, dof]):
+                    self.add(dof, self.unit(int(wheel)), times * float(per_wheel[wheel, dof]))
+
+    def speed_limits(self) -> tuple[float, float]:
+        """Returns the greatest fall and rise of the speed, infinite where none was found."""
+        rise, fall = (float(each) for each in self.response.limit)
+        most = UNLIMITED * LIMIT_RANGE[1]
+        return -fall if fall < most else -np.inf, rise if rise < most else np.inf
+
+    def made(self) -> TaylorModel:
+        """Returns the model."""
+        keys = sorted({key for row in self.terms.values() for key in row})
+        coefficients = np.zeros((len(self.spec.dof_names), len(keys)))
+        for dof, row in self.terms.items():
+            for key, value in row.items():
+                coefficients[dof, keys.index(key)] = value
+        powers = np.array(keys, dtype=np.int64).reshape(len(keys), self.x.shape[1])
+        return TaylorModel(
+            self.spec.variable_names,
+            self.spec.dof_names,
+            self.spec.dof_units,
+            powers=powers,
+            coefficients=coefficients,
+            dt=self.like.dt,
+            low=self.x.min(axis=0),
+            high=self.x.max(axis=0),
+            bounded=self.like.bounded,
+            inputs=tuple(_dead_zones(self.response, self.spec)),
+            limits=self.limits,
+        )

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify import planted
+from nics_drl_bridge.generator import generate, lidar_of, load_model, save_model
+from nics_drl_bridge.identify.acceptance import (
+    THRESHOLDS,
+    Outcome,
+    Verdict,
+    combined,
+    compare,
+    comparison_noise,
+    loses_to_textbook,
+    rate,
+    rate_unseen,
+    shortfall,
+)
+from nics_drl_bridge.identify.conclusion import conclude
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.report import with_error
+from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
+
+RADIUS_M = 0.2
+
+
+def errors(position: float) -> EndErrors:
+    return EndErrors(position, 0.01)
+
+
+def after_5_s(
+    position: float,
+    path: float = 10.0,
+    textbook: float | None = None,
+    twist: float = 8.0,
+    coverage: float | None = 0.95,
+    noise: float = 0.0,
+) -> tuple[HorizonErrors, ...]:
+    """Returns the judgement of a model of which one horizon is known."""
+    at = HorizonErrors(
+        horizon_s=5.0,
+        windows=100,
+        path_m=path,
+        model=errors(position),
+        kept_twist=errors(twist),
+        textbook=None if textbook is None else errors(textbook),
+        band_m=1.0,
+        coverage=coverage,
+        kept_twist_noise_m=noise,
+        textbook_noise_m=noise,
+    )
+    return (at,)
+
+
+@pytest.mark.parametrize(
+    ("judgement", "verdict"),
+    [
+        (after_5_s(0.2), Verdict.GOOD),
+        (after_5_s(1.0), Verdict.GOOD),
+        (after_5_s(1.01), Verdict.WITH_CARE),
+        (after_5_s(2.5), Verdict.WITH_CARE),
+        (after_5_s(2.51), Verdict.DO_NOT_TRAIN),
+        (after_5_s(float("inf")), Verdict.DO_NOT_TRAIN),
+        (after_5_s(float("nan")), Verdict.DO_NOT_TRAIN),
+        (after_5_s(0.2, coverage=0.80), Verdict.GOOD),
+        (after_5_s(0.2, coverage=0.79), Verdict.WITH_CARE),
+        (after_5_s(0.2, coverage=0.49), Verdict.DO_NOT_TRAIN),
+        (after_5_s(0.2, coverage=None), Verdict.GOOD),
+        (after_5_s(0.9, twist=0.5), Verdict.DO_NOT_TRAIN),
+        (after_5_s(0.9, twist=1.0, noise=0.5), Verdict.WITH_CARE),
+        (after_5_s(0.9, textbook=0.5), Verdict.DO_NOT_TRAIN),
+        (after_5_s(0.9, textbook=0.5, noise=0.5), Verdict.GOOD),
+        (after_5_s(0.1, path=0.0), Verdict.DO_NOT_TRAIN),  # half of the robot, on the spot
+        (after_5_s(0.01, path=0.0), Verdict.GOOD),
+        ((), Verdict.DO_NOT_TRAIN),
+    ],
+)
+def test_the_verdict_is_one_of_three_words_by_stated_thresholds(judgement, verdict):
+    found = rate(judgement, RADIUS_M, textbook=False)
+    assert found.verdict is verdict
+    assert bool(found.reasons) == (verdict is not Verdict.GOOD and bool(judgement))
+
+
+def test_a_reason_names_the_figure_and_its_limit():
+    error, band = rate(after_5_s(2.04, coverage=0.6), RADIUS_M, textbook=False).reasons
+    assert "20.4% of their path" in error
+    assert "within 10%" in error
+    assert "holds 60%" in band
+    assert "less than 80%" in band
+
+
+def test_much_time_without_a_pose_is_a_reason_for_care():
+    assert rate_unseen(1.0, 100.0).verdict is Verdict.GOOD
+    unseen = rate_unseen(27.8, 200.0)
+    assert unseen.verdict is Verdict.WITH_CARE
+    assert "missing for 27.8 s, 14% of the drive" in unseen.reasons[0]
+
+
+def test_the_least_favourable_verdict_counts():
+    ratings = [rate_unseen(0.0, 100.0), rate(after_5_s(3.0), RADIUS_M, False), rate_unseen(9.0, 10)]
+    both = combined(ratings)
+    assert both.verdict is Verdict.DO_NOT_TRAIN
+    assert len(both.reasons) == 2
+
+
+def test_a_tie_is_neither_better_nor_worse():
+    assert compare(errors(0.1005), errors(0.1), 0.0, 2.0) is Outcome.ALIKE  # 0.5 mm
+    assert compare(errors(0.2), errors(0.1), 0.15, 2.0) is Outcome.ALIKE
+    assert compare(errors(0.2), errors(0.1), 0.05, 2.0) is Outcome.WORSE
+    assert compare(errors(0.1), errors(0.2), 0.05, 2.0) is Outcome.BETTER
+    assert compare(errors(float("inf")), errors(0.2), 0.05, 2.0) is Outcome.WORSE
+
+
+def test_a_tie_with_the_textbook_is_no_shortfall():
+    tie = after_5_s(0.1005, path=2.0, textbook=0.1)
+    assert not loses_to_textbook(tie)
+    assert list(shortfall(tie)) == []
+    assert rate(tie, RADIUS_M, textbook=False).verdict is Verdict.GOOD
+
+
+def test_the_noise_of_a_comparison_is_that_of_stretches_and_not_of_windows():
+    """Windows of one stretch are copies of each other: ten times as many tell no more."""
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=20)
+    few = comparison_noise(np.repeat(means, 5), np.repeat(5.0 * np.arange(20), 5), 5.0)
+    many = comparison_noise(np.repeat(means, 50), np.repeat(5.0 * np.arange(20), 50), 5.0)
+    assert few == pytest.approx(many)
+    assert few == pytest.approx(means.std(ddof=1) / np.sqrt(20.0), rel=0.3)
+
+
+def test_in_one_stretch_the_noise_is_that_of_a_single_window():
+    difference = np.array([0.1, 0.3, 0.2, 0.4])
+    noise = comparison_noise(difference, np.linspace(0.0, 1.0, 4), 5.0)
+    assert noise == pytest.approx(difference.std())
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (4.63, 0.02, "(4.63 +- 0.02)"),
+        (0.312, 36.0, "(0.312 +- 36)"),
+        (3.2, 36.0, "(3.2 +- 36)"),
+        (1.6, 1.6, "(1.6 +- 1.6)"),
+        (0.00123, 0.5, "(0.00123 +- 0.5)"),
+        (1234.0, 500.0, "(1234 +- 500)"),
+    ],
+)
+def test_a_coefficient_is_printed_so_that_it_can_be_used(value, error, text):
+    assert with_error(value, error) == text
+
+
+@pytest.fixture(scope="module")
+def commanded():
+    """A drive of a robot with two wheels, of which commands and poses are known."""
+    spec = planted.wheeled().model_copy(update={"state": ()})
+    recording = replace(planted.wheeled_drive(), state=None)
+    return spec, recording, identify(recording, spec, alpha="auto")
+
+
+@pytest.mark.slow
+def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(commanded, tmp_path):
+    spec, recording, found = commanded
+    assert found.findings.replaced
+    told = conclude(found)
+    assert "the model that was written is the textbook" in " ".join(told.doubts)
+    (at,) = [at for at in found.judgement if at.horizon_s == 5.0]
+    assert at.model.position_m < 0.03
+    model, again = generate(recording, spec, lidar_of(spec), (), alpha="auto")
+    assert again.findings.replaced
+    save_model(model, tmp_path / "model")
+    opened = load_model(tmp_path / "model")
+    assert opened.kinematics.named.terms == model.kinematics.named.terms
+    pose, _ = opened.kinematics.step(np.zeros(3), np.zeros(0), np.array([1.0, 0.0]))
+    assert pose[0] == pytest.approx(opened.kinematics.dt, rel=0.02)
+
+
+@pytest.mark.slow
+def test_the_written_textbook_is_that_of_the_trial_and_fitted_no_further(commanded):
+    _, _, found = commanded
+    assert found.trial.model is found.findings.model
+    assert found.model.terms_kept == found.trial.model.terms_kept
+    assert not any("fitted to all" in note for note in found.notes)
+
+
+def test_the_thresholds_are_in_order():
+    assert 0.0 < THRESHOLDS.good_error < THRESHOLDS.worst_error < 1.0
+    assert 0.0 < THRESHOLDS.worst_coverage < THRESHOLDS.good_coverage < 1.0
