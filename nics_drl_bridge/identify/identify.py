@@ -421,6 +421,7 @@ def settle(drive: Drive, findings: Findings) -> Findings:
         return findings
     _, model = _fitted(findings)
     spec, until = drive.spec, drive.settings.train_until_s
+    start_spec = spec
     try:
         yardstick = fit_yardstick(
             findings.whole, until, findings.calibration.clock_offset_s, one_limit=True
@@ -431,6 +432,9 @@ def settle(drive: Drive, findings: Findings) -> Findings:
             drive, start = _with_actuators(drive, start, yardstick)
             spec = drive.spec
         samples = aligned(start.training, start)
+        if spec is not start_spec:  # figures of another state's rates
+            linear = fitting.fit(samples, spec, noisy=True)
+            start = replace(start, regression=linear.regression, linear=linear)
         book = textbook_model(yardstick, model, samples, spec)
         if book is None:
             return findings

@@ -19,6 +19,7 @@ from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 WIDTH = 96
 CURVE_POINTS = 8
 TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_arm_y_m"
+DEAD_ZONE, EAGER = "dead zone on both sides of 0", "does more than in proportion, by minus"
 LEAST_DIGITS = 3  # of a coefficient: the printed equations predict as the model does
 MOST_LEFT = 0.5  # share of the error of standing still above which a model is hardly better
 COARSE = 2.0 / 3.0  # share of a state's range between two rows that is sampled too coarsely
@@ -102,7 +103,7 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
         (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
         for curve in model.inputs
         for name, words, unit, usual in (
-            ("dead", "dead zone on both sides of 0", units[curve.command], 0.0),
+            ("dead", DEAD_ZONE if curve.dead > 0.0 else EAGER, units[curve.command], 0.0),
             ("least", "saturates below", units[curve.command], -np.inf),
             ("most", "saturates above", units[curve.command], np.inf),
             ("back", "gain backwards, relative to forwards", "", 1.0),

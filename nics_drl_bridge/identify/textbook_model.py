@@ -89,6 +89,16 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     fastest = float(np.abs(known_state(drive).values[:, forward]).max())
     told = np.abs(drive.recording.command.values[:, steering]).max()
     widest = float(np.abs(response.gain[2, steering]) * told + abs(response.offset[2]))
+    told_speed, told_angle = (
+        max(abs(spec.command[place].min), abs(spec.command[place].max))
+        for place in (speed, steering)
+    )
+    gains = abs(float(response.gain[0, speed])), abs(float(response.gain[2, steering]))
+    if spec.command[speed].unit == "m/s":
+        fastest = max(fastest, told_speed)
+    fastest = max(fastest, gains[0] * told_speed)
+    widest = max(widest, told_angle if spec.command[steering].unit == "rad" else 0.0)
+    widest = max(widest, gains[1] * told_angle)
     reach = {"wheel_speed": MARGIN * fastest, "wheel_angle": MARGIN * widest}
     states = (("wheel_speed", "m/s", speed), ("wheel_angle", "rad", steering))
     data = spec.model_dump()
@@ -102,8 +112,10 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
         }
         for name, unit, place in states
     ]
-    lags = {"speed_lag": response.lag_s[0], "steering_lag": response.lag_s[2]}
-    data["parameters"] = spec.parameters | {name: float(lag) for name, lag in lags.items()}
+    found = {"speed_lag": float(response.lag_s[0]), "steering_lag": float(response.lag_s[2])}
+    if "speed_gain" in spec.parameters:  # of a car that is told shares of throttle and steering
+        found |= {"speed_gain": gains[0], "greatest_steering": gains[1]}
+    data["parameters"] = spec.parameters | found
     return RobotSpec.model_validate(data)
 
 
