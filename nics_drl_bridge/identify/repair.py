@@ -247,7 +247,8 @@ def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tu
     if pair is None:
         return ()
     asked, driven, alike = pair
-    places, notes = _places(spec), []
+    places = _places(spec)
+    notes = list[str]()
     if len(places) == 2:
         _check_swapped(drive, [0, 1], min(alike[0, 1], alike[1, 0]), np.trace(alike))
     told = [(c.name, c.unit) for c in spec.command] if places else [("speed", "rad/s")]

@@ -28,6 +28,7 @@ ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
+    spec = identified.drive.spec  # of a textbook that was written, which may have another state
     model = identified.model
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
     joined = bool(identified.recording.episodes)
@@ -310,6 +311,7 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
 def why_useless(identified: Identified, spec: RobotSpec) -> str:
     """Returns a sentence on why a model is useless, by median errors; empty if it is not."""
     held_out, recording = identified.held_out, identified.recording
+    spec = identified.drive.spec
     if held_out is None:
         return ""
     error, standing = held_out.median_position_error_m, held_out.median_displacement_m

@@ -340,15 +340,16 @@ class _Expansion:
         rate = (1.0 - float(np.exp(-self.like.dt / np.mean(lag)))) / self.like.dt
         for wheel in range(self.states):
             self.add(3 + wheel, self.unit(wheel), -rate)
-            for command in np.flatnonzero(per_command[:, wheel]):
-                row = self.unit(self.command_place(int(command)))
-                self.add(3 + wheel, row, rate * float(per_command[command, wheel]))
+            for place in np.flatnonzero(per_command[:, wheel]):
+                row = self.unit(self.command_place(int(place)))
+                self.add(3 + wheel, row, rate * float(per_command[place, wheel]))
         for dof in range(3):
             power = float(steady[dof] @ steady[dof])
             if power > 0.0:
                 times = float(self.response.gain[dof] @ steady[dof]) / power
-                for wheel in np.flatnonzero(per_wheel[:, dof]):
-                    self.add(dof, self.unit(int(wheel)), times * float(per_wheel[wheel, dof]))
+                for turning in np.flatnonzero(per_wheel[:, dof]):
+                    share = times * float(per_wheel[turning, dof])
+                    self.add(dof, self.unit(int(turning)), share)
 
     def speed_limits(self) -> tuple[float, float]:
         """Returns the greatest fall and rise of the speed, infinite where none was found."""

@@ -161,7 +161,7 @@ def about_mounting(
 
 def faces_backwards(calibration: Calibration) -> bool:
     """True if the robot travels where the back of the tracked body points."""
-    return abs(geometry.wrap_angle(calibration.rotation_rad - np.pi)) < BACKWARDS
+    return bool(abs(geometry.wrap_angle(calibration.rotation_rad - np.pi)) < BACKWARDS)
 
 
 def about_responses(

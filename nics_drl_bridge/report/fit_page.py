@@ -75,6 +75,7 @@ def write_fit_page(
 ) -> None:
     """Writes the page of a fit to a recording from a source, with the fit report as text."""
     conclusion, folder = conclude(identified), file.parent
+    spec = identified.drive.spec  # of a textbook that was written, which may have another state
     tile, model = fit_tile(identified), identified.model
     terms = str(model.terms_kept), f"terms of a model with a step of {model.dt:g} s", True
     assumed = len(model.assumed)

@@ -58,6 +58,7 @@ CAPTIONS = {
 
 def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) -> tuple[Path, ...]:
     """Writes the pictures of a fit and of its calibration as PNG files, and returns these."""
+    spec = identified.drive.spec  # of a textbook that was written, which may have another state
     drawn = {**fit_pictures(spec, identified), **calibration_pictures(spec, identified)}
     files = {Path(folder) / f"{name}.png": picture for name, picture in drawn.items()}
     for file, picture in files.items():
@@ -67,7 +68,8 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
 
 def fit_pictures(spec: RobotSpec, identified: Identified, paths: bool = True) -> dict[str, bytes]:
     """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
-    by_motion = identified.findings.width is not None  # pruning did not choose its terms
+    by_motion = identified.findings.width is not None or bool(identified.findings.replaced)
+    # then pruning did not choose its terms
     pictures = {} if by_motion else {"accuracy": accuracy(identified)}
     if paths and identified.held_out is not None:
         pictures["paths"] = held_out_paths(identified.trial)
