@@ -9,6 +9,7 @@ import numpy as np
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.acceptance import THRESHOLDS
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import CERTAIN, TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
@@ -61,9 +62,10 @@ def about_stamps(drive: Drive) -> Iterator[str]:
 
 
 def time_without_pose(drive: Drive) -> float:
-    """Returns the time in gaps of the pose [s]."""
+    """Returns the time in long gaps of the pose [s]."""
     t = drive.dated.t
-    return float(sum(t[row + 1] - t[row] for row in _gap_rows(drive)))
+    spans = [float(t[row + 1] - t[row]) for row in _gap_rows(drive)]
+    return sum(span for span in spans if span > THRESHOLDS.shortest_unseen_s)
 
 
 def _gap_rows(drive: Drive) -> list[int]:
