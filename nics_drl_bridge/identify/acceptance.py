@@ -44,6 +44,8 @@ class Thresholds:
     alike: float = 0.005  # share of the path
     # Of what the robot did while its pose was unknown nothing was learnt, and nothing was tested.
     most_unseen: float = 0.10  # share of the drive
+    # In a shorter gap a robot goes on as before; predictions over 5 s bridge it.
+    shortest_unseen_s: float = 1.0
 
 
 THRESHOLDS = Thresholds()

@@ -202,7 +202,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
     left_over = response_residual(command, spec, target)
     if early and not _explains(left_over, delay):
         early = 0.0
-    drift = _drift(command, spec, target, delay)
+    drift = 0.0 if recording.episodes else _drift(command, spec, target, delay)
     return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early, drift)
 
 

@@ -44,10 +44,10 @@ def conclude(identified: Identified) -> Conclusion:
     replaced = identified.findings.replaced
     about = (
         *wrong,
-        *(str(note) for note in identified.notes if isinstance(note, Alone)),
-        *doubts_of_commands(identified.judgement, identified.calibration),
         *strange,
+        *(str(note) for note in identified.notes if isinstance(note, Alone)),
         *((replaced,) if replaced else ()),
+        *doubts_of_commands(identified.judgement, identified.calibration),
         *assessment.reasons,
     )
     beyond = *narrow(identified.recording, spec), overdriven(spec)

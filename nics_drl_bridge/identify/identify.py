@@ -553,9 +553,10 @@ def _plain(found: Findings) -> tuple[str, ...]:
 def _sentences(found: Findings) -> tuple[str, ...]:
     drive, calibration = found.training, found.calibration
     if found.replaced:  # latency, lags and mounting are those of the fitted textbook
+        timed = replace(calibration, command_latency_s=found.timing.latency)
         return (
             *verdict.about_stamps(drive),
-            *verdict.about_clocks(drive, calibration, found.timing),
+            *verdict.about_clocks(drive, timed, found.timing),
         )
     return (
         *verdict.about_stamps(drive), *verdict.about_clocks(drive, calibration, found.timing),

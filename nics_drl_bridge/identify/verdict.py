@@ -9,6 +9,7 @@ import numpy as np
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.acceptance import THRESHOLDS
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import CERTAIN, TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
@@ -61,19 +62,21 @@ def about_stamps(drive: Drive) -> Iterator[str]:
 
 
 def time_without_pose(drive: Drive) -> float:
-    """Returns the time in gaps of the pose [s]."""
+    """Returns the time in long gaps of the pose [s]."""
     t = drive.dated.t
-    return float(sum(t[row + 1] - t[row] for row in _gap_rows(drive)))
+    spans = [float(t[row + 1] - t[row]) for row in _gap_rows(drive)]
+    return sum(span for span in spans if span > THRESHOLDS.shortest_unseen_s)
 
 
 def _gap_rows(drive: Drive) -> list[int]:
-    """Returns the poses after which there is a gap, that of the longest first.
-
-    The time between two episodes is no gap: the robot was not recorded there.
-    """
-    span = np.diff(drive.recording.without_gaps(drive.dated.t))
+    """Returns the poses after which there is a gap, that of the longest first."""
+    t = drive.dated.t
+    span = np.diff(t)
     usual = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
-    rows = np.flatnonzero(span > max(MAX_GAP_S, GAP_STEPS * usual))
+    wide = span > max(MAX_GAP_S, GAP_STEPS * usual)
+    if drive.recording.episodes:  # between two of them there is no drive
+        wide &= np.diff(drive.recording.episode_at(t)) == 0
+    rows = np.flatnonzero(wide)
     return [int(row) for row in rows[np.argsort(-span[rows], kind="stable")]]
 
 
