@@ -1,0 +1,452 @@
+"""A robot that nobody here modelled: recorded, generated, trained and driven by the documented commands.
+
+The robot is a skid-steer in DART (`measuring/dart_skid_steer.py`): a real process behind ROS 2 topics, with
+wheel odometry that believes in turns that slip, and a gyro. It is recorded in an open place, a simulator is
+generated, a policy is trained, and then gate, estimator and policy drive it to goals among pillars. Each goal
+is given relative to the robot, and judged by the true pose, which no node hears. Afterwards its body is held
+while its wheels go on, and the gate has to stop it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from measuring.verdict import answer, parser_of
+from numpy.typing import NDArray
+from rclpy.node import Node
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+
+Array = NDArray[np.float64]
+
+CONTROLS = {
+    "no_gyro": "the robot has no gyro, so that its estimator believes the slipping wheels",
+    "no_gate_rule": "the gate does not compare scans with odometry, so that a held body goes on",
+}
+SUCCESS_BAR = 0.95
+HELD_BAR_S = 1.0
+GOAL_RADIUS = 0.3  # at which the policy's task ends [m]
+TRUE_RADIUS = 0.4  # within which the true pose counts as at the goal [m]
+GOAL_DISTANCE = (2.0, 5.0)
+GOAL_CLEARANCE = 0.9  # of a goal from pillars and walls [m]
+GOAL_PATIENCE_S = 60.0
+REST_S = 1.0  # at rest for so long, the robot has ended a drive
+ARMED_S = 300.0  # between two armings
+HERE = Path(__file__).resolve().parent
+
+OPEN_PLACE = {"size": [30.0, 30.0], "pillars": []}
+FIELD = {
+    "size": [12.0, 12.0],
+    "pillars": [
+        [2.5, 1.5, 0.3], [-2.0, 2.8, 0.2], [3.6, -2.2, 0.35], [-3.4, -2.6, 0.3], [0.6, 4.0, 0.25],
+        [-4.2, 1.0, 0.2], [0.4, -3.6, 0.35], [4.2, 3.9, 0.2], [-1.4, -1.3, 0.2], [2.0, -4.6, 0.2],
+    ],
+}  # fmt: skip
+WORLD = {
+    "name": "field",
+    "size": [12.0, 12.0],
+    "obstacles": [
+        {
+            "shapes": [{"kind": "circle", "radius": 0.2}, {"kind": "circle", "radius": 0.35}],
+            "count": 10,
+            "gap": 1.2,
+        }
+    ],
+    "clearance": 0.9,
+    "goal_distance": list(GOAL_DISTANCE),
+}
+LIDAR = {
+    "beams": 720,
+    "angle_min": -2.356194490192345,
+    "angle_max": 2.356194490192345,
+    "range_min": 0.1,
+    "range_max": 10.0,
+    "rate": 10.0,
+    "noise_std": 0.01,
+}
+ROBOT = {
+    "name": "rover",
+    "kind": "skid_steer",
+    "footprint": [[0.45, 0.34], [-0.45, 0.34], [-0.45, -0.34], [0.45, -0.34]],
+    "lidar": "lidar.yaml",
+    "lidar_mount": [0.25, 0.0, 0.0],
+    "parameters": {"track": 0.57, "wheel_radius": 0.165},
+    "command": [
+        {"name": "forward_command", "unit": "m/s", "min": -0.8, "max": 0.8, "cmd_vel": "linear.x"},
+        {"name": "turn_command", "unit": "rad/s", "min": -1.2, "max": 1.2, "cmd_vel": "angular.z"},
+    ],
+}
+LIMITS = {
+    "robot": "rover",
+    "commands": {
+        "forward_command": {"min": -0.4, "max": 0.8, "rate": 2.0, "jerk": 40.0},
+        "turn_command": {"min": -1.2, "max": 1.2, "rate": 6.0, "jerk": 120.0},
+    },
+}
+
+
+def arguments() -> argparse.Namespace:
+    """Returns the options of the command line."""
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--goals", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0, help="of goals, noise and the training")
+    parser.add_argument("--minutes", type=float, default=0.0, help="drive on, re-arming every 5")
+    parser.add_argument("--folder", type=Path, help="keep all files there, and use what is there")
+    return parser.parse_args()
+
+
+class Workshop:
+    """The folder of a run, and the commands that a user would type in it."""
+
+    def __init__(self, folder: Path, domain_id: int, with_imu: bool, seed: int) -> None:
+        self.folder = folder
+        self._with_imu = with_imu
+        self._seed = seed
+        chosen = {
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+        self._environment = os.environ | chosen
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "lidar.yaml").write_text(yaml.safe_dump(LIDAR))
+        (folder / "robot.yaml").write_text(yaml.safe_dump(ROBOT))
+        (folder / "limits.yaml").write_text(yaml.safe_dump(LIMITS))
+        (folder / "field.yaml").write_text(yaml.safe_dump(WORLD))
+        (folder / "open_place.json").write_text(json.dumps(OPEN_PLACE))
+        (folder / "field.json").write_text(json.dumps(FIELD))
+
+    def nics(self, *words: str) -> str:
+        """Runs a `nics` command in the folder; returns what it printed."""
+        command = [str(Path(sys.executable).with_name("nics")), *words]
+        done = subprocess.run(
+            command, cwd=self.folder, env=self._environment, capture_output=True, text=True
+        )
+        (self.folder / f"{words[0]}.log").write_text(done.stdout + done.stderr)
+        if done.returncode != 0:
+            raise SystemExit(f"nics {' '.join(words)} ended with {done.returncode}: {done.stderr}")
+        return done.stdout
+
+    @contextmanager
+    def driver(self, place: str) -> Iterator[None]:
+        """The robot's own driver in a place, until the end of the block."""
+        command = [sys.executable, "-m", "measuring.dart_skid_steer"]
+        command += ["--place", str(self.folder / place), "--seed", str(self._seed)]
+        if not self._with_imu:
+            command.append("--no-imu")
+        with (self.folder / "driver.log").open("wb") as log:
+            process = subprocess.Popen(
+                command, cwd=HERE, env=self._environment, stdout=log, stderr=log
+            )
+        try:
+            yield
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(10.0)
+
+    def record(self) -> None:
+        """Drives the robot in an open place and records it."""
+        if (self.folder / "drive").exists():
+            return
+        with self.driver("open_place.json"):
+            self.nics(
+                "record", "--robot", "robot.yaml", "--out", "drive", "--bound", "5",
+                "--duration", "90", "--yes",
+            )  # fmt: skip
+
+    def generate(self) -> str:
+        """Generates the simulator; returns the report."""
+        if not (self.folder / "rover" / "model.yaml").exists():
+            self.nics("generate", "drive", "--robot", "robot.yaml", "--out", "rover")
+        return (self.folder / "rover" / "report.txt").read_text()
+
+    def train(self) -> Path:
+        """Trains the policy; returns its file."""
+        if not (self.folder / "policies").exists():
+            self.nics(
+                "train", "--robot", "rover", "--world", "field.yaml", "--seeds", str(self._seed),
+                "--out", "policies",
+            )  # fmt: skip
+        return self.folder / "policies" / f"seed_{self._seed}" / "policy.onnx"
+
+
+class Operator(Node):
+    """A person with a button and a map: gives goals, arms the gate, and judges by the true pose."""
+
+    def __init__(self, place: dict[str, Any], seed: int) -> None:
+        super().__init__("operator")
+        self._pillars = np.array(place["pillars"])
+        self._size = np.array(place["size"])
+        self._rng = np.random.default_rng(seed)
+        self.pose: Array | None = None
+        self.touched = False
+        self.commanded: list[tuple[float, bool]] = []  # time [s], whether it moves
+        self.create_subscription(PoseStamped, "true_pose", self._on_pose, 10)
+        self.create_subscription(Bool, "touched", self._on_touch, 10)
+        self.create_subscription(TwistStamped, "cmd_vel", self._on_command, 10)
+        self._goal = self.create_publisher(PoseStamped, "goal_pose", 1)
+        self._button = self.create_publisher(Bool, "e_stop", 10)
+        self._hold = self.create_publisher(Bool, "hold", 10)
+        self.create_timer(0.05, lambda: self._button.publish(Bool(data=False)))
+        self._gate = {
+            name: self.create_client(Trigger, f"command_gate/{name}")
+            for name in ("arm", "reset", "e_stop")
+        }
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        turned = message.pose.orientation
+        heading = 2.0 * math.atan2(turned.z, turned.w)
+        self.pose = np.array([message.pose.position.x, message.pose.position.y, heading])
+
+    def _on_touch(self, message: Bool) -> None:
+        self.touched |= message.data
+
+    def _on_command(self, message: TwistStamped) -> None:
+        twist = message.twist
+        moves = bool(twist.linear.x or twist.linear.y or twist.angular.z)
+        self.commanded.append((time.monotonic(), moves))
+
+    def wait_until(self, condition: Callable[[], bool], patience_s: float) -> bool:
+        """Listens until a condition holds; False after so long."""
+        deadline = time.monotonic() + patience_s
+        while time.monotonic() < deadline:
+            rclpy.spin_once(self, timeout_sec=0.05)
+            if condition():
+                return True
+        return False
+
+    def ask_gate(self, service: str) -> tuple[bool, str]:
+        """Calls a service of the gate; returns whether it agreed and what it said."""
+        client = self._gate[service]
+        if not self.wait_until(client.service_is_ready, 60.0):
+            return False, f"command_gate/{service} is not there"
+        future = client.call_async(Trigger.Request())
+        if not self.wait_until(future.done, 10.0):
+            return False, f"command_gate/{service} does not answer"
+        return bool(future.result().success), str(future.result().message)
+
+    def arm(self, patience_s: float) -> str:
+        """Arms the gate, asking again until it agrees; returns its last refusal, or nothing."""
+        deadline = time.monotonic() + patience_s
+        message = "not asked"
+        while time.monotonic() < deadline:
+            agreed, message = self.ask_gate("arm")
+            if agreed:
+                return ""
+            self.ask_gate("reset")
+            self.wait_until(lambda: False, 0.5)
+        return message
+
+    def draw_goal(self) -> Array:
+        """Draws a free place at some distance from the robot (2,) [m], in the world."""
+        assert self.pose is not None
+        while True:
+            goal = self._rng.uniform(-0.5, 0.5, 2) * (self._size - 2.0 * GOAL_CLEARANCE)
+            far = float(np.linalg.norm(goal - self.pose[:2]))
+            gaps = np.linalg.norm(self._pillars[:, :2] - goal, axis=1) - self._pillars[:, 2]
+            if GOAL_DISTANCE[0] <= far <= GOAL_DISTANCE[1] and gaps.min() >= GOAL_CLEARANCE:
+                return goal
+
+    def send_goal(self, goal: Array) -> None:
+        """Sends a goal of the world, relative to where the robot stands."""
+        assert self.pose is not None
+        cos, sin = math.cos(self.pose[2]), math.sin(self.pose[2])
+        away = goal - self.pose[:2]
+        message = PoseStamped()
+        message.header.frame_id = "base_link"
+        message.pose.position.x = float(cos * away[0] + sin * away[1])
+        message.pose.position.y = float(-sin * away[0] + cos * away[1])
+        message.pose.orientation.w = 1.0
+        self._goal.publish(message)
+
+    def is_at_rest(self, since_s: float) -> bool:
+        """Returns whether the robot moved after a moment and has been at rest for a while since."""
+        moved = [at for at, moves in self.commanded if moves and at > since_s]
+        return bool(moved) and time.monotonic() - moved[-1] > REST_S
+
+    def hold(self, held: bool) -> None:
+        """Holds the robot's body, or lets it go."""
+        self._hold.publish(Bool(data=held))
+
+
+@dataclass
+class Drives:
+    """What became of the goals.
+
+    Attributes:
+        away: true distance from each goal when the robot came to rest [m]; NaN after a time-out.
+        refusals: what the gate said where it could not be armed.
+        armings: how often it was armed.
+        touched: whether the robot has touched anything.
+    """
+
+    away: list[float] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
+    armings: int = 0
+    touched: bool = False
+
+    @property
+    def success(self) -> float:
+        """Share of the goals that were truly reached."""
+        return float(np.mean([away <= TRUE_RADIUS for away in self.away])) if self.away else 0.0
+
+
+def drive_to_goals(operator: Operator, goals: int, minutes: float) -> Drives:
+    """Drives to so many goals, and for so many minutes, re-arming the gate every five of them."""
+    drives = Drives()
+    began_s = time.monotonic()
+    armed_s = -math.inf
+    while len(drives.away) < goals or time.monotonic() - began_s < 60.0 * minutes:
+        if time.monotonic() - armed_s > ARMED_S:
+            if drives.armings:
+                operator.ask_gate("e_stop")
+            refusal = operator.arm(60.0)
+            if refusal:
+                drives.refusals.append(refusal)
+                break
+            drives.armings += 1
+            armed_s = time.monotonic()
+        goal = operator.draw_goal()
+        begin_s = time.monotonic()
+        operator.send_goal(goal)
+        ended = operator.wait_until(lambda: operator.is_at_rest(begin_s), GOAL_PATIENCE_S)
+        away = float(np.linalg.norm(operator.pose[:2] - goal)) if ended else math.nan
+        drives.away.append(away)
+        operator.commanded.clear()
+        print(f"goal {len(drives.away)}: {away:.2f} m away", file=sys.stderr)
+        if not ended:
+            operator.ask_gate("reset")
+            armed_s = -math.inf
+    drives.touched = operator.touched
+    return drives
+
+
+def time_to_stop_when_held(operator: Operator) -> float:
+    """Holds the body while the robot drives; returns the time to the last command that moves [s]."""
+    refusal = operator.arm(60.0)
+    if refusal:
+        return math.nan
+    operator.send_goal(operator.draw_goal())
+    began_s = time.monotonic()
+    drives = operator.wait_until(
+        lambda: sum(moves for at, moves in operator.commanded if at > began_s) > 40, 20.0
+    )
+    if not drives:
+        return math.nan
+    operator.hold(True)
+    held_s = time.monotonic()
+    operator.wait_until(lambda: operator.is_at_rest(held_s - 1.0), 10.0)
+    moved = [at for at, moves in operator.commanded if moves]
+    operator.hold(False)
+    return moved[-1] - held_s
+
+
+def run_bridge(workshop: Workshop, policy: Path, domain_id: int, control: str | None) -> ExitStack:
+    """Starts gate, estimator and policy as `vehicle.launch.py` does; returns what ends them."""
+    shared = {"model": str(workshop.folder / "rover"), "enable_stamped_cmd_vel": True}
+    gate = shared | {"limits": str(workshop.folder / "limits.yaml"), "odom_rate": 20.0}
+    if control == "no_gate_rule":
+        gate |= {"scan_consistency": False}
+    nodes = {
+        "command_gate": gate,
+        "middleware_node": shared,
+        "policy_node": shared | {"policy": str(policy)},
+    }
+    stack = ExitStack()
+    for name, parameters in nodes.items():
+        folder = workshop.folder / "nodes"
+        stack.enter_context(NodeProcess(name, folder, parameters, domain_id))
+    return stack
+
+
+def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Records, generates, trains and drives; returns the figures."""
+    domain_id = free_domain_id()
+    workshop = Workshop(folder, domain_id, options.control != "no_gyro", options.seed)
+    workshop.record()
+    report = workshop.generate()
+    policy = workshop.train()
+    os.environ |= {
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    rclpy.init()
+    operator = Operator(FIELD, options.seed)
+    with workshop.driver("field.json"), run_bridge(workshop, policy, domain_id, options.control):
+        if not operator.wait_until(lambda: operator.pose is not None, 30.0):
+            raise SystemExit("the robot's driver is silent; see driver.log.")
+        drives = drive_to_goals(operator, options.goals, options.minutes)
+        held_s = time_to_stop_when_held(operator)
+    operator.destroy_node()
+    rclpy.try_shutdown()
+    return {
+        "report": report.splitlines()[:8],
+        "success": drives.success,
+        "away_m": drives.away,
+        "touched": drives.touched,
+        "armings": drives.armings,
+        "refusals": drives.refusals,
+        "held_stopped_after_s": held_s,
+    }
+
+
+def missed_of(result: dict[str, Any]) -> list[str]:
+    """Returns a sentence for each bar that was missed."""
+    missed = []
+    if not result["success"] >= SUCCESS_BAR:
+        missed.append(f"success {result['success']:.3f} by true pose, bar {SUCCESS_BAR:g}")
+    if result["touched"]:
+        missed.append("the robot touched something")
+    if result["refusals"]:
+        missed.append(f"the gate could not be armed: {result['refusals'][-1]}")
+    if not result["held_stopped_after_s"] <= HELD_BAR_S:
+        told = f"a held body was stopped after {result['held_stopped_after_s']:.2f} s"
+        missed.append(f"{told}, bar {HELD_BAR_S:g} s")
+    return missed
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """Returns the figures for people."""
+    ended = [away for away in result["away_m"] if math.isfinite(away)]
+    rows = [
+        *result["report"],
+        f"goals              {len(result['away_m'])}",
+        f"success            {result['success']:.3f}",
+        f"true distance [m]  mean {np.mean(ended):.3f}, greatest {np.max(ended):.3f}"
+        if ended
+        else "no drive has ended",
+        f"touched            {result['touched']}",
+        f"armed              {result['armings']} times, refused: {result['refusals']}",
+        f"held body stopped  after {result['held_stopped_after_s']:.2f} s",
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def main() -> None:
+    """Prints the figures; ends with 1 where a bar was missed."""
+    options = arguments()
+    with tempfile.TemporaryDirectory() as temporary:
+        result = measure(options, (options.folder or Path(temporary)).resolve())
+    answer(result, missed_of(result), table_of(result), options.json)
+
+
+if __name__ == "__main__":
+    main()
