@@ -71,6 +71,7 @@ EXTRAS = {
         "colcon-bash",
         "colcon-package-selection",
         "colcon-ros",
+        f"dartpy>=6.20; {ROS_WHEELS_EXIST}",  # a physics engine of others
         "dockerfile-parse",
         "flake8",
         "hypothesis",

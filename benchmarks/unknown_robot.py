@@ -1,10 +1,10 @@
-"""A robot that nobody here modelled: recorded, generated, trained and driven by the documented commands.
+"""A robot that nobody here modelled, driven by the documented commands.
 
-The robot is a skid-steer in DART (`measuring/dart_skid_steer.py`): a real process behind ROS 2 topics, with
-wheel odometry that believes in turns that slip, and a gyro. It is recorded in an open place, a simulator is
-generated, a policy is trained, and then gate, estimator and policy drive it to goals among pillars. Each goal
-is given relative to the robot, and judged by the true pose, which no node hears. Afterwards its body is held
-while its wheels go on, and the gate has to stop it.
+The robot is a skid-steer in DART (`measuring/dart_skid_steer.py`): a real process behind ROS 2
+topics, with wheel odometry that believes in turns that slip, and a gyro. It is recorded in an open
+place, a simulator is generated, a policy is trained, and then gate, estimator and policy drive it
+to goals among pillars. Each goal is given relative to the robot, and judged by the true pose, which
+no node hears. Afterwards its body is held while its wheels go on, and the gate has to stop it.
 """
 
 from __future__ import annotations
@@ -277,6 +277,16 @@ class Operator(Node):
         message.pose.orientation.w = 1.0
         self._goal.publish(message)
 
+    def drive_to(self, goal: Array) -> float:
+        """Lets the robot drive; returns how far from the goal it rests [m], NaN if it does not."""
+        begin_s = time.monotonic()
+        self.send_goal(goal)
+        ended = self.wait_until(lambda: self.is_at_rest(begin_s), GOAL_PATIENCE_S)
+        self.commanded.clear()
+        if not ended or self.pose is None:
+            return math.nan
+        return float(np.linalg.norm(self.pose[:2] - goal))
+
     def is_at_rest(self, since_s: float) -> bool:
         """Returns whether the robot moved after a moment and has been at rest for a while since."""
         moved = [at for at, moves in self.commanded if moves and at > since_s]
@@ -325,14 +335,10 @@ def drive_to_goals(operator: Operator, goals: int, minutes: float) -> Drives:
             drives.armings += 1
             armed_s = time.monotonic()
         goal = operator.draw_goal()
-        begin_s = time.monotonic()
-        operator.send_goal(goal)
-        ended = operator.wait_until(lambda: operator.is_at_rest(begin_s), GOAL_PATIENCE_S)
-        away = float(np.linalg.norm(operator.pose[:2] - goal)) if ended else math.nan
+        away = operator.drive_to(goal)
         drives.away.append(away)
-        operator.commanded.clear()
         print(f"goal {len(drives.away)}: {away:.2f} m away", file=sys.stderr)
-        if not ended:
+        if math.isnan(away):
             operator.ask_gate("reset")
             armed_s = -math.inf
     drives.touched = operator.touched
@@ -340,7 +346,7 @@ def drive_to_goals(operator: Operator, goals: int, minutes: float) -> Drives:
 
 
 def time_to_stop_when_held(operator: Operator) -> float:
-    """Holds the body while the robot drives; returns the time to the last command that moves [s]."""
+    """Holds the body while the robot drives; returns the time to the last moving command [s]."""
     refusal = operator.arm(60.0)
     if refusal:
         return math.nan
@@ -364,7 +370,7 @@ def run_bridge(workshop: Workshop, policy: Path, domain_id: int, control: str | 
     shared = {"model": str(workshop.folder / "rover"), "enable_stamped_cmd_vel": True}
     gate = shared | {"limits": str(workshop.folder / "limits.yaml"), "odom_rate": 20.0}
     if control == "no_gate_rule":
-        gate |= {"scan_consistency": False}
+        gate |= {"stop_when_held": False}
     nodes = {
         "command_gate": gate,
         "middleware_node": shared,

@@ -1,9 +1,9 @@
 """A skid-steer robot in DART, Gazebo's physics engine, behind the topics of an ordinary driver.
 
-Nothing here uses this package's kinematics or lidar: four wheels roll and slip by DART's contacts, and
-the lidar is an analytic ray cast. The wheels turn the robot less than the driver's odometry believes,
-because the driver computes with one effective track. A gyro measures the true turn rate, with noise and
-a constant bias.
+Nothing here uses this package's kinematics or lidar: four wheels roll and slip by DART's contacts,
+and the lidar is an analytic ray cast. The wheels turn the robot less than the driver's odometry
+believes, because the driver computes with one effective track. A gyro measures the true turn rate,
+with noise and a constant bias.
 
 Subscribes to `cmd_vel` (TwistStamped), publishes `odom`, `scan`, `imu` and, for the judge alone,
 `true_pose` and `touched`. `hold` (Bool) fixes the body to the ground while its wheels go on.

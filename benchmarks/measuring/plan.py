@@ -60,6 +60,7 @@ RUNS: dict[str, Run] = {
     "fig4_pointcloud": row("fig4_pointcloud", "", "--scans 12 --without-slam"),
     "files": row("files", "", "--kills 5 --flips 20 --cuts 10 --changes 20"),
     "first_hour": row("first_hour", "", "--roads recording", HOUR),
+    "unknown_robot": row("unknown_robot", "--minutes 120", "--goals 3", 4 * HOUR),
     "gate_held": row("gate_held", "", "--hours 0.1 --holds 13", 2 * HOUR),
     "gate_envelope": row("gate_envelope", "--steps 1000000", "--steps 5000"),
     "gate_faults": row("gate_faults", "--load 2 --repeats 100", "--repeats 1", 4 * HOUR),

@@ -1,0 +1,93 @@
+"""A skid-steer robot in a physics engine that nobody here wrote."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from .runs import BENCHMARKS, asked, fails
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+pytest.importorskip("dartpy", reason="needs DART: dartpy is not installed")
+
+SCRIPT = "unknown_robot.py"
+ARENA = {"size": [8.0, 8.0], "pillars": [[2.0, 0.0, 0.3], [-1.0, 2.5, 0.2]]}
+
+
+@pytest.fixture
+def dart(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
+    from measuring import dart_skid_steer
+
+    return dart_skid_steer
+
+
+@pytest.fixture
+def place(dart):
+    return dart.Place(np.array(ARENA["size"]), np.array(ARENA["pillars"]))
+
+
+def turned(engine, dart, seconds: float) -> tuple[float, float]:
+    """Lets the robot turn on the spot; returns its true turn and that by its wheels [rad]."""
+    true_turn, by_wheels = 0.0, 0.0
+    for _ in range(round(seconds / dart.STEP_S)):
+        engine.wheel_speeds[:] = [-2.0, 2.0, -2.0, 2.0]
+        engine.step()
+        speeds = dart.WHEEL_RADIUS * engine.measured_wheel_speeds
+        true_turn += dart.STEP_S * engine.turn_rate
+        by_wheels += dart.STEP_S * (speeds[1] - speeds[0]) / dart.BELIEVED_TRACK
+    return true_turn, by_wheels
+
+
+def test_its_wheels_slip_when_it_turns_so_that_odometry_believes_in_too_much(dart):
+    engine = dart.Engine(dart.Place(np.array([8.0, 8.0]), np.zeros((0, 3))), np.zeros(3))
+    true_turn, by_wheels = turned(engine, dart, 4.0)
+    assert true_turn > 0.5
+    assert by_wheels > 1.15 * true_turn
+
+
+def test_a_held_body_stands_while_its_wheels_go_on(dart):
+    engine = dart.Engine(dart.Place(np.array([8.0, 8.0]), np.zeros((0, 3))), np.zeros(3))
+    engine.hold(True)
+    true_turn, by_wheels = turned(engine, dart, 1.0)
+    assert abs(true_turn) < 0.01
+    assert by_wheels > 0.3
+    engine.hold(False)
+    assert turned(engine, dart, 1.0)[0] > 0.1
+
+
+def test_a_pillar_in_its_way_is_touched(dart, place):
+    engine = dart.Engine(place, np.array([0.8, 0.0, 0.0]))
+    for _ in range(round(2.0 / dart.STEP_S)):
+        assert not engine.touches or engine.pose[0] > 1.0
+        engine.wheel_speeds[:] = 4.0
+        engine.step()
+    assert engine.touches
+
+
+def test_its_lidar_sees_walls_and_pillars_where_they_are(dart, place):
+    lidar = dart.Lidar(beams=5, angle_min=-math.pi / 2, angle_max=math.pi / 2, noise_std=0.0)
+    ranges = lidar.scan(place, np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
+    diagonal = 4.0 * math.sqrt(2.0)
+    np.testing.assert_allclose(ranges, [4.0, diagonal, 1.7, diagonal, 4.0], atol=1e-9)
+
+
+@pytest.mark.ros
+@pytest.mark.campaign
+@pytest.mark.timeout(3600)
+def test_it_is_driven_to_its_goals_by_the_documented_commands():
+    code, result = asked(SCRIPT, "--goals", "10", timeout_s=3500.0)
+    assert (code, result["failures"]) == (0, [])
+
+
+@pytest.mark.ros
+@pytest.mark.campaign
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("control", ["no_gyro", "no_gate_rule"])
+def test_without_gyro_or_without_the_rule_for_held_bodies_a_bar_is_missed(control):
+    missed = fails(SCRIPT, control, "--goals", "10", timeout_s=3500.0)
+    wanted = {"no_gyro": "success", "no_gate_rule": "a held body"}[control]
+    assert any(line.startswith(wanted) for line in missed)
