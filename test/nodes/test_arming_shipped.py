@@ -76,7 +76,7 @@ class Standing:
             while odometries * self.model.control_period <= self.now:
                 stamp = START_NS + round(odometries * self.model.control_period * NS_PER_S)
                 self.give(inputs.Odometry(stamp, np.zeros(3), np.zeros(3)))
-                self.give(inputs.Estimate(np.zeros(3), np.full(2, 0.01)))
+                self.give(inputs.Estimate(np.zeros(3), np.zeros(3), np.diag([1e-4] * 3)))
                 odometries += 1
             while scans / lidar.rate <= self.now:
                 stamp = START_NS + round(scans / lidar.rate * NS_PER_S)
