@@ -18,7 +18,7 @@ PACKAGE = "nics_drl_bridge"
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
     ("errors", "geometry", "interface", "kernels"),
-    ("extensions", "random_kernels", "seeds"),
+    ("arguments", "extensions", "random_kernels", "seeds"),
     ("config", "files", "style", "threads"),
     ("robot",),
     ("recording",),

@@ -48,9 +48,9 @@ def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[st
 
 ROBOTS, WORLDS = completing("robots"), completing("worlds", "world_sets", also=("barn",))
 POLICIES = completing("policies", also=("dynamic_window", "mppi", "random", "straight"))
-RobotOption = Annotated[str, Option(autocompletion=ROBOTS,
+RobotOption = Annotated[str, Option("--robot", "--model", autocompletion=ROBOTS,
     help="A shipped robot (see nics list robots) or a YAML file.")]  # fmt: skip
-DrivenRobotOption = Annotated[str | None, Option(autocompletion=ROBOTS,
+DrivenRobotOption = Annotated[str | None, Option("--robot", "--model", autocompletion=ROBOTS,
     help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")]  # fmt: skip
 LidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
     help="A shipped lidar or a YAML file; else the robot's own, or paper.")]  # fmt: skip
