@@ -19,6 +19,7 @@ from nics_drl_bridge.commands.start import was_interrupted
 from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
+from nics_drl_bridge.status import STATUS
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -227,9 +228,14 @@ def progress_bar(begin: str = "starting") -> Iterator[Tell]:
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(begin, total=None)
-        yield lambda what, done, total: progress.update(
-            task, description=what, completed=done, total=total or None
-        )
+
+        def show(text: str) -> None:
+            progress.update(task, description=text)
+
+        with STATUS.shown_by(show):
+            yield lambda what, done, total: progress.update(
+                task, description=what, completed=done, total=total or None
+            )
 
 
 @contextmanager
