@@ -42,7 +42,7 @@ FOREIGN_ROS := $(if $(BASE)$(SYSTEM_ROS),$(if $(SYSTEM_ROS),,$(shell $(BASE) -c 
 WHEELS_EXIST := $(filter Linux-x86_64,$(shell uname -s)-$(shell uname -m))
 ROS := $(if $(SYSTEM_ROS),system,$(if $(WHEELS_EXIST),wheels,none))
 EXTRAS := $(if $(SYSTEM_ROS),dev-without-ros,dev)
-DEMO_EXTRAS := deploy,train,view$(if $(SYSTEM_ROS),,$(COMMA)ros)
+DEMO_EXTRAS := bags,deploy,train,view$(if $(SYSTEM_ROS),,$(COMMA)ros)
 
 # Written last, so a half-built .venv has none and is built anew; its name says for which Python
 # and which ROS 2 the environment is. The demo needs a part of it only.

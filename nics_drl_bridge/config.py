@@ -209,7 +209,8 @@ def find_config(name: str | Path, kind: str, also: Iterable[str] = ()) -> Path:
     if path.is_file():
         return path
     hint = nearest(name, (*shipped_names(kind), *also))
-    unknown = f"unknown {kind.removesuffix('s')} {name!r}"
+    word = {"training": "settings", "limits": "limits"}.get(kind, kind.removesuffix("s"))
+    unknown = f"unknown {word} {name!r}"
     raise ConfigError(f"{unknown}; {hint} (or give the path of a YAML file).")
 
 

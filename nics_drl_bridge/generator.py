@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import Field
 
 from nics_drl_bridge import files
+from nics_drl_bridge.arguments import check_path, checked_arguments, shown
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, shipped_names, validate
-from nics_drl_bridge.errors import ConfigError, FitError, ModelError
+from nics_drl_bridge.errors import ConfigError, FitError, ModelError, nearest
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
@@ -118,15 +119,17 @@ class _File(Schema):
     gyro: bool = False
 
 
+@checked_arguments("generate")
 def generate(
-    recording: Recording | Sequence[Recording], robot: RobotSpec, lidar: LidarSpec,
-    shapes: Sequence[Shape],
+    recording: Recording | Sequence[Recording], robot: RobotSpec | SimulatorModel | str | Path,
+    lidar: LidarSpec | str | Path | None = None, shapes: Sequence[Shape] = (),
     order: fit.Order = "auto", alpha: fit.Alpha = "auto", assume: bool = False,
     strict: bool = False, anyway: bool = False, sensors: Sequence[Sensor] = (),
 ) -> tuple[SimulatorModel, Identified]:  # fmt: skip
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
-    Several recordings of one robot are fitted together (`identify.joined`).
+    Several recordings of one robot are fitted together (`identify.joined`). The robot (or `model`)
+    is a RobotSpec, a name, a YAML file, or a model of it; the lidar is by default the robot's own.
     The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor
     model, `auto` for the one that predicts best, `alpha` the pruning threshold of Eq. 2. `assume`
     fills in from the textbook what the drive did not show, marked as assumed; `strict` refuses a
@@ -134,6 +137,12 @@ def generate(
     standing robot's; `sensors` are beside its lidar. Raises RecordingError for a recording that is
     unfit for the robot, FitError for a useless model.
     """
+    _check_given(recording, shapes, sensors)
+    alpha = fit.parse_alpha(str(alpha))
+    order = fit.parse_order(str(order))
+    robot = _spec_of(robot)
+    if not isinstance(lidar, LidarSpec):
+        lidar = lidar_of(robot, None if lidar is None else str(lidar))
     if not isinstance(recording, Recording):
         recording = join_recordings(recording, robot)
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
@@ -149,6 +158,30 @@ def generate(
         recording.latency, tuple(sensors), identified.recording.gyro is not None,
     )  # fmt: skip
     return model, identified
+
+
+def _check_given(recording: object, shapes: object, sensors: object) -> None:
+    """Raises ConfigError for a recording, shapes or sensors of a wrong type."""
+    every = list(recording) if isinstance(recording, list | tuple) else [recording]
+    if not every or not all(isinstance(one, Recording) for one in every):
+        needed = "a Recording, as read_recording(path) gives, or a list of them"
+        raise ConfigError(f"generate: recording={shown(recording)}: must be {needed}.")
+    for name, given in (("shapes", shapes), ("sensors", sensors)):
+        fits = isinstance(given, list | tuple) and all(isinstance(one, Schema) for one in given)
+        if not fits:
+            needed = f"a list of {name} of this package"
+            raise ConfigError(f"generate: {name}={shown(given)}: must be {needed}.")
+
+
+def _spec_of(robot: object) -> RobotSpec:
+    if isinstance(robot, RobotSpec):
+        return robot
+    if isinstance(robot, SimulatorModel):
+        return robot.robot
+    if isinstance(robot, str | Path):
+        return open_model(robot).robot if Path(robot).is_dir() else load_robot(robot)
+    needed = "a RobotSpec, a robot's name or YAML file, or a model"
+    raise ConfigError(f"generate: robot={shown(robot)}: must be {needed}.")
 
 
 def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
@@ -181,24 +214,35 @@ def builtin_model(robot: str, content: str = "") -> SimulatorModel:
     return generate(drive, spec, lidar_of(spec), ())[0]
 
 
-def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
+def open_model(
+    name: str | Path | SimulatorModel, lidar: str | None = None
+) -> SimulatorModel:
     """Opens a model by a shipped robot (`ackermann`), by folder (`./mine`), or by a robot's YAML.
 
-    A `lidar`, shipped or a YAML file, takes the place of the model's own.
+    A `lidar`, shipped or a YAML file, takes the place of the model's own. A model that is open
+    already is returned as it is.
     """
+    if not isinstance(name, str | Path | SimulatorModel) or name == "":
+        needed = "a shipped robot's name, a model's folder, a robot's YAML, or a SimulatorModel"
+        raise ModelError(f"model={shown(name)}: must be {needed}.")
     if lidar is not None:
         model = open_model(name)
         spec = lidar_of(model.robot, lidar)
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
+    if isinstance(name, SimulatorModel):
+        return name
     if Path(name).is_dir() and name not in shipped_names("robots"):  # never so for a Path
         return load_model(name)
     if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
+    if not name.endswith((".yaml", ".yml")) and name not in shipped_names("robots"):
+        hint = nearest(name, shipped_names("robots"))
+        fix = "or give a model's folder, or a robot's YAML file"
+        raise ModelError(f"unknown robot {name!r}; {hint} ({fix}).")
     try:
         return builtin_model(name, *([read_text(name)] if Path(name).is_file() else []))
     except ConfigError as error:
-        reason = str(error).removesuffix(".")
-        raise ModelError(f"{reason}; there is no folder of this name either.") from None
+        raise ModelError(str(error)) from None
 
 
 def check_place(folder: str | Path) -> None:
@@ -224,6 +268,7 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
 
 def load_model(folder: str | Path) -> SimulatorModel:
     """Reads a model that `save_model` wrote; ConfigError, ModelError if it is not whole."""
+    check_path("folder", folder)
     folder = Path(folder)
     path = folder / MODEL_FILE
     if not path.is_file():

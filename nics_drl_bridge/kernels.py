@@ -10,7 +10,6 @@ import hashlib
 import math
 import os
 import re
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -31,10 +30,12 @@ from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
+from nics_drl_bridge.status import REPEATED_S, STATUS
+
 PACKAGE = Path(__file__).parent
 PATIENCE_S = 2.0  # Compiling that takes longer is announced, on standard error
-REPEATED_S = 20.0  # it is announced again, as long as it takes
 SECONDS_EACH = 0.5  # typical for a kernel with what only it calls [s]
+TRUSTED_AFTER = 5  # kernels after which the pace of this process counts as much as that
 KERNELS: list[Any] = []  # every kernel that was imported so far, as numba's dispatchers
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
@@ -263,18 +264,30 @@ def imports_of(file: Path) -> tuple[Path, ...]:
     return tuple(file for file in files if file.is_file())
 
 
-def _say(text: str) -> None:
-    sys.stderr.write(f"nics_drl_bridge: {text}\n")
+def pace_s(compiled: int, spent_s: float) -> float:
+    """Returns the time that a kernel takes [s], by those that were compiled so far."""
+    return (TRUSTED_AFTER * SECONDS_EACH + spent_s) / (TRUSTED_AFTER + compiled)
+
+
+def estimate(left: int, compiled: int, spent_s: float) -> str:
+    """Tells how long compiling will take: up to `left` kernels, as not all may be called."""
+    what = "compiling, once on this machine"
+    if left < 1:  # further types of arguments of kernels that were compiled for others
+        return f"{what}: the last kernels"
+    seconds = max(1, round(left * pace_s(compiled, spent_s)))
+    kernels = "1 kernel" if left == 1 else f"{left} kernels"
+    return f"{what}, up to {kernels}: about {seconds} s"
 
 
 class _Compiling(event.Listener):  # type: ignore[misc]
-    """Counts what this process compiles, and says so once to whoever waits for it."""
+    """Counts what this process compiles, and tells whoever waits how long it will take."""
 
     def __init__(self) -> None:
         self.count = 0  # specialisations of kernels, and of what they call
         self.cpu_s = 0.0  # CPU time that compiling took
         self.quiet = False  # True: nothing is to be said
-        self.patience_s, self.tell = PATIENCE_S, _say
+        self.patience_s = PATIENCE_S
+        self.tell: Callable[[str], None] = STATUS.show
         self._told = -math.inf
         self._lock, self._depth, self._collects = threading.Lock(), 0, True
         self._begun = self._begun_cpu = self._spent = 0.0
@@ -288,11 +301,11 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             self._depth += 1
             spent = self._spent + time.monotonic() - self._begun
             silent = time.monotonic() - self._told
-            if spent >= self.patience_s and silent > REPEATED_S and not self.quiet:
+            interval = STATUS.interval_s if self.tell == STATUS.show else REPEATED_S
+            if spent >= self.patience_s and silent > interval and not self.quiet:
                 self._told = time.monotonic()
                 left = sum(not each.is_warm for each in KERNELS)
-                seconds = f"about {left * SECONDS_EACH:.0f} s"
-                self.tell(f"compiling, once on this machine, up to {left} kernels: {seconds}")
+                self.tell(estimate(left, self.count, spent))
 
     def on_end(self, event: event.Event) -> None:
         with self._lock:
@@ -301,6 +314,7 @@ class _Compiling(event.Listener):  # type: ignore[misc]
                 if self._collects:
                     gc.enable()
                 self._spent += time.monotonic() - self._begun
+                STATUS.clear()
                 self.cpu_s += time.thread_time() - self._begun_cpu
 
 

@@ -17,8 +17,9 @@ PACKAGE = "nics_drl_bridge"
 
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
+    ("status",),
     ("errors", "geometry", "interface", "kernels"),
-    ("extensions", "random_kernels", "seeds"),
+    ("arguments", "extensions", "random_kernels", "seeds"),
     ("config", "files", "style", "threads"),
     ("robot",),
     ("recording",),
@@ -219,7 +220,7 @@ def modules_after(code: str) -> set[str]:
 
 LIGHT = {
     "config.py", "errors.py", "geometry.py", "interface.py", "robot/curve.py", "robot/taylor.py",
-    "sim/state.py", "strict_yaml.py",
+    "sim/state.py", "status.py", "strict_yaml.py",
 }  # fmt: skip
 
 

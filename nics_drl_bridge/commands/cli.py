@@ -2,12 +2,15 @@
 
 import os
 import sys
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import typer
 from typer import Option
+from typer.core import TyperGroup
 
 from nics_drl_bridge import __version__, extensions
+from nics_drl_bridge.arguments import ROBOT_WORDS
 from nics_drl_bridge.commands.console import EXIT_BAD_INPUT, one_sentence
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, explain
@@ -23,7 +26,27 @@ from nics_drl_bridge.commands.watch import watch
 from nics_drl_bridge.commands.world import world
 from nics_drl_bridge.errors import LONGEST, shortened
 
+
+class OneWordForARobot(TyperGroup):
+    """Commands whose `--robot` and `--model` are one option: two values for it are refused."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parses the words of a command line; UsageError for two robots by two words."""
+        robots = [value for word in ROBOT_WORDS for value in values_of(f"--{word}", args)]
+        if len(set(robots)) > 1:
+            told = " and ".join(map(repr, robots))
+            ctx.fail(f"--robot and --model are one option, and name {told}; give one of them")
+        return super().parse_args(ctx, args)
+
+
+def values_of(option: str, args: Sequence[str]) -> list[str]:
+    """Returns the values of an option in a command line: `--robot X` or `--robot=X`."""
+    joined = [word.partition("=")[2] for word in args if word.startswith(f"{option}=")]
+    return joined + [args[k + 1] for k, word in enumerate(args[:-1]) if word == option]
+
+
 app = typer.Typer(
+    cls=OneWordForARobot,
     help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

@@ -19,6 +19,7 @@ from nics_drl_bridge.commands.start import was_interrupted
 from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
+from nics_drl_bridge.status import STATUS
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -48,9 +49,9 @@ def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[st
 
 ROBOTS, WORLDS = completing("robots"), completing("worlds", "world_sets", also=("barn",))
 POLICIES = completing("policies", also=("dynamic_window", "mppi", "random", "straight"))
-RobotOption = Annotated[str, Option(autocompletion=ROBOTS,
+RobotOption = Annotated[str, Option("--robot", "--model", autocompletion=ROBOTS,
     help="A shipped robot (see nics list robots) or a YAML file.")]  # fmt: skip
-DrivenRobotOption = Annotated[str | None, Option(autocompletion=ROBOTS,
+DrivenRobotOption = Annotated[str | None, Option("--robot", "--model", autocompletion=ROBOTS,
     help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")]  # fmt: skip
 LidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
     help="A shipped lidar or a YAML file; else the robot's own, or paper.")]  # fmt: skip
@@ -227,9 +228,14 @@ def progress_bar(begin: str = "starting") -> Iterator[Tell]:
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(begin, total=None)
-        yield lambda what, done, total: progress.update(
-            task, description=what, completed=done, total=total or None
-        )
+
+        def show(text: str) -> None:
+            progress.update(task, description=text)
+
+        with STATUS.shown_by(show):
+            yield lambda what, done, total: progress.update(
+                task, description=what, completed=done, total=total or None
+            )
 
 
 @contextmanager

@@ -16,7 +16,7 @@ EXIT_FINDINGS = 1
 
 def doctor(
     bag: Annotated[Path | None, Argument(help="A bag to check; else the live robot.")] = None,
-    model: Annotated[str | None, Option(autocompletion=console.ROBOTS,
+    model: Annotated[str | None, Option("--model", "--robot", autocompletion=console.ROBOTS,
         help=f"Check against a model's folder, or a shipped robot ({DEFAULT_ROBOT}).")] = None,
     policy: Annotated[str | None, Option(help="Check against a policy file instead.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",

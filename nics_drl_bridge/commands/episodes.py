@@ -117,7 +117,7 @@ def env_with(
 def check_place(place: str, robot: RobotSpec) -> None:
     """Raises ConfigError if there is no such place, or it lacks a module or can't have a robot."""
     if place not in PLACES:
-        raise ConfigError(f"--in {place!r}: there is no such world; {nearest(place, PLACES)}")
+        raise ConfigError(f"--in {place!r}: there is no such simulator; {nearest(place, PLACES)}")
     if place == FAST:
         return
     robot.require_cmd_vel()

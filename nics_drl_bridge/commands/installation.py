@@ -90,5 +90,6 @@ def _kernels() -> Check:
 
     cold = sum(not each.is_warm for each in KERNELS)
     told = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
-    fix = f"nics warmup, about {cold * SECONDS_EACH:.0f} s; else each is compiled at its first use"
+    seconds = max(1, round(cold * SECONDS_EACH))
+    fix = f"nics warmup, about {seconds} s; else each is compiled at its first use"
     return Check("kernels", cold == 0, told, fix)

@@ -10,6 +10,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
+from nics_drl_bridge.commands.first_checks import check_drive
 from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.files import json_of
@@ -44,6 +45,7 @@ def record(
         "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
         "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time, "imu": imu,
     } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
+    check_drive(given)
     if not preview:
         # First: with ROS 2 from wheels it restarts Python.
         with console.needs_ros("nics record"):

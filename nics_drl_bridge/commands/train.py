@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -15,6 +15,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
+from nics_drl_bridge.commands.first_checks import check_settings, check_training
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -23,9 +24,9 @@ OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_setti
 
 
 def train(
-    more_seeds: Annotated[list[int] | None, Argument(hidden=True)] = None,
+    more_seeds: Annotated[list[str] | None, Argument(hidden=True)] = None,
     task: Annotated[str, Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
-    robot: Annotated[str | None, Option(autocompletion=console.ROBOTS,
+    robot: Annotated[str | None, Option("--robot", "--model", autocompletion=console.ROBOTS,
         help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.")] = None,
     settings: Annotated[str | None,
         Option(help="Shipped settings (navigation_differential), or a YAML file; else those of the "
@@ -61,6 +62,12 @@ def train(
     if watch and engine is not None and engine not in OWN:
         reason = "worlds of other processes are not shown; leave out --watch, or --engine"
         raise ConfigError(f"--watch --engine {engine}: {reason}.")
+    further_seeds = seeds_of_words(more_seeds or [], seeds is not None)
+    every_seed = [*(seeds or []), *further_seeds]
+    check_training(task, robot, world or [], every_seed, out)
+    check_engine(engine, {"address": address, "env-runners": env_runners})
+    if (settings or algorithm) and not resume:
+        check_settings(task, settings, named)
     extensions.require("training", *extensions.TRAINING)
     with console.progress_bar("loading PyTorch"):
         from nics_drl_bridge.policy import train as train_run
@@ -72,10 +79,19 @@ def train(
     command = shlex.join(["nics", *sys.argv[1:]])
     if begun := train_run.seeds_of(folder) if resume and not seeds else []:
         typer.echo(f"seeds that were begun: {begun}; --seeds names others", err=True)
-    every = [*(seeds or begun or [0]), *(more_seeds or [])]
+    every = [*(seeds or begun or [0]), *further_seeds]
     order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
     with _learner(engine, address, env_runners, chosen.num_envs) as learn:
         (_run_watched if watch else _run)(train_run, order, learn, as_json)
+
+
+def seeds_of_words(words: Sequence[str], after_seeds: bool) -> list[int]:
+    """Returns the further seeds of `--seeds 0 1 2`; ConfigError for a word that is none."""
+    for word in words:
+        if not after_seeds or not word.isdecimal():
+            fix = f"a task is given as --task {word}, seeds as --seeds 0 1 2"
+            raise ConfigError(f"nics train: what {word!r} means is not said; {fix}.")
+    return [int(word) for word in words]
 
 
 def _plain(result: Any) -> dict[str, Any]:
@@ -94,19 +110,24 @@ def _told(task: str, settings: str | None, named: dict[str, Any]) -> Any:
     return chosen.settings
 
 
-@contextmanager
-def _learner(
-    engine: str | None, address: str | None, runners: int | None, worlds: int
-) -> Iterator[Any]:
+def check_engine(engine: str | None, of_clusters: dict[str, Any]) -> None:
+    """Raises ConfigError for an unknown engine, or an option that this one does not have."""
     engines = (*OWN, *extensions.known("engines"))
     if engine is not None and engine not in engines:
         raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")
     if engine is None or engine in OWN:
-        from nics_drl_bridge.policy.train import train as learn
-
-        for name, value in (("address", address), ("env-runners", runners)):
+        for name, value in of_clusters.items():
             if value is not None:
                 raise ConfigError(f"--{name}: belongs to --engine ray; add that, or leave it out.")
+
+
+@contextmanager
+def _learner(
+    engine: str | None, address: str | None, runners: int | None, worlds: int
+) -> Iterator[Any]:
+    if engine is None or engine in OWN:
+        from nics_drl_bridge.policy.train import train as learn
+
         yield learn
     else:
         with extensions.load("engines", engine)(address, runners, worlds) as learn:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.arguments import check_options, checked_arguments, shown
 from nics_drl_bridge.env import guard
-from nics_drl_bridge.env.guard import give, halts_on_error
+from nics_drl_bridge.env.guard import give, halts_on_error, refused_after_close
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import completed, make_backend
 from nics_drl_bridge.env.snapshot import Snapshot, gate_of, goals_of
@@ -74,7 +75,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     Args:
         backend: `sim`, `dds`, or your own object, see `interface.Backend`; it may lack `halt` and
             `facts`, see `env.sim_backend.CompletedBackend`.
-        model: a SimulatorModel, its folder, or a shipped robot's name; else `DEFAULT_ROBOT`.
+        model: a SimulatorModel, its folder, or a shipped robot's name; else `DEFAULT_ROBOT`. The
+            keyword `robot` means the same.
         world: a World, its YAML file, the name of a shipped one, or a list of these: a set.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
@@ -98,8 +100,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         "render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS,
     }  # fmt: skip
 
+    @checked_arguments("BridgeEnv")
     def __init__(
-        self, backend: str | Backend = "sim", model: str | SimulatorModel = DEFAULT_ROBOT,
+        self, backend: str | Backend = "sim", model: str | SimulatorModel | None = None,
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,
@@ -107,8 +110,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         simulator: str | None = None,
     ) -> None:  # fmt: skip
         check_render_mode(render_mode, self.metadata)
+        check_options("backend_options", backend_options)
         self.render_mode = render_mode
-        self.model = model if isinstance(model, SimulatorModel) else open_model(model)
+        self._closed = False
+        self.model = open_model(DEFAULT_ROBOT if model is None else model)
         self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
@@ -137,6 +142,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             backend = make_backend(backend, self.model, self.world, **options)
         self._backend: Backend = completed(backend, self._row(self._rest))
 
+    @refused_after_close
     @halts_on_error
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -187,6 +193,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
 
+    @refused_after_close
     @halts_on_error
     def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
@@ -200,6 +207,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             self.render()
         return observation.reshape(-1), reduce(add, each, 0.0), bool(self.ended.all()), False, info
 
+    @refused_after_close
     @halts_on_error
     def advance(
         self, action: NDArray[Any]
@@ -253,6 +261,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         ages |= {"sensed_age_s": view.sensed_age_s} if view.sensed else {}
         return {**shown, "pose": self._row(view.pose[0]).copy(), **ages, **facts}
 
+    @refused_after_close
     @halts_on_error
     def render(self) -> Any:
         """Draws the current world from above; see Gymnasium."""
@@ -287,7 +296,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     @halts_on_error
     def close(self) -> None:
         """Stops the robot with a zero command and closes the page."""
-        picture, self._picture = self._picture, None
+        picture = self._picture
+        self._picture = None
+        self._closed = True
         try:
             self._backend.close()
         finally:
@@ -299,4 +310,5 @@ def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
     """Raises ConfigError for a mode that the env does not support."""
     known = metadata["render_modes"]
     if mode is not None and mode not in known:
-        raise ConfigError(f"unknown render_mode {mode!r}; {nearest(mode, known)}")
+        name = mode if isinstance(mode, str) else ""
+        raise ConfigError(f"unknown render_mode {shown(mode)}; {nearest(name, known)}")

@@ -41,6 +41,25 @@ def halts_on_error(method: Callable[Concatenate[Any, P], T]) -> Callable[Concate
     return guarded
 
 
+class ClosedEnvError(ConfigError, gymnasium.error.ClosedEnvironmentError):
+    """A method was called after `close`."""
+
+
+def refused_after_close(
+    method: Callable[Concatenate[Any, P], T],
+) -> Callable[Concatenate[Any, P], T]:
+    """Makes a method of an env raise ClosedEnvError once `_closed` is True."""
+
+    @wraps(method)
+    def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        if self._closed:
+            call = f"{method.__name__}() after close()"
+            raise ClosedEnvError(f"{call}: the env is closed; make another one.")
+        return method(self, *args, **kwargs)
+
+    return guarded
+
+
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
     """Defers Ctrl-C to the end of the block, so that stopping a robot is not interrupted."""

@@ -71,6 +71,10 @@ class Navigation(Task):
     progress_reward: float = 1.0
     time_reward: float = -0.01
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_above_zero("goal_radius", self.goal_radius)
+
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""

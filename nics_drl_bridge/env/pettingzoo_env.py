@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.arguments import check_count, checked_arguments
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -49,12 +49,14 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         "render_fps": RENDER_FPS, "is_parallelizable": True,
     }  # fmt: skip
 
+    @checked_arguments("BridgeParallelEnv")
     def __init__(
-        self, model: str | SimulatorModel = DEFAULT_ROBOT, world: str | AnyWorld = "arena",
+        self, model: str | SimulatorModel | None = None, world: str | AnyWorld = "arena",
         task: str | type[Task] | Task = "cooperative_reaching",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = MAX_EPISODE_STEPS,
         randomisation: str | Randomisation | None = None, render_mode: str | None = None,
     ) -> None:  # fmt: skip
+        check_count("max_episode_steps", max_episode_steps)
         self.env = BridgeEnv(
             "sim", model, world, task, task_options,
             randomisation=randomisation, render_mode=render_mode,
@@ -95,6 +97,10 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
         """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
+        given: object = actions
+        if not isinstance(given, dict):
+            needed = "must be a dict of an action for each agent"
+            raise ConfigError(f"actions of type {type(given).__name__}: {needed}.")
         if missing := sorted(set(self.agents) - set(actions)):
             raise ConfigError(f"no action for {', '.join(missing)}; each agent that is left acts.")
         space = self.env.task.action_space

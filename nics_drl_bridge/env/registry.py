@@ -1,13 +1,23 @@
 """Tasks by name or by the path of a user's file; the environments, for `gymnasium.make`."""
 
+from collections.abc import Iterable
 from importlib import import_module
 from inspect import Parameter, signature
+from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.arguments import (
+    check_count,
+    check_kind,
+    check_options,
+    in_own_word,
+    keywords_of,
+    refuse_unknown,
+    shown,
+)
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
@@ -31,12 +41,17 @@ def make_task(
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
+    check_options("task_options", options)
     options = dict(options or {})
     found = class_for(task, options)
     if "scan" in options:
         options["scan"] = layout_of(options["scan"], model.lidar)
     if "sensors" in options:
-        options["sensors"] = tuple(_sensor(name, model) for name in options["sensors"])
+        names = options["sensors"]
+        if isinstance(names, str) or not isinstance(names, Iterable):
+            fix = "must be a list of names of the model's sensors"
+            raise ConfigError(f"task option sensors={shown(names)}: {fix}.")
+        options["sensors"] = tuple(_sensor(name, model) for name in names)
     try:
         return found(model.robot, model.lidar, **options)
     except TypeError as error:
@@ -56,31 +71,17 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
 def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
     """Returns a task's class; ConfigError if there is none, or it does not take the options."""
     found = task if isinstance(task, type) else _class_of(task)
+    if not issubclass(found, Task):
+        raise ConfigError(f"task {found.__name__}: is no subclass of env.task.Task; derive it.")
     known = signature(found).parameters
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
     for name, value in options.items():
         if name not in known and not free:
             hint = nearest(name, set(known) - {"robot", "lidar"})
             raise ConfigError(f"task {found.__name__}: unknown task option {name!r}; {hint}")
-        annotation = known[name].annotation if name in known else None
-        kind, none, _ = str(getattr(annotation, "__name__", annotation)).partition(" | None")
-        if kind in KINDS and not (_fits(value, kind) or (none and value is None)):
-            raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
+        if name in known:
+            check_kind(f"task option {name}", value, known[name].annotation)
     return found
-
-
-KINDS: dict[str, tuple[tuple[type, ...], str]] = {  # annotation -> types, name in errors
-    "bool": ((bool, np.bool_), "True or False"),
-    "int": ((int, np.integer), "a whole number"),
-    "float": ((int, np.integer, float, np.floating), "a finite number"),
-}
-
-
-def _fits(value: Any, kind: str) -> bool:
-    if isinstance(value, bool | np.bool_):
-        return kind == "bool"
-    finite = kind != "float" or not isinstance(value, float | np.floating) or np.isfinite(value)
-    return isinstance(value, KINDS[kind][0]) and bool(finite)
 
 
 def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
@@ -96,8 +97,13 @@ def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) 
     return task
 
 
-def _class_of(name: str) -> type[Task]:
+def _class_of(name: Any) -> type[Task]:
+    if not isinstance(name, str):
+        fix = "a name, path/to/file.py:ClassName, a subclass of Task, or a Task"
+        raise ConfigError(f"task={shown(name)}: must be {fix}.")
     path, colon, attribute = name.rpartition(":")
+    if not colon and name.endswith(".py"):
+        raise ConfigError(f"task {name!r}: {_missing_class(Path(name))}")
     if not colon:
         if name not in TASKS:
             hint = nearest(name, TASKS)
@@ -106,11 +112,31 @@ def _class_of(name: str) -> type[Task]:
     module = extensions.module_at(path, "task")
     found = getattr(module, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Task)):
-        classes = [each for each in vars(module).values() if isinstance(each, type)]
-        own = [each for each in classes if each.__module__ == module.__name__]
-        tasks = [each.__name__ for each in own if issubclass(each, Task)]
+        tasks = _tasks_in(module)
+        if not tasks:
+            raise ConfigError(f"task {name!r}: {path} {NO_TASK}")
         raise ConfigError(f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}")
     return found
+
+
+NO_TASK = "defines no subclass of nics_drl_bridge.env.task.Task; see docs/tasks.md."
+
+
+def _tasks_in(module: Any) -> list[str]:
+    """Returns the names of the tasks that a module itself defines."""
+    classes = [each for each in vars(module).values() if isinstance(each, type)]
+    own = [each for each in classes if each.__module__ == module.__name__]
+    return [each.__name__ for each in own if issubclass(each, Task)]
+
+
+def _missing_class(file: Path) -> str:
+    """Says what to give instead of a file without the name of a class in it."""
+    if not file.is_file():
+        return "no such file; give path/to/file.py:ClassName."
+    tasks = _tasks_in(extensions.module_at(str(file), "task"))
+    if not tasks:
+        return NO_TASK
+    return f"name the class in it, as {file}:{tasks[0]}."
 
 
 NAVIGATION = "NicsBridge/Navigation-v0"
@@ -138,12 +164,32 @@ def register_envs() -> None:
 register_envs()
 
 
-def make(task: str = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
-    """An env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
+OF_GYMNASIUM = ("max_episode_steps", "disable_env_checker")  # arguments of `gymnasium.make` itself
+
+
+def make(
+    task: str | type[Task] | Task = "navigation", **arguments: Any
+) -> gymnasium.Env[Any, Any]:
+    """Makes an env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
+    single = import_module("nics_drl_bridge.env.bridge_env")  # which imports this module
+    in_own_word("make", "model", arguments)
+    refuse_unknown("make", arguments, {*keywords_of(single.BridgeEnv), "robot", *OF_GYMNASIUM})
+    single.check_render_mode(arguments.get("render_mode"), single.BridgeEnv.metadata)
+    if (most := arguments.get("max_episode_steps")) is not None:
+        check_count("make: max_episode_steps", most)
     return gymnasium.make(TASK, task=task, **arguments)
 
 
-def make_vec(num_envs: int, task: str = "navigation", **arguments: Any) -> Any:
-    """A `BridgeVectorEnv`: a task in many worlds at once, for training."""
+def make_vec(
+    task: str | type[Task] | Task = "navigation", num_envs: int = 1, **arguments: Any
+) -> Any:
+    """Makes a `BridgeVectorEnv`: a task in many worlds at once, for training."""
     vectors = import_module("nics_drl_bridge.env.vector_env")  # which imports this module
+    first: object = task
+    if isinstance(first, int) and not isinstance(first, bool):
+        raise ConfigError(f"make_vec: task={first}: the task comes first; give num_envs={first}.")
+    if "vectorization_mode" in arguments:
+        mode = shown(arguments["vectorization_mode"])
+        reason = "one process steps all worlds together; leave it out, threads=2 uses two cores"
+        raise ConfigError(f"make_vec: vectorization_mode={mode}: {reason}.")
     return vectors.BridgeVectorEnv(num_envs, task=task, **arguments)

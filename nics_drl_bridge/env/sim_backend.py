@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.arguments import check_count, checked_arguments
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
@@ -33,10 +34,13 @@ class SimBackend:
     commands have a leading (M,) if M > 1 `robots`; `simulation` are arguments of the FastSimulator.
     """
 
+    @checked_arguments("backend 'sim'", FastSimulator, without=("worlds",))
     def __init__(
         self, model: SimulatorModel, world: AnyWorld, renderer: Renderer = "baked",
         estimator: bool = False, robots: int = 1, **simulation: Any,
     ) -> None:  # fmt: skip
+        check_count("robots", robots)
+        check_count("threads", simulation.get("threads", 1))
         self._robot = model.robot
         self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
         self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]

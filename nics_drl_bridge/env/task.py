@@ -117,10 +117,18 @@ class Task(ABC):
             raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
         if self.top_speed is not None and not self.top_speed > 0.0:
             raise ConfigError(f"task option top_speed={self.top_speed!r}: must be above 0 m/s.")
+        if not self.contact_margin >= 0.0:
+            value = self.contact_margin
+            raise ConfigError(f"task option contact_margin={value!r}: must be at least 0 m.")
         if self.sensors and not self.observes_sensors:
             name = type(self).__name__
             raise ConfigError(f"task option sensors: {name} observes no further sensors.")
         _ = self.plan  # a lidar that can't fill the layout is refused here
+
+    def check_above_zero(self, option: str, metres: float) -> None:
+        """Raises ConfigError for an option that is a length and not above 0 m."""
+        if not metres > 0.0:
+            raise ConfigError(f"task option {option}={metres!r}: must be above 0 m.")
 
     @property
     def robots(self) -> int:
@@ -199,7 +207,11 @@ class Task(ABC):
             self.valid(f"reward term {name!r}", term, each)
         for name, fact in info.items():
             self._leads(f"info {name!r}", fact, each)
-        return Outcome(terms, self.valid("end", self.end(after, memory), each), info)
+        ended = self.valid("end", self.end(after, memory), each)
+        if np.asarray(ended).dtype != np.bool_:
+            kind = np.asarray(ended).dtype
+            raise self._wrong("end", f"must be True or False for each robot, and is {kind}")
+        return Outcome(terms, ended, info)
 
     def begun(self, episodes: Episodes) -> Memory:
         """Returns the memory of `reset`. Raises ConfigError if it does not fit or lacks `shown`."""
@@ -223,7 +235,7 @@ class Task(ABC):
 
     def valid(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
         """Returns what a method gave. Raises ConfigError if it is not finite, or of this shape."""
-        if np.shape(given) != shape or not np.isfinite(given).all():
+        if np.shape(given) != shape or not _finite(given):
             fault = f"must be finite, of shape {shape}, and is {given!r:.80} of {np.shape(given)}"
             raise self._wrong(what, fault)
         return given
@@ -310,6 +322,12 @@ class Task(ABC):
         per_metre = np.float32(1.0 / self.sight.range_max)
         beside = int(CONTACT_ANGLE / 2.0 / abs(self.lidar.angle_increment))
         return ScanScale(per_metre, leaves, beside, sectors, self.plan)
+
+
+def _finite(given: Any) -> bool:
+    """True if all that a method gave are finite numbers."""
+    values = np.asarray(given)
+    return values.dtype.kind in "fiub" and bool(np.isfinite(values).all())
 
 
 def discrete_commands(robot: RobotSpec) -> Array:

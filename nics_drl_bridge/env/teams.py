@@ -80,6 +80,7 @@ class CooperativeReaching(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.check_above_zero("goal_radius", self.goal_radius)
         if self.robots < 2:
             raise ConfigError(f"task option robots={self.robots}: a team has at least 2.")
 
@@ -204,6 +205,7 @@ class PursuitEvasion(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.check_above_zero("capture_gap", self.capture_gap)
         if min(self.pursuers, self.evaders) < 1:
             given = f"pursuers={self.pursuers}, evaders={self.evaders}"
             raise ConfigError(f"task options {given}: at least 1 each.")

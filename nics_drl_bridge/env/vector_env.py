@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from nics_drl_bridge.arguments import check_count, checked_arguments, shown
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import episode_seeds
@@ -53,14 +54,15 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     ## Arguments
 
-    `num_envs` is N; `model`, `world`, `task`, `task_options` are those of `BridgeEnv`. An episode
-    is truncated after `max_episode_steps`. `autoreset_mode` is `NextStep` (an ended world is reset
-    in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
-    `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
-    array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
-    None. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
-    `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
-    Raises ConfigError, ModelError for an unknown name or a wrong file.
+    `num_envs` is N; `model` (or `robot`), `world`, `task`, `task_options` are those of `BridgeEnv`.
+    An episode is truncated after `max_episode_steps`. `autoreset_mode` is `NextStep` (an ended
+    world is reset in the next step, whose action it ignores) or `SameStep` (at once; the last
+    observation is in `info["final_obs"]`). With `copy` the caller may keep what
+    `step` returns; False reuses the array of the observation in the next step. `render_mode` is
+    `rgb_array`, of every world, or None. Further arguments are those of the FastSimulator:
+    `renderer` (`baked` by default, or `exact`), `threads`, on which the numbers do not depend, and
+    `randomisation`, see `BridgeEnv`. Raises ConfigError, ModelError for an unknown name or a wrong
+    file.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
@@ -68,8 +70,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }  # fmt: skip
 
+    @checked_arguments("BridgeVectorEnv", FastSimulator, without=("worlds", "robots"))
     def __init__(
-        self, num_envs: int = 1, model: str | SimulatorModel = DEFAULT_ROBOT,
+        self, num_envs: int = 1, model: str | SimulatorModel | None = None,
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
@@ -77,14 +80,20 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     ) -> None:  # fmt: skip
         self._pictures: list[Any] = []
         check_render_mode(render_mode, self.metadata)
-        self.num_envs, self.render_mode = num_envs, render_mode
-        self._limit, self.copy = max_episode_steps, copy
+        check_count("num_envs", num_envs)
+        check_count("max_episode_steps", max_episode_steps)
+        check_count("threads", simulation.get("threads", 1))
+        self._closed = False
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self._limit = max_episode_steps
+        self.copy = copy
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
-        if mode not in MODES:
-            raise ConfigError(f"autoreset_mode {mode!r}: must be one of {', '.join(MODES)}.")
+        if not isinstance(mode, str) or mode not in MODES:
+            raise ConfigError(f"autoreset_mode {shown(mode)}: must be one of {', '.join(MODES)}.")
         self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
-        self.model = model if isinstance(model, SimulatorModel) else open_model(model)
+        self.model = open_model(DEFAULT_ROBOT if model is None else model)
         self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
@@ -134,6 +143,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         known = self._teacher.changing if self._teacher else {}
         return {**own, **data, **known, "goals": self.simulator.goals}
 
+    @guard.refused_after_close
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
@@ -196,6 +206,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         seen = data.odom[rows], data.twist[rows], data.ranges[rows]
         return RobotView(*seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings})
 
+    @guard.refused_after_close
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
@@ -297,6 +308,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[:, 0] if self.robots == 1 else rows
 
+    def close_extras(self, **_: Any) -> None:
+        """Marks the env as closed; there is nothing to free."""
+        self._closed = True
+
+    @guard.refused_after_close
     def render(self) -> tuple[Any, ...] | None:
         """Draws every world; see Gymnasium."""
         if self.render_mode is None:

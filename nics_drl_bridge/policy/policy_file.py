@@ -168,6 +168,8 @@ def load_policy(path: str | Path) -> PolicyFile:
             sizes = f"is {size / 2**20:.0f} MB, a policy is at most {limit // 2**20} MB"
             raise PolicyError(source, "file", f"{sizes}; not opened.")
         data = file.read_bytes()
+    except FileNotFoundError:
+        raise PolicyError(source, "file", "there is no such file; check the path.") from None
     except OSError as error:
         raise PolicyError(source, "file", f"can't be read ({error.strerror}).") from None
     return policy_of(data, file)

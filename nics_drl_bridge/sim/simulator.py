@@ -165,7 +165,7 @@ class FastSimulator:
                 f"and a longest_age of at least 0, not {delay} and {longest_age}."
             )
         _check_memory(model, world, worlds, robots)
-        if isinstance(randomisation, str):
+        if randomisation is not None and not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
         _check_speed(model.kinematics, model.robot, world)
         self.model, self.world, self.randomisation = model, world, randomisation

@@ -1,5 +1,6 @@
 """World files: the field of the episodes and its obstacles."""
 
+import math
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
 
 MOST_OBSTACLES = 10_000
+MOST_ACROSS_M = 1000.0  # diagonal; observations tell distances of goals up to 1000 m
 MOST_WALLS = 10_000
 MOST_PLACES = 10_000
 SMALLEST_FIELD = 0.01  # Least side of a field [m]
@@ -113,6 +115,11 @@ class World(Schema):
         x1, y1, x2, y2 = self.bounds or (0.0, 0.0, 1.0, 1.0)
         if not all(SMALLEST_FIELD <= side <= LARGEST for side in (x2 - x1, y2 - y1)):
             raise ValueError("bounds must be [least x, least y, greatest x, greatest y] in metres")
+        field = self.size or (x2 - x1, y2 - y1)
+        if (across := math.hypot(*field)) > MOST_ACROSS_M:
+            fix = f"a field may be {MOST_ACROSS_M:g} m across, the farthest that a task can tell"
+            sides = f"{field[0]:g} m x {field[1]:g} m"
+            raise ValueError(f"the field of {sides} is {across:.0f} m across; {fix}")
         if not 0.0 <= self.goal_distance[0] < self.goal_distance[1]:
             raise ValueError("goal_distance must be [least, greatest] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:

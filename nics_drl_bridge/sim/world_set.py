@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from pydantic import Field
 
+from nics_drl_bridge.arguments import shown
 from nics_drl_bridge.config import Schema, parse_yaml, read_text, share_folder, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
@@ -86,6 +87,10 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     for a missing or wrong file; of a member it names which.
     """
     if not isinstance(name, str | Path):
+        several = isinstance(name, list | tuple)
+        if not several or not all(isinstance(one, str | Path) for one in name):
+            needed = "a name, the path of a YAML file or a folder, a World, or a list of names"
+            raise ConfigError(f"world={shown(name)}: must be {needed}.")
         return _set_of("worlds", _members([str(one) for one in name], Path()))
     text, sets = str(name), share_folder() / "config" / "world_sets"
     path = shipped if (shipped := sets / f"{name}.yaml").is_file() else Path(name)

@@ -67,7 +67,7 @@ MISTAKES = {
     "train --algorithm dqn": "input should be 'ppo' or 'sac', not 'dqn'",
     "train --engine sb4": "unknown engine 'sb4'; did you mean 'sb3'?",
     "evaluate diferential": "unknown policy 'diferential'; did you mean 'differential'?",
-    "evaluate differential --in fasst": "there is no such world; did you mean 'fast'?",
+    "evaluate differential --in fasst": "there is no such simulator; did you mean 'fast'?",
     "evaluate differential --in fast --world circels": "did you mean 'circles'?",
     "evaluate differential --in fast --gate mechanum": "did you mean 'mecanum'?",
     "evaluate differential --in fast --fallback dynamic": "no such planner; did you mean",

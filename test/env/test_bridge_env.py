@@ -320,7 +320,7 @@ def test_an_unknown_name_gives_the_nearest(arguments, error, sentence):
 
 
 def test_an_option_that_the_simulator_does_not_take_is_named():
-    with pytest.raises(ConfigError, match=r"backend 'sim': .*argument 'sead'; look at its arg"):
+    with pytest.raises(ConfigError, match=r"backend 'sim': unknown argument 'sead'; valid are: "):
         BridgeEnv(backend_options={"sead": 3})
 
 

@@ -81,7 +81,7 @@ def test_wrong_settings_are_refused_with_the_key(tmp_path, text, sentence):
     file.write_text(text)
     with pytest.raises(ConfigError, match=sentence):
         load_training(str(file))
-    with pytest.raises(ConfigError, match="unknown training 'navigation_mecanun'; did you mean"):
+    with pytest.raises(ConfigError, match="unknown settings 'navigation_mecanun'; did you mean"):
         load_training("navigation_mecanun")
 
 

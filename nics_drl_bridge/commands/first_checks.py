@@ -1,0 +1,102 @@
+"""Checks of a command's names and files that load no heavy library, so that a refusal is quick."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+from nics_drl_bridge.errors import ConfigError, ModelError, nearest
+
+# Of numpy's global generator, from which Stable-Baselines3 draws.
+GREATEST_TRAINING_SEED = 2**32 - 1
+
+
+def check_writable(path: Path) -> None:
+    """Raises ConfigError unless a file could be written at a path; leaves nothing there."""
+    from nics_drl_bridge.files import check_above
+
+    check_above(path)
+    above = next(parent for parent in path.resolve().parents if parent.exists())
+    try:
+        with TemporaryFile(dir=above):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ConfigError(f"--out {path}: {above}: {reason}; choose another place.") from None
+
+
+def check_robot(name: str) -> None:
+    """Raises ConfigError or ModelError unless a robot, or the folder of a model, can be opened."""
+    from nics_drl_bridge.config import shipped_names
+    from nics_drl_bridge.robot.spec import load_robot
+
+    shipped = shipped_names("robots")
+    if name in shipped or name.endswith((".yaml", ".yml")):
+        load_robot(name)
+        return
+    folder = Path(name)
+    if not folder.is_dir() and "/" in name:
+        raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
+    if not folder.is_dir():
+        fix = "or give a model's folder, or a robot's YAML file"
+        raise ModelError(f"unknown robot {name!r}; {nearest(name, shipped)} ({fix}).")
+    if not (folder / "model.yaml").is_file():
+        raise ModelError(f"{folder}: holds no model.yaml; make a model with `nics generate`.")
+
+
+def check_task(name: str) -> None:
+    """Raises ConfigError unless a task, shipped or of the user's own file, is there."""
+    file = Path(name.rpartition(":")[0] or name)
+    if file.suffix == ".py" and not file.is_file():
+        raise ConfigError(f"task {str(file)!r}: no such file; give path/to/file.py:ClassName.")
+    from nics_drl_bridge.env.registry import class_for
+
+    class_for(name, {})
+
+
+def check_training(
+    task: str, robot: str | None, worlds: Sequence[str], seeds: Sequence[int], out: Path | None
+) -> None:
+    """Raises ConfigError or ModelError for the first name, seed or place that can't be used."""
+    from nics_drl_bridge.seeds import checked_seeds
+
+    checked_seeds(seeds, GREATEST_TRAINING_SEED)
+    if len(set(seeds)) < len(seeds):
+        raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
+    if out is not None:
+        if out.exists() and not out.is_dir():
+            raise ConfigError(f"--out {out}: is a file, not a folder; give the name of a folder.")
+        check_writable(out / "settings.yaml")
+    if robot is not None:
+        check_robot(robot)
+    if task != "navigation":
+        check_task(task)
+    if worlds:
+        from nics_drl_bridge.sim.world_set import load_worlds
+
+        for world in worlds:
+            load_worlds(world)
+
+
+def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> None:
+    """Raises ConfigError unless settings of a training can be read and take the changes."""
+    from nics_drl_bridge.config import find_config
+
+    if settings is not None and not (file := find_config(settings, "training")).is_file():
+        raise ConfigError(f"--settings {file}: no such file; check the path.")
+    from nics_drl_bridge.policy.training_settings import chosen_settings
+
+    chosen_settings(task, settings, changes)
+
+
+def check_drive(given: dict[str, Any]) -> None:
+    """Raises BridgeError for a name, place or number with which `nics record` could not drive."""
+    from nics_drl_bridge.recording.excite import DrivePlan
+    from nics_drl_bridge.recording.topic_roles import topic_roles
+    from nics_drl_bridge.recording.write import check_out
+    from nics_drl_bridge.robot.spec import load_robot
+
+    robot = load_robot(given["robot"])
+    check_writable(check_out(Path(given["out"])))
+    topic_roles(given["topics"] or None)
+    DrivePlan(robot, given["bound"], given["duration"], given["speed"], given["seed"])

@@ -1,0 +1,57 @@
+"""The status line: what takes long is told there, and on a terminal each text replaces the last."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+UPDATED_S = 0.5  # time between two texts where they replace each other [s]
+REPEATED_S = 20.0  # and where each is a line of its own
+CLEAR_LINE = "\r\x1b[K"
+
+
+class StatusLine:
+    """A line on standard error, or in a progress bar that shows it instead."""
+
+    def __init__(self) -> None:
+        self._bars: list[Callable[[str], None]] = []  # the innermost is the last
+        self._is_shown = False  # True while a text stands on the terminal's last line
+
+    @property
+    def in_place(self) -> bool:
+        """True if a text replaces the one before."""
+        return bool(self._bars) or sys.stderr.isatty()
+
+    @property
+    def interval_s(self) -> float:
+        """Suitable time between two texts [s]."""
+        return UPDATED_S if self.in_place else REPEATED_S
+
+    def show(self, text: str) -> None:
+        """Shows a text in place of the last one, or as a line where nothing can be replaced."""
+        if self._bars:
+            self._bars[-1](text)
+        elif sys.stderr.isatty():
+            sys.stderr.write(f"{CLEAR_LINE}nics_drl_bridge: {text}")
+            sys.stderr.flush()
+            self._is_shown = True
+        else:
+            sys.stderr.write(f"nics_drl_bridge: {text}\n")
+
+    def clear(self) -> None:
+        """Removes the text from a terminal, so that the next output has the line for itself."""
+        if self._is_shown:
+            sys.stderr.write(CLEAR_LINE)
+            sys.stderr.flush()
+            self._is_shown = False
+
+    @contextmanager
+    def shown_by(self, bar: Callable[[str], None]) -> Iterator[None]:
+        """Makes a progress bar, which owns the terminal's line, show the texts of a block."""
+        self._bars.append(bar)
+        try:
+            yield
+        finally:
+            self._bars.remove(bar)
+
+
+STATUS = StatusLine()

@@ -1,0 +1,65 @@
+"""What callers pass to public functions is checked, and a robot goes by either of two words."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from nics_drl_bridge.arguments import check_count, check_path, checked_arguments, shown
+from nics_drl_bridge.errors import ConfigError
+
+
+@checked_arguments("drive")
+def drive(model: str = "ackermann", metres: float = 1.0, turns: int | None = None) -> Any:
+    """Returns its arguments."""
+    return model, metres, turns
+
+
+@pytest.mark.parametrize("word", ["robot", "model"])
+def test_either_word_names_the_robot(word: str) -> None:
+    assert drive(**{word: "jackal"})[0] == "jackal"
+
+
+def test_both_words_may_name_the_same_robot() -> None:
+    assert drive(robot="jackal", model="jackal")[0] == "jackal"  # type: ignore[call-arg]
+    assert drive("jackal", robot=Path("jackal"))[0] == "jackal"  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("first", [{"model": "ackermann"}, {}])
+def test_two_words_for_two_robots_are_refused(first: dict[str, Any]) -> None:
+    given = () if first else ("ackermann",)
+    with pytest.raises(ConfigError, match=r"model='ackermann' and robot='jackal'.*give one"):
+        drive(*given, robot="jackal", **first)  # type: ignore[call-arg]
+
+
+def test_an_unknown_keyword_is_told_with_the_nearest_one() -> None:
+    with pytest.raises(ConfigError, match="drive: unknown argument 'metre'; did you mean 'metres'"):
+        drive(metre=2.0)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("value", [None, "1", [1.0], float("nan"), float("inf"), True])
+def test_a_value_that_is_no_number_is_refused(value: Any) -> None:
+    with pytest.raises(ConfigError, match=r"drive: metres=.*must be a finite number"):
+        drive(metres=value)
+
+
+def test_a_value_that_may_be_none_is_accepted_as_none() -> None:
+    assert drive(turns=None)[2] is None
+    with pytest.raises(ConfigError, match=r"turns=1\.5: must be a whole number, or None"):
+        drive(turns=1.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("value", [0, -1, 1.5, True, None, "3", float("nan"), 2**31])
+def test_a_count_is_a_whole_number_of_at_least_one(value: Any) -> None:
+    with pytest.raises(ConfigError, match="must be a whole number"):
+        check_count("num_envs", value)
+
+
+@pytest.mark.parametrize("value", [3, None, True, ["a"], "a\0b"])
+def test_a_path_is_text_or_a_path(value: Any) -> None:
+    with pytest.raises(ConfigError, match="path"):
+        check_path("folder", value)
+
+
+def test_a_large_object_is_quoted_by_its_type() -> None:
+    assert shown([1.0] * 1000) == "of type list"
