@@ -224,6 +224,10 @@ class Operator(Node):
         moves = bool(twist.linear.x or twist.linear.y or twist.angular.z)
         self.commanded.append((time.monotonic(), moves))
 
+    def is_policy_there(self) -> bool:
+        """Returns whether a node listens to goals."""
+        return self._goal.get_subscription_count() > 0
+
     def wait_until(self, condition: Callable[[], bool], patience_s: float) -> bool:
         """Listens until a condition holds; False after so long."""
         deadline = time.monotonic() + patience_s
@@ -399,6 +403,8 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     with workshop.driver("field.json"), run_bridge(workshop, policy, domain_id, options.control):
         if not operator.wait_until(lambda: operator.pose is not None, 30.0):
             raise SystemExit("the robot's driver is silent; see driver.log.")
+        if not operator.wait_until(operator.is_policy_there, 120.0):
+            raise SystemExit("the policy does not listen; see nodes/policy_node.log.")
         drives = drive_to_goals(operator, options.goals, options.minutes)
         held_s = time_to_stop_when_held(operator)
     operator.destroy_node()
