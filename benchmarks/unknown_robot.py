@@ -74,21 +74,11 @@ WORLD = {
     "clearance": 0.9,
     "goal_distance": list(GOAL_DISTANCE),
 }
-LIDAR = {
-    "beams": 720,
-    "angle_min": -2.356194490192345,
-    "angle_max": 2.356194490192345,
-    "range_min": 0.1,
-    "range_max": 10.0,
-    "rate": 10.0,
-    "noise_std": 0.01,
-}
 ROBOT = {
     "name": "rover",
     "kind": "skid_steer",
     "footprint": [[0.45, 0.34], [-0.45, 0.34], [-0.45, -0.34], [0.45, -0.34]],
-    "lidar": "lidar.yaml",
-    "lidar_mount": [0.25, 0.0, 0.0],
+    "lidar": "rplidar_a2",
     "parameters": {"track": 0.57, "wheel_radius": 0.165},
     "command": [
         {"name": "forward_command", "unit": "m/s", "min": -0.8, "max": 0.8, "cmd_vel": "linear.x"},
@@ -127,7 +117,6 @@ class Workshop:
         }
         self._environment = os.environ | chosen
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "lidar.yaml").write_text(yaml.safe_dump(LIDAR))
         (folder / "robot.yaml").write_text(yaml.safe_dump(ROBOT))
         (folder / "limits.yaml").write_text(yaml.safe_dump(LIMITS))
         (folder / "field.yaml").write_text(yaml.safe_dump(WORLD))

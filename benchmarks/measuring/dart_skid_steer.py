@@ -43,7 +43,6 @@ WHEEL_ACCELERATION = 12.0  # [rad/s^2]
 BODY = (0.9, 0.4, 0.2)  # [m]
 BELIEVED_TRACK = 1.35 * TRACK  # by which the driver converts wheel speeds and turn rates
 COMMAND_TIMEOUT_S = 0.5
-LIDAR_AHEAD = 0.25  # of the body's middle [m]
 
 
 @dataclass(frozen=True)
@@ -68,19 +67,22 @@ class Place:
 
 @dataclass(frozen=True)
 class Lidar:
-    """The beams of the lidar, as a YAML file of a user would describe them."""
+    """A lidar that sees all around, by default with the figures of an RPLIDAR A2."""
 
-    beams: int = 720
-    angle_min: float = -2.356194490192345
-    angle_max: float = 2.356194490192345
-    range_min: float = 0.1
-    range_max: float = 10.0
-    noise_std: float = 0.01
+    beams: int = 800
+    range_min: float = 0.15
+    range_max: float = 12.0
+    noise: float = 0.005  # standard deviation as a fraction of a range
 
     @property
     def angles(self) -> Array:
         """Of the beams, seen from the lidar (B,) [rad]."""
-        return np.linspace(self.angle_min, self.angle_max, self.beams)
+        return -math.pi + self.angle_increment * np.arange(self.beams)
+
+    @property
+    def angle_increment(self) -> float:
+        """Between two beams [rad]."""
+        return 2.0 * math.pi / self.beams
 
     def scan(self, place: Place, pose: Array, rng: np.random.Generator) -> Array:
         """Returns the ranges (B,) [m] from a pose (3,) of the lidar; inf where nothing is hit."""
@@ -89,7 +91,7 @@ class Lidar:
         ranges = np.minimum(
             _range_of_walls(place, pose, rays), _range_of_pillars(place, pose, rays)
         )
-        ranges += rng.normal(0.0, self.noise_std, self.beams)
+        ranges *= 1.0 + rng.normal(0.0, self.noise, self.beams)
         return np.where((ranges > self.range_min) & (ranges < self.range_max), ranges, np.inf)
 
 
@@ -371,16 +373,14 @@ class Driver(Node):
         self._imu.publish(message)
 
     def _publish_scan(self) -> None:
-        pose = self.engine.pose
-        ahead = LIDAR_AHEAD * np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
-        ranges = self._lidar.scan(self._place, pose + ahead, self._rng)
         lidar = self._lidar
+        ranges = lidar.scan(self._place, self.engine.pose, self._rng)
         message = LaserScan()
         self._set_stamp(message.header)
         message.header.frame_id = "laser"
-        message.angle_min = lidar.angle_min
-        message.angle_max = lidar.angle_max
-        message.angle_increment = (lidar.angle_max - lidar.angle_min) / (lidar.beams - 1)
+        message.angle_min = float(lidar.angles[0])
+        message.angle_max = float(lidar.angles[-1])
+        message.angle_increment = lidar.angle_increment
         message.scan_time = 1.0 / self.SCAN_HZ
         message.range_min = lidar.range_min
         message.range_max = lidar.range_max

@@ -69,10 +69,10 @@ def test_a_pillar_in_its_way_is_touched(dart, place):
 
 
 def test_its_lidar_sees_walls_and_pillars_where_they_are(dart, place):
-    lidar = dart.Lidar(beams=5, angle_min=-math.pi / 2, angle_max=math.pi / 2, noise_std=0.0)
+    lidar = dart.Lidar(beams=8, noise=0.0)
     ranges = lidar.scan(place, np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
-    diagonal = 4.0 * math.sqrt(2.0)
-    np.testing.assert_allclose(ranges, [4.0, diagonal, 1.7, diagonal, 4.0], atol=1e-9)
+    far = 4.0 * math.sqrt(2.0)  # to a corner
+    np.testing.assert_allclose(ranges, [4.0, far, 4.0, far, 1.7, far, 4.0, far], atol=1e-9)
 
 
 @pytest.mark.ros
