@@ -49,6 +49,7 @@ TRUE_RADIUS = 0.4  # within which the true pose counts as at the goal [m]
 GOAL_DISTANCE = (2.0, 5.0)
 GOAL_CLEARANCE = 0.9  # of a goal from pillars and walls [m]
 GOAL_PATIENCE_S = 60.0
+ANSWER_S = 3.0  # within which the policy takes up a goal
 REST_S = 1.0  # at rest for so long, the robot has ended a drive
 ARMED_S = 300.0  # between two armings
 HERE = Path(__file__).resolve().parent
@@ -177,6 +178,12 @@ class Workshop:
         return self.folder / "policies" / f"seed_{self._seed}" / "policy.onnx"
 
 
+def is_moving(message: TwistStamped) -> bool:
+    """Returns whether a command moves the robot."""
+    twist = message.twist
+    return bool(twist.linear.x or twist.linear.y or twist.angular.z)
+
+
 class Operator(Node):
     """A person with a button and a map: gives goals, arms the gate, and judges by the true pose."""
 
@@ -188,9 +195,11 @@ class Operator(Node):
         self.pose: Array | None = None
         self.touched = False
         self.commanded: list[tuple[float, bool]] = []  # time [s], whether it moves
+        self._policy_moves = False  # since the last goal
         self.create_subscription(PoseStamped, "true_pose", self._on_pose, 10)
         self.create_subscription(Bool, "touched", self._on_touch, 10)
         self.create_subscription(TwistStamped, "cmd_vel", self._on_command, 10)
+        self.create_subscription(TwistStamped, "cmd_vel_raw", self._on_wish, 10)
         self._goal = self.create_publisher(PoseStamped, "goal_pose", 1)
         self._button = self.create_publisher(Bool, "e_stop", 10)
         self._hold = self.create_publisher(Bool, "hold", 10)
@@ -209,9 +218,10 @@ class Operator(Node):
         self.touched |= message.data
 
     def _on_command(self, message: TwistStamped) -> None:
-        twist = message.twist
-        moves = bool(twist.linear.x or twist.linear.y or twist.angular.z)
-        self.commanded.append((time.monotonic(), moves))
+        self.commanded.append((time.monotonic(), is_moving(message)))
+
+    def _on_wish(self, message: TwistStamped) -> None:
+        self._policy_moves |= is_moving(message)
 
     def is_policy_there(self) -> bool:
         """Returns whether a node listens to goals."""
@@ -268,12 +278,17 @@ class Operator(Node):
         message.pose.position.x = float(cos * away[0] + sin * away[1])
         message.pose.position.y = float(-sin * away[0] + cos * away[1])
         message.pose.orientation.w = 1.0
+        self._policy_moves = False
         self._goal.publish(message)
 
     def drive_to(self, goal: Array) -> float:
         """Lets the robot drive; returns how far from the goal it rests [m], NaN if it does not."""
         begin_s = time.monotonic()
         self.send_goal(goal)
+        while not self.wait_until(lambda: self._policy_moves, ANSWER_S):
+            if time.monotonic() - begin_s > GOAL_PATIENCE_S:
+                return math.nan
+            self.send_goal(goal)  # it may have come before the policy knew where it is
         ended = self.wait_until(lambda: self.is_at_rest(begin_s), GOAL_PATIENCE_S)
         self.commanded.clear()
         if not ended or self.pose is None:
