@@ -49,8 +49,11 @@ def _of_messages(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, S
 
 
 def _up_axis(table: TableSurvey) -> UpAxis:
-    """Returns the axis of an IMU's messages that points up."""
-    columns = [table.data[f"linear_acceleration.{axis}"].astype(np.float64) for axis in AXES]
+    """Returns the axis of an IMU's messages that points up; z if they tell no acceleration."""
+    names = [f"linear_acceleration.{axis}" for axis in AXES]
+    if not all(name in table.data for name in names):
+        return UpAxis()
+    columns = [table.data[name].astype(np.float64) for name in names]
     return up_axis_of(np.array([float(np.nanmedian(column)) for column in columns]))
 
 
