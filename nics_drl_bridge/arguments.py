@@ -3,14 +3,13 @@
 A robot and the model of it are one thing to a caller, so `robot=` and `model=` are one keyword.
 """
 
+import math
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from inspect import Parameter, signature
 from os import PathLike
 from typing import Any, ParamSpec, TypeVar
-
-import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, nearest
 
@@ -19,18 +18,24 @@ T = TypeVar("T")
 ROBOT_WORDS = ("robot", "model")
 LARGEST_COUNT = 2**31 - 1
 KINDS: dict[str, tuple[tuple[type, ...], str]] = {  # annotation -> types, name in errors
-    "bool": ((bool, np.bool_), "True or False"),
-    "int": ((int, np.integer), "a whole number"),
-    "float": ((int, np.integer, float, np.floating), "a finite number"),
+    "bool": ((bool,), "True or False"),
+    "int": ((int,), "a whole number"),
+    "float": ((int, float), "a finite number"),
 }
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = 80
 _SHORT.maxother = 80
 
 
+def plain(value: Any) -> Any:
+    """Returns the number of a numpy scalar, and other values as they are; it loads no numpy."""
+    return value.item() if getattr(value, "shape", None) == () else value
+
+
 def shown(value: Any) -> str:
     """Returns a value as a message quotes it: a number or text itself, else its type."""
-    if value is None or isinstance(value, str | bool | int | float | np.generic | PathLike):
+    value = plain(value)
+    if value is None or isinstance(value, str | bool | int | float | PathLike):
         return _SHORT.repr(value)
     if isinstance(value, list | tuple | dict | set) and len(value) == 0:
         return repr(value)
@@ -46,10 +51,10 @@ def check_kind(what: str, value: Any, annotation: Any) -> None:
     if kind not in KINDS or (optional and value is None):
         return
     types, name = KINDS[kind]
-    is_bool = isinstance(value, bool | np.bool_)
-    fits = kind == "bool" if is_bool else isinstance(value, types)
-    if fits and isinstance(value, float | np.floating):
-        fits = bool(np.isfinite(value))
+    number = plain(value)
+    fits = kind == "bool" if isinstance(number, bool) else isinstance(number, types)
+    if fits and isinstance(number, float):
+        fits = math.isfinite(number)
     if not fits:
         needed = f"{name}, or None" if optional else name
         raise ConfigError(f"{what}={shown(value)}: must be {needed}.")

@@ -214,9 +214,7 @@ def builtin_model(robot: str, content: str = "") -> SimulatorModel:
     return generate(drive, spec, lidar_of(spec), ())[0]
 
 
-def open_model(
-    name: str | Path | SimulatorModel, lidar: str | None = None
-) -> SimulatorModel:
+def open_model(name: str | Path | SimulatorModel, lidar: str | None = None) -> SimulatorModel:
     """Opens a model by a shipped robot (`ackermann`), by folder (`./mine`), or by a robot's YAML.
 
     A `lidar`, shipped or a YAML file, takes the place of the model's own. A model that is open

@@ -167,9 +167,7 @@ register_envs()
 OF_GYMNASIUM = ("max_episode_steps", "disable_env_checker")  # arguments of `gymnasium.make` itself
 
 
-def make(
-    task: str | type[Task] | Task = "navigation", **arguments: Any
-) -> gymnasium.Env[Any, Any]:
+def make(task: str | type[Task] | Task = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
     """Makes an env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
     single = import_module("nics_drl_bridge.env.bridge_env")  # which imports this module
     in_own_word("make", "model", arguments)

@@ -11,7 +11,7 @@ import pytest
 from identify.drives import drive
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.identify import verdict
+from nics_drl_bridge.identify import acceptance, verdict
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
@@ -303,8 +303,9 @@ def test_a_model_of_every_partial_drive_stays_finite(car):
         assert np.abs(poses[0, :, :2]).max() < 20.0
 
 
-def test_where_predictions_run_away_the_model_is_linear():
+def test_where_predictions_run_away_the_model_is_linear(monkeypatch):
     """Each half second of commands comes late by another time, as over a bad link."""
+    monkeypatch.setattr(acceptance, "loses_to_textbook", lambda judgement: False)
     spec, rng = load_robot("differential"), np.random.default_rng(9)
     whole = record(spec, rng, 40.0, dt=0.02)
     poses = whole.pose.values + rng.normal(0.0, 1e-3, whole.pose.values.shape)

@@ -8,6 +8,7 @@ import pytest
 
 from identify.drives import drive
 from nics_drl_bridge import geometry
+from nics_drl_bridge.identify import acceptance
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
@@ -79,7 +80,23 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
     assert result.mean_path_m == pytest.approx(1.0)
 
 
+@pytest.fixture
+def no_textbook(monkeypatch):
+    """Leaves a model as it is, however much better its textbook is."""
+    monkeypatch.setattr(acceptance, "loses_to_textbook", lambda judgement: False)
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
+def test_the_textbook_takes_the_place_of_a_useless_model(name, request):
+    spec = request.getfixturevalue(name)
+    found = identify(coarse(spec, every=30), spec, alpha="auto")
+    assert found.findings.replaced in found.notes
+    assert why_useless(found, spec) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_textbook")
 @pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
 def test_rows_too_far_apart_are_named(name, request):
     spec = request.getfixturevalue(name)
@@ -150,6 +167,7 @@ def test_a_model_of_too_few_terms_is_not_put_down_to_the_recording(car):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_textbook")
 @pytest.mark.parametrize("name", ["car", "mecanum"])
 def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request):
     spec = request.getfixturevalue(name)
@@ -159,7 +177,7 @@ def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request)
         found = identify(recording, spec)
         sentence = why_useless(found, spec)
     assert "is useless: on unseen data its predictions end" in sentence
-    assert any("of their path away" in note and "do not train" in note for note in found.notes)
+    assert found.verdict is acceptance.Verdict.DO_NOT_TRAIN
     ran_away = replace(found.held_out, mean_position_error_m=np.inf)
     sentence = why_useless(replace(found, held_out=ran_away), spec)
     assert "its predictions have run away after 5 s" in sentence

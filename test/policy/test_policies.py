@@ -183,8 +183,8 @@ def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
     assert crawling < 0.3
     still = asking._search[0][asking._commands[:, 0] == crawling]
     assert np.abs(still).max() < 1e-3
-    rests = asking._search[1].rest - plain._search[1].rest
-    assert rests == pytest.approx(1.4, abs=0.1)  # from 0.7 m/s by 0.5 m/s^2
+    slowness = asking._search[1].slowness - plain._search[1].slowness
+    assert 0.7 * slowness == pytest.approx(1.4, abs=0.35)  # from 0.7 m/s by 0.5 m/s^2, not by 2
 
 
 def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():

@@ -116,7 +116,7 @@ def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(tmp_path, m
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text("")
     done = nics("--task", "mine.py:Patrol", "--out", "run")
-    assert "mine.py has no such Task" in " ".join(done.output.split())
+    assert "'mine.py:Patrol': mine.py defines no subclass" in " ".join(done.output.split())
     assert not (tmp_path / "run").exists()
 
 
