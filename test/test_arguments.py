@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 
+import nics_drl_bridge
 from nics_drl_bridge.arguments import check_count, check_path, checked_arguments, shown
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BridgeError, ConfigError
 
 
 @checked_arguments("drive")
@@ -63,3 +64,17 @@ def test_a_path_is_text_or_a_path(value: Any) -> None:
 
 def test_a_large_object_is_quoted_by_its_type() -> None:
     assert shown([1.0] * 1000) == "of type list"
+
+
+@pytest.mark.parametrize("value", [3, None, [], 1.5, True, {}, object(), "a\0b"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "load_model", "load_policy", "load_recording", "load_robot", "load_world", "load_worlds",
+        "open_model", "read_recording",
+    ],
+)  # fmt: skip
+def test_what_is_no_path_is_refused_by_all_that_opens_one(name: str, value: Any) -> None:
+    with pytest.raises(BridgeError) as caught:
+        getattr(nics_drl_bridge, name)(value)
+    assert "\n" not in str(caught.value)

@@ -10,8 +10,7 @@ from typer import Option
 from typer.core import TyperGroup
 
 from nics_drl_bridge import __version__, extensions
-from nics_drl_bridge.arguments import ROBOT_WORDS
-from nics_drl_bridge.commands.console import EXIT_BAD_INPUT, one_sentence
+from nics_drl_bridge.commands.console import EXIT_BAD_INPUT, ROBOT_OPTIONS, one_sentence
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
@@ -32,7 +31,7 @@ class OneWordForARobot(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses the words of a command line; UsageError for two robots by two words."""
-        robots = [value for word in ROBOT_WORDS for value in values_of(f"--{word}", args)]
+        robots = [value for word in ROBOT_OPTIONS for value in values_of(word, args)]
         if len(set(robots)) > 1:
             told = " and ".join(map(repr, robots))
             ctx.fail(f"--robot and --model are one option, and name {told}; give one of them")

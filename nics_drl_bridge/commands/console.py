@@ -49,6 +49,7 @@ def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[st
 
 ROBOTS, WORLDS = completing("robots"), completing("worlds", "world_sets", also=("barn",))
 POLICIES = completing("policies", also=("dynamic_window", "mppi", "random", "straight"))
+ROBOT_OPTIONS = ("--robot", "--model")  # two words for one option, of every command
 RobotOption = Annotated[str, Option("--robot", "--model", autocompletion=ROBOTS,
     help="A shipped robot (see nics list robots) or a YAML file.")]  # fmt: skip
 DrivenRobotOption = Annotated[str | None, Option("--robot", "--model", autocompletion=ROBOTS,

@@ -5,7 +5,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,10 +16,12 @@ from typer import Argument, Option
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_settings, check_training
+from nics_drl_bridge.commands.start import was_interrupted
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
+DEFAULT_EPISODES = 500
 OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.PpoSettings`
 
 
@@ -37,7 +39,8 @@ def train(
     algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
     seeds: Annotated[list[int] | None, Option(help="One or more: --seeds 0 1 2.")] = None,
     steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
-    episodes: Annotated[int, Option(min=1, help="Evaluation episodes in each world.")] = 500,
+    episodes: Annotated[int, Option(
+        min=1, help="Evaluation episodes in each world.")] = DEFAULT_EPISODES,
     out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, Option(help="Continue an interrupted --out.")] = False,
     engine: Annotated[str | None,
@@ -81,8 +84,58 @@ def train(
         typer.echo(f"seeds that were begun: {begun}; --seeds names others", err=True)
     every = [*(seeds or begun or [0]), *further_seeds]
     order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
-    with _learner(engine, address, env_runners, chosen.num_envs) as learn:
+    again = ResumeCommand(folder, every, episodes, own_task, engine, address, env_runners)
+    with (
+        told_if_interrupted(again, train_run.seeds_of),
+        _learner(engine, address, env_runners, chosen.num_envs) as learn,
+    ):
         (_run_watched if watch else _run)(train_run, order, learn, as_json)
+
+
+@dataclass(frozen=True)
+class ResumeCommand:
+    """All that the command line which resumes a training has to say again."""
+
+    out: Path
+    seeds: Sequence[int]
+    episodes: int
+    task: str | None  # the user's own; a shipped one is in the settings of the run
+    engine: str | None
+    address: str | None
+    env_runners: int | None
+
+    @property
+    def line(self) -> str:
+        """The command, as it can be pasted into a shell."""
+        words = ["nics", "train", "--resume", "--out", str(self.out)]
+        words += ["--seeds", *map(str, self.seeds)]
+        if self.episodes != DEFAULT_EPISODES:
+            words += ["--episodes", str(self.episodes)]
+        if self.task is not None:
+            words += ["--task", self.task]
+        if self.engine is not None and self.engine not in OWN:
+            words += ["--engine", self.engine]
+        if self.address is not None:
+            words += ["--address", self.address]
+        if self.env_runners is not None:
+            words += ["--env-runners", str(self.env_runners)]
+        return shlex.join(words)
+
+
+@contextmanager
+def told_if_interrupted(
+    again: ResumeCommand, seeds_of: Callable[[Path], list[int]]
+) -> Iterator[None]:
+    """Tells the command that resumes a training, where Ctrl-C or SIGTERM ends the block."""
+    try:
+        yield
+    except BaseException as error:
+        if was_interrupted(error) or isinstance(error, SystemExit):
+            if seeds_of(again.out):
+                typer.echo(f"to go on from the last checkpoint: {again.line}", err=True)
+            else:
+                typer.echo(f"{again.out}: no checkpoint was written yet; begin anew.", err=True)
+        raise
 
 
 def seeds_of_words(words: Sequence[str], after_seeds: bool) -> list[int]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
@@ -153,6 +154,7 @@ class PolicyFile:
 
 def load_policy(path: str | Path) -> PolicyFile:
     """Loads a policy file, by path or shipped name, with all checks; PolicyError has the field."""
+    check_path("policy", path)
     file, suffix = Path(path), contracts.SUFFIX
     if not (str(path).endswith(suffix) or file.is_file()):
         file = contracts.shipped() / f"{path}{suffix}"

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import find_config, no_device
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag, opened
@@ -75,6 +76,7 @@ def read_recording(
 
     RecordingError, ConfigError: it is missing or unreadable, or does not fit robot or mapping.
     """
+    check_path("recording", path)
     path, topics = Path(path), topics or TopicRoles()
     if mapping is not None and not is_recording(path):
         return _by_mapping(path, spec, topics, mapping)

@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import Array
@@ -63,6 +64,7 @@ def read_sdf(
     Raises:
         ConfigError: the file is damaged or no SDF, holds what is no shape, or nothing stands there.
     """
+    check_path("path", path)
     path = Path(path)
     placed, unknown, seen = list[Placed](), dict[str, list[str]](), 0
     try:

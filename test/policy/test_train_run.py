@@ -1,6 +1,11 @@
 from __future__ import annotations
 
 import json
+import shlex
+import signal
+import subprocess
+import sys
+import time
 from importlib.util import find_spec
 
 import filelock
@@ -211,3 +216,46 @@ def test_where_ray_is_missing_one_sentence_says_what_to_install(tmp_path):
     words = " ".join(done.output.split())
     assert "engine 'ray' needs the module 'ray'" in words
     assert "pip install 'nics_drl_bridge[train,distributed]'" in words
+
+
+@pytest.mark.process
+def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
+    own = "from nics_drl_bridge.env.navigation import Navigation\nclass Mine(Navigation): pass\n"
+    (tmp_path / "own.py").write_text(own)
+    settings = "worlds: {empty: 64}\nsteps: 20000000\ncheckpoint_every: 2000\n"
+    (tmp_path / "short.yaml").write_text(settings)
+    program = [sys.executable, "-c", "from nics_drl_bridge.commands.start import main; main()"]
+    train = [*program, "train", "--settings", "short.yaml", "--task", "own.py:Mine"]
+    train += ["--out", "my run", "--seeds", "3", "4", "--episodes", "7"]
+    with subprocess.Popen(
+        train, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:  # fmt: skip
+        checkpoint = tmp_path / "my run" / "seed_3" / "checkpoint.pt"
+        wait_for(lambda: checkpoint.is_file() or process.poll() is not None, 300.0)
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=60.0)[1]
+    assert process.returncode == 130, said
+    line = next(each for each in said.splitlines() if each.startswith("to go on from the last"))
+    command = line.partition("checkpoint: ")[2]
+    expected = "nics train --resume --out 'my run' --seeds 3 4 --episodes 7 --task own.py:Mine"
+    assert command == expected
+    resume = [*program, *shlex.split(command)[1:]]
+    with subprocess.Popen(
+        resume, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:  # fmt: skip
+        before = checkpoint.stat().st_mtime_ns
+        changed = lambda: checkpoint.stat().st_mtime_ns != before  # noqa: E731
+        wait_for(lambda: changed() or process.poll() is not None, 300.0)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert expected in process.communicate(timeout=60.0)[1]
+
+
+def wait_for(condition, timeout_s):
+    """Waits until a condition holds; fails after a deadline."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
