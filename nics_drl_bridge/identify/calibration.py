@@ -103,7 +103,7 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     """Puts a drive on one time axis, at `base_link`; RecordingError: no overlap in time."""
     # Without corrections it is used bit for bit; else noisy poses are smoothed by local parabolas.
     recording, period = drive.recording, drive.settings.control_period_s
-    if calibration.is_identity and (shared := _shared_stamps(recording, period)) is not None:
+    if calibration.is_exact and (shared := _shared_stamps(recording, period)) is not None:
         samples = samples_on_one_clock(*shared)
         return replace(samples, dt=part_of(period, samples.dt))
     grid, step = _grid(recording, calibration, period)
