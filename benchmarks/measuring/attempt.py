@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import resource
 import select
 import signal
@@ -25,6 +26,8 @@ LONGEST_SENTENCE = 1000
 ROOM = 4 * 2**30
 """Address space that a process may take besides what it has, so that the machine survives."""
 EXIT_BAD_INPUT = 2
+
+PROGRESS = re.compile(r"^[a-z][\w ]* \(\d+ s\)\n", re.MULTILINE)  # where a step takes long
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,8 @@ def nics(*words: object) -> Callable[[], None]:
             said.seek(0)
             text = said.read()
         if code == EXIT_BAD_INPUT:
-            raise BridgeError(text.rstrip("\n")) if _is_sentence(text) else ValueError(text[:2000])
+            told = PROGRESS.sub("", text)
+            raise BridgeError(told.rstrip("\n")) if _is_sentence(told) else ValueError(text[:2000])
         if code not in (0, None, 1):
             raise ValueError(f"exit code {code}: {text[:2000]}")
 

@@ -238,7 +238,7 @@ def generate(
     pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Generates a simulator from one recording, or several, and writes its folder."""
+    """Generates a simulator from recordings and writes its folder."""
     from nics_drl_bridge.generator import check_place, lidar_of, save_model
     from nics_drl_bridge.generator import generate as generate_model
     from nics_drl_bridge.identify.fit import parse_alpha, parse_order

@@ -117,9 +117,6 @@ class Task(ABC):
             raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
         if self.top_speed is not None and not self.top_speed > 0.0:
             raise ConfigError(f"task option top_speed={self.top_speed!r}: must be above 0 m/s.")
-        if not self.contact_margin >= 0.0:
-            value = self.contact_margin
-            raise ConfigError(f"task option contact_margin={value!r}: must be at least 0 m.")
         if self.sensors and not self.observes_sensors:
             name = type(self).__name__
             raise ConfigError(f"task option sensors: {name} observes no further sensors.")

@@ -69,7 +69,7 @@ def table(path: Path) -> None:
     """A drive as columns of text."""
     drive = drive_of("differential")
     rows = np.column_stack([drive.pose.t, drive.pose.values, drive.command.values])
-    np.savetxt(path, rows, delimiter=",", header="t,x,y,yaw,v,w", comments="")
+    np.savetxt(path, rows, delimiter=",", header="t,x,y,yaw,cmd_vel_x,cmd_vel_omega", comments="")
 
 
 def bag(path: Path) -> None:

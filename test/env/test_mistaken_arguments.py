@@ -37,7 +37,7 @@ OF_MANY: dict[str, tuple[Any, ...]] = {
     "longest_age": (-1, 1.5, None, True), "vectorization_mode": ("async", 3), "robots": (2,),
 }  # fmt: skip
 OPTIONS: dict[str, tuple[Any, ...]] = {
-    "goal_radius": NO_LENGTHS, "contact_margin": (-1.0, *NO_LENGTHS[2:]), "top_speed": (0.0, -1.0),
+    "goal_radius": NO_LENGTHS, "contact_margin": NO_LENGTHS[2:], "top_speed": (0.0, -1.0),
     "success_reward": (NAN, "x", None, True), "scan": (0, -3, 1.5, "x", [1]), "robot": ("x",),
     "actions": (3, None, "x", []), "sensors": ("x", 3, [3]), "goal_radios": (1.0,),
 }  # fmt: skip
