@@ -23,6 +23,7 @@ from nics_drl_bridge.sim.collision_kernels import Outline
 
 Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+ALIKE = 0.9  # share of a bound from which on a stop that is shorter needs no sweep of its own
 FINEST = 6  # bisections of the scale
 SPEEDS, TURNS = 3, 9
 """Arcs of the family: number of speeds along each axis, and number of turn rates."""
@@ -235,20 +236,58 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
     old = max(0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors))
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
-    since, ends = now - old - given.latency_s, [time for time, _ in state.recent[1:]]
+    late = given.latency_s if given.turn is None else max(given.latency_s, given.turn.reaction_s)
+    since, ends = now - old - late, [time for time, _ in state.recent[1:]]
     past = [one[1] for one, end in zip(state.recent, [*ends, now], strict=False) if end >= since]
     react = given.hold_s + given.latency_s
     calm = 1.0 / config.scan_rate + react + given.latency_s
     hard = old + react
     standing = points * (1.0, 1.0, 0.0)  # static: against fast obstacles a calm stop is no use
-    for seen, commands, twist, blind, deceleration in (
-        (standing, [value], None, calm, CALM * given.deceleration),
-        (points, [*past, state.value, value], odometry, hard, given.deceleration),
+    for seen, commands, twist, blind, share, latencies in (
+        (standing, [value], None, calm, CALM, 2.0),
+        (points, [*past, state.value, value], odometry, hard, 1.0, 1.0),
     ):
         twists = _family(config, given, np.array(commands), twist)
-        if not shield_kernels.free(seen, twists, body, blind, deceleration, STEP):
-            return False
+        for stop in sweeps(given, body, blind, share, latencies):
+            if not shield_kernels.free(seen, twists, *stop, STEP):
+                return False
     return True
+
+
+def sweeps(
+    given: ShieldConfig, body: shield_kernels.Body, blind: float, share: float, latencies: float
+) -> list[tuple[shield_kernels.Body, float, float]]:
+    """Returns body, time before it brakes [s] and deceleration [m/s^2] of the stops to sweep.
+
+    Where the turn brakes apart from the speed, either may end sooner than it is bound to.
+
+    Args:
+        given: the stopping behaviour.
+        body: that is swept.
+        blind: time before the speed is braked, with as many latencies as given [s].
+        share: of the decelerations with which the robot brakes.
+        latencies: number of them within that time.
+    """
+    turn = given.turn
+    deceleration = share * given.deceleration
+    if turn is None:
+        return [(body, blind, deceleration)]
+    stops = []
+    shares = [(1.0, 1.0)]
+    if turn.least_turn < ALIKE:
+        shares.append((1.0, turn.least_turn))
+    if turn.least_path < ALIKE:
+        shares.append((turn.least_path, 1.0))
+    for path_share, turn_share in shares:
+        path_blind = blind - (1.0 - path_share) * given.latency_s
+        turn_latencies = latencies - (1.0 - turn_share)
+        turn_blind = blind - latencies * given.latency_s + turn_latencies * turn.reaction_s
+        braked = body._replace(
+            turn_later=turn_blind - path_blind,
+            turn_deceleration=share * turn.deceleration / turn_share,
+        )
+        stops.append((braked, path_blind, deceleration / path_share))
+    return stops
 
 
 def _family(

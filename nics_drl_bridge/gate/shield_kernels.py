@@ -9,6 +9,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 
 ROUNDING = 1e-9  # tolerance for the distance that must not become smaller [m]
+BISECTIONS = 24  # that find when a braking robot has moved by a path
 WIDTH = 0.02  # old beams within this angle of a bearing are compared [rad]
 
 
@@ -50,6 +51,8 @@ class Body(NamedTuple):
         margin: clearance [m].
         lever: by which a turn rate adds to the speed that is braked, [m/rad].
         order: of the norm of ahead and sideways that is braked; see `robot.braking.Braking`.
+        turn_later: time by which the braking of a turn begins later than that of the speed [s].
+        turn_deceleration: of a turn that brakes apart from the speed [rad/s^2]; 0 if it does not.
     """
 
     outline: Outline
@@ -58,6 +61,8 @@ class Body(NamedTuple):
     margin: float
     lever: float = 0.0
     order: float = 2.0
+    turn_later: float = 0.0
+    turn_deceleration: float = 0.0
 
 
 @kernel
@@ -77,7 +82,8 @@ def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-un
     longest, rest, most = 0.0, 0.0, 0
     for k in range(twists.shape[0]):
         path, pace = _path(twists[k], body, blind, deceleration)
-        longest, rest = max(longest, path), max(rest, blind + pace / deceleration)
+        longest = max(longest, path)
+        rest = max(rest, _rest(twists[k], pace, body, blind, deceleration))
         most = max(most, math.ceil(path / step))
     near = _near(points, body, longest, rest)
     places = np.empty((most + 1, 5))
@@ -90,6 +96,10 @@ def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-un
         each = duration / steps
         slowest = each + math.sqrt(2.0 * pace * each / deceleration)  # time of the last step
         made = False
+        if body.turn_deceleration > 0.0 and near.shape[0] > 0:
+            made = True
+            some = places[: steps + 1]
+            slowest = _follow_apart(some, twists[k], path, pace, body, blind, deceleration)
         for p in range(near.shape[0]):
             most_each = path / steps + near[p, 2] * slowest
             s = _steps_apart(near[p, 4] - near[p, 3], most_each, steps)
@@ -122,8 +132,21 @@ def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
         across = abs(twist[0]) + abs(twist[1])
     elif body.order == math.inf:
         across = max(abs(twist[0]), abs(twist[1]))
+    if body.turn_deceleration > 0.0:
+        turn_blind = blind + body.turn_later
+        turn_time = turn_blind + abs(twist[2]) / (2.0 * body.turn_deceleration)
+        return speed * (blind + across / (2.0 * deceleration)) + turn * turn_time, across
     pace = max(across + abs(twist[2]) * body.lever, turn)
     return (speed + turn) * (blind + pace / (2.0 * deceleration)), pace
+
+
+@kernel
+def _rest(twist, pace, body, blind, deceleration):  # type: ignore[no-untyped-def]
+    """Returns the time until a braking robot rests [s]."""
+    rest = blind + pace / deceleration
+    if body.turn_deceleration > 0.0:
+        rest = max(rest, blind + body.turn_later + abs(twist[2]) / body.turn_deceleration)
+    return rest
 
 
 @kernel(allocates=True)
@@ -161,6 +184,53 @@ def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
         return part
     left = speed * speed - 2.0 * deceleration * speed * (part - blind)
     return blind + (speed - math.sqrt(max(left, 0.0))) / deceleration
+
+
+@kernel
+def _full_speed_time(time, speed, blind, deceleration):  # type: ignore[no-untyped-def]
+    """Returns the time at full speed in which a robot gets as far as in a time of braking [s]."""
+    if time <= blind or speed == 0.0:
+        return min(time, blind)
+    braked = min(time - blind, speed / deceleration)
+    return blind + braked * (1.0 - deceleration * braked / (2.0 * speed))
+
+
+@kernel(allocates=True)
+def _follow_apart(places, twist, path, pace, body, blind, deceleration):  # type: ignore[no-untyped-def]
+    """Fills places as `_follow` of a turn that brakes apart; returns the longest time between two.
+
+    The footprint moves by the same path, at most, from each place to the next.
+    """
+    speed, rate = math.hypot(twist[0], twist[1]), abs(twist[2])
+    turn_blind = blind + body.turn_later
+    rest = _rest(twist, pace, body, blind, deceleration)
+    steps = len(places) - 1
+    places[0, 0], places[0, 1], places[0, 2], places[0, 3], places[0, 4] = 0.0, 0.0, 1.0, 0.0, 0.0
+    before, moved, turned, longest = 0.0, 0.0, 0.0, 0.0
+    for s in range(1, steps + 1):
+        low, high = before, rest
+        for _ in range(BISECTIONS if s < steps else 0):
+            middle = 0.5 * (low + high)
+            straight = _full_speed_time(middle, pace, blind, deceleration)
+            about = _full_speed_time(middle, rate, turn_blind, body.turn_deceleration)
+            if speed * straight + rate * body.reach * about < path * s / steps:
+                low = middle
+            else:
+                high = middle
+        straight = _full_speed_time(high, pace, blind, deceleration)
+        about = _full_speed_time(high, rate, turn_blind, body.turn_deceleration)
+        along = straight - moved
+        step = (twist[0] * along, twist[1] * along, twist[2] * (about - turned))
+        x, y, cosine, sine = place(step, 1.0)
+        c, d = places[s - 1, 2], places[s - 1, 3]
+        places[s, 0] = places[s - 1, 0] + c * x - d * y
+        places[s, 1] = places[s - 1, 1] + d * x + c * y
+        places[s, 2] = c * cosine - d * sine
+        places[s, 3] = d * cosine + c * sine
+        places[s, 4] = high
+        longest = max(longest, high - before)
+        before, moved, turned = high, straight, about
+    return longest
 
 
 class MountedBeams(NamedTuple):

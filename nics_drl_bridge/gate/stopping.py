@@ -13,7 +13,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
 from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.robot.braking import Braking, braking_of
+from nics_drl_bridge.robot.braking import Braking, OwnTurn, braking_of
 from nics_drl_bridge.robot.spec import RobotSpec
 
 ANGLE = "rad"
@@ -75,13 +75,24 @@ def shield_config(
         wheelbase=wheelbase(model.robot), obstacle_speed=values.obstacle_speed,
         range_max=lidar.range_max, range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
         outline=model.robot.footprint or (), lever=braking.lever_m,
-        order=braking.order, drift=braking.drift,
+        order=braking.order, drift=braking.drift, turn=_turn_as_told(braking, values),
     )  # fmt: skip
     source = f"by {path}" if measured is not None else "derived from model and limits"
     if given:
         source += f", but {', '.join(sorted(given))} by parameter"
     listed = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
     return config, f"the shield is on: {listed} ({source})"
+
+
+def _turn_as_told(braking: Braking, told: Stopping) -> OwnTurn | None:
+    """Returns the turn's own braking, which is worse if the speed is told to brake worse."""
+    if braking.turn is None:
+        return None
+    later = max(0.0, told.latency - braking.reaction_s)
+    weaker = min(1.0, told.deceleration / min(braking.deceleration, HARDEST))
+    own = braking.turn
+    deceleration = min(own.deceleration * weaker, HARDEST)
+    return replace(own, reaction_s=own.reaction_s + later, deceleration=deceleration)
 
 
 def braking_by(model: SimulatorModel, limits: Limits | None) -> Braking:
@@ -103,8 +114,11 @@ def braking_by(model: SimulatorModel, limits: Limits | None) -> Braking:
     reaction = braking.reaction_s
     if not model.kinematics.state_size or braking == Braking(0.0, math.inf):
         reaction += UNKNOWN_LAG_S  # it shows no lag, and every robot has one
-    reaction += max(0.0, model.calibration.command_latency_s) + model.control_period
-    return replace(braking, reaction_s=round(reaction, 9))
+    late = max(0.0, model.calibration.command_latency_s) + model.control_period
+    turn = braking.turn
+    if turn is not None:
+        turn = replace(turn, reaction_s=round(turn.reaction_s + late, 9))
+    return replace(braking, reaction_s=round(reaction + late, 9), turn=turn)
 
 
 def wheelbase(robot: RobotSpec) -> float:

@@ -20,6 +20,8 @@ class LookAhead(NamedTuple):
     reaction: float  # time until a robot that is told to stop brakes [s]
     slowness: float  # inverse of the deceleration that follows [s^2/m]
     lever: float  # by which a turn rate adds to the speed that is braked [m]
+    turn_reaction: float  # likewise of a turn that brakes apart from the speed, else 0 [s]
+    turn_slowness: float  # inverse of its deceleration [s^2/rad]
     far: float  # distance along an axis, beyond which nothing is known [m]
 
 
@@ -100,4 +102,6 @@ def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-de
         faster = max(1.0, present / speed)
         pace = max(pace, present + ahead.lever * abs(twist[2]))
     rest = faster * (ahead.reaction + 0.5 * pace * ahead.slowness)
+    if aimed[2] != 0.0:
+        rest = max(rest, ahead.turn_reaction + 0.5 * abs(aimed[2]) * ahead.turn_slowness)
     return cost + (2.0 * INADMISSIBLE if moves and free * period < rest else 0.0)

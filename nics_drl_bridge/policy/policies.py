@@ -176,9 +176,15 @@ class DynamicWindow:
         late = 0.0 if self.model is None else max(0.0, self.model.calibration.command_latency_s)
         # A twist is held for a period and looked at a period later; then the robot reacts. Its
         # reaction is known no finer than the steps of its model.
-        reaction = 2.0 * self.period + late + round(braking.reaction_s, 2)
+        held = 2.0 * self.period + late
+        reaction = held + round(braking.reaction_s, 2)
+        turn_reaction = 0.0
+        turn_slowness = 0.0
+        if braking.turn is not None:
+            turn_reaction = held + round(braking.turn.reaction_s, 2)
+            turn_slowness = 1.0 / braking.turn.deceleration
         step = 1.5 * self.period
-        slowest = float(braking.pace(twists).max()) / (2.0 * braking.deceleration)
+        slowest = float(braking.mean_time_s(twists).max()) - braking.reaction_s
         needed = math.ceil((reaction + slowest) / step)
         far = math.inf
         count = self.steps
@@ -187,7 +193,15 @@ class DynamicWindow:
             fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
             far = min(fastest * step * count, self.task.sight.range_max, MOST_M)
         ahead = kernels.LookAhead(
-            reach, step, count, reaction, 1.0 / braking.deceleration, braking.lever_m, far
+            reach,
+            step,
+            count,
+            reaction,
+            1.0 / braking.deceleration,
+            braking.lever_m,
+            turn_reaction,
+            turn_slowness,
+            far,
         )
         return twists, ahead, kernels.TwistWeights(*self.weights)
 

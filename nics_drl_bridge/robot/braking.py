@@ -2,7 +2,8 @@
 
 The model is brought to the steady motion of many commands over their range: forwards, backwards,
 sideways, turning, and mixtures. Each motion is then stopped. From all stops follow a reaction time
-and a deceleration that bound every one of them from above.
+and a deceleration that bound every one of them from above. A turn that ends apart from the speed,
+as that of a robot whose turn rate lags more than its speed, has a bound of its own: `OwnTurn`.
 """
 
 import math
@@ -36,6 +37,8 @@ LEVERS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)
 """That are tried, in footprint radii."""
 ORDERS = (2.0, math.inf, 1.0)  # that are tried, see `Braking.order`
 NEGLIGIBLE = 0.02  # by which a lever may bound the stops less tightly than the best one
+LEAST_SHARE = 0.05  # least share of its bound by which a component is said to move
+MISSED_M = 0.01  # by which two bounds of their own may miss a motion whose speed is a creep [m]
 MOST_MOTIONS = 2500
 INSTANT = 1e-6  # half the inverse of a deceleration [s^2/m] below which lags are all
 LEVELS: dict[int, tuple[float, ...]] = {
@@ -71,6 +74,24 @@ NO_DRIFT = Drift()
 
 
 @dataclass(frozen=True)
+class OwnTurn:
+    """How a turn ends that brakes apart from the speed.
+
+    The robot turns no further than if it kept its turn rate for the reaction time, and then braked
+    it evenly by the deceleration. It may stop sooner, but not by much: the least shares tell.
+    """
+
+    reaction_s: float  # until the braking of the turn counts, lags included
+    deceleration: float  # of the turn that follows; infinite if the lags are all [rad/s^2]
+    least_turn: float = 1.0  # share of this bound by which the robot turns at least
+    least_path: float = 1.0  # share of the bound of its path that the robot moves at least
+
+    def mean_time_s(self, rate: Array) -> Array:
+        """Returns the times (...) at full turn rates (...) in which the robot turns as far."""
+        return np.asarray(self.reaction_s + np.abs(rate) / (2.0 * self.deceleration))
+
+
+@dataclass(frozen=True)
 class Braking:
     """An upper bound of a robot's stops.
 
@@ -86,6 +107,7 @@ class Braking:
     # of the norm of ahead and sideways: infinite if the slower of both stops as if it were alone,
     # 1 if the brakes have to take away the sum, 2 otherwise
     order: float = 2.0
+    turn: OwnTurn | None = None  # None if the turn brakes as the speed does
 
     def pace(self, twist: Array) -> Array:
         """Returns the speed that the brakes take away (...) from twists (..., 3) [m/s]."""
@@ -94,7 +116,19 @@ class Braking:
 
     def time_s(self, twist: Array) -> Array:
         """Returns the times to rest (...) from twists (..., 3)."""
-        return np.asarray(self.reaction_s + self.pace(twist) / self.deceleration)
+        times = self.reaction_s + self.pace(twist) / self.deceleration
+        if self.turn is not None:
+            turning = self.turn.reaction_s + np.abs(twist[..., 2]) / self.turn.deceleration
+            times = np.maximum(times, np.where(twist[..., 2] == 0.0, 0.0, turning))
+        return np.asarray(times)
+
+    def mean_time_s(self, twist: Array) -> Array:
+        """Returns the times (...) at full twists (..., 3) in which the robot moves as far."""
+        times = self.reaction_s + self.pace(twist) / (2.0 * self.deceleration)
+        if self.turn is not None:
+            turning = self.turn.mean_time_s(twist[..., 2])
+            times = np.maximum(times, np.where(twist[..., 2] == 0.0, 0.0, turning))
+        return np.asarray(times)
 
     def distance(self, speed: float) -> float:
         """Returns the length of the path to rest from a speed straight ahead [m]."""
@@ -156,8 +190,15 @@ def _bound(robot: RobotSpec, model: TaylorModel, low: Array, high: Array, ramp: 
         sudden = _together([simulate_stops(robot, each, commands, at_once) for each in variants])
     for stops in (ramped, sudden):
         _require_rest(robot, stops)
-    bound = fit_bound(ramped, robot.footprint_radius, robot.footprint is not None)
-    return replace(bound, drift=_drift(sudden, robot.footprint_radius))
+    radius = robot.footprint_radius
+    shared = fit_bound(ramped, radius, robot.footprint is not None)
+    shared = replace(shared, drift=_drift(sudden, radius))
+    if robot.steers or (shared.lever_m == 0.0 and shared.drift.is_none):
+        return shared
+    apart = fit_apart(_together([ramped, sudden]), radius)
+    if apart is None or _slack(apart, ramped, radius) > _slack(shared, ramped, radius) - NEGLIGIBLE:
+        return shared
+    return apart
 
 
 def motions(low: Array, high: Array) -> Array:
@@ -403,6 +444,73 @@ def _tightest(
     # The solver meets each bound up to its tolerance.
     missing = float((distance / whole - reaction - pace * inverse).max())
     return slack, float(reaction) + max(missing, 0.0), float(inverse)
+
+
+def fit_apart(stops: Stops, radius: float) -> Braking | None:
+    """Returns the tightest bound of the path and of the turn, each by itself; None if none holds.
+
+    Args:
+        stops: of motions of all kinds.
+        radius: of the circle around the footprint [m].
+    """
+    rate = np.abs(stops.twist[:, 2])
+    speeds = stops.twist[:, :2]
+    moves = np.hypot(speeds[:, 0], speeds[:, 1]) > CREEP
+    turns = radius * rate > CREEP
+    if not (moves.any() and turns.any()):
+        return None
+    sideways = np.abs(speeds).min(axis=1) > MINOR * np.abs(speeds).max(axis=1)
+    found = []
+    for order in ORDERS if sideways[moves].any() else (2.0,):
+        speed = np.hypot(speeds[:, 0], speeds[:, 1])
+        pace = Braking(0.0, 1.0, order=order).pace(stops.twist)
+        found.append((order, *_bound_alone(speed[moves], pace[moves], stops.path[moves])))
+    order, _, reaction, inverse = min(found, key=lambda row: row[1])
+    bound = _rounded(Braking(0.0, 1.0, order=order), reaction, inverse)
+    turned = stops.travel[:, 2]
+    _, reaction, inverse = _bound_alone(rate[turns], rate[turns], turned[turns])
+    turn = _rounded(Braking(0.0, 1.0), reaction, inverse)
+    own = OwnTurn(turn.reaction_s, turn.deceleration)
+    most_path = _path_bound(bound, stops.twist)
+    most_turn = rate * own.mean_time_s(rate)
+    missed = np.maximum(stops.path - most_path, radius * (turned - most_turn))
+    if float(missed.max()) > MISSED_M:
+        return None
+    mixed = moves & turns
+    if mixed.any():
+        least_path = _least_share(stops.path[mixed], most_path[mixed])
+        least_turn = _least_share(turned[mixed], most_turn[mixed])
+        least_path, least_turn = np.clip([least_path, least_turn], LEAST_SHARE, 1.0).tolist()
+        own = replace(own, least_turn=least_turn, least_path=least_path)
+    return replace(bound, turn=own)
+
+
+def _least_share(distance: Array, most: Array) -> float:
+    """Returns the least share of its bound that a distance (K,) comes to; 1 if all bounds are 0."""
+    shares = np.divide(distance, most, out=np.ones_like(distance), where=most > 0.0)
+    return float(shares.min())
+
+
+def _bound_alone(speed: Array, pace: Array, distance: Array) -> tuple[float, float, float]:
+    """Returns what `_tightest` does of a component by itself, which counts at all speeds."""
+    return _tightest(speed, pace, distance, np.ones(len(speed), np.bool_), distance)
+
+
+def _path_bound(bound: Braking, twist: Array) -> Array:
+    """Returns the bound of the paths (K,) of twists (K, 3), as far as the speed brakes [m]."""
+    speed = np.hypot(twist[:, 0], twist[:, 1])
+    return speed * (bound.reaction_s + bound.pace(twist) / (2.0 * bound.deceleration))
+
+
+def _slack(bound: Braking, stops: Stops, radius: float) -> float:
+    """Returns the mean, over all motions, of how far a bound is above them, as a share."""
+    rate = np.abs(stops.twist[:, 2])
+    turn_time = bound.reaction_s + bound.pace(stops.twist) / (2.0 * bound.deceleration)
+    if bound.turn is not None:
+        turn_time = bound.turn.mean_time_s(rate)
+    assumed = _path_bound(bound, stops.twist) + radius * rate * turn_time
+    needed = stops.path + radius * stops.travel[:, 2]
+    return float(((assumed - needed) / (needed + SLACK_M)).mean())
 
 
 def _drift(stops: Stops, radius: float) -> Drift:

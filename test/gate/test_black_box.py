@@ -21,7 +21,7 @@ from nics_drl_bridge.gate.black_box import (
 from nics_drl_bridge.gate.inputs import EStop
 from nics_drl_bridge.gate.state import ShieldConfig
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.robot.braking import Drift
+from nics_drl_bridge.robot.braking import Drift, OwnTurn
 
 
 class Recorded(Rig):
@@ -52,6 +52,15 @@ def stopped(path, kept_s=30.0):
 def test_a_robot_that_leaves_its_arc_while_it_brakes_is_replayed(tmp_path):
     shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, lever=0.2, order=np.inf)
     shield = replace(shield, drift=Drift(0.9, 2.0, 1.1))
+    rig = Recorded(config(shield=shield), 30.0).drive()
+    rig.command([np.nan, 1.0, -0.0])
+    rig.run(0.3)
+    write(rig.config, rig.box.copy(), tmp_path / "stop.jsonl")
+    assert replay(tmp_path / "stop.jsonl").differing == ()
+
+
+def test_a_robot_whose_turn_brakes_apart_from_its_speed_is_replayed(tmp_path):
+    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, turn=OwnTurn(0.4, 3.0, 0.6, 0.5))
     rig = Recorded(config(shield=shield), 30.0).drive()
     rig.command([np.nan, 1.0, -0.0])
     rig.run(0.3)

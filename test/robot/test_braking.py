@@ -7,12 +7,22 @@ from functools import cache
 
 import numpy as np
 import pytest
+from skid_rover import kinematics as skid_steer_kinematics
+from skid_rover import rover
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.robot.braking import Braking, Drift, braking_of, motions, slowest_of
+from nics_drl_bridge.robot.braking import (
+    Braking,
+    Drift,
+    OwnTurn,
+    _least_share,
+    braking_of,
+    motions,
+    slowest_of,
+)
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import robot_from
 from nics_drl_bridge.robot.taylor import TaylorModel, exponents
@@ -221,11 +231,42 @@ def test_a_turn_that_ends_later_is_counted():
             assert turned / turn <= 1.02 * braking.drift.greatest * path / speed
 
 
+def test_a_turn_that_ends_apart_from_the_speed_makes_no_mixture_look_slow():
+    """Each motion of the range is bounded, by little more than what its slower response needs."""
+    robot = rover()
+    plant = skid_steer_kinematics()
+    slower = slowest_of(plant)
+    braking = braking_of(robot, plant)
+    assert braking.turn is not None
+    shares = [(ahead, turn) for ahead in SHARES for turn in (*SHARES, 0.0)]
+    shares += [(0.0, turn) for turn in SHARES]
+    commands = np.array(shares) * [0.8, 1.2]
+    for model in (plant, slower):
+        for speed, rate, path, turned in zip(*run_stops(model, commands), strict=True):
+            straight = np.array([speed, 0.0, 0.0])
+            assumed = speed * float(braking.mean_time_s(straight))
+            turns = rate * float(braking.turn.mean_time_s(rate))
+            assert assumed >= 0.998 * path - 2e-3
+            assert turns >= 0.998 * turned - 2e-3
+            if model is slower:
+                assert assumed <= 1.3 * path + 0.05
+                assert turns <= 1.3 * turned + 0.05
+
+
+def test_a_mixture_takes_as_long_as_the_slower_of_its_parts():
+    turn = OwnTurn(reaction_s=0.4, deceleration=2.0)
+    braking = Braking(0.2, 0.5, turn=turn)
+    assert braking.time_s(np.array([1.0, 0.0, 0.0])) == pytest.approx(2.2)
+    assert braking.time_s(np.array([0.1, 0.0, 2.0])) == pytest.approx(1.4)
+    assert braking.mean_time_s(np.array([0.1, 0.0, 2.0])) == pytest.approx(0.9)
+
+
 def test_a_robot_that_stays_on_its_arc_has_no_drift():
     for name in ("differential", "jackal", "mecanum", "turtlebot3_burger"):
         braking = braking_of(*shipped(name))
         assert braking.drift == Drift()
         assert braking.lever_m == 0.0
+        assert braking.turn is None
 
 
 def test_a_ramp_of_the_commands_is_added():
@@ -282,3 +323,9 @@ def test_time_and_distance_are_those_of_even_braking_after_the_reaction():
     assert braking.distance(1.0) == pytest.approx(1.2)
     assert braking.time_s(np.array([-1.0, 0.0, -5.0])) == pytest.approx(3.2)
     assert replace(braking, order=1.0).pace(np.array([0.5, -0.25, 0.0])) == pytest.approx(0.75)
+
+
+def test_no_share_of_a_bound_of_zero_is_taken():
+    bounded = _least_share(np.array([0.0, 0.3]), np.array([0.0, 0.5]))
+    assert bounded == pytest.approx(0.6)
+    assert _least_share(np.zeros(2), np.zeros(2)) == 1.0

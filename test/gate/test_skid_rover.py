@@ -1,0 +1,166 @@
+"""A skid-steer whose turn ends apart from its speed, among pillars behind gate and shield."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skid_rover import kinematics, limits_in, pillars, rover, rover_model
+
+from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.gate.gated_backend import GatedBackend
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.shield import STEP, body_of, sweeps
+from nics_drl_bridge.gate.shield_kernels import clearance, free
+from nics_drl_bridge.gate.stopping import shield_config
+from nics_drl_bridge.interface import Start
+from nics_drl_bridge.robot.braking import slowest_of
+
+ARRIVED_M = 0.3
+HELD_S = 0.4
+BESIDE_A_PILLAR = (1.74, 2.53, 0.0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return rover_model()
+
+
+class Drive:
+    """The robot behind its gate, and what was told of each period."""
+
+    def __init__(self, model, folder, start):
+        self.bare = SimBackend(model, pillars(), estimator=True)
+        self.gated = GatedBackend(self.bare, model, limits_in(folder))
+        self.gated.reset(Start(3, np.array(start)))
+        self.told = []
+
+    @property
+    def pose(self):
+        return self.bare.simulator.data.pose[0, 0].copy()
+
+    def command(self, forward, turn, periods=1):
+        for _ in range(periods):
+            self.told.append(self.gated.step(np.array([forward, turn]))[1])
+        return self
+
+    @property
+    def touched(self):
+        return any(each["true_collision"] for each in self.told)
+
+
+def bearing(pose, goal):
+    """Angle from the heading to a goal [rad]."""
+    away = np.arctan2(goal[1] - pose[1], goal[0] - pose[0]) - pose[2]
+    return float(np.angle(np.exp(1j * away)))
+
+
+@pytest.mark.parametrize(
+    ("start", "goal"),
+    [
+        ((0.0, 0.0, 0.0), (3.0, 0.0)),
+        ((0.0, 0.0, 0.0), (0.3, 2.98)),
+        ((0.0, 0.0, 1.57), (2.4, 2.6)),
+        ((-3.0, 0.0, 0.0), (0.0, -0.4)),
+    ],
+)
+@pytest.mark.parametrize("weaves", [0.0, 0.9])
+def test_it_reaches_a_goal_three_metres_away_and_does_not_creep(
+    model, tmp_path, start, goal, weaves
+):
+    drive = Drive(model, tmp_path, start)
+    for k in range(80):
+        pose = drive.pose
+        if np.hypot(*(goal - pose[:2])) < ARRIVED_M:
+            break
+        aim = bearing(pose, goal)
+        turn = 2.0 * aim + weaves * np.sin(np.pi * k * model.control_period)
+        drive.command(0.8 * max(0.0, np.cos(aim)), float(np.clip(turn, -1.2, 1.2)))
+    assert np.hypot(*(goal - drive.pose[:2])) < ARRIVED_M
+    assert not drive.touched
+    way = np.hypot(goal[0] - start[0], goal[1] - start[1]) - ARRIVED_M
+    time_s = len(drive.told) * model.control_period
+    assert way / time_s > 0.45
+
+
+@pytest.mark.parametrize("command", [(0.0, 0.8), (0.0, -0.8), (0.4, 0.4), (0.6, 0.0)])
+def test_beside_a_pillar_it_may_turn_and_go_ahead(model, tmp_path, command):
+    drive = Drive(model, tmp_path, BESIDE_A_PILLAR).command(*command, periods=15)
+    moved = drive.pose - BESIDE_A_PILLAR
+    assert np.hypot(*moved[:2]) + 0.5 * abs(moved[2]) > 0.3
+    assert not drive.touched
+
+
+def test_it_backs_up_into_ground_that_it_drove_over_and_no_further(model, tmp_path):
+    """At first it knows no ground behind it, as its lidar does not look there."""
+    x, y, heading = BESIDE_A_PILLAR
+    unknown = Drive(model, tmp_path, BESIDE_A_PILLAR).command(-0.3, 0.06, periods=40)
+    assert unknown.pose[0] > x - 0.1
+    drive = Drive(model, tmp_path, (x - 1.1, y, heading))
+    while drive.pose[0] < x - 0.1 and len(drive.told) < 60:
+        drive.command(0.4, 0.0)
+    drive.command(0.0, 0.0, periods=10)
+    before = drive.pose[0]
+    drive.command(-0.3, 0.06, periods=40)
+    assert before - drive.pose[0] > 0.5
+    assert drive.pose[0] > x - 1.1
+    assert not drive.touched
+
+
+@pytest.fixture(scope="module")
+def shield(model, tmp_path_factory):
+    file = limits_in(tmp_path_factory.mktemp("limits"))
+    return shield_config(model, load_limits(file, model.robot))[0]
+
+
+def stopping_poses(plant, command, latency_s):
+    """Poses (T, 3) from the steady motion of a command: it is kept for a time, then stopped."""
+    state = np.zeros((1, 2))
+    pose = np.zeros((1, 3))
+    command = np.array([command])
+    for _ in range(200):
+        _, state = plant.step(pose, state, command)
+    poses = [pose[0]]
+    for k in range(150):
+        told = command if k * plant.dt < latency_s else 0.0 * command
+        pose, state = plant.step(pose, state, told)
+        poses.append(pose[0])
+    return np.array(poses)
+
+
+COMMANDS = [(0.8, 1.2), (0.8, 0.5), (0.4, -1.2), (-0.4, 1.0), (0.15, 1.2), (0.0, 1.2), (0.8, 0.0)]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("responds", ["as its model", "as slowly as its errors allow"])
+def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
+    model, shield, command, responds
+):
+    plant = kinematics()
+    if responds != "as its model":
+        plant = slowest_of(plant)
+        assert plant is not None
+    # The command that the base heard last is followed for a period.
+    poses = stopping_poses(plant, command, HELD_S + model.control_period)
+    state = np.array(command) * (10.6 / 10.7, 3.21 / 4.45)
+    twist = np.array([[state[0], 0.0, state[1]]])
+    body = body_of(shield)
+    stops = sweeps(shield, body, HELD_S + shield.latency_s, 1.0, 1.0)
+    count = 0
+    for x, y in np.random.default_rng(0).uniform(-1.5, 1.5, (1500, 2)):
+        if clearance(x, y, body) < shield.margin:
+            continue
+        point = np.array([[x, y, 0.0]])
+        if not all(free(point, twist, *stop, STEP) for stop in stops):
+            continue
+        count += 1
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        dx, dy = x - poses[:, 0], y - poses[:, 1]
+        seen = zip(c * dx + s * dy, c * dy - s * dx, strict=True)
+        assert min(clearance(*each, body) for each in seen) > 0.5 * shield.margin
+    assert count > 100
+
+
+def test_it_is_a_robot_whose_turn_ends_apart_from_its_speed(shield):
+    assert shield.lever == 0.0
+    assert shield.turn is not None
+    assert not rover().steers
