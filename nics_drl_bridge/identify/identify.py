@@ -464,7 +464,8 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     beaten = (findings.replaced,) if findings.replaced else shortfall(findings.judgement)
     return (
         *about_recordings(_fitted(findings)[1], calibration, findings.whole),
-        *beaten, *drive.recording.repairs, *findings.repairs, *verdict.about_gaps(drive),
+        *beaten, *_why_replaced(drive, findings),
+        *drive.recording.repairs, *findings.repairs, *verdict.about_gaps(drive),
         *_sentences(findings), *findings.refinement,
         *verdict.mirror_note(
             known(findings.samples, "the training part", "fit"), spec, calibration
@@ -478,6 +479,16 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
         *verdict.untried(drive, findings.held_out, findings.judgement),
         *findings.assumptions,
     )  # fmt: skip
+
+
+def _why_replaced(drive: Drive, findings: Findings) -> Iterator[str]:
+    """Tells if rows that are too far apart are why a model lost to its textbook."""
+    if not findings.replaced or drive.recording.state is None:
+        return
+    linear, _ = _fitted(findings)
+    whole = findings.whole
+    if coarse := verdict.coarsest_state(whole.recording, whole.spec, linear.unmoved):
+        yield verdict.Gap(f"{coarse}.")
 
 
 def structure(findings: Findings) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import Curve
-from nics_drl_bridge.identify.verdict import FAR_OFF, Doubt, Mistake
+from nics_drl_bridge.identify.verdict import FAR_OFF, Doubt, Mistake, coarsest_state
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
@@ -22,8 +22,6 @@ TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_a
 DEAD_ZONE, EAGER = "dead zone on both sides of 0", "does more than in proportion, by minus"
 LEAST_DIGITS = 3  # of a coefficient: the printed equations predict as the model does
 MOST_LEFT = 0.5  # share of the error of standing still above which a model is hardly better
-COARSE = 2.0 / 3.0  # share of a state's range between two rows that is sampled too coarsely
-ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
@@ -330,17 +328,8 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
     recording, unmoved = identified.recording, identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
-    coarsest = (0.0, "")
-    if recording.state is not None:
-        spread = np.ptp(np.percentile(rows.values, ENDS, axis=0), axis=0)
-        steps = np.percentile(np.abs(np.diff(rows.values, axis=0)), ENDS[1], axis=0)
-        for variable, step, size in zip(spec.state, steps, spread, strict=True):
-            if size > 0.0 and variable.name not in unmoved:
-                coarsest = max(coarsest, (float(step / size), variable.name))
-    share, name = coarsest  # the greatest step between rows, as a share of its range
-    if share > COARSE:
-        coarse = f"{name} changes by {share:.0%} of its range between rows that are {apart}"
-        return f"{coarse}, so record at a higher rate"
+    if coarse := coarsest_state(recording, spec, unmoved):
+        return coarse
     if still := ", ".join(c.name for c in spec.command if c.name in unmoved):
         reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"
         return f"{reason}, which the fit learns from, so change it from the start"

@@ -19,7 +19,7 @@ from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import errors_of
-from nics_drl_bridge.recording.recording import Samples, Stream
+from nics_drl_bridge.recording.recording import Recording, Samples, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
 
@@ -35,6 +35,8 @@ GAP_STEPS = 3.0  # a pause of the pose longer than so many usual steps, and MAX_
 GAPS_TOLD = 4  # one by one
 LINEAR = "Predictions by terms of a higher order ran away, so the model has those of order 1 alone."
 EARLY = "The robot moves"  # begins a note on motion before its commands
+COARSE = 2.0 / 3.0  # share of a state's range between two rows that is sampled too coarsely
+ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
 
 
@@ -95,6 +97,24 @@ def about_gaps(drive: Drive) -> Iterator[str]:
             f"The pose has {len(rest)} more gaps, of up to {max(rest):.2f} s "
             f"and of {sum(rest):.1f} s in all."
         )
+
+
+def coarsest_state(recording: Recording, spec: RobotSpec, unmoved: Sequence[str]) -> str:
+    """Names the measured state that changes by most of its range from row to row; "" if none."""
+    if recording.state is None:
+        return ""
+    values = recording.state.values
+    spread = np.ptp(np.percentile(values, ENDS, axis=0), axis=0)
+    steps = np.percentile(np.abs(np.diff(values, axis=0)), ENDS[1], axis=0)
+    greatest, name = COARSE, ""
+    for variable, step, size in zip(spec.state, steps, spread, strict=True):
+        if size > 0.0 and variable.name not in unmoved and step / size > greatest:
+            greatest, name = float(step / size), variable.name
+    if not name:
+        return ""
+    apart = float(np.median(np.diff(recording.state.t)))
+    finding = f"{name} changes by {greatest:.0%} of its range between rows that are {apart:.2g} s"
+    return f"{finding} apart, so record at a higher rate"
 
 
 def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> Iterator[str]:

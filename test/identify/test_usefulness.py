@@ -13,9 +13,12 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.identify.report import is_useless, why_useless
+from nics_drl_bridge.identify.verdict import coarsest_state
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec
+
+TOO_COARSE = "between rows that are 0.3 s apart, so record at a higher rate."
 
 
 def coarse(spec: RobotSpec, every: int, duration: float = 60.0) -> Recording:
@@ -93,6 +96,17 @@ def test_the_textbook_takes_the_place_of_a_useless_model(name, request):
     found = identify(coarse(spec, every=30), spec, alpha="auto")
     assert found.findings.replaced in found.notes
     assert why_useless(found, spec) == ""
+    assert any(gap.endswith(TOO_COARSE) for gap in found.gaps)
+
+
+def test_only_rows_that_are_too_far_apart_are_named(differential):
+    assert coarsest_state(coarse(differential, every=5), differential, ()) == ""
+    far = coarse(differential, every=30)
+    named = coarsest_state(far, differential, ())
+    assert named.split()[0] in {v.name for v in differential.state}
+    assert f"{named}.".endswith(TOO_COARSE)
+    assert coarsest_state(far, differential, [v.name for v in differential.state]) == ""
+    assert coarsest_state(replace(far, state=None), differential, ()) == ""
 
 
 @pytest.mark.slow
@@ -104,7 +118,7 @@ def test_rows_too_far_apart_are_named(name, request):
     start = f"textbook {spec.name}: the fitted model is useless: on unseen data its predictions "
     assert sentence.startswith(start)
     assert any(f"; {v.name} changes by " in sentence for v in spec.state)
-    assert sentence.endswith("between rows that are 0.3 s apart, so record at a higher rate.")
+    assert sentence.endswith(TOO_COARSE)
 
 
 @pytest.mark.slow
