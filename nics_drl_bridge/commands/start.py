@@ -63,6 +63,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 def main() -> None:
     """Runs a command, which imports what it needs as it runs."""
+    _interrupts.clear()
     take_signals()
     try:
         _run()

@@ -183,8 +183,8 @@ def read_settings(path: Path, task: str | None = None) -> TrainingSettings:
 
 
 def is_code(task: str) -> bool:
-    """True for a task of a user's own, `path/to/file.py:ClassName`."""
-    return ":" in task
+    """True for a task of a user's own, `path/to/file.py:ClassName`, or a file without its class."""
+    return ":" in task or task.endswith(".py")
 
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:

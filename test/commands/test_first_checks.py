@@ -51,7 +51,7 @@ def test_a_wrong_name_or_place_is_refused_before_anything_heavy_is_loaded(
 ) -> None:
     (tmp_path / "mine.py").write_text("x = 1\n")
     (tmp_path / "empty").mkdir()
-    command = [sys.executable, "-c", PROGRAM, *words.split()]
+    command = [sys.executable, "-B", "-c", PROGRAM, *words.split()]  # without __pycache__
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
     )

@@ -229,7 +229,17 @@ def test_a_run_with_other_settings_is_not_overwritten(folder):
     assert "run: holds a run with other settings; choose another --out" in sentence_of(done)
 
 
-def test_ctrl_c_before_a_command_has_begun_is_one_sentence(capsys):
+@pytest.fixture
+def signals():
+    """Handlers of signals as they were before a test that takes them."""
+    numbers = list(start.ENDING)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+def test_ctrl_c_before_a_command_has_begun_is_one_sentence(signals, capsys):
     with (
         mock.patch("nics_drl_bridge.commands.cli.main", side_effect=KeyboardInterrupt),
         pytest.raises(SystemExit) as end,
@@ -239,7 +249,7 @@ def test_ctrl_c_before_a_command_has_begun_is_one_sentence(capsys):
     assert capsys.readouterr().err == "nics: interrupted; nothing was started.\n"
 
 
-def test_where_no_kernel_can_be_kept_the_sentence_names_the_variable(capsys):
+def test_where_no_kernel_can_be_kept_the_sentence_names_the_variable(signals, capsys):
     error = RuntimeError("cannot cache function 'step': no locator available for file 'kernels.py'")
     with (
         mock.patch("nics_drl_bridge.commands.cli.main", side_effect=error),

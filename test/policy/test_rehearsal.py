@@ -21,6 +21,7 @@ MOST_RSS = 1000 * 2**10  # of any process [kB]; without a limit it is 8.8 GB
 MOST_S = 25.0  # of a processor; without a limit 31 s, of which most is swapped or refused here
 MEASURE = """
 import resource, sys, time
+from pathlib import Path
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.policy.policy_file import load_policy
 begun = time.process_time()
@@ -28,7 +29,9 @@ try:
     load_policy(sys.argv[1])
 except PolicyError as error:
     print(error)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+# ru_maxrss would count what the process that started this one holds.
+status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+print(status["VmHWM"].split()[0])
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime + time.process_time() - begun)
 """
