@@ -179,6 +179,12 @@ def test_odometry_that_shows_too_much_or_too_little_does_not_stop_the_robot(scal
     assert scene.run(4.0).cause is None
 
 
+def test_wheels_that_slip_as_a_turn_begins_do_not_stop_the_robot():
+    scene = started(twist=(0.0, 0.0, 0.2))
+    scene.scale = np.array([1.0, 1.0, 4.0])
+    assert scene.run(4.0).cause is None
+
+
 @pytest.mark.parametrize("walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"])
 def test_where_a_motion_can_not_be_seen_nothing_is_decided(walls):
     scene = started(walls=walls, twist=(0.5, 0.0, 0.0))
