@@ -376,7 +376,7 @@ def time_to_stop_when_held(operator: Operator) -> float:
 def run_bridge(workshop: Workshop, policy: Path, domain_id: int, control: str | None) -> ExitStack:
     """Starts gate, estimator and policy as `vehicle.launch.py` does; returns what ends them."""
     shared = {"model": str(workshop.folder / "rover"), "enable_stamped_cmd_vel": True}
-    gate = shared | {"limits": str(workshop.folder / "limits.yaml"), "odom_rate": 20.0}
+    gate = shared | {"limits": str(workshop.folder / "limits.yaml")}
     if control == "no_gate_rule":
         gate |= {"stop_when_held": False}
     nodes = {

@@ -317,8 +317,21 @@ def _rate(topic: str, arrivals: Arrivals, declared: float, config: GateConfig, n
     high = declared * (1.0 + config.rate_tolerance)
     if arriving >= low and low <= stamped <= high:
         return ""
-    rates = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz, declared are {declared:.1f} Hz"
-    return f"{topic} comes at {rates}"
+    rates = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz"
+    return f"{topic} comes at {rates}, declared are {declared:.1f} Hz"
+
+
+def _odom_rate(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    """Odometry comes at its rate; where none was declared, at least as often as is needed."""
+    arrivals = state.odometries
+    if config.odom_rate_declared:
+        return _rate(ODOM, arrivals, config.odom_rate, config, now)
+    arriving, stamped = stops.rate(arrivals, now, config.settle_s)
+    if min(arriving, stamped) >= config.odom_rate * (1.0 - config.rate_tolerance):
+        return ""
+    rates = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz"
+    needed = f"one per control period is needed, {config.odom_rate:.1f} Hz"
+    return f"odom comes at {rates}, {needed}, unless the parameter 'odom_rate' declares less"
 
 
 def _clocks(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
@@ -381,7 +394,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("scan_rate", lambda c, s, _, now: _rate(SCAN, s.scans, c.scan_rate, c, now)),
     ("sensors_fresh", _sensors),
     ("odom_fresh", lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now)),
-    ("odom_rate", lambda c, s, _, now: _rate(ODOM, s.odometries, c.odom_rate, c, now)),
+    ("odom_rate", _odom_rate),
     ("clocks_agree", _clocks), ("estimator_converged", _estimator), ("one_publisher", _publishers),
     ("standing_still", _standing), ("one_policy", _policies),
 )  # fmt: skip

@@ -62,6 +62,7 @@ class GateConfig:
     range_min: float  # of the lidar [m]
     scan_rate: float  # declared [Hz]
     odom_rate: float  # declared [Hz]
+    odom_rate_declared: bool = True  # else it is the least that a model needs: more is as good
     range_max: float = 0.0  # of the lidar [m]; 0 if unknown
     scan_age_s: float = 0.30  # greatest age of the newest scan, and of the scan behind a command
     odom_age_s: float = 0.30  # greatest age of the newest odometry

@@ -31,7 +31,8 @@ def gate_config(
 ) -> GateConfig:
     """Returns the configuration of a robot's gate; `rules` are further fields of it."""
     lidar, robot = model.lidar, model.robot
-    given = {"odom_rate": 1.0 / model.control_period, **rules}
+    least_rate = {"odom_rate": 1.0 / model.control_period, "odom_rate_declared": False}
+    given = rules if "odom_rate" in rules else {**least_rate, **rules}
     return GateConfig(
         fields=robot.cmd_vel_places, bicycle=robot.bicycle if robot.takes_turn_rate else None,
         limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,

@@ -82,12 +82,11 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
 
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
-    return {
-        f"{row.name}_s"
-        if row.name in parameters.RULES_IN_SECONDS
-        else row.name: runner.declare_row(node, row)
-        for row in parameters.gate_rules(1.0 / model.control_period, scan_age)
-    }
+    rules: dict[str, Any] = {"odom_rate_declared": "odom_rate" in runner.given_values(node)}
+    for row in parameters.gate_rules(1.0 / model.control_period, scan_age):
+        field = f"{row.name}_s" if row.name in parameters.RULES_IN_SECONDS else row.name
+        rules[field] = runner.declare_row(node, row)
+    return rules
 
 
 def declare_black_box(node: Node) -> Path:

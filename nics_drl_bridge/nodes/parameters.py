@@ -260,7 +260,8 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
     seconds = (0.01, 10.0)
     heard = "Whether e_stop must have been received before arming; false only in simulations."
     return [
-        Row("odom_rate", odom_rate, "Rate of odom [Hz].", (0.1, 1e4), shown="1 per control period"),
+        Row("odom_rate", odom_rate, "Rate of odom [Hz].", (0.1, 1e4),
+            shown="1 per control period, or more"),
         Row("scan_age", scan_age, "Oldest scan, also behind a command [s].", seconds,
             shown=f"{Default.scan_age_s:g}, or more for a slow lidar"),
         Row("odom_age", Default.odom_age_s, "Oldest odometry [s].", seconds),

@@ -76,6 +76,15 @@ def test_a_rate_other_than_declared_is_named(topic, declared, right):
         assert failed(rig) == {f"{topic}_rate"}
 
 
+@pytest.mark.parametrize(("needed", "right"), [(5.0, True), (10.0, True), (20.0, False)])
+def test_where_no_rate_of_odometry_is_declared_more_than_is_needed_is_as_good(needed, right):
+    rig = settled(odom_rate=needed, odom_rate_declared=False)
+    if right:
+        assert rig.arm().granted
+    else:
+        assert failed(rig) == {"odom_rate"}
+
+
 def test_a_simulation_that_runs_at_double_speed_keeps_its_declared_rates():
     rig = Rig(config(clock_rate=2.0))
     for _ in range(60):
