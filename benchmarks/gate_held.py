@@ -52,6 +52,7 @@ def zero_thresholds() -> None:
     settings = scan_motion.Settings(
         least_path=0.0, least_turn=0.0, least_half=0.0, least_change=0.0, deviations=0.0,
         least_sectors=1, agreeing=0.0, sector_share=np.inf, held_share=np.inf, confirmed_s=0.0,
+        greatest_changed=np.inf,
     )  # fmt: skip
     scan_motion.watch_scan = partial(scan_motion.watch_scan, settings=settings)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from nics_drl_bridge.gate import scan_motion_kernels as kernels
 from nics_drl_bridge.gate.inputs import Odometry, Scan
-from nics_drl_bridge.gate.scan_motion_kernels import Directions, Noise
+from nics_drl_bridge.gate.scan_motion_kernels import Directions, Noise, Thresholds
 from nics_drl_bridge.gate.state import (
     Cause,
     GateConfig,
@@ -56,15 +56,21 @@ class Settings:
     # deviations of the lidar's noise, in the root mean square.
     least_change: float = 0.03
     deviations: float = 1.8
+    # A range changed visibly if it did by this [m] and by so many of these deviations.
+    visible_change: float = 0.05
+    visible_deviations: float = 3.0
     gap: float = 0.25  # neighbours whose ranges differ by this share are two surfaces
     # Held: of at least so many sectors that tell something this share shows less than
-    # `sector_share` of the motion, and the median less than `held_share`. A skid-steer robot whose
-    # odometry turns 30 % too far shows 0.77, one on ice 0.5, and one that begins to turn on the
-    # spot, in DART, for half a second a fifth.
+    # `sector_share` of the motion, the median shows less than `held_share`, and in the median less
+    # than `greatest_changed` of a sector's ranges changed visibly. A skid-steer robot whose
+    # odometry turns 30 % too far shows 0.77, one on ice 0.5, and one that begins to turn, in DART,
+    # for half a second a tenth of the turn: it is not held, as its ranges change by what it drives
+    # ahead.
     least_sectors: int = 5
     agreeing: float = 0.6
     sector_share: float = 0.45
-    held_share: float = 0.15
+    held_share: float = 0.2
+    greatest_changed: float = 0.5
     confirmed_s: float = 0.15  # time over which scans must say so, without one that says otherwise
     forgotten_s: float = 1.0  # time after which an unconfirmed contradiction is forgotten
 
@@ -158,17 +164,29 @@ def judge_motion(
     directions = directions_of(config, settings)
     predicted = np.empty_like(old.ranges)
     kernels.predict_scan(old.ranges, directions, moved, settings.gap, predicted)
-    shares = kernels.compare_sectors(
-        old.ranges, newest.ranges, predicted, round(settings.sector / directions.step) or 1,
-        noise_of(config, directions), settings.deviations, settings.least_change,
-    )  # fmt: skip
-    known = shares[~np.isnan(shares)]
-    if len(known) < max(settings.least_sectors, 1):
-        return UNDECIDED._replace(sectors=len(known))
-    share = float(np.median(known))
-    unmoved = np.count_nonzero(np.abs(known) < settings.sector_share)
-    agree = unmoved >= settings.agreeing * len(known)
-    return Verdict(len(known), share, bool(agree and abs(share) < settings.held_share))
+    sector = round(settings.sector / directions.step) or 1
+    thresholds = Thresholds(
+        settings.least_change,
+        settings.deviations,
+        settings.visible_change,
+        settings.visible_deviations,
+    )
+    noise = noise_of(config, directions)
+    shares, changed = kernels.compare_sectors(
+        old.ranges, newest.ranges, predicted, sector, noise, thresholds
+    )
+    known = ~np.isnan(shares)
+    sectors = int(np.count_nonzero(known))
+    if sectors < max(settings.least_sectors, 1):
+        return UNDECIDED._replace(sectors=sectors)
+    share = float(np.median(shares[known]))
+    unmoved = np.count_nonzero(np.abs(shares[known]) < settings.sector_share)
+    held = (
+        unmoved >= settings.agreeing * sectors
+        and abs(share) < settings.held_share
+        and np.median(changed[known]) < settings.greatest_changed
+    )
+    return Verdict(sectors, share, bool(held))
 
 
 def _reference(

@@ -27,6 +27,15 @@ class Noise(NamedTuple):
     proportional: float
 
 
+class Thresholds(NamedTuple):
+    """Changes of a range that count: the greater of a length and a number of deviations."""
+
+    telling: float  # a predicted change that tells something [m]
+    telling_deviations: float
+    visible: float  # an observed change that was no noise [m]
+    visible_deviations: float
+
+
 @kernel(allocates=True)
 def reduce_scan(ranges, directions, out):  # type: ignore[no-untyped-def]
     """Writes the median range around each direction (K,) to `out`; NaN where few beams return."""
@@ -100,29 +109,44 @@ def predict_scan(ranges, directions, moved, gap, out):  # type: ignore[no-untype
 
 
 @kernel(allocates=True)
-def compare_sectors(old, new, predicted, sector, noise, deviations, least):  # type: ignore[no-untyped-def]
-    """Returns, of each sector, the share of the predicted change that was observed; NaN: unknown.
+def compare_sectors(old, new, predicted, sector, noise, thresholds):  # type: ignore[no-untyped-def]
+    """Compares the observed changes of ranges with the predicted ones, sector by sector.
 
     Ranges (K,) are those of an old scan, of a new one, and what the motion in between predicts.
     A `sector` has so many directions. It is unknown if a third of them or fewer are, or if the root
-    mean square of its predicted changes is below `least` [m] or so many `deviations` of the noise.
-    The share is that of least squares, with observed changes cut at twice the predicted ones.
+    mean square of its predicted changes is below the threshold of what tells something.
+
+    Returns:
+        shares: of the predicted change that was observed (S,), by least squares, with observed
+            changes cut at twice the predicted ones; NaN for a sector that is unknown.
+        changed: fraction of the known directions (S,) whose ranges changed visibly.
     """
     count = old.shape[0]
     shares = np.full((count + sector - 1) // sector, math.nan)
+    changed = np.zeros(shares.shape[0])
     for index in range(shares.shape[0]):
-        begin, end = index * sector, min((index + 1) * sector, count)
-        known, products, squares, needed = 0, 0.0, 0.0, 0.0
+        begin = index * sector
+        end = min(begin + sector, count)
+        known = 0
+        visible = 0
+        products = 0.0
+        squares = 0.0
+        needed = 0.0
         for k in range(begin, end):
-            change, observed = predicted[k] - old[k], new[k] - old[k]
-            if not (math.isfinite(change) and math.isfinite(observed)):
+            predicted_change = predicted[k] - old[k]
+            observed_change = new[k] - old[k]
+            if not (math.isfinite(predicted_change) and math.isfinite(observed_change)):
                 continue
-            threshold = max(least, deviations * (noise.constant + noise.proportional * old[k]))
-            observed = min(max(observed, -2.0 * abs(change)), 2.0 * abs(change))
+            std = noise.constant + noise.proportional * old[k]
+            telling = max(thresholds.telling, thresholds.telling_deviations * std)
+            if abs(observed_change) > max(thresholds.visible, thresholds.visible_deviations * std):
+                visible += 1
+            most = 2.0 * abs(predicted_change)
             known += 1
-            products += change * observed
-            squares += change * change
-            needed += threshold * threshold
+            products += predicted_change * min(max(observed_change, -most), most)
+            squares += predicted_change * predicted_change
+            needed += telling * telling
         if 3 * known > end - begin and squares > needed:
             shares[index] = products / squares
-    return shares
+            changed[index] = visible / known
+    return shares, changed

@@ -11,6 +11,7 @@ from nics_drl_bridge.gate.inputs import Reset, Scan
 from nics_drl_bridge.gate.scan_motion import SETTINGS, directions_of
 from nics_drl_bridge.gate.scan_motion_kernels import (
     Noise,
+    Thresholds,
     compare_sectors,
     predict_scan,
     reduce_scan,
@@ -180,9 +181,9 @@ def test_odometry_that_shows_too_much_or_too_little_does_not_stop_the_robot(scal
 
 
 def test_wheels_that_slip_as_a_turn_begins_do_not_stop_the_robot():
-    scene = started(twist=(0.0, 0.0, 0.2))
-    scene.scale = np.array([1.0, 1.0, 4.0])
-    assert scene.run(4.0).cause is None
+    scene = started(twist=(0.2, 0.0, 0.1))
+    scene.scale = np.array([2.0, 1.0, 6.0])
+    assert scene.run(1.0).cause is None
 
 
 @pytest.mark.parametrize("walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"])
@@ -289,10 +290,12 @@ def test_sectors_show_the_share_of_the_motion_that_took_place():
     predicted[:20] += 0.2
     new = old + 0.5 * (predicted - old)
     new[25] = np.nan
-    shares = compare_sectors(old, new, predicted, 10, Noise(0.01, 0.0), 2.0, 0.03)
+    thresholds = Thresholds(0.03, 2.0, 0.04, 3.0)
+    shares, changed = compare_sectors(old, new, predicted, 10, Noise(0.01, 0.0), thresholds)
     assert shares[:2] == pytest.approx(0.5, abs=1e-5)
     assert np.isnan(shares[2])
-    noisy = compare_sectors(old, new, predicted, 10, Noise(0.2, 0.0), 2.0, 0.03)
+    assert changed.tolist() == [1.0, 1.0, 0.0]
+    noisy, _ = compare_sectors(old, new, predicted, 10, Noise(0.2, 0.0), thresholds)
     assert np.isnan(noisy).all()
 
 
