@@ -96,7 +96,9 @@ EXTRAS["all"] = [
 ]
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.
 APART = ("ros", "distributed", "all")
-EXTRAS["dev-without-ros"] = [one for name in EXTRAS if name not in APART for one in EXTRAS[name]]
+EXTRAS["dev-without-ros"] = [
+    one for name in EXTRAS if name not in APART for one in EXTRAS[name]
+]
 EXTRAS["dev"] = EXTRAS["dev-without-ros"] + EXTRAS["ros"]
 
 
@@ -114,13 +116,17 @@ def data_files() -> list[tuple[str, list[str]]]:
         "share/ament_index/resource_index/packages": [f"resource/{PACKAGE}"],
         SHARE: ["package.xml"],
     }
-    if not {"bdist_wheel", "editable_wheel"} & set(sys.argv):  # pip makes one of its own
+    if not {"bdist_wheel", "editable_wheel"} & set(
+        sys.argv
+    ):  # pip makes one of its own
         by_folder["bin"] = ["resource/bin/nics"]
     for top in ("config", "launch", "urdf"):
         for path in sorted((ROOT / top).rglob("*")):
             file = path.relative_to(ROOT)
             if path.is_file() and "__pycache__" not in file.parts:
-                by_folder.setdefault(f"{SHARE}/{file.parent.as_posix()}", []).append(str(file))
+                by_folder.setdefault(f"{SHARE}/{file.parent.as_posix()}", []).append(
+                    str(file)
+                )
     return list(by_folder.items())
 
 

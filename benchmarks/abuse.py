@@ -27,8 +27,12 @@ OF_CONTROL = {"credulous": "files", "no_guard": "env"}
 
 def run(name: str, seed: int, rounds: int, control: str | None) -> Score:
     """One campaign; a control belongs to one of them."""
-    campaign: Callable[[int, int, str | None], Score] = import_module(CAMPAIGNS[name]).campaign
-    return campaign(seed, rounds, control if OF_CONTROL.get(control or "") == name else None)
+    campaign: Callable[[int, int, str | None], Score] = import_module(
+        CAMPAIGNS[name]
+    ).campaign
+    return campaign(
+        seed, rounds, control if OF_CONTROL.get(control or "") == name else None
+    )
 
 
 def missed_of(scores: dict[str, Score]) -> list[str]:
@@ -39,7 +43,9 @@ def missed_of(scores: dict[str, Score]) -> list[str]:
             missed.append(f"{name}: 0 tries, the bar is 1 or more")
         for bar in BARS:
             if getattr(score, bar) != 0:
-                missed.append(f"{name}: {bar} {getattr(score, bar)} of {score.tries}, the bar is 0")
+                missed.append(
+                    f"{name}: {bar} {getattr(score, bar)} of {score.tries}, the bar is 0"
+                )
         if not getattr(score, "good", 1) > 0:
             missed.append(f"{name}: no good input was tried, the bar is 1 or more")
         if getattr(score, "good_refused", 0) != 0:
@@ -51,24 +57,39 @@ def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when something got through."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rounds", type=int, default=100, help="of each campaign's sources")
-    parser.add_argument("--only", choices=list(CAMPAIGNS), help="one campaign; by default both")
+    parser.add_argument(
+        "--rounds", type=int, default=100, help="of each campaign's sources"
+    )
+    parser.add_argument(
+        "--only", choices=list(CAMPAIGNS), help="one campaign; by default both"
+    )
     given = parser.parse_args()
     COMPILING.quiet = True  # that kernels are compiled is no part of a sentence
     chosen = given.only or OF_CONTROL.get(given.control or "")
     names = [chosen] if chosen else list(CAMPAIGNS)
-    scores = {name: run(name, given.seed, given.rounds, given.control) for name in names}
+    scores = {
+        name: run(name, given.seed, given.rounds, given.control) for name in names
+    }
     kinds: Counter[str] = Counter()
     for name, score in scores.items():
         kinds.update(getattr(score, "by_kind", {name: score.tries}))
     keys = ("tries", *BARS)
-    result = {key: sum(getattr(score, key) for score in scores.values()) for key in keys}
+    result = {
+        key: sum(getattr(score, key) for score in scores.values()) for key in keys
+    }
     result["good"] = sum(getattr(score, "good", 0) for score in scores.values())
-    result["good_refused"] = sum(getattr(score, "good_refused", 0) for score in scores.values())
+    result["good_refused"] = sum(
+        getattr(score, "good_refused", 0) for score in scores.values()
+    )
     told = [line for score in scores.values() for line in score.told]
     table = "".join(f"{key:12} {value}\n" for key, value in result.items())
     table += "".join(f"{line}\n" for line in told)
-    answer({**result, "by_kind": dict(kinds), "told": told}, missed_of(scores), table, given.json)
+    answer(
+        {**result, "by_kind": dict(kinds), "told": told},
+        missed_of(scores),
+        table,
+        given.json,
+    )
 
 
 if __name__ == "__main__":

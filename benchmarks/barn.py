@@ -45,7 +45,10 @@ from nics_drl_bridge.sim.world_set import BARN, AnyWorld, WorldSet, load_worlds
 
 CONTROLS = {"standing": "the driving: the robot stands still"}
 ROBOT = "jackal"
-BARS = {"fast": {"success": 0.95, "collision": 0.02, "score": 0.45}, "mujoco_dds": {"score": 0.40}}
+BARS = {
+    "fast": {"success": 0.95, "collision": 0.02, "score": 0.45},
+    "mujoco_dds": {"score": 0.40},
+}
 TRAINING_BAR_S = 600.0  # of one policy, on two cores
 SPEED, GOAL_RADIUS, TIME_OUT_S = 2.0, 1.0, 100.0
 """[m/s], [m], [s]: of the challenge."""
@@ -98,7 +101,10 @@ class Runs:
 
     def told(self) -> dict[str, Any]:
         """Figures of all runs, and of those in each world."""
-        each = {str(n): self.figures(self.numbers == n) for n in np.unique(self.numbers).tolist()}
+        each = {
+            str(n): self.figures(self.numbers == n)
+            for n in np.unique(self.numbers).tolist()
+        }
         return {**self.figures(), "worlds": each}
 
 
@@ -122,7 +128,9 @@ def courses(folder: Path | None) -> dict[int, Course]:
         }
     given = {number: worlds(at) for number, at in read_cylinders(folder).items()}
     known = read_csv(folder / "reference_paths.csv")
-    paths = {n: known[n] if n in known else shortest_path(at) for n, (_, at) in given.items()}
+    paths = {
+        n: known[n] if n in known else shortest_path(at) for n, (_, at) in given.items()
+    }
     return {n: Course(world, length_of(paths[n])) for n, (world, _) in given.items()}
 
 
@@ -141,12 +149,20 @@ def read_cylinders(folder: Path) -> dict[int, Array]:
     for file in folder.glob("*.world"):
         number = int("".join(filter(str.isdigit, file.stem)) or -1)
         groups = read_sdf(file, HEIGHT).obstacles
-        if any(shape != Circle(radius=barn.RADIUS) for group in groups for shape in group.shapes):
+        if any(
+            shape != Circle(radius=barn.RADIUS)
+            for group in groups
+            for shape in group.shapes
+        ):
             wanted = f"cylinders with a radius of {barn.RADIUS:g} m, as the challenge has them"
-            raise ConfigError(f"{file}: holds something else than {wanted}; leave it out.")
+            raise ConfigError(
+                f"{file}: holds something else than {wanted}; leave it out."
+            )
         found[number] = np.array([pose[:2] for group in groups for pose in group.at])
     if not found:
-        raise ConfigError(f"{folder}: holds neither cylinders.csv nor world files; name another.")
+        raise ConfigError(
+            f"{folder}: holds neither cylinders.csv nor world files; name another."
+        )
     return dict(sorted(found.items()))
 
 
@@ -157,10 +173,14 @@ def read_csv(file: Path) -> dict[int, Array]:
         with file.open(newline="") as lines:
             for k, row in enumerate(csv.DictReader(lines), 2):
                 try:
-                    found[int(row["world"])].append((float(row["x_m"]), float(row["y_m"])))
+                    found[int(row["world"])].append(
+                        (float(row["x_m"]), float(row["y_m"]))
+                    )
                 except (KeyError, TypeError, ValueError):
                     wanted = "numbers in the columns world, x_m, y_m"
-                    raise ConfigError(f"{file}: line {k} lacks {wanted}; correct it.") from None
+                    raise ConfigError(
+                        f"{file}: line {k} lacks {wanted}; correct it."
+                    ) from None
     return {number: np.array(points) for number, points in found.items()}
 
 
@@ -177,7 +197,10 @@ def seeds_of(world: AnyWorld, runs: int) -> NDArray[np.int64]:
 
 
 def judged(
-    given: Mapping[int, Course], runs: int, flags: Sequence[Sequence[bool]], time_s: Sequence[float]
+    given: Mapping[int, Course],
+    runs: int,
+    flags: Sequence[Sequence[bool]],
+    time_s: Sequence[float],
 ) -> Runs:
     """Scores the runs in each of the courses, one course after another.
 
@@ -186,10 +209,14 @@ def judged(
     numbers = np.repeat(list(given), runs)
     best = np.repeat([course.best_s for course in given.values()], runs)
     score = np.asarray(flags[0]) * best / np.clip(time_s, 2.0 * best, 8.0 * best)
-    return Runs(numbers, *np.asarray(flags, np.bool_), np.asarray(time_s, np.float64), score)
+    return Runs(
+        numbers, *np.asarray(flags, np.bool_), np.asarray(time_s, np.float64), score
+    )
 
 
-def drive_fast(name: str, given: Mapping[int, Course], runs: int, control: str | None) -> Runs:
+def drive_fast(
+    name: str, given: Mapping[int, Course], runs: int, control: str | None
+) -> Runs:
     """Drives in the fast simulator, all worlds side by side."""
     model = open_model(ROBOT)
     policy, task = opened(name, control)
@@ -220,9 +247,13 @@ def drive_folds(
     """
     chosen, driven, longest_s = load_training(settings), [], 0.0
     if BARN not in chosen.worlds:
-        raise ConfigError(f"{settings}: --five-fold replaces the world {BARN!r}, which it lacks.")
+        raise ConfigError(
+            f"{settings}: --five-fold replaces the world {BARN!r}, which it lacks."
+        )
     if len(numbers := list(given)) < FOLDS:
-        raise ConfigError(f"--five-fold needs {FOLDS} worlds, not {len(numbers)}; name more.")
+        raise ConfigError(
+            f"--five-fold needs {FOLDS} worlds, not {len(numbers)}; name more."
+        )
     for fold in range(FOLDS):
         held = {number: given[number] for number in numbers[fold::FOLDS]}
         with tempfile.TemporaryDirectory() as folder:
@@ -232,7 +263,10 @@ def drive_folds(
                 for world, copies in chosen.worlds.items()
             }
             order = TrainOrder(
-                chosen.model_copy(update={"worlds": worlds}), (fold,), Path(folder, "run"), 1
+                chosen.model_copy(update={"worlds": worlds}),
+                (fold,),
+                Path(folder, "run"),
+                1,
             )
             longest_s = max(longest_s, *(one.trained.wall_s for one in run(order)))
             policy = str(order.out / f"seed_{fold}" / POLICY)
@@ -256,13 +290,19 @@ def drive_mujoco(name: str, given: Mapping[int, Course]) -> Runs:
     with tempfile.TemporaryDirectory() as folder:
         worlds = saved(given, Path(folder, "worlds"))
         seeds = seeds_of(load_worlds(worlds), 1).tolist()
-        conditions = Conditions(steps=round(TIME_OUT_S / model.control_period), task=OPTIONS)
+        conditions = Conditions(
+            steps=round(TIME_OUT_S / model.control_period), task=OPTIONS
+        )
         told = Path(folder), lambda _: None
-        episodes = drive_in(MUJOCO, name, ROBOT, worlds, seeds, *told, conditions=conditions)
+        episodes = drive_in(
+            MUJOCO, name, ROBOT, worlds, seeds, *told, conditions=conditions
+        )
     results = np.array([one.result for one in episodes])
     believed = [one.believed_success for one in episodes]
     flags = results == "success", believed, results == "collision"
-    return judged(given, 1, flags, [model.control_period * one.steps for one in episodes])
+    return judged(
+        given, 1, flags, [model.control_period * one.steps for one in episodes]
+    )
 
 
 def missed(
@@ -275,7 +315,9 @@ def missed(
         if not (value >= bar if least else value <= bar):
             said.append(f"{policy}: {name} {value:.3f}, bar {bar}")
     if training_s is not None and not training_s <= TRAINING_BAR_S:
-        said.append(f"{policy}: a training took {training_s:.0f} s, bar {TRAINING_BAR_S:.0f} s")
+        said.append(
+            f"{policy}: a training took {training_s:.0f} s, bar {TRAINING_BAR_S:.0f} s"
+        )
     return said
 
 
@@ -295,15 +337,22 @@ def main() -> None:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--worlds", type=Path, help="folder of other worlds")
     parser.add_argument("--in", dest="place", choices=tuple(BARS), default=FAST)
-    parser.add_argument("--policy", nargs="+", help="files or names; the shipped one, and planners")
     parser.add_argument(
-        "--five-fold", metavar="SETTINGS", nargs="?", const=f"shipped_{ROBOT}",
+        "--policy", nargs="+", help="files or names; the shipped one, and planners"
+    )
+    parser.add_argument(
+        "--five-fold",
+        metavar="SETTINGS",
+        nargs="?",
+        const=f"shipped_{ROBOT}",
         help="learn from four fifths of the worlds, judge in the others",
-    )  # fmt: skip
+    )
     parser.add_argument("--runs", type=int, default=1, help="in each world")
     given = parser.parse_args()
     if given.place != FAST and (given.control or given.five_fold):
-        parser.error("a control stands, and --five-fold learns, in fast alone; leave out --in")
+        parser.error(
+            "a control stands, and --five-fold learns, in fast alone; leave out --in"
+        )
     try:
         runs, training_s = driven(given)
     except BridgeError as error:
@@ -319,11 +368,15 @@ def driven(given: argparse.Namespace) -> tuple[dict[str, Runs], float | None]:
     """The runs of each policy, and how long one was learnt for it, if any was [s]."""
     found = courses(given.worlds)
     if given.five_fold:
-        runs, training_s = drive_folds(given.five_fold, found, given.runs, given.control)
+        runs, training_s = drive_folds(
+            given.five_fold, found, given.runs, given.control
+        )
         return {given.five_fold: runs}, training_s
     policies = given.policy or [ROBOT, *(name for name in POLICIES if name != "random")]
     if given.place == FAST:
-        return {n: drive_fast(n, found, given.runs, given.control) for n in policies}, None
+        return {
+            n: drive_fast(n, found, given.runs, given.control) for n in policies
+        }, None
     found = dict(list(found.items())[::EVERY])
     return {name: drive_mujoco(name, found) for name in policies}, None
 

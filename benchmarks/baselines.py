@@ -14,7 +14,12 @@ from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.policy.evaluation import FIRST_SEED, Summary, drive_worlds, summarise
+from nics_drl_bridge.policy.evaluation import (
+    FIRST_SEED,
+    Summary,
+    drive_worlds,
+    summarise,
+)
 from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
 from nics_drl_bridge.policy.train import line_of
 
@@ -26,7 +31,9 @@ FLOORS |= dict.fromkeys(ROBOTS, 0.8)
 LEAST_WAY_M = 1.0
 
 
-def measure(robot: str, name: str, world: str, episodes: int, control: str | None) -> Summary:
+def measure(
+    robot: str, name: str, world: str, episodes: int, control: str | None
+) -> Summary:
     """A policy by name, in a world."""
     model = open_model(robot)
     policy, task = open_policy(name, model)

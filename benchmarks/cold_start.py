@@ -40,7 +40,12 @@ os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp()
 
 def environment(folder: Path, control: str | None) -> dict[str, str]:
     """That of a newcomer: nothing of the environment that this runs in."""
-    left = {"LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH", "VIRTUAL_ENV"}
+    left = {
+        "LD_LIBRARY_PATH",
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+        "PYTHONPATH",
+        "VIRTUAL_ENV",
+    }
     if "ROS_DISTRO" in os.environ:
         left -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
     kept = {name: value for name, value in os.environ.items() if name not in left}
@@ -52,13 +57,20 @@ def environment(folder: Path, control: str | None) -> dict[str, str]:
     return kept
 
 
-def waited(command: list[str], folder: Path, environment: dict[str, str]) -> tuple[float, str]:
+def waited(
+    command: list[str], folder: Path, environment: dict[str, str]
+) -> tuple[float, str]:
     """Runs a command that must not fail; returns how long it took [s] and what it printed."""
     begin = time.monotonic()
     done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S,
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
         check=False,
-    )  # fmt: skip
+    )
     if done.returncode:
         end = done.stderr[-2000:]
         raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}:\n{end}")
@@ -74,7 +86,9 @@ def measure(folder: Path, control: str | None) -> dict[str, Any]:
     ready = next((clone / ".venv").glob(".demo-*")).stat().st_mtime
     warm_demo_s, _ = waited(["make", "demo"], clone, around)
     python = clone / ".venv" / "bin" / "python"
-    caches = {name: {"NUMBA_CACHE_DIR": str(folder / name)} for name in ("warmup", "reset")}
+    caches = {
+        name: {"NUMBA_CACHE_DIR": str(folder / name)} for name in ("warmup", "reset")
+    }
     warmup = [str(python.with_name("nics")), "warmup", "--json"]
     if control == "compiled":
         waited(warmup, clone, around | caches["warmup"])
@@ -99,9 +113,13 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     if not result["demo_s"] <= DEMO_S:
         missed.append(f"the demo took {result['demo_s']:.0f} s, bar {DEMO_S:g} at most")
     if not result["compile_s"] <= COMPILE_S:
-        missed.append(f"compiling took {result['compile_s']:.0f} s of CPU, bar {COMPILE_S:g}")
+        missed.append(
+            f"compiling took {result['compile_s']:.0f} s of CPU, bar {COMPILE_S:g}"
+        )
     if not result["kernels"] >= 100:
-        missed.append(f"{result['kernels']} kernels were compiled: nothing was measured")
+        missed.append(
+            f"{result['kernels']} kernels were compiled: nothing was measured"
+        )
     if not result["told"].startswith("demo: "):
         missed.append(f"the demo ended with {result['told']!r}")
     if not result["warm_demo_s"] < result["demo_s"]:

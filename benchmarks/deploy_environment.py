@@ -50,7 +50,12 @@ def export(folder: Path) -> tuple[Path, Path]:
 
 def environment() -> dict[str, str]:
     """That of a child: the ROS 2 wheels leave words in it that lead others to wrong libraries."""
-    left = {"LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH", "VIRTUAL_ENV"}
+    left = {
+        "LD_LIBRARY_PATH",
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+        "PYTHONPATH",
+        "VIRTUAL_ENV",
+    }
     if "ROS_DISTRO" in os.environ:
         left -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
     kept = {name: value for name, value in os.environ.items() if name not in left}
@@ -59,13 +64,23 @@ def environment() -> dict[str, str]:
 
 def installed(folder: Path) -> Path:
     """The Python of a new environment with the package and `deploy`."""
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, env=environment())
+    subprocess.run(
+        [sys.executable, "-m", "venv", str(folder)], check=True, env=environment()
+    )
     source = folder / "source"
     kept = shutil.ignore_patterns(".git", ".venv", "__pycache__", "build", "*.egg-info")
     shutil.copytree(ROOT, source, ignore=kept)
     python = folder / "bin" / "python"
     extras = "deploy" if "ROS_DISTRO" in os.environ else "deploy,ros"
-    command = [str(python), "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt")]
+    command = [
+        str(python),
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "-c",
+        str(ROOT / "constraints.txt"),
+    ]
     command.append(f"{source}[{extras}]")
     subprocess.run(command, check=True, env=environment(), timeout=INSTALL_S)
     return python
@@ -75,7 +90,11 @@ def present(python: Path) -> list[str]:
     """Which of the forbidden modules an environment has."""
     code = f"import importlib.util as u; print(*[n for n in {FORBIDDEN!r} if u.find_spec(n)])"
     done = subprocess.run(
-        [str(python), "-c", code], env=environment(), capture_output=True, text=True, check=True
+        [str(python), "-c", code],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return done.stdout.split()
 
@@ -99,8 +118,11 @@ def measure(control: str | None, here: bool) -> dict[str, Any]:
         done = subprocess.run(
             [str(python), str(STAND_IN), str(model), str(policy)],
             env=environment() | ({"PYTHONPATH": str(ROOT)} if here else {}),
-            cwd=folder, capture_output=True, text=True, timeout=DRIVE_S,
-        )  # fmt: skip
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=DRIVE_S,
+        )
     told = {"install_s": round(install_s, 1), "training_modules": found}
     if done.returncode != 0:
         said = [line for line in done.stderr.splitlines() if line.strip()]
@@ -122,7 +144,9 @@ def main() -> None:
     """Prints what was found; 0 when the node drove without anything of training."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument(
-        "--here", action="store_true", help="in this environment; it takes no time to install"
+        "--here",
+        action="store_true",
+        help="in this environment; it takes no time to install",
     )
     given = parser.parse_args()
     found = measure(given.control, given.here or given.control is not None)

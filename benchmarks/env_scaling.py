@@ -85,11 +85,15 @@ def members(count: int) -> list[World]:
         bodies = sample_scene(usual, MODEL.robot.footprint_radius, seed).bodies
         at = tuple((x, y, 0.0) for x, y in bodies[:, :2].tolist())
         stands = group.model_copy(update={"count": None, "at": at})
-        found.append(usual.model_copy(update={"name": f"field_{seed}", "obstacles": (stands,)}))
+        found.append(
+            usual.model_copy(update={"name": f"field_{seed}", "obstacles": (stands,)})
+        )
     return found
 
 
-def environment(worlds: int, robots: int, world: AnyWorld, beams: int) -> BridgeVectorEnv:
+def environment(
+    worlds: int, robots: int, world: AnyWorld, beams: int
+) -> BridgeVectorEnv:
     """Worlds of robots that have to reach goals."""
     model = MODEL
     if beams != model.lidar.beams:
@@ -98,7 +102,13 @@ def environment(worlds: int, robots: int, world: AnyWorld, beams: int) -> Bridge
         model = replace(model, lidar=lidar, table=bake(lidar, model.table.shapes))
     options = {"team": robots}
     return BridgeVectorEnv(
-        worlds, model, world, task=Crowd, task_options=options, copy=False, max_episode_steps=300
+        worlds,
+        model,
+        world,
+        task=Crowd,
+        task_options=options,
+        copy=False,
+        max_episode_steps=300,
     )
 
 
@@ -109,7 +119,9 @@ def sweep(name: str, value: int) -> BridgeVectorEnv:
         return environment(value, 1, world, BEAMS)
     if name == "robots":
         side = max(SIDE, side_of(value, AREA_PER_ROBOT))
-        return environment(max(1, ROBOT_STEPS // value), value, field(OBSTACLES, side), BEAMS)
+        return environment(
+            max(1, ROBOT_STEPS // value), value, field(OBSTACLES, side), BEAMS
+        )
     if name == "obstacles":
         return environment(
             WORLDS, 1, field(value, max(SIDE, side_of(value, AREA_PER_OBSTACLE))), BEAMS
@@ -149,7 +161,9 @@ def apart(count: int) -> list[BridgeVectorEnv]:
     return [environment(copies, 1, world, BEAMS) for world in members(count)]
 
 
-def measure(name: str, values: Sequence[int], repeats: int, control: str | None) -> list[float]:
+def measure(
+    name: str, values: Sequence[int], repeats: int, control: str | None
+) -> list[float]:
     """The cost of an env step at each point of a curve [us]."""
     costs = []
     for value in values:
@@ -211,7 +225,9 @@ def judge(result: dict[str, Any]) -> list[str]:
         if not result["end_to_end"][name] <= bar
     ]
     if not result["members_memory"] <= MEMORY_BAR:
-        taken = f"{result['members_memory']:.2f} times the memory of one, bar {MEMORY_BAR}"
+        taken = (
+            f"{result['members_memory']:.2f} times the memory of one, bar {MEMORY_BAR}"
+        )
         missed.append(f"members: {result['members'][-1]} take {taken}")
     return missed
 
@@ -223,7 +239,9 @@ def draw(result: dict[str, Any], file: Path) -> None:
         costs = result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
         axes.loglog(result[name], costs, "o-")
         axes.set_xlabel(name)
-        axes.set_ylabel("us per robot and step" if name == "robots" else "us per env step")
+        axes.set_ylabel(
+            "us per robot and step" if name == "robots" else "us per env step"
+        )
         axes.grid(visible=True, which="both")
     write_bytes(file, style.png(figure))
 
@@ -232,18 +250,28 @@ def table_of(result: dict[str, Any]) -> str:
     """One line per point."""
     text = f"{'':<11}{'':>8}{'us per env step':>17}{'per robot':>12}\n"
     for name in SWEEPS:
-        for k, (value, cost) in enumerate(zip(result[name], result[f"{name}_us"], strict=True)):
-            one = f"{result['robots_us_per_robot'][k]:>12.2f}" if name == "robots" else ""
+        for k, (value, cost) in enumerate(
+            zip(result[name], result[f"{name}_us"], strict=True)
+        ):
+            one = (
+                f"{result['robots_us_per_robot'][k]:>12.2f}" if name == "robots" else ""
+            )
             text += f"{name:<11}{value:>8}{cost:>17.2f}{one}\n"
-    return text + f"memory of the most members: {result['members_memory']:.2f} times one\n"
+    return (
+        text + f"memory of the most members: {result['members_memory']:.2f} times one\n"
+    )
 
 
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar is missed."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--repeats", type=int, default=20_000, help="env steps of each point")
+    parser.add_argument(
+        "--repeats", type=int, default=20_000, help="env steps of each point"
+    )
     parser.add_argument("--picture", type=Path, help="draw the curves into this file")
-    parser.add_argument("--ends-only", action="store_true", help="two points of each curve")
+    parser.add_argument(
+        "--ends-only", action="store_true", help="two points of each curve"
+    )
     given = parser.parse_args()
     result = run(given.repeats, given.ends_only, given.control)
     if given.picture:

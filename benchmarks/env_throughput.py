@@ -89,7 +89,9 @@ class Case:
             lidar = lidar.model_copy(update={"noise_std": 0.0, "faults": LidarFaults()})
         if lidar == peers.MODEL.lidar:
             return peers.MODEL
-        return replace(peers.MODEL, lidar=lidar, table=bake(lidar, peers.MODEL.table.shapes))
+        return replace(
+            peers.MODEL, lidar=lidar, table=bake(lidar, peers.MODEL.table.shapes)
+        )
 
     @property
     def world(self) -> World:
@@ -97,13 +99,17 @@ class Case:
         side = (peers.WORLD.size or (0.0,))[0] * (self.obstacles / peers.CIRCLES) ** 0.5
         (group,) = peers.WORLD.obstacles
         more = group.model_copy(update={"count": self.obstacles})
-        return peers.WORLD.model_copy(update={"size": (side, side), "obstacles": (more,)})
+        return peers.WORLD.model_copy(
+            update={"size": (side, side), "obstacles": (more,)}
+        )
 
 
 USUAL = Case()
 
 
-def actions_for(space: gymnasium.Space[Any], control: str | None) -> NDArray[np.float32]:
+def actions_for(
+    space: gymnasium.Space[Any], control: str | None
+) -> NDArray[np.float32]:
     """(ACTIONS, ...) random actions, or those of no motion."""
     size = (ACTIONS, *(space.shape or ()))
     if control == "standing":
@@ -121,7 +127,10 @@ class Worlds:
         self.env = BridgeVectorEnv(worlds, self.model, case.world, **further)
         self.seen, _ = self.env.reset(seed=0)
         self.actions = actions_for(self.env.action_space, case.control)
-        self.times, self.steps = TIMES_SLOWER if case.control == "slow" else 1, CHUNK * worlds
+        self.times, self.steps = (
+            TIMES_SLOWER if case.control == "slow" else 1,
+            CHUNK * worlds,
+        )
 
     def chunk(self) -> None:
         """Steps all worlds."""
@@ -134,10 +143,14 @@ class Worlds:
         beams, moved, changed, episodes = self.model.lidar.beams, 0.0, 0.0, 0
         for k in range(CHUNK):
             was_seen, was = self.seen, self.env.simulator.data.pose[:, 0, :2].copy()
-            self.seen, _, terminated, truncated, _ = self.env.step(self.actions[k % ACTIONS])
+            self.seen, _, terminated, truncated, _ = self.env.step(
+                self.actions[k % ACTIONS]
+            )
             episodes += int((terminated | truncated).sum())
             apart = self.env.simulator.data.pose[:, 0, :2] - was
-            moved += float(np.median(np.hypot(*apart.T)))  # not those whose episode began
+            moved += float(
+                np.median(np.hypot(*apart.T))
+            )  # not those whose episode began
             changed += np.count_nonzero(self.seen[:, :beams] != was_seen[:, :beams])
         return {
             "moved_m_per_period": moved / CHUNK,
@@ -156,7 +169,10 @@ class Alone:
         )
         self.seen, _ = self.env.reset(seed=0)
         self.actions = actions_for(self.env.action_space, case.control)
-        self.times, self.steps = TIMES_SLOWER if case.control == "slow" else 1, SINGLE_CHUNK
+        self.times, self.steps = (
+            TIMES_SLOWER if case.control == "slow" else 1,
+            SINGLE_CHUNK,
+        )
 
     def chunk(self) -> None:
         """Steps the env."""
@@ -170,8 +186,12 @@ class Alone:
         beams, moved, changed, episodes, was = self.model.lidar.beams, 0.0, 0, 0, None
         for k in range(SINGLE_CHUNK):
             was_seen = self.seen
-            self.seen, _, terminated, truncated, info = self.env.step(self.actions[k % ACTIONS])
-            moved += 0.0 if was is None else float(np.hypot(*(info["true_pose"] - was)[:2]))
+            self.seen, _, terminated, truncated, info = self.env.step(
+                self.actions[k % ACTIONS]
+            )
+            moved += (
+                0.0 if was is None else float(np.hypot(*(info["true_pose"] - was)[:2]))
+            )
             changed += np.count_nonzero(self.seen[:beams] != was_seen[:beams])
             was = info["true_pose"].copy()
             if terminated or truncated:
@@ -242,18 +262,30 @@ def run(
         "write": write_chunk(worlds, case.model.lidar.beams),
         "cartpole": cartpole_chunk(),
     }
-    calls: dict[str, Callable[[], object]] = {name: one.chunk for name, one in ours.items()}
-    found = peers.measure({**calls, **yardsticks}, rivals, peers.scenes(SCENES), repeats)
+    calls: dict[str, Callable[[], object]] = {
+        name: one.chunk for name, one in ours.items()
+    }
+    found = peers.measure(
+        {**calls, **yardsticks}, rivals, peers.scenes(SCENES), repeats
+    )
     rate = {name: one.steps / found.seconds[name] for name, one in ours.items()}
     rate["all"] = ours["all"].steps / found.wall["all"]
     write = WRITES * worlds / found.seconds["write"]
     cartpole = SINGLE_CHUNK / found.seconds["cartpole"]
-    whole = {name: 1.0 / one["period_with_ten_scans_s"] for name, one in found.peers.items()}
-    equal = {name: 1.0 / one["period_with_one_scan_s"] for name, one in found.peers.items()}
+    whole = {
+        name: 1.0 / one["period_with_ten_scans_s"] for name, one in found.peers.items()
+    }
+    equal = {
+        name: 1.0 / one["period_with_one_scan_s"] for name, one in found.peers.items()
+    }
     nobody = dict.fromkeys(peers.PEERS)
     result: dict[str, Any] = {
-        "times_as_fast_at_equal_work": {name: rate["one"] / one for name, one in equal.items()},
-        "times_as_fast_with_ten_scans": {name: rate["one"] / one for name, one in whole.items()},
+        "times_as_fast_at_equal_work": {
+            name: rate["one"] / one for name, one in equal.items()
+        },
+        "times_as_fast_with_ten_scans": {
+            name: rate["one"] / one for name, one in whole.items()
+        },
         "single_thread_env_steps_per_s": rate["one"],
         "all_threads_env_steps_per_s": rate["all"],
         "threads": threads,
@@ -277,7 +309,9 @@ def run(
     return result, found
 
 
-def judge(result: dict[str, Any], found: peers.Measured, case: Case = USUAL) -> list[str]:
+def judge(
+    result: dict[str, Any], found: peers.Measured, case: Case = USUAL
+) -> list[str]:
     """The bars that were missed."""
     bars = [
         ("share_of_write_limit", WRITE_BAR),
@@ -285,8 +319,11 @@ def judge(result: dict[str, Any], found: peers.Measured, case: Case = USUAL) -> 
         ("share_of_cartpole_with_estimator", ESTIMATOR_BAR),
     ]
     if not case.is_usual:
-        least = [each for name, each in SHARES_OF_USUAL.items()
-                 if getattr(case, name) != getattr(USUAL, name)]  # fmt: skip
+        least = [
+            each
+            for name, each in SHARES_OF_USUAL.items()
+            if getattr(case, name) != getattr(USUAL, name)
+        ]
         bars = [("share_of_usual", float(np.prod(least)))]
     missed = [
         f"{SHARES[key]}: {100.0 * result[key]:.3g} %, bar {100.0 * bar:g} %"
@@ -294,10 +331,14 @@ def judge(result: dict[str, Any], found: peers.Measured, case: Case = USUAL) -> 
         if not result[key] >= bar
     ]
     if not (times := result.get("times_as_long_as_clean", 1.0)) <= CLEAN_BAR:
-        missed.append(f"times as long as without the lidar's faults: {times:.3f}, bar {CLEAN_BAR}")
+        missed.append(
+            f"times as long as without the lidar's faults: {times:.3f}, bar {CLEAN_BAR}"
+        )
     for name, ratio in result["times_as_fast_at_equal_work"].items():
         if not ratio >= (bar := EQUAL_WORK_BARS[name]):
-            missed.append(f"times as fast as {name} at equal work: {ratio:.0f}, bar {bar:.0f}")
+            missed.append(
+                f"times as fast as {name} at equal work: {ratio:.0f}, bar {bar:.0f}"
+            )
     missed += peers.missed_by(found)
     for name, drove in result["drove"].items():
         missed += peers.missed_by_robots(f"our env {name!r}", drove)
@@ -307,7 +348,10 @@ def judge(result: dict[str, Any], found: peers.Measured, case: Case = USUAL) -> 
 def table_of(result: dict[str, Any]) -> str:
     """The figures for people."""
     row, text = "{:<56}{:>12}\n", ""
-    equal, ten = "times as fast as {} at equal work", "times as fast as {} with ten of its steps"
+    equal, ten = (
+        "times as fast as {} at equal work",
+        "times as fast as {} with ten of its steps",
+    )
     for title, key in ((equal, "equal_work"), (ten, "with_ten_scans")):
         key = f"times_as_fast_{'at_' if key == 'equal_work' else ''}{key}"
         for name, ratio in result[key].items():
@@ -326,10 +370,14 @@ def table_of(result: dict[str, Any]) -> str:
     for name, reason in result["missing"].items():
         text += f"{name}: {reason}\n"
     if "share_of_usual" in result:
-        text += row.format("share of the usual env's rate", f"{result['share_of_usual']:.3g}")
+        text += row.format(
+            "share of the usual env's rate", f"{result['share_of_usual']:.3g}"
+        )
     if "times_as_long_as_clean" in result:
         clean = result["times_as_long_as_clean"]
-        text += row.format("times as long as without the lidar's faults", f"{clean:.3g}")
+        text += row.format(
+            "times as long as without the lidar's faults", f"{clean:.3g}"
+        )
     return text + f"memory: {result['memory_bytes_per_env'] / 1e3:.1f} kB per world\n"
 
 
@@ -338,14 +386,20 @@ def main() -> None:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--worlds", type=int, default=2048, help="of the vector env")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--repeats", type=int, default=10, help="timed chunks; thrice if alone")
+    parser.add_argument(
+        "--repeats", type=int, default=10, help="timed chunks; thrice if alone"
+    )
     parser.add_argument("--lidar", help="name or file of another lidar; without peers")
-    parser.add_argument("--obstacles", type=int, default=peers.CIRCLES, help="more; without peers")
+    parser.add_argument(
+        "--obstacles", type=int, default=peers.CIRCLES, help="more; without peers"
+    )
     parser.add_argument("--without-peers", action="store_true", help="install nothing")
     given = parser.parse_args()
     case = Case(given.lidar, given.obstacles, given.control)
     rivals = () if given.without_peers or not case.is_usual else tuple(peers.PEERS)
-    repeats = given.repeats if rivals else 3 * given.repeats  # a share is told to a few percent
+    repeats = (
+        given.repeats if rivals else 3 * given.repeats
+    )  # a share is told to a few percent
     result, found = run(given.worlds, given.threads, repeats, rivals, case)
     answer(result, judge(result, found, case), table_of(result), given.json)
 

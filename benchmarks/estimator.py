@@ -69,7 +69,12 @@ NOISE = Noise(
     heading_drift=Level(std=0.03, unit="rad/sqrt(s)", source="measured"),
 )
 WIDE = World.model_validate(
-    {"name": "wide", "size": [200.0, 200.0], "clearance": 0.1, "goal_distance": [1.0, 3.0]}
+    {
+        "name": "wide",
+        "size": [200.0, 200.0],
+        "clearance": 0.1,
+        "goal_distance": [1.0, 3.0],
+    }
 )
 
 
@@ -136,7 +141,9 @@ def noisy(robot: str) -> SimulatorModel:
     model = builtin_model(robot)
     states = {
         v.name: Level(
-            std=STATE_DRIFT * (v.max - v.min), unit=f"{v.unit}/sqrt(s)", source="measured"
+            std=STATE_DRIFT * (v.max - v.min),
+            unit=f"{v.unit}/sqrt(s)",
+            source="measured",
         )
         for v in model.robot.state
     }
@@ -144,7 +151,11 @@ def noisy(robot: str) -> SimulatorModel:
 
 
 def drive(
-    model: SimulatorModel, simulator: FastSimulator, middleware: Middleware, seed: int, moving: bool
+    model: SimulatorModel,
+    simulator: FastSimulator,
+    middleware: Middleware,
+    seed: int,
+    moving: bool,
 ) -> Drive:
     """Drives at random; measurements are under way for the latency, and some get lost."""
     rng = np.random.default_rng(seed)
@@ -155,7 +166,9 @@ def drive(
     raw, estimated = [], []
     for k in range(DRIVE_S * 10):
         if k % 5 == 0:
-            command = rng.uniform(model.robot.command_low, model.robot.command_high) * moving
+            command = (
+                rng.uniform(model.robot.command_low, model.robot.command_high) * moving
+            )
         middleware.command(k * PERIOD, command)
         simulator.step(command[None, None])
         now, data = (k + 1) * PERIOD, simulator.data
@@ -163,7 +176,10 @@ def drive(
         raw.append(np.sum((data.odom[0, 0] - truth[-1])[:2] ** 2))
         odometry = data.odom[0, 0].copy(), data.twist[0, 0].copy()
         captured = truth[-1] + rng.normal(size=3) * POSE_STD
-        for topic, content in (("odom", odometry), ("pose", (captured, np.diag(POSE_STD**2)))):
+        for topic, content in (
+            ("odom", odometry),
+            ("pose", (captured, np.diag(POSE_STD**2))),
+        ):
             if rng.random() >= LOST:
                 underway.append((now, topic, content))
         while underway and underway[0][0] + LATENCY <= now:
@@ -204,13 +220,21 @@ def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]
         elif kind == 1:
             estimator.command(now, rng.uniform(low, high))
         elif kind == 2:
-            estimator.update(Kind.TWIST, rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 2.0))
+            estimator.update(
+                Kind.TWIST, rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 2.0)
+            )
         elif kind == 3:
-            estimator.update(Kind.YAW_RATE, float(rng.normal()), 10.0 ** rng.uniform(-6.0, 1.0))
+            estimator.update(
+                Kind.YAW_RATE, float(rng.normal()), 10.0 ** rng.uniform(-6.0, 1.0)
+            )
         else:
-            estimator.update(Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-6.0, 3.0, 3))
+            estimator.update(
+                Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-6.0, 3.0, 3)
+            )
         mean, covariance = estimator.belief.mean, estimator.belief.covariance
-        sound = sound and bool(np.isfinite(mean).all() and (covariance == covariance.T).all())
+        sound = sound and bool(
+            np.isfinite(mean).all() and (covariance == covariance.T).all()
+        )
         try:
             np.linalg.cholesky(covariance)
         except np.linalg.LinAlgError:
@@ -245,7 +269,9 @@ def run(drives: int, steps: int, seed: int, control: str | None) -> dict[str, An
     for robot in ROBOTS:
         model = noisy(robot)
         simulator, seeds = FastSimulator(model, WIDE), range(seed, seed + drives)
-        found[robot] = [drive(model, simulator, make(model), one, moving) for one in seeds]
+        found[robot] = [
+            drive(model, simulator, make(model), one, moving) for one in seeds
+        ]
         jumped[robot] = clock_jumps.campaign(model, simulator, make, seeds, moving)
     shares = [random_steps(noisy(r), -(-steps // len(ROBOTS)), seed) for r in ROBOTS]
     return {
@@ -271,12 +297,20 @@ def missed(result: dict[str, Any], steps: int) -> list[str]:
     for robot, each in result["robots"].items():
         said += _missed_share(robot, each, SHARE_OF_EACH)
         if not each["way_m"] >= LEAST_WAY_M:
-            said.append(f"{robot} drove {each['way_m']:.2f} m a drive, less than {LEAST_WAY_M} m")
+            said.append(
+                f"{robot} drove {each['way_m']:.2f} m a drive, less than {LEAST_WAY_M} m"
+            )
     low, high = result["nees_95_band"]
     if not low <= result["nees_mean"] <= high:
-        said.append(f"NEES is {result['nees_mean']:.2f}, not within {low:.2f} to {high:.2f}")
-    if not (result["finite_and_positive_definite"] and result["random_steps"] >= steps > 0):
-        said.append(f"the covariance was unsound after {result['random_steps']} random steps")
+        said.append(
+            f"NEES is {result['nees_mean']:.2f}, not within {low:.2f} to {high:.2f}"
+        )
+    if not (
+        result["finite_and_positive_definite"] and result["random_steps"] >= steps > 0
+    ):
+        said.append(
+            f"the covariance was unsound after {result['random_steps']} random steps"
+        )
     return said + _missed_jumps(result["clock_jump"])
 
 
@@ -284,7 +318,9 @@ def _missed_share(who: str, figures: dict[str, Any], most: float) -> list[str]:
     share = figures["ekf_rmse_m"] / figures["raw_rmse_m"]
     if share <= most:
         return []
-    return [f"{who}: the estimate is off by {share:.2f} of what odometry is, more than {most}"]
+    return [
+        f"{who}: the estimate is off by {share:.2f} of what odometry is, more than {most}"
+    ]
 
 
 def _missed_jumps(jumps: dict[str, Any]) -> list[str]:
@@ -317,9 +353,12 @@ def table_of(result: dict[str, Any]) -> str:
     for name, each in {**result["robots"], "all": result}.items():
         low, high = each["nees_95_band"]
         text += row.format(
-            name, f"{each['raw_rmse_m']:.3f}", f"{each['ekf_rmse_m']:.3f}",
-            f"{each['nees_mean']:.2f}", f"{low:.2f} to {high:.2f}",
-        )  # fmt: skip
+            name,
+            f"{each['raw_rmse_m']:.3f}",
+            f"{each['ekf_rmse_m']:.3f}",
+            f"{each['nees_mean']:.2f}",
+            f"{low:.2f} to {high:.2f}",
+        )
     jumps = result["clock_jump"]
     text += (
         f"after a clock jump, by odometry alone, {jumps['driven_unseen_m']:.2f} m unseen: off by "

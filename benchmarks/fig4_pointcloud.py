@@ -32,21 +32,41 @@ CONTROLS = {
     "shifted": "the baked scans are taken 0.1 m beside",
     "nan": "one range of the baked scans is none",
 }
-BARS_M = {"cloud": {"baked": 0.01, "mujoco": 1e-4}, "range": {"baked": 0.05, "mujoco": 1e-4}}
+BARS_M = {
+    "cloud": {"baked": 0.01, "mujoco": 1e-4},
+    "range": {"baked": 0.05, "mujoco": 1e-4},
+}
 SLAM_PART = 0.5
 """SLAM leaves no more than this part of the odometry's error."""
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
-SLAM = ("yag-slam==0.3.0", "opencv-python-headless==5.0.0.93", "numpy==2.4.6", "numba==0.68.1")
+SLAM = (
+    "yag-slam==0.3.0",
+    "opencv-python-headless==5.0.0.93",
+    "numpy==2.4.6",
+    "numba==0.68.1",
+)
 ROOM = np.array([(-4.0, -3.0), (4.0, -3.0), (4.0, 3.0), (-4.0, 3.0)])
 WALLS = np.concatenate([ROOM, np.roll(ROOM, -1, axis=0)], axis=1)
 CORNER = Polygon(
-    points=((-0.5, -0.4), (0.5, -0.4), (0.5, -0.1), (-0.2, -0.1), (-0.2, 0.5), (-0.5, 0.5))
+    points=(
+        (-0.5, -0.4),
+        (0.5, -0.4),
+        (0.5, -0.1),
+        (-0.2, -0.1),
+        (-0.2, 0.5),
+        (-0.5, 0.5),
+    )
 )
 OBSTACLES: tuple[Shape, ...] = (
-    Circle(radius=0.35), CORNER, Rectangle(size=(0.6, 0.6)), Rectangle(size=(1.4, 0.14)),
-)  # fmt: skip
-POSES = np.array([(-1.1, 0.3, 0.0), (1.0, -0.2, 0.3), (3.1, 2.2, 0.5), (-3.0, -2.1, -0.7)])
+    Circle(radius=0.35),
+    CORNER,
+    Rectangle(size=(0.6, 0.6)),
+    Rectangle(size=(1.4, 0.14)),
+)
+POSES = np.array(
+    [(-1.1, 0.3, 0.0), (1.0, -0.2, 0.3), (3.1, 2.2, 0.5), (-3.0, -2.1, -0.7)]
+)
 LAPS, DRIFT = 1.15, np.array([1.02, 1.0, 1.04])
 ODOMETRY_NOISE = np.array([0.004, 0.002, 0.004])
 
@@ -82,13 +102,17 @@ def cloud_rmse(points: Array, reference: Array) -> float:
     return float(np.sqrt((cKDTree(reference).query(points)[0] ** 2).mean()))
 
 
-def slam(spec: LidarSpec, ranges: NDArray[np.float32], odometry: Array) -> dict[str, Array]:
+def slam(
+    spec: LidarSpec, ranges: NDArray[np.float32], odometry: Array
+) -> dict[str, Array]:
     """Poses and map of yag-slam. Raises NotInstalledError where it can't be had."""
     python = python_with("yag_slam", SLAM)
     with tempfile.TemporaryDirectory() as folder:
         asked, answered = Path(folder) / "scans.npz", Path(folder) / "map.npz"
         limits = np.array([spec.range_min, spec.range_max])
-        np.savez(asked, ranges=ranges, odometry=odometry, angles=spec.angles, limits=limits)
+        np.savez(
+            asked, ranges=ranges, odometry=odometry, angles=spec.angles, limits=limits
+        )
         run(python, HERE / "measuring" / "yag_slam_map.py", str(asked), str(answered))
         with np.load(answered) as found:
             return dict(found)
@@ -108,9 +132,14 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         for name, bar in bars.items()
         if name in result["cloud_rmse_m"] and not result[f"{kind}_rmse_m"][name] <= bar
     ]
-    missed += [f"{name}: no point" for name, count in result["points"].items() if not count > 0]
+    missed += [
+        f"{name}: no point" for name, count in result["points"].items() if not count > 0
+    ]
     if result["slam"] is not None:
-        after, before = result["slam"]["path_error_m"], result["slam"]["odometry_error_m"]
+        after, before = (
+            result["slam"]["path_error_m"],
+            result["slam"]["odometry_error_m"],
+        )
         if not after <= SLAM_PART * before:
             missed.append(
                 f"yag-slam: the path is off by {after:.3f} m, bar {SLAM_PART:g} of the "
@@ -145,10 +174,14 @@ def panel(axes: Axes, title: str, truth: Array) -> None:
 
 def draw_cloud(axes: Axes, points: Array) -> None:
     """A point cloud."""
-    axes.plot(*points.T, ".", ms=1.2, mew=0.0, color=MEASURED, alpha=0.6, rasterized=True)
+    axes.plot(
+        *points.T, ".", ms=1.2, mew=0.0, color=MEASURED, alpha=0.6, rasterized=True
+    )
 
 
-def draw_map(axes: Axes, found: dict[str, Array], points: Array, odometry: Array) -> None:
+def draw_map(
+    axes: Axes, found: dict[str, Array], points: Array, odometry: Array
+) -> None:
     """The map as yag-slam drew it, the cloud from its path, and the path of the odometry."""
     image = found["image"]
     cell = float(found["resolution"])
@@ -190,7 +223,9 @@ def picture(
     return figure
 
 
-def measure(scans: int, with_slam: bool, out: Path, control: str | None) -> dict[str, Any]:
+def measure(
+    scans: int, with_slam: bool, out: Path, control: str | None
+) -> dict[str, Any]:
     """Scans the path, compares the clouds, makes the map and the picture."""
     spec, truth = load_lidar("paper_12m"), path(scans)
     baked = make_scanner(spec, OBSTACLES, "baked")
@@ -198,7 +233,10 @@ def measure(scans: int, with_slam: bool, out: Path, control: str | None) -> dict
     bodies = np.broadcast_to(exact.place(OBSTACLES, POSES), (scans, len(OBSTACLES), 7))
     beside = truth.copy()
     beside[:, 0] += 0.1 if control == "shifted" else 0.0
-    ranges = {"exact": exact.scan(truth, bodies, WALLS), "baked": baked.scan(beside, bodies, WALLS)}
+    ranges = {
+        "exact": exact.scan(truth, bodies, WALLS),
+        "baked": baked.scan(beside, bodies, WALLS),
+    }
     if control == "nan":
         ranges["baked"][0, 0] = np.nan
     missing = {}
@@ -211,8 +249,12 @@ def measure(scans: int, with_slam: bool, out: Path, control: str | None) -> dict
     result: dict[str, Any] = {
         "scans": scans,
         "points": {name: len(points) for name, points in clouds.items()},
-        "cloud_rmse_m": {name: cloud_rmse(clouds[name], clouds["exact"]) for name in others},
-        "range_rmse_m": {name: beam_rmse(ranges[name], ranges["exact"]) for name in others},
+        "cloud_rmse_m": {
+            name: cloud_rmse(clouds[name], clouds["exact"]) for name in others
+        },
+        "range_rmse_m": {
+            name: beam_rmse(ranges[name], ranges["exact"]) for name in others
+        },
         "slam": None,
     }
     odometry, mapped = drifting(truth, 0), None
@@ -249,7 +291,9 @@ def titles_of(result: dict[str, Any]) -> dict[str, str]:
             titles[name] = f"{letter}) {word}: {less}{apart:.2f} mm RMSE from a)"
     titles["slam"] = "d) map by yag-slam: not available"
     if result["slam"] is not None:
-        before, after = (1e3 * result["slam"][key] for key in ("odometry_error_m", "path_error_m"))
+        before, after = (
+            1e3 * result["slam"][key] for key in ("odometry_error_m", "path_error_m")
+        )
         titles["slam"] = (
             f"d) yag-slam from b): path off by {after:.0f} mm, odometry {before:.0f} mm"
         )
@@ -263,8 +307,13 @@ def report(result: dict[str, Any]) -> str:
         beams = result["range_rmse_m"][name]
         text += f"{name:<8}cloud {apart:.2e} m RMSE from scan mode, beam by beam {beams:.2e} m\n"
     if result["slam"] is not None:
-        before, after = result["slam"]["odometry_error_m"], result["slam"]["path_error_m"]
-        text += f"yag-slam: path off by {after:.3f} m RMSE, odometry by {before:.3f} m\n"
+        before, after = (
+            result["slam"]["odometry_error_m"],
+            result["slam"]["path_error_m"],
+        )
+        text += (
+            f"yag-slam: path off by {after:.3f} m RMSE, odometry by {before:.3f} m\n"
+        )
     text += "".join(f"{name}: {reason}\n" for name, reason in result["missing"].items())
     return text + f"picture: {result['picture']}\n"
 
@@ -273,7 +322,9 @@ def main() -> None:
     """Draws the picture; prints a few lines, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--scans", type=int, default=200, help="scans along the path")
-    parser.add_argument("--without-slam", action="store_true", help="install nothing, draw no map")
+    parser.add_argument(
+        "--without-slam", action="store_true", help="install nothing, draw no map"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/fig4_pointcloud.png"))
     given = parser.parse_args()
     result = measure(given.scans, not given.without_slam, given.out, given.control)

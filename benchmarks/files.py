@@ -43,7 +43,9 @@ def table_of(result: dict[str, Any], bags: Score) -> str:
 def missed_of(result: dict[str, Any]) -> list[str]:
     """A sentence for each bar that is missed."""
     missed = [f"{bar} {result[bar]}, the bar is 0" for bar in BARS if result[bar] != 0]
-    missed += [f"{key} {result[key]}, the bar is 1" for key in MEASURED if not result[key] > 0]
+    missed += [
+        f"{key} {result[key]}, the bar is 1" for key in MEASURED if not result[key] > 0
+    ]
     during, kills = result["kills_during_a_write"], result["kills"]
     if not during >= LEAST_DURING * kills > 0:
         missed.append(
@@ -55,8 +57,12 @@ def missed_of(result: dict[str, Any]) -> list[str]:
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a damage was not found."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--kills", type=int, default=300, help="of the writer of each artefact")
-    parser.add_argument("--flips", type=int, default=300, help="of a bit of each artefact")
+    parser.add_argument(
+        "--kills", type=int, default=300, help="of the writer of each artefact"
+    )
+    parser.add_argument(
+        "--flips", type=int, default=300, help="of a bit of each artefact"
+    )
     parser.add_argument("--cuts", type=int, default=200, help="bags to cut off")
     parser.add_argument("--changes", type=int, default=500, help="bags to change")
     parser.add_argument("--seed", type=int, default=0)

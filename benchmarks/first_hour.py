@@ -64,8 +64,9 @@ def moved(picture: Path) -> int:
     return max(box[2] - box[0], box[3] - box[1]) if box else 0
 
 
-def travelled(name: str, clone: Path, folder: Path, around: dict[str, str], control: str | None
-              ) -> tuple[float, list[str]]:  # fmt: skip
+def travelled(
+    name: str, clone: Path, folder: Path, around: dict[str, str], control: str | None
+) -> tuple[float, list[str]]:
     """Goes one of the roads; returns how long it took [s], and what each command printed."""
     folder.mkdir()
     (folder / "examples").symlink_to(clone / "examples")
@@ -92,7 +93,12 @@ def measure(folder: Path, roads: Sequence[str], control: str | None) -> dict[str
         if name in SUCCESS:
             (world,) = json.loads(told[-1])["seeds"][0]["worlds"].values()
             success[name] = world["success"]["value"]
-    result = {"seconds": seconds, "setup_s": setup_s, "success": success, "cores": os.cpu_count()}
+    result = {
+        "seconds": seconds,
+        "setup_s": setup_s,
+        "success": success,
+        "cores": os.cpu_count(),
+    }
     if "picture" in roads:
         seconds["picture"] += setup_s
         result["moved_pixels"] = moved(folder / "picture" / "moving.gif")
@@ -116,7 +122,11 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     ]
     if not (differ := result.get("moved_pixels", MOVED)) >= MOVED:
         missed.append(f"picture: {differ} pixels differ, so that nothing moves")
-    return missed if result.get("report_bytes", 1) else [*missed, "recording: there is no report"]
+    return (
+        missed
+        if result.get("report_bytes", 1)
+        else [*missed, "recording: there is no report"]
+    )
 
 
 def table_of(result: dict[str, Any]) -> str:
@@ -124,7 +134,9 @@ def table_of(result: dict[str, Any]) -> str:
     text = f"{'make setup':<14}{result['setup_s']:>8.0f} s\n"
     for name, seconds in result["seconds"].items():
         share = result["success"].get(name)
-        text += f"{name:<14}{seconds:>8.0f} s" + ("\n" if share is None else f"{share:>8.1%}\n")
+        text += f"{name:<14}{seconds:>8.0f} s" + (
+            "\n" if share is None else f"{share:>8.1%}\n"
+        )
     return text
 
 

@@ -31,7 +31,9 @@ CONTROLS = {
     "standing": "the commands are zero",
 }
 ROBOTS = ("ackermann", "differential", "mecanum")
-LIDAR = LidarSpec(beams=8, angle_min=-3.0, angle_max=3.0, range_min=0.05, range_max=3.0, rate=10.0)
+LIDAR = LidarSpec(
+    beams=8, angle_min=-3.0, angle_max=3.0, range_min=0.05, range_max=3.0, rate=10.0
+)
 SHORTEST_S, LONGEST_S = 1e-3, 0.22
 TOLERANCE = 1e-6
 """Of a finite difference: rounding of the published values, divided by the interval."""
@@ -59,7 +61,8 @@ class Judge:
         rows = parse_yaml(read_text(path), str(path))["commands"]
         each = [rows[variable.name] for variable in spec.command]
         self.low, self.high, self._rate, self._jerk = (
-            np.array([row[key] for row in each]) for key in ("min", "max", "rate", "jerk")
+            np.array([row[key] for row in each])
+            for key in ("min", "max", "rate", "jerk")
         )
         self._slopes = limits is None  # of others, rounding may be all there is
         if limits is not None:
@@ -67,7 +70,9 @@ class Judge:
         self._spec = spec
         self._value, self._slope = np.zeros(len(each)), np.zeros(len(each))
         self._time, self.sane = -np.inf, True
-        self.violations = dict.fromkeys(("value", "rate", "jerk", "stop", "odd", "unused"), 0)
+        self.violations = dict.fromkeys(
+            ("value", "rate", "jerk", "stop", "odd", "unused"), 0
+        )
 
     def see(self, decision: Decision, now: float) -> None:
         """Judges one decision of the gate."""
@@ -112,7 +117,9 @@ def drive(
     drawn = random_limits(spec, config.limits, rng) if random else None
     limits, judge = drawn or config.limits, Judge(spec, drawn)
     if control == "no_limits":
-        wide = {key: 100.0 * getattr(limits, key) for key in ("low", "high", "rate", "jerk")}
+        wide = {
+            key: 100.0 * getattr(limits, key) for key in ("low", "high", "rate", "jerk")
+        }
         limits = replace(limits, **wide)
     gate = Gate(replace(config, limits=limits), LIDAR)
     ranges, pose, twist = np.ones(LIDAR.beams, np.float32), np.zeros(3), np.zeros(3)
@@ -174,7 +181,9 @@ def _within_random_limits(
     moving = 0
     for begin in range(0, steps, WITH_ONE):
         with np.errstate(over="ignore", invalid="ignore"):
-            some, moved = drive(spec, min(WITH_ONE, steps - begin), rng, control, random=True)
+            some, moved = drive(
+                spec, min(WITH_ONE, steps - begin), rng, control, random=True
+            )
         total = {name: total.get(name, 0) + count for name, count in some.items()}
         moving += moved
     return total, moving
@@ -187,7 +196,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     total: dict[str, int] = {}
-    table, moving, shipped_steps, moved_random, control = "", 0, 0, 0, given.control or ""
+    table, moving, shipped_steps, moved_random, control = (
+        "",
+        0,
+        0,
+        0,
+        given.control or "",
+    )
     for index, robot in enumerate(ROBOTS):
         rng, spec = np.random.default_rng([given.seed, index]), load_robot(robot)
         steps = given.steps // len(ROBOTS) + (index < given.steps % len(ROBOTS))
@@ -195,8 +210,10 @@ def main() -> None:
         within, moved = drive(spec, steps - others, rng, control, random=False)
         beyond, more = _within_random_limits(spec, others, rng, control)
         moving, shipped_steps, moved_random = (
-            moving + moved, shipped_steps + steps - others, moved_random + more,
-        )  # fmt: skip
+            moving + moved,
+            shipped_steps + steps - others,
+            moved_random + more,
+        )
         both = {name: count + beyond.get(name, 0) for name, count in within.items()}
         total = {name: total.get(name, 0) + count for name, count in both.items()}
         counts = ", ".join(f"{name} {count}" for name, count in both.items())
@@ -216,7 +233,10 @@ def main() -> None:
 def missed_by(result: dict[str, object]) -> list[str]:
     """A sentence for each bar that was missed."""
     missed, by = [], result["by"]
-    steps, moving = result["steps_within_shipped_limits"], result["in_motion_within_shipped_limits"]
+    steps, moving = (
+        result["steps_within_shipped_limits"],
+        result["in_motion_within_shipped_limits"],
+    )
     if result["violations"] != 0:
         missed.append(f"{result['violations']} violations, bar 0: {by}")
     if not steps or not moving / steps >= LEAST_MOTION:  # type: ignore[operator]

@@ -66,7 +66,9 @@ class Result:
         """For the JSON object; NaN where nothing was measured."""
         return {
             "n": len(self.times),
-            "p50_s": round(float(np.median(self.after)), 4) if self.after else float("nan"),
+            "p50_s": round(float(np.median(self.after)), 4)
+            if self.after
+            else float("nan"),
             "max_s": round(max(self.times), 4) if self.times else float("nan"),
             "limit_s": limit_s,
             "unsafe_commands": self.unsafe,
@@ -77,11 +79,17 @@ def missed_by(name: str, one: dict[str, Any], wanted: int) -> list[str]:
     """A sentence for each bar that a fault's summary misses."""
     missed = []
     if one["n"] < wanted:
-        missed.append(f"{name}: {one['n']} of {wanted} were measured: the robot did not move")
+        missed.append(
+            f"{name}: {one['n']} of {wanted} were measured: the robot did not move"
+        )
     if not one["max_s"] <= one["limit_s"]:
-        missed.append(f"{name}: zero after {one['max_s']} s at worst, limit {one['limit_s']} s")
+        missed.append(
+            f"{name}: zero after {one['max_s']} s at worst, limit {one['limit_s']} s"
+        )
     if one["limit_s"] == LATE_S and not one["p50_s"] <= MEDIAN_S:
-        missed.append(f"{name}: zero after {one['p50_s']} s in the median, bar {MEDIAN_S} s")
+        missed.append(
+            f"{name}: zero after {one['p50_s']} s in the median, bar {MEDIAN_S} s"
+        )
     if one["unsafe_commands"] != 0:
         missed.append(f"{name}: {one['unsafe_commands']} unsafe commands, bar 0")
     return missed
@@ -107,7 +115,11 @@ def inject(around: Around, name: str, result: Result, patience_s: float) -> None
     result.after.append(stopped - broken)
     low, high = np.array([0.0, 0.0, -0.5]), np.array([1.0, 0.0, 0.5])
     wild = sum(not ((twist >= low) & (twist <= high)).all() for _, twist in robot.heard)
-    late = len(moving) if fault.first_word else sum(w - good > fault.limit_s for w in moving)
+    late = (
+        len(moving)
+        if fault.first_word
+        else sum(w - good > fault.limit_s for w in moving)
+    )
     result.unsafe += int(wild) + int(late)
 
 
@@ -123,7 +135,11 @@ class Bench:
     def __init__(self, name: str, control: str, stack: ExitStack) -> None:
         self.domain_id = free_domain_id()
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        given: dict[str, Any] = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
+        given: dict[str, Any] = {
+            "model": ROBOT,
+            "limits": ROBOT,
+            "e_stop_required": True,
+        }
         given["black_box"] = str(self.folder / "black_box")
         given["enable_stamped_cmd_vel"] = False
         given["stop_when_held"] = False  # the robot's scans do not show how it moves
@@ -159,7 +175,9 @@ def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
     """One injection; or, if the policy outlives it, all of them with one policy."""
     if not FAULTS[name].policy:
         try:
-            inject(Around(bench.robot, None, bench.gate), name, result, bench.patience_s)
+            inject(
+                Around(bench.robot, None, bench.gate), name, result, bench.patience_s
+            )
         except NoMotionError as error:
             sys.stderr.write(f"{name}: {error}\n")
         return
@@ -171,8 +189,12 @@ def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
                 inject(around, name, result, bench.patience_s)
             except NoMotionError as error:
                 # Nothing was injected yet; who was killed may leave DDS ill.
-                told = policy.log.read_text(encoding="utf-8", errors="replace")[-LOG_CHARACTERS:]
-                sys.stderr.write(f"{name}: {error}; another policy is started. {told}\n")
+                told = policy.log.read_text(encoding="utf-8", errors="replace")[
+                    -LOG_CHARACTERS:
+                ]
+                sys.stderr.write(
+                    f"{name}: {error}; another policy is started. {told}\n"
+                )
                 return
             try:
                 os.kill(policy.pid, signal.SIGCONT)
@@ -189,7 +211,9 @@ def _spin_for_ever() -> None:
 def load(stack: ExitStack, count: int) -> None:
     """Keeps so many cores busy until the stack ends."""
     for _ in range(count):
-        process = multiprocessing.get_context("spawn").Process(target=_spin_for_ever, daemon=True)
+        process = multiprocessing.get_context("spawn").Process(
+            target=_spin_for_ever, daemon=True
+        )
         process.start()
         stack.callback(process.kill)
 
@@ -199,7 +223,9 @@ def _ends(given: Any, control: str, told: Callable[[str], None]) -> Ended:
     with ExitStack() as stack:
         bench = Bench(END, control, stack)
         try:
-            return end_after_stops(bench.robot, bench.gate, bench.folder, given.seconds, told)
+            return end_after_stops(
+                bench.robot, bench.gate, bench.folder, given.seconds, told
+            )
         except NoMotionError as error:
             told(f"{END}: {error}")
             return Ended()
@@ -211,8 +237,12 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=30)
     known = sorted([*FAULTS, END])
     parser.add_argument("--fault", action="append", choices=known, help="only this one")
-    parser.add_argument("--load", type=int, default=0, help="keep so many cores busy besides")
-    parser.add_argument("--seconds", type=float, default=15.0, help=f"of commands for {END}")
+    parser.add_argument(
+        "--load", type=int, default=0, help="keep so many cores busy besides"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=15.0, help=f"of commands for {END}"
+    )
     given = parser.parse_args()
     control, names = given.control or "", given.fault or [*FAULTS, END]
 
@@ -225,7 +255,11 @@ def main() -> None:
         results = measure(faults, given.repeats, told, control)
         ended = _ends(given, control, told) if END in names else None
     summary = {name: one.summary(FAULTS[name].limit_s) for name, one in results.items()}
-    missed = [line for name in faults for line in missed_by(name, summary[name], given.repeats)]
+    missed = [
+        line
+        for name in faults
+        for line in missed_by(name, summary[name], given.repeats)
+    ]
     table = "".join(
         f"{name:<26}{one['n']:>3} times, zero after {one['p50_s']:.3f} s, "
         f"{one['max_s']:.3f} s at worst, limit {one['limit_s']:.2f} s, "

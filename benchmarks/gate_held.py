@@ -32,12 +32,22 @@ CASES = (
     Case("turtlebot3_burger", "crowd", rate=5.0, path_scale=0.9, turn_scale=1.3),
     Case("differential", "crowd", "hokuyo_ust_10lx", "random", 40.0, turn_scale=1.3),
     Case("differential", "corridor", "rplidar_a1", rate=5.5, path_scale=0.9),
-    Case("differential", "arena", "sick_tim571", "random", beams=180, turn_scale=1.3, dropout=0.05),
+    Case(
+        "differential",
+        "arena",
+        "sick_tim571",
+        "random",
+        beams=180,
+        turn_scale=1.3,
+        dropout=0.05,
+    ),
     Case("differential", "arena", driver="differential", turn_scale=1.3),
     Case("mecanum", "clutter", "sick_tim571", rate=15.0, path_scale=1.1, dropout=0.1),
     Case("mecanum", "crowd", "rplidar_a2", "random", path_scale=0.95, turn_scale=0.9),
     Case("ackermann", "corridor", "hokuyo_ust_10lx", rate=20.0, beams=180),
-    Case("ackermann", "doorway", "sick_tim571", "random", path_scale=1.05, noise_told=0.0),
+    Case(
+        "ackermann", "doorway", "sick_tim571", "random", path_scale=1.05, noise_told=0.0
+    ),
 )
 WORLDS = 8
 WITHIN_S = 1.0
@@ -50,10 +60,18 @@ LEAST_JUDGED = 0.5
 def zero_thresholds() -> None:
     """Lets any scan contradict odometry, in this process."""
     settings = scan_motion.Settings(
-        least_path=0.0, least_turn=0.0, least_half=0.0, least_change=0.0, deviations=0.0,
-        least_sectors=1, agreeing=0.0, sector_share=np.inf, held_share=np.inf, confirmed_s=0.0,
+        least_path=0.0,
+        least_turn=0.0,
+        least_half=0.0,
+        least_change=0.0,
+        deviations=0.0,
+        least_sectors=1,
+        agreeing=0.0,
+        sector_share=np.inf,
+        held_share=np.inf,
+        confirmed_s=0.0,
         greatest_changed=np.inf,
-    )  # fmt: skip
+    )
     scan_motion.watch_scan = partial(scan_motion.watch_scan, settings=settings)
 
 
@@ -77,28 +95,40 @@ def missed(result: dict[str, object], hours: float, holds: int) -> list[str]:
     """A sentence for each bar that was missed."""
     found = []
     if result["trips"]:
-        found.append(f"{result['trips']} robots that drove freely were stopped by {RULE}, bar 0")
+        found.append(
+            f"{result['trips']} robots that drove freely were stopped by {RULE}, bar 0"
+        )
     if result["hours"] < 0.99 * hours:
         found.append(f"invalid: {result['hours']} h were driven, not {hours}")
     if result["judged_share"] < LEAST_JUDGED:
-        found.append(f"invalid: scans told something in {result['judged_share']} of the time")
+        found.append(
+            f"invalid: scans told something in {result['judged_share']} of the time"
+        )
     if result["held"] < holds:
         found.append(f"invalid: {result['held']} bodies were held, not {holds}")
     share = result["stopped_in_time"] / max(result["held"], 1)
     if not share >= LEAST_STOPPED:
-        found.append(f"{share:.3f} of the held bodies were stopped in time, bar {LEAST_STOPPED}")
+        found.append(
+            f"{share:.3f} of the held bodies were stopped in time, bar {LEAST_STOPPED}"
+        )
     return found
 
 
 def main() -> None:
     """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--hours", type=float, default=10.0, help="of free driving, all together")
-    parser.add_argument("--holds", type=int, default=390, help="bodies that are held, all together")
+    parser.add_argument(
+        "--hours", type=float, default=10.0, help="of free driving, all together"
+    )
+    parser.add_argument(
+        "--holds", type=int, default=390, help="bodies that are held, all together"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--case", type=int, action="append", choices=range(len(CASES)))
     given = parser.parse_args()
-    warnings.simplefilter("ignore")  # robots may be driven faster than their recordings were
+    warnings.simplefilter(
+        "ignore"
+    )  # robots may be driven faster than their recordings were
 
     def change(config: GateConfig) -> GateConfig:
         return replace(config, stop_when_held=given.control != "rule_off")
@@ -114,7 +144,9 @@ def main() -> None:
         free.add(drive_freely(case, WORLDS, seconds, seed, change))
         held.add(hold_bodies(case, WORLDS, holds, seed + 500, change))
         late = f"{len(held.missed)} of {len(held.delays_s)} held bodies stopped late"
-        sys.stderr.write(f"{case.robot} in {case.world}: {len(free.trips)} trips so far, {late}\n")
+        sys.stderr.write(
+            f"{case.robot} in {case.world}: {len(free.trips)} trips so far, {late}\n"
+        )
     result = summary(free, held)
     table = (
         f"{result['hours']} h of free driving: {result['trips']} stops by {RULE}; scans told "

@@ -109,8 +109,9 @@ def _often(call: Callable[..., Any]) -> Callable[..., Any]:
 def started(words: list[str], domain_id: int) -> Iterator[subprocess.Popen[bytes]]:
     """This script as another process."""
     environment = os.environ | {
-        "ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }  # fmt: skip
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
     with subprocess.Popen(
         [sys.executable, __file__, *words], env=environment, stderr=subprocess.DEVNULL
     ) as process:
@@ -123,11 +124,16 @@ def started(words: list[str], domain_id: int) -> Iterator[subprocess.Popen[bytes
 def gate(domain_id: int, folder: Path, control: str) -> Any:
     """The gate as a process, or a control's."""
     parameters = {
-        "model": ROBOT, "limits": ROBOT, "e_stop_required": "true", "odom_rate": float(ODOM_HZ),
-        "black_box": str(folder), "rate_tolerance": 0.6, "shield": "false",
+        "model": ROBOT,
+        "limits": ROBOT,
+        "e_stop_required": "true",
+        "odom_rate": float(ODOM_HZ),
+        "black_box": str(folder),
+        "rate_tolerance": 0.6,
+        "shield": "false",
         "enable_stamped_cmd_vel": "false",
         "stop_when_held": "false",  # the robot's scans do not show how it moves
-    }  # fmt: skip
+    }
     given = [f"{name}:={value}" for name, value in parameters.items()]
     return started(
         [
@@ -151,7 +157,9 @@ def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
         robot = SteadyRobot(domain_id)
         try:
             if not robot.until(lambda: robot.listeners() >= 2, PATIENCE_S):
-                raise RuntimeError(f"not within {PATIENCE_S} s: the gate and the bare node")
+                raise RuntimeError(
+                    f"not within {PATIENCE_S} s: the gate and the bare node"
+                )
             robot.drive()
             robot.until(lambda: False, 1.0)
             shares = share_of_a_core(robot, (real.pid, bare.pid), seconds)
@@ -160,7 +168,9 @@ def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
             robot.close()
 
 
-def share_of_a_core(robot: SteadyRobot, pids: tuple[int, int], seconds: float) -> dict[str, Any]:
+def share_of_a_core(
+    robot: SteadyRobot, pids: tuple[int, int], seconds: float
+) -> dict[str, Any]:
     """What the gate and the bare node use while commands pass."""
     robot.heard.clear()
     began, sent = time.monotonic(), robot.sent
@@ -189,7 +199,10 @@ def ended_after_a_burst(
     robot.heard.clear()
     robot.mad = True
     robot.until(lambda: False, seconds)
-    times, moving = [when for when, _ in robot.heard], [moves for _, moves in robot.heard]
+    times, moving = (
+        [when for when, _ in robot.heard],
+        [moves for _, moves in robot.heard],
+    )
     real.send_signal(signal.SIGINT)
     began = time.monotonic()
     robot.until(lambda: real.poll() is not None, PATIENCE_S)
@@ -213,15 +226,21 @@ def missed_bars(result: dict[str, Any]) -> list[str]:
         )
     for key in ("longest_gap_s", "longest_gap_in_burst_s"):
         if not result[key] <= LONGEST_GAP_S:
-            missed.append(f"{key}: no command for {result[key]} s, bar {LONGEST_GAP_S} s")
+            missed.append(
+                f"{key}: no command for {result[key]} s, bar {LONGEST_GAP_S} s"
+            )
     if not result["sent"] >= LEAST_SENT:
         missed.append(f"invalid: only {result['sent']} of the messages were sent")
     if not result["moving"] >= LEAST_MOVING:
-        missed.append(f"invalid: only {result['moving']} of the commands came and moved")
+        missed.append(
+            f"invalid: only {result['moving']} of the commands came and moved"
+        )
     if not result["stops"] >= LEAST_STOPS:
         missed.append(f"invalid: only {result['stops']} stops in the burst")
     if not result["exit_s"] <= LONGEST_EXIT_S:
-        missed.append(f"the gate ended {result['exit_s']} s after SIGINT, bar {LONGEST_EXIT_S} s")
+        missed.append(
+            f"the gate ended {result['exit_s']} s after SIGINT, bar {LONGEST_EXIT_S} s"
+        )
     if not result["replayed"]:
         missed.append("the first stop of the burst is not in the black box")
     return missed
@@ -231,7 +250,9 @@ def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--seconds", type=float, default=30.0, help="of driving")
-    parser.add_argument("--burst", type=float, default=15.0, help="of stops, before the end [s]")
+    parser.add_argument(
+        "--burst", type=float, default=15.0, help="of stops, before the end [s]"
+    )
     parser.add_argument("--part", help=argparse.SUPPRESS)
     given, rest = parser.parse_known_args()
     if given.part == "bare":

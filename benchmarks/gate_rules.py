@@ -67,7 +67,9 @@ def tests_fail_without(name: str | None, control: str, tests: str) -> bool:
     words += ["--control", control] if control else []
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600)
     if done.returncode not in (0, 1):
-        raise SystemExit(f"pytest ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+        raise SystemExit(
+            f"pytest ended with {done.returncode}:\n{done.stdout}{done.stderr}"
+        )
     return done.returncode == 1
 
 

@@ -44,10 +44,14 @@ BATCH, HOLDS = 1024, 20
 ROUNDS = 3
 
 
-def errors(found: Identified, drives: list[Recording], spec: RobotSpec) -> dict[str, float]:
+def errors(
+    found: Identified, drives: list[Recording], spec: RobotSpec
+) -> dict[str, float]:
     """Mean errors of the predictions on unseen drives, each as long as the others."""
     results = [
-        open_loop_error(found.model, found.calibration, Drive(d, spec), 0.0, d.pose.t[-1])
+        open_loop_error(
+            found.model, found.calibration, Drive(d, spec), 0.0, d.pose.t[-1]
+        )
         for d in drives
     ]
     shares = [f.mean_position_error_m / f.mean_path_m for f in results]
@@ -57,7 +61,9 @@ def errors(found: Identified, drives: list[Recording], spec: RobotSpec) -> dict[
         "position_error_over_path": position / path,
         "worst_drive_error_over_path": max(shares),
         "mean_position_error_m": position,
-        "mean_heading_error_rad": float(np.mean([f.mean_heading_error_rad for f in results])),
+        "mean_heading_error_rad": float(
+            np.mean([f.mean_heading_error_rad for f in results])
+        ),
         "mean_path_m": path,
         "unseen_drives": len(drives),
         "windows": sum(f.windows for f in results),
@@ -78,8 +84,9 @@ def missed_of(robots: dict[str, dict[str, float]]) -> list[str]:
     missed = []
     for name, robot in robots.items():
         for key, bar in (
-            ("position_error_over_path", ERROR), ("worst_drive_error_over_path", WORST),
-        ):  # fmt: skip
+            ("position_error_over_path", ERROR),
+            ("worst_drive_error_over_path", WORST),
+        ):
             if not robot[key] <= bar:
                 missed.append(f"{name}: {key} {robot[key]:.3g}, bar {bar:g}")
         if not robot["speed_up_batched"] >= FASTER:
@@ -87,7 +94,9 @@ def missed_of(robots: dict[str, dict[str, float]]) -> list[str]:
                 f"{name}: {robot['speed_up_batched']:.3g} times MuJoCo's speed, bar {FASTER:g}"
             )
         if not robot["mean_path_m"] > 0.1:
-            missed.append(f"{name}: the unseen paths are {robot['mean_path_m']:.3g} m long")
+            missed.append(
+                f"{name}: the unseen paths are {robot['mean_path_m']:.3g} m long"
+            )
     return missed
 
 
@@ -97,8 +106,13 @@ def batched_speed(model: TaylorModel, spec: RobotSpec) -> float:
     low, high = spec.command_low[:, None], spec.command_high[:, None]
     commands = rng.uniform(low, high, (HOLDS, len(low), BATCH))
     terms, per_hold = term_arrays(model), round(0.1 / model.dt)
-    terms = terms._replace(coefficient=np.repeat(terms.coefficient[:, None], BATCH, axis=1))
-    x, dq = np.ones((len(model.variables) + 1, BATCH)), np.zeros((len(model.dofs), BATCH))
+    terms = terms._replace(
+        coefficient=np.repeat(terms.coefficient[:, None], BATCH, axis=1)
+    )
+    x, dq = (
+        np.ones((len(model.variables) + 1, BATCH)),
+        np.zeros((len(model.dofs), BATCH)),
+    )
 
     def drive() -> None:
         pose = np.zeros((6, BATCH))
@@ -114,9 +128,14 @@ def batched_speed(model: TaylorModel, spec: RobotSpec) -> float:
 def single_speed(model: TaylorModel, spec: RobotSpec, steps: int = 50_000) -> float:
     """Simulated seconds per second of one robot, many steps in one call."""
     rng = np.random.default_rng(7)
-    held = rng.uniform(spec.command_low, spec.command_high, (1, steps // 10, len(spec.command)))
+    held = rng.uniform(
+        spec.command_low, spec.command_high, (1, steps // 10, len(spec.command))
+    )
     commands, terms = np.repeat(held, 10, axis=1), term_arrays(model)
-    poses, states = np.zeros((1, steps + 1, 3)), np.zeros((1, steps + 1, model.state_size))
+    poses, states = (
+        np.zeros((1, steps + 1, 3)),
+        np.zeros((1, steps + 1, model.state_size)),
+    )
 
     def drive() -> None:
         rollout(poses, states, commands, terms, SERIES, model.dt)
@@ -198,7 +217,9 @@ def table(robots: dict[str, dict[str, float]]) -> str:
     """One line per figure, one column per robot."""
     rows = ["".join([f"{'':<34}", *(f"{name:>14}" for name in robots)])]
     for key in next(iter(robots.values())):
-        rows.append("".join([f"{key:<34}", *(f"{r[key]:>14.4g}" for r in robots.values())]))
+        rows.append(
+            "".join([f"{key:<34}", *(f"{r[key]:>14.4g}" for r in robots.values())])
+        )
     return "\n".join(rows)
 
 

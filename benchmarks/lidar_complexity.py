@@ -43,7 +43,12 @@ class Scans:
 def polygon(vertices: int, seed: int, notch: float) -> Polygon:
     """A random polygon: convex with `notch` 0, a star whose corners lie up to that deep inside."""
     rng = np.random.default_rng([seed, vertices])
-    angles = 2.0 * np.pi / vertices * (np.arange(vertices) + rng.uniform(-0.3, 0.3, vertices))
+    angles = (
+        2.0
+        * np.pi
+        / vertices
+        * (np.arange(vertices) + rng.uniform(-0.3, 0.3, vertices))
+    )
     depth = 1.0 - notch * rng.random(vertices)
     points = depth[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     hull = convex_hull(points)
@@ -52,7 +57,11 @@ def polygon(vertices: int, seed: int, notch: float) -> Polygon:
 
 
 def scans_of(
-    shapes: tuple[Shape, ...], density: Density, scans: int, obstacles: int, control: str | None
+    shapes: tuple[Shape, ...],
+    density: Density,
+    scans: int,
+    obstacles: int,
+    control: str | None,
 ) -> dict[str, Scans]:
     """A batch of scans, exact and baked."""
     table = bake(SPEC, shapes, density)
@@ -94,7 +103,9 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     """The bars that were missed."""
     missed, ratio = [], result["baked_end_to_end"]
     if not ratio <= BAR:
-        missed.append(f"baked costs {ratio:.2f} times as much with other vertices, bar {BAR:g}")
+        missed.append(
+            f"baked costs {ratio:.2f} times as much with other vertices, bar {BAR:g}"
+        )
     exact, baked = result["exact_us"][-1], result["baked_us"][-1]
     if not exact >= FASTER * baked:
         missed.append(
@@ -109,7 +120,10 @@ def run(
 ) -> dict[str, Any]:
     """All figures, see the head of this file."""
     vertices = [count for count in VERTICES if count <= most]
-    many = {str(count): (polygon(count, 0, 0.0), polygon(count, 1, 0.5)) for count in vertices}
+    many = {
+        str(count): (polygon(count, 0, 0.0), polygon(count, 1, 0.5))
+        for count in vertices
+    }
     few: dict[str, tuple[Shape, ...]] = {
         "circle": (CIRCLE,),
         "segment": (Segment(ends=((-0.2, 0.0), (0.2, 0.0))),),
@@ -131,9 +145,12 @@ def table_of(result: dict[str, Any]) -> str:
     """The figures for people."""
     row = "{:<12}{:>13}{:>13}{:>17}\n"
     text = row.format("vertices", "exact [us]", "baked [us]", "exact / baked")
-    named = [(str(count), {"exact": e, "baked": b}) for count, e, b in zip(
-        result["vertices"], result["exact_us"], result["baked_us"], strict=True
-    )]  # fmt: skip
+    named = [
+        (str(count), {"exact": e, "baked": b})
+        for count, e, b in zip(
+            result["vertices"], result["exact_us"], result["baked_us"], strict=True
+        )
+    ]
     alone = [(f"1 {name}", cost) for name, cost in result["alone"].items()]
     for name, cost in [*named, *result["few"].items(), *alone]:
         exact, baked = cost["exact"], cost["baked"]
@@ -154,11 +171,17 @@ def table_of(result: dict[str, Any]) -> str:
 def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--most", type=int, default=VERTICES[-1], help="vertices to end with")
+    parser.add_argument(
+        "--most", type=int, default=VERTICES[-1], help="vertices to end with"
+    )
     parser.add_argument("--scans", type=int, default=BATCH, help="scans of a batch")
     parser.add_argument("--repeats", type=int, default=60, help="timed batches")
-    parser.add_argument("--distances", type=int, default=100, help="grid distances of the table")
-    parser.add_argument("--rotations", type=int, default=240, help="grid rotations of the table")
+    parser.add_argument(
+        "--distances", type=int, default=100, help="grid distances of the table"
+    )
+    parser.add_argument(
+        "--rotations", type=int, default=240, help="grid rotations of the table"
+    )
     given = parser.parse_args()
     density = Density(distances=given.distances, rotations=given.rotations)
     result = run(given.most, given.scans, given.repeats, density, given.control)

@@ -12,7 +12,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from measuring.peers import MODEL, PEERS, WORLD, Measured, block_of, measure, missed_by, scenes
+from measuring.peers import (
+    MODEL,
+    PEERS,
+    WORLD,
+    Measured,
+    block_of,
+    measure,
+    missed_by,
+    scenes,
+)
 from measuring.scenes import BATCH, CIRCLE, errors
 from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
@@ -85,7 +94,9 @@ def run(
     """All rates; `None` for a peer that can't be installed or was not asked for."""
     table = bake(SPEC, (CIRCLE,))
     batch = Scans(table, scenes(scans), TIMES_SLOWER if control == "slow" else 1)
-    calls: dict[str, Callable[[], object]] = {name: batch.call(name) for name in RENDERERS}
+    calls: dict[str, Callable[[], object]] = {
+        name: batch.call(name) for name in RENDERERS
+    }
     drawn = scenes(count)
     alone = "scan_by_the_lidar" if control == "other_way" else "scan"
     found = measure({**calls, "write": batch.write}, peers, drawn, repeats, alone)
@@ -95,7 +106,9 @@ def run(
     exact = few.ranges("exact", SPEC.angle_increment if control == "shifted" else 0.0)
     ranges = {"baked": few.ranges("baked"), **found.ranges}
     result = {
-        "times_as_fast_at_equal_work": {name: rate["baked"] / one for name, one in theirs.items()},
+        "times_as_fast_at_equal_work": {
+            name: rate["baked"] / one for name, one in theirs.items()
+        },
         "baked": rate["baked"],
         "exact": rate["exact"],
         **dict.fromkeys(PEERS),
@@ -131,7 +144,11 @@ def table_of(result: dict[str, Any]) -> str:
     """The rates for people."""
     row = "{:<9}{:>12}{:>18}{:>24}{:>28}\n"
     text = row.format(
-        "", "scans/s", "baked is faster", "RMSE against exact [m]", "within a step / alone"
+        "",
+        "scans/s",
+        "baked is faster",
+        "RMSE against exact [m]",
+        "within a step / alone",
     )
     for name in ("baked", "exact", *PEERS):
         if result[name] is None:
@@ -151,8 +168,12 @@ def table_of(result: dict[str, Any]) -> str:
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar is missed."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--scans", type=int, default=BATCH, help="scans of one of our batches")
-    parser.add_argument("--scenes", type=int, default=50, help="scenes that the peers go through")
+    parser.add_argument(
+        "--scans", type=int, default=BATCH, help="scans of one of our batches"
+    )
+    parser.add_argument(
+        "--scenes", type=int, default=50, help="scenes that the peers go through"
+    )
     parser.add_argument("--repeats", type=int, default=10, help="timed rounds of each")
     parser.add_argument("--without-peers", action="store_true", help="install nothing")
     given = parser.parse_args()

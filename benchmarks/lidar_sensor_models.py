@@ -69,7 +69,10 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     missed = [
         f"{name}: {result['times_as_long_median'][name]:.2f} times as long, bar {NOISY:g}"
         for name in MODELS
-        if not min(result[key][name] for key in ("times_as_long", "times_as_long_median")) <= NOISY
+        if not min(
+            result[key][name] for key in ("times_as_long", "times_as_long_median")
+        )
+        <= NOISY
     ]
     plain = result["returns"]["no model"]
     missed += [
@@ -80,7 +83,9 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed
 
 
-def run(scans: int, repeats: int, density: Density, control: str | None) -> dict[str, Any]:
+def run(
+    scans: int, repeats: int, density: Density, control: str | None
+) -> dict[str, Any]:
     """All figures, see the head of this file."""
     calls, sizes, returns = calls_of(density, scans, control)
     times = interleaved(calls, repeats, warm=True)
@@ -89,7 +94,9 @@ def run(scans: int, repeats: int, density: Density, control: str | None) -> dict
     return {
         "scans_per_s": {name: scans / each for name, each in least.items()},
         "times_as_long": {name: each / least[plain] for name, each in least.items()},
-        "times_as_long_median": {name: each / middle[plain] for name, each in middle.items()},
+        "times_as_long_median": {
+            name: each / middle[plain] for name, each in middle.items()
+        },
         "table_bytes": sizes,
         "returns": returns,
         "bar_met": max(least[name] for name in MODELS) <= BAR * least[plain],
@@ -104,9 +111,11 @@ def table_of(result: dict[str, Any]) -> str:
         ratios = (result["times_as_long"][name], result["times_as_long_median"][name])
         size = result["table_bytes"].get(name)
         text += row.format(
-            name, f"{rate:.2e}", *(f"{ratio:.3f}" for ratio in ratios),
+            name,
+            f"{rate:.2e}",
+            *(f"{ratio:.3f}" for ratio in ratios),
             "" if size is None else f"{size / 1e6:.1f} MB",
-        )  # fmt: skip
+        )
     met = "met" if result["bar_met"] else "missed"
     return text + f"ranges with any model, bar {BAR} times as long: {met}\n"
 
@@ -116,8 +125,12 @@ def main() -> None:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--scans", type=int, default=BATCH, help="scans of a batch")
     parser.add_argument("--repeats", type=int, default=200, help="timed batches")
-    parser.add_argument("--distances", type=int, default=100, help="grid distances of the table")
-    parser.add_argument("--rotations", type=int, default=240, help="grid rotations of the table")
+    parser.add_argument(
+        "--distances", type=int, default=100, help="grid distances of the table"
+    )
+    parser.add_argument(
+        "--rotations", type=int, default=240, help="grid rotations of the table"
+    )
     given = parser.parse_args()
     density = Density(distances=given.distances, rotations=given.rotations)
     result = run(given.scans, given.repeats, density, given.control)

@@ -81,7 +81,9 @@ def poses(grid: GridMap, seed: int) -> NDArray[np.float64]:
     """(SCANS, 4) x, y, cosine, sine of lidars in free places."""
     rng = np.random.default_rng(seed)
     places = np.argwhere(grid.distance_field > CLEARANCE)
-    chosen = places[rng.integers(0, len(places), SCANS)] + rng.uniform(-0.5, 0.5, (SCANS, 2))
+    chosen = places[rng.integers(0, len(places), SCANS)] + rng.uniform(
+        -0.5, 0.5, (SCANS, 2)
+    )
     heading = rng.uniform(-np.pi, np.pi, SCANS)
     at = grid.cell_to_world(chosen)
     return np.column_stack([at, np.cos(heading), np.sin(heading)])
@@ -93,7 +95,9 @@ def run(out, beams, at, range_max, arrays, walk, lanes):
     for n in range(at.shape[0]):
         out[n] = np.inf
         x, y, c, s = at[n]
-        map_kernels.map_into(out[n], beams, LidarPose(x, y, c, s), range_max, arrays, walk, lanes)
+        map_kernels.map_into(
+            out[n], beams, LidarPose(x, y, c, s), range_max, arrays, walk, lanes
+        )
 
 
 def timed(*arguments: Any) -> tuple[NDArray[np.float32], float]:
@@ -120,7 +124,9 @@ def measure(seed: int, control: str | None) -> dict[str, Any]:
         for lidar in LIDARS:
             spec = load_lidar(lidar)
             directions = np.ascontiguousarray(spec.directions.T)
-            beams = beams_of(directions, spec.angle_min, spec.angle_increment, spec.full_circle)
+            beams = beams_of(
+                directions, spec.angle_min, spec.angle_increment, spec.full_circle
+            )
             at = poses(grid, seed + 1)
             arguments = (beams, at, spec.range_max, grid.arrays)
             exact, exact_speed = timed(*arguments, True, scan_lanes())
@@ -155,12 +161,16 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     for row in result["rows"]:
         name = f"{row['map']}, {row['range_max_m']:g} m"
         if not row["ratio"] >= FASTER:
-            missed.append(f"{name}: {row['ratio']:.2f} times the walk's speed, bar {FASTER:g}")
+            missed.append(
+                f"{name}: {row['ratio']:.2f} times the walk's speed, bar {FASTER:g}"
+            )
         if not row["rmse_m"] <= RMSE_M:
             missed.append(f"{name}: RMSE {row['rmse_m']:.2e} m, bar {RMSE_M:g}")
         off = row["beams_off_by_1_mm"] / row["beams_compared"]
         if not off <= MOST_OFF:
-            missed.append(f"{name}: {off:.2e} of the beams are off by 1 mm, bar {MOST_OFF:g}")
+            missed.append(
+                f"{name}: {off:.2e} of the beams are off by 1 mm, bar {MOST_OFF:g}"
+            )
     return missed
 
 

@@ -41,11 +41,18 @@ ROOM = 0.05  # by which planned paths keep away from walls beyond the footprint 
 SAME_M = 0.05  # by which two ranges of one beam may differ [m]
 NEAR = 0.35  # from the goal at the end, by the truth [m]
 STARTED_S, BARE_S = 300.0, 60.0  # longest time until all is served [s]
-ARCHIVE = Path(__file__).resolve().parents[2] / "shared" / "upstream" / "nav2_interfaces.tar.gz"
+ARCHIVE = (
+    Path(__file__).resolve().parents[2]
+    / "shared"
+    / "upstream"
+    / "nav2_interfaces.tar.gz"
+)
 UPSTREAM = "navigation2/nav2_bringup/params/nav2_params.yaml"
 
 
-def map_agreement(name: str, seeds: range = range(3), bare: bool = False) -> tuple[float, float]:
+def map_agreement(
+    name: str, seeds: range = range(3), bare: bool = False
+) -> tuple[float, float]:
     """Share of beams that agree, in a world's episodes, and of those whose own range does."""
     worlds, lidar, shares = load_worlds(name), load_lidar(LIDAR), []
     sampler = SetSampler(worlds, load_robot(ROBOT).footprint_radius)
@@ -58,11 +65,16 @@ def map_agreement(name: str, seeds: range = range(3), bare: bool = False) -> tup
         exact = make_scanner(lidar, shapes, "exact", world.grid)
         free = np.argwhere(grid.distance_field > 0.2)
         free = free[np.random.default_rng(seed).integers(len(free), size=POSES)]
-        poses = np.column_stack([grid.cell_to_world(free), np.linspace(-3.0, 3.0, POSES)])
+        poses = np.column_stack(
+            [grid.cell_to_world(free), np.linspace(-3.0, 3.0, POSES)]
+        )
         bodies = np.tile(exact.place(shapes, np.reshape(at, (-1, 3))), (POSES, 1, 1))
         true = exact.scan(poses, bodies, world.all_walls())
         seen = make_scanner(lidar, [], "exact", grid).scan(poses, [])
-        around, slack = np.stack([np.roll(true, k, 1) for k in (-1, 0, 1)]), 1.5 * grid.resolution
+        around, slack = (
+            np.stack([np.roll(true, k, 1) for k in (-1, 0, 1)]),
+            1.5 * grid.resolution,
+        )
         low, high = around.min(axis=0) - slack, around.max(axis=0) + slack
         same = (np.abs(seen - true) <= SAME_M) | (seen == true)  # both may see nothing
         shares.append((np.mean((seen >= low) & (seen <= high)), np.mean(same)))
@@ -70,7 +82,9 @@ def map_agreement(name: str, seeds: range = range(3), bare: bool = False) -> tup
     return agreed, of_one
 
 
-def followed(domain_id: int, folder: Path, episodes: int, bare: bool = False) -> dict[str, Any]:
+def followed(
+    domain_id: int, folder: Path, episodes: int, bare: bool = False
+) -> dict[str, Any]:
     """Share of planned paths that are followed over DDS, and why the others were not."""
     from measuring.nav2_stand_in import StandIn
     from nav2_msgs.action import FollowPath
@@ -93,26 +107,44 @@ def followed(domain_id: int, folder: Path, episodes: int, bare: bool = False) ->
         tree = StandIn(domain_id, FollowPath, "Nobody" if bare else "FollowPath")
         opened.callback(tree.close)
         tree.until(tree.client.server_is_ready, "the action follow_path", kick=True)
-        tree.until(lambda: tree.poses.get_subscription_count() >= 2, "both ends of initialpose")
+        tree.until(
+            lambda: tree.poses.get_subscription_count() >= 2, "both ends of initialpose"
+        )
         for seed in range(episodes):
             request = SetParametersAtomically.Request()
-            request.parameters = [Parameter("episode_seed", value=seed).to_parameter_msg()]
-            tree.call(SetParametersAtomically, "simulator_node/set_parameters_atomically", request)
+            request.parameters = [
+                Parameter("episode_seed", value=seed).to_parameter_msg()
+            ]
+            tree.call(
+                SetParametersAtomically,
+                "simulator_node/set_parameters_atomically",
+                request,
+            )
             tree.truths.clear()
             tree.call(Trigger, "simulator_node/reset")
             scene = sampler.draw([seed])[0]
-            shown = occupancy(worlds, standing(sampler, 0, scene.bodies)).cells.tobytes()
-            tree.until(lambda shown=shown: tree.shows(shown), "map and truth", kick=True)
+            shown = occupancy(
+                worlds, standing(sampler, 0, scene.bodies)
+            ).cells.tobytes()
+            tree.until(
+                lambda shown=shown: tree.shows(shown), "map and truth", kick=True
+            )
             tree.place(scene.starts[0])
             result = tree.drive(scene.goals[0], radius + ROOM)
             far = math.dist(tree.pose[:2], scene.goals[0])
             if result.status != 4 or far > NEAR or tree.touched():  # 4: succeeded
-                told = getattr(result.result, "error_msg", "") or f"status {result.status}"
-                why.append(f"seed {seed}: {told}, {far:.2f} m off, touched {tree.touched()}")
+                told = (
+                    getattr(result.result, "error_msg", "") or f"status {result.status}"
+                )
+                why.append(
+                    f"seed {seed}: {told}, {far:.2f} m off, touched {tree.touched()}"
+                )
     return {"follow_path_success": 1.0 - len(why) / episodes, "not_followed": why}
 
 
-def missing(domain_id: int, folder: Path, parameters: Path, bare: bool = False) -> list[str]:
+def missing(
+    domain_id: int, folder: Path, parameters: Path, bare: bool = False
+) -> list[str]:
     """A line for each name of a parameter file of Nav2 that nobody serves."""
     from measuring import nav2_names
     from rclpy.node import Node
@@ -133,7 +165,11 @@ def missing(domain_id: int, folder: Path, parameters: Path, bare: bool = False) 
             opened.enter_context(NodeProcess(name, folder, given, domain_id))
         context = open_context(domain_id=domain_id)
         opened.callback(context.try_shutdown)
-        node, told, ended = Node("asker", context=context), list[Any](), threading.Event()
+        node, told, ended = (
+            Node("asker", context=context),
+            list[Any](),
+            threading.Event(),
+        )
         node.create_subscription(TFMessage, "/tf", told.append, qos.TRANSFORMS)
         node.create_subscription(TFMessage, "/tf_static", told.append, qos.LATCHED)
         thread = threading.Thread(target=spin, args=(node, ended), daemon=True)
@@ -141,7 +177,9 @@ def missing(domain_id: int, folder: Path, parameters: Path, bare: bool = False) 
 
         def faults() -> list[str]:
             known = nav2_names.frames_in(list(told))
-            lacking = [f"{each}: no such frame on /tf" for each in sorted(frames - known)]
+            lacking = [
+                f"{each}: no such frame on /tf" for each in sorted(frames - known)
+            ]
             found = nav2_names.unserved_topics(node, topics) + lacking
             return found + nav2_names.unserved_actions(node)
 
@@ -192,9 +230,13 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     for name, bar in BARS.items():
         value, least = result[name], name != "nav2_names_missing"
         if math.isnan(value):
-            found.append(f"{name}: not measured; source what `make test-messages` builds")
+            found.append(
+                f"{name}: not measured; source what `make test-messages` builds"
+            )
         elif value < bar if least else value > bar:
-            found.append(f"{name}: {value:g}, bar at {'least' if least else 'most'} {bar:g}")
+            found.append(
+                f"{name}: {value:g}, bar at {'least' if least else 'most'} {bar:g}"
+            )
     return found
 
 

@@ -31,12 +31,16 @@ CONTROLS = {"late": "the handler that ends a node within a step of native code"}
 LIMIT_S, PATIENCE_S, READY_S, POLL_S = 1.0, 60.0, 280.0, 0.01
 FIRST_LINE_S = 1.0  # until a node says that it starts, on cores that are not busy
 PHASES = {
-    "starting": "]: starting", "compiling": "]: compiling, once", "native": "native code, seconds",
+    "starting": "]: starting",
+    "compiling": "]: compiling, once",
+    "native": "native code, seconds",
     "running": "]: running",
-}  # fmt: skip
+}
 COLD = ("compiling", "native")  # into an empty cache
 NEVER_COMPILES = ("record_node",)
-MOMENTS_S = 2.0  # after its line, a node is ended at moments that are spread over this time [s]
+MOMENTS_S = (
+    2.0  # after its line, a node is ended at moments that are spread over this time [s]
+)
 MODEL = ["-p", "model:=ackermann"]
 GIVEN = {
     "command_gate": [*MODEL, "-p", "limits:=ackermann"],
@@ -90,7 +94,9 @@ def busy(loops: int) -> Iterator[None]:
             each.wait()
 
 
-def ended(node: str, phase: str, number: int, control: str | None, folder: Path) -> dict[str, Any]:
+def ended(
+    node: str, phase: str, number: int, control: str | None, folder: Path
+) -> dict[str, Any]:
     """Ends a node once in a phase: its exit code, the time [s], and what it wrote if it failed."""
     log, own = folder / "log", {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
     if phase in COLD:
@@ -100,14 +106,20 @@ def ended(node: str, phase: str, number: int, control: str | None, folder: Path)
     with log.open("wb") as file:
         process = subprocess.Popen(
             [sys.executable, "-c", START, control or "", phase, node, *words],
-            env=os.environ | own, stdout=file, stderr=file, stdin=subprocess.DEVNULL, cwd=folder,
+            env=os.environ | own,
+            stdout=file,
+            stderr=file,
+            stdin=subprocess.DEVNULL,
+            cwd=folder,
             start_new_session=True,
-        )  # fmt: skip
+        )
     try:
         deadline = begin + READY_S
         while PHASES[phase] not in log.read_text(errors="replace"):
             if process.poll() is not None or time.monotonic() > deadline:
-                raise RuntimeError(f"{node} was never {phase}:\n{log.read_text(errors='replace')}")
+                raise RuntimeError(
+                    f"{node} was never {phase}:\n{log.read_text(errors='replace')}"
+                )
             time.sleep(POLL_S)
         reached_s = time.monotonic() - begin
         time.sleep(number % 10 / 10 * MOMENTS_S)
@@ -124,8 +136,12 @@ def ended(node: str, phase: str, number: int, control: str | None, folder: Path)
     clean = code == 0 and "Traceback" not in told
     said = "" if clean else told[-2000:]
     return {
-        "code": code, "took_s": took_s, "reached_s": reached_s, "clean": clean, "log": said
-    }  # fmt: skip
+        "code": code,
+        "took_s": took_s,
+        "reached_s": reached_s,
+        "clean": clean,
+        "log": said,
+    }
 
 
 def summary(endings: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -152,11 +168,19 @@ def measure(given: argparse.Namespace) -> dict[str, Any]:
             for each in own:
                 each.mkdir()
             name = f"{node} {phase}"
-            found[name] = summary([
-                ended(node, phase, k, given.control, each) for k, each in enumerate(own)
-            ])  # fmt: skip
+            found[name] = summary(
+                [
+                    ended(node, phase, k, given.control, each)
+                    for k, each in enumerate(own)
+                ]
+            )
             sys.stderr.write(row_of(name, found[name]))
-    return {"times": given.times, "loops": given.loops, "limit_s": LIMIT_S, "endings": found}
+    return {
+        "times": given.times,
+        "loops": given.loops,
+        "limit_s": LIMIT_S,
+        "endings": found,
+    }
 
 
 def missed_of(result: dict[str, Any]) -> list[str]:
@@ -166,36 +190,52 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         quiet = name.endswith("starting") and not result["loops"]
         if quiet and not each["reached_s"] <= FIRST_LINE_S:
             bar = f"bar {FIRST_LINE_S:g} at most"
-            missed.append(f"{name}: its first line took {each['reached_s']:.2f} s, {bar}")
+            missed.append(
+                f"{name}: its first line took {each['reached_s']:.2f} s, {bar}"
+            )
         if not each["longest_s"] <= LIMIT_S:
-            missed.append(f"{name}: took {each['longest_s']:.2f} s, bar {LIMIT_S:g} at most")
+            missed.append(
+                f"{name}: took {each['longest_s']:.2f} s, bar {LIMIT_S:g} at most"
+            )
         if each["failed"]:
             codes = sorted({str(one["code"]) for one in each["failed"]})
-            missed.append(f"{name}: {len(each['failed'])} ended badly, codes {', '.join(codes)}")
+            missed.append(
+                f"{name}: {len(each['failed'])} ended badly, codes {', '.join(codes)}"
+            )
     return missed
 
 
 def row_of(name: str, each: dict[str, Any]) -> str:
     """A line of the table."""
-    figures = "".join(f"{each[key]:>12.3f}" for key in ("reached_s", "median_s", "longest_s"))
+    figures = "".join(
+        f"{each[key]:>12.3f}" for key in ("reached_s", "median_s", "longest_s")
+    )
     figures += f"{len(each['failed']):>5}"
     return f"{name:<28}{figures}\n"
 
 
 def table_of(result: dict[str, Any]) -> str:
     """The figures, a node and phase in a line."""
-    heads = "".join(f"{each:>12}" for each in ("reached [s]", "median [s]", "longest [s]"))
+    heads = "".join(
+        f"{each:>12}" for each in ("reached [s]", "median [s]", "longest [s]")
+    )
     head = f"{'':<28}{heads}{'bad':>5}\n"
-    return head + "".join(row_of(name, each) for name, each in result["endings"].items())
+    return head + "".join(
+        row_of(name, each) for name, each in result["endings"].items()
+    )
 
 
 def options(words: Sequence[str] | None = None) -> argparse.Namespace:
     """The arguments."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--times", type=int, default=10, help="of each node in each phase")
+    parser.add_argument(
+        "--times", type=int, default=10, help="of each node in each phase"
+    )
     parser.add_argument("--loops", type=int, default=2, help="busy ones")
     parser.add_argument("--nodes", nargs="+", default=list(NODES), choices=list(NODES))
-    parser.add_argument("--phases", nargs="+", default=list(PHASES), choices=list(PHASES))
+    parser.add_argument(
+        "--phases", nargs="+", default=list(PHASES), choices=list(PHASES)
+    )
     return parser.parse_args(words)
 
 

@@ -53,7 +53,10 @@ SENT_SHARES = (0.8, 1.2)
 """Of the scans that were to be sent; a robot without them tells nothing about the gate."""
 REPEAT_S, SLOW_SKIP = 0.02, 3
 PATIENCE_S, STANDING_S = 90.0, 5.0
-NETWORK = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+NETWORK = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+}
 """Shared memory would go past the network."""
 
 
@@ -90,12 +93,18 @@ class Stack(_End):
             self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
             self.node.create_timer(REPEAT_S, self._repeat)
         self._raw = self.node.create_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
-        self._estimate = self.node.create_publisher(Odometry, "odometry/filtered", qos.COMMAND)
+        self._estimate = self.node.create_publisher(
+            Odometry, "odometry/filtered", qos.COMMAND
+        )
         self.node.create_subscription(LaserScan, "scan", self._act, qos.SENSOR)
-        self.node.create_subscription(Odometry, "odom", self._estimate.publish, qos.SENSOR)
+        self.node.create_subscription(
+            Odometry, "odom", self._estimate.publish, qos.SENSOR
+        )
 
     def _act(self, scan: LaserScan) -> None:
-        command = TwistStamped(header=scan.header, twist=conversions.twist_to_ros([SPEED, 0, 0.1]))
+        command = TwistStamped(
+            header=scan.header, twist=conversions.twist_to_ros([SPEED, 0, 0.1])
+        )
         self._raw.publish(command)
         self._last = command.twist
         stamp = conversions.stamp_from_ros(scan.header.stamp) / NS_PER_S
@@ -143,7 +152,9 @@ class Robot(_End):
 
     def _ask(self) -> None:
         if not self.moves and self._arm.service_is_ready():
-            reset = self._reset.call_async(Trigger.Request())  # two at once may change places
+            reset = self._reset.call_async(
+                Trigger.Request()
+            )  # two at once may change places
             reset.add_done_callback(lambda _: self._arm.call_async(Trigger.Request()))
 
     def _send(self) -> None:
@@ -151,12 +162,20 @@ class Robot(_End):
         self._x, now = self._x + speed * PERIOD_S, time.time_ns()
         self._timed += 1
         if self._timed % self._skip == 0:
-            ranges = np.full(self._lidar.beams, 2.0 + 0.1 * np.sin(now * 1e-9), np.float32)
-            self._topics["scan"].publish(conversions.scan_to_ros(self._lidar, ranges, now, "laser"))
+            ranges = np.full(
+                self._lidar.beams, 2.0 + 0.1 * np.sin(now * 1e-9), np.float32
+            )
+            self._topics["scan"].publish(
+                conversions.scan_to_ros(self._lidar, ranges, now, "laser")
+            )
             self.sent += 1
         self._topics["odom"].publish(
             conversions.odometry_to_ros(
-                [self._x, 0.0, 0.0], [speed, 0.0, 0.0], now, ("odom", "base_link"), (1e-4,) * 4
+                [self._x, 0.0, 0.0],
+                [speed, 0.0, 0.0],
+                now,
+                ("odom", "base_link"),
+                (1e-4,) * 4,
             )
         )
         self._topics["e_stop"].publish(Bool(data=False))
@@ -238,7 +257,11 @@ def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str
         parts = []
         for end, part in enumerate(("robot", "stack")):
             words = [sys.executable, __file__, "--part", part, "--folder", name]
-            words += ["--seconds", str(seconds), *(["--control", control] if control else [])]
+            words += [
+                "--seconds",
+                str(seconds),
+                *(["--control", control] if control else []),
+            ]
             parts.append(subprocess.Popen(cable.command(end, words), env=environment))
         try:
             deadline = time.monotonic() + PATIENCE_S
@@ -257,7 +280,12 @@ def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str
     arrived = sum(stamp >= since for _, stamp in used)
     judged = judge(heard["heard"], used, since)
     asked = round(seconds / PERIOD_S)
-    return {"scans_asked": asked, "scans_sent": heard["scans"], "scans_arrived": arrived, **judged}
+    return {
+        "scans_asked": asked,
+        "scans_sent": heard["scans"],
+        "scans_arrived": arrived,
+        **judged,
+    }
 
 
 def missed_bars(name: str, one: dict[str, Any]) -> list[str]:
@@ -287,8 +315,12 @@ def missed_bars(name: str, one: dict[str, Any]) -> list[str]:
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of driving at each loss")
-    parser.add_argument("--loss", type=int, action="append", help="of a hundred packets")
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="of driving at each loss"
+    )
+    parser.add_argument(
+        "--loss", type=int, action="append", help="of a hundred packets"
+    )
     parser.add_argument("--part", choices=("robot", "stack"), help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -299,7 +331,9 @@ def main() -> None:
     try:
         with link() as cable:
             runs = {
-                f"loss_{percent}": measure(percent, given.seconds, cable, given.control or "")
+                f"loss_{percent}": measure(
+                    percent, given.seconds, cable, given.control or ""
+                )
                 for percent in given.loss or LOSSES
             }
     except NoNamespacesError as error:

@@ -36,7 +36,9 @@ def missed(robots: dict[str, dict[str, Any]]) -> list[str]:
                     f"less than {LEAST_REACHED:.0%}"
                 )
             if off is None or not off <= bar:
-                said.append(f"{robot} {LABELS[place]}: paths are {off} m apart, more than {bar:g}")
+                said.append(
+                    f"{robot} {LABELS[place]}: paths are {off} m apart, more than {bar:g}"
+                )
     return said if robots else ["no robot was driven"]
 
 
@@ -46,24 +48,35 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=6)
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
     parser.add_argument("--out", type=Path, default=Path("runs/paper_fig7"))
-    parser.add_argument("--policy", help="a baseline instead of each robot's shipped policy")
+    parser.add_argument(
+        "--policy", help="a baseline instead of each robot's shipped policy"
+    )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     told = {}
     with tempfile.TemporaryDirectory() as folder:
         runs = {
             robot: Run(
-                given.policy or robot, robot, WORLD, given.episodes, FIRST_SEED,
-                Path(folder) / robot, given.control,
+                given.policy or robot,
+                robot,
+                WORLD,
+                given.episodes,
+                FIRST_SEED,
+                Path(folder) / robot,
+                given.control,
             )
             for robot in given.robots
-        }  # fmt: skip
+        }
         for robot, places in evaluations(runs).items():
             picture = given.out / f"fig7_{robot}.png"
-            shutil.move(next((Path(folder) / robot).glob("trajectories_*.png")), picture)
+            shutil.move(
+                next((Path(folder) / robot).glob("trajectories_*.png")), picture
+            )
             told[robot] = {
                 "picture": str(picture),
-                "success": {place: figures["success"][0] for place, figures in places.items()},
+                "success": {
+                    place: figures["success"][0] for place, figures in places.items()
+                },
                 "deviation_m": {
                     place: figures["deviation"][0] for place, figures in places.items()
                 },

@@ -38,7 +38,11 @@ OF_SIMULATOR = {"true_pose", "true_collision", "randomisation"}
 """What only the simulator in process tells."""
 OF_CLOCKS = {"stamp_ns"}
 """What counts from another beginning in each."""
-DIFFERENCE, LATE, DRIVEN = "max_abs_observation_difference", "late_observations", "driven_m"
+DIFFERENCE, LATE, DRIVEN = (
+    "max_abs_observation_difference",
+    "late_observations",
+    "driven_m",
+)
 ROBOTS = ("ackermann", "differential", "mecanum")
 FLEET = 4
 
@@ -67,7 +71,12 @@ class Spoilt(gymnasium.Wrapper):
 
 
 def measure(
-    robot: str, world: str, steps: int, seed: int, robots: int = 1, control: str | None = None
+    robot: str,
+    world: str,
+    steps: int,
+    seed: int,
+    robots: int = 1,
+    control: str | None = None,
 ) -> dict[str, float]:
     """Drives both envs for `steps` steps and compares every observation."""
     register_envs()
@@ -80,7 +89,9 @@ def measure(
         tempfile.TemporaryDirectory() as folder,
         NodeProcess("simulator_node", Path(folder), parameters, domain_id),
     ):
-        here = gymnasium.make(**task, backend="sim", model=robot, world=world, estimator=True)
+        here = gymnasium.make(
+            **task, backend="sim", model=robot, world=world, estimator=True
+        )
         there = gymnasium.make(
             **task,
             backend="dds",
@@ -110,14 +121,22 @@ def told_differently(one: dict[str, Any], other: dict[str, Any]) -> float:
     worst = 0.0 if set(one) - set(other) <= OF_SIMULATOR else float("inf")
     for name in set(one) & set(other):
         a, b = one[name], other[name]
-        pairs = [(a[term], b.get(term, np.nan)) for term in a] if isinstance(a, dict) else [(a, b)]
+        pairs = (
+            [(a[term], b.get(term, np.nan)) for term in a]
+            if isinstance(a, dict)
+            else [(a, b)]
+        )
         if name not in OF_CLOCKS:
             worst = max([worst, *(difference(*pair) for pair in pairs)])
     return worst
 
 
 def compare(
-    here: gymnasium.Env, there: gymnasium.Env, steps: int, seed: int, stands: bool = False
+    here: gymnasium.Env,
+    there: gymnasium.Env,
+    steps: int,
+    seed: int,
+    stands: bool = False,
 ) -> dict[str, float]:
     """Steps two envs side by side, beginning a new episode in both whenever one ends.
 
@@ -133,7 +152,9 @@ def compare(
     ended = True
     for _ in range(steps):
         if ended:
-            (a, info_a), (b, info_b) = (env.reset(seed=seed + episodes) for env in (here, there))
+            (a, info_a), (b, info_b) = (
+                env.reset(seed=seed + episodes) for env in (here, there)
+            )
             episodes += 1
             worst = max(worst, difference(a, b), told_differently(info_a, info_b))
         before = info_b["pose"]
@@ -162,9 +183,13 @@ def compare(
     }
 
 
-def measure_all(world: str, steps: int, seed: int, control: str | None) -> dict[str, Any]:
+def measure_all(
+    world: str, steps: int, seed: int, control: str | None
+) -> dict[str, Any]:
     """Each robot alone, then the fleet; with the worst of all on top."""
-    runs = {robot: measure(robot, world, steps, seed, control=control) for robot in ROBOTS}
+    runs = {
+        robot: measure(robot, world, steps, seed, control=control) for robot in ROBOTS
+    }
     fleet = measure(ROBOTS[0], world, steps, seed, FLEET, control)
     runs[f"{FLEET} robots in namespaces"] = fleet
     return {
@@ -184,7 +209,9 @@ def bars(result: dict[str, Any]) -> list[str]:
     if not result[LATE] <= 0:
         missed.append(f"{LATE} {result[LATE]}: must be 0")
     if not result[DRIVEN] >= DRIVEN_M:
-        missed.append(f"{DRIVEN} {result[DRIVEN]}: must be {DRIVEN_M} at least in every run")
+        missed.append(
+            f"{DRIVEN} {result[DRIVEN]}: must be {DRIVEN_M} at least in every run"
+        )
     return missed
 
 
@@ -212,7 +239,9 @@ def main() -> None:
     else:
         robot = given.robot or ROBOTS[0]
         alone = given.robots or 1
-        result = measure(robot, given.world, given.steps, given.seed, alone, given.control)
+        result = measure(
+            robot, given.world, given.steps, given.seed, alone, given.control
+        )
     answer(result, bars(result), table(result), given.json)
 
 

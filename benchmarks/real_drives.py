@@ -23,7 +23,7 @@ from measuring.drive_bars import (
     SEGMENT_S,
     SEGMENTED,
     missed_of,
-)  # fmt: skip
+)
 from measuring.foreign_robots import ROBOTS, foreign_drive
 from measuring.truths import Truth, compared
 from measuring.verdict import answer, parser_of
@@ -33,7 +33,13 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import Identified, identify
-from nics_drl_bridge.identify.open_loop import HORIZON_S, SPACING_S, Windows, predict, windows
+from nics_drl_bridge.identify.open_loop import (
+    HORIZON_S,
+    SPACING_S,
+    Windows,
+    predict,
+    windows,
+)
 from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist
 from nics_drl_bridge.recording.readers import robot_and_drive
 from nics_drl_bridge.recording.recording import Recording
@@ -49,9 +55,13 @@ OTHER_TIME = 0.37  # share of the drive by which the commands of the control are
 
 def arguments() -> argparse.Namespace:
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--recordings", type=Path, default=RECORDINGS, help="folder of the drives")
+    parser.add_argument(
+        "--recordings", type=Path, default=RECORDINGS, help="folder of the drives"
+    )
     names = [*DRIVES, *ROBOTS]
-    parser.add_argument("--only", nargs="+", choices=names, default=names, help="by name")
+    parser.add_argument(
+        "--only", nargs="+", choices=names, default=names, help="by name"
+    )
     return parser.parse_args()
 
 
@@ -64,16 +74,20 @@ def under(control: str | None, recording: Recording) -> Recording:
     return replace(recording, command=replace(command, values=values))
 
 
-def judged(found: Identified, recording: Recording, control: str | None) -> dict[str, Any]:
+def judged(
+    found: Identified, recording: Recording, control: str | None
+) -> dict[str, Any]:
     """Returns the errors of a model, and of its yardsticks, on what it has not seen."""
     # The trial: what is written was fitted to the last third, too. The yardsticks know the commands
     # that were given, whatever a control made of them.
     found = found.trial
     drive, calibration, until = found.drive, found.calibration, found.train_until_s
     chosen = windows(drive, calibration, until, drive.duration_s, HORIZON_S, SPACING_S)
-    ends = chosen.start if control == "standing" else predict(
-        found.model, calibration, drive, chosen
-    )  # fmt: skip
+    ends = (
+        chosen.start
+        if control == "standing"
+        else predict(found.model, calibration, drive, chosen)
+    )
     given = drive.part(replace(drive.recording, command=recording.command))
     yardstick = fit_yardstick(given, until, calibration.clock_offset_s)
     error, share, heading = off(ends, chosen)
@@ -84,8 +98,12 @@ def judged(found: Identified, recording: Recording, control: str | None) -> dict
         "yardstick_share": off(yardstick.predict(given, chosen), chosen)[1],
         "constant_twist_share": off(kept_twist(drive, chosen), chosen)[1],
         "coverage_95": found.coverage.get(HORIZON_S, float("nan")),
-        "coverages_95": {f"{horizon:g}": share for horizon, share in found.coverage.items()},
-        "errors_m": {f"{at.horizon_s:g}": at.model.position_m for at in found.judgement},
+        "coverages_95": {
+            f"{horizon:g}": share for horizon, share in found.coverage.items()
+        },
+        "errors_m": {
+            f"{at.horizon_s:g}": at.model.position_m for at in found.judgement
+        },
         "path_m": float(chosen.path.mean()),
         "windows": len(chosen.start_t),
     }
@@ -99,10 +117,16 @@ def off(ends: Array, chosen: Windows) -> tuple[float, float, float]:
     return error, error / float(chosen.path.mean()), heading
 
 
-def figures(source: Path, mapping: Path, truth: Truth, control: str | None) -> dict[str, Any]:
+def figures(
+    source: Path, mapping: Path, truth: Truth, control: str | None
+) -> dict[str, Any]:
     """Returns a drive's figures, or the sentence that refuses it."""
     begin = time.perf_counter()
-    lines = [line for line in mapping.read_text("utf-8").splitlines() if line[:1] not in ("#", "")]
+    lines = [
+        line
+        for line in mapping.read_text("utf-8").splitlines()
+        if line[:1] not in ("#", "")
+    ]
     told: dict[str, Any] = {"lines_of_mapping": len(lines)}
     try:
         spec, recording = robot_and_drive(source, None, TopicRoles(), mapping)
@@ -114,9 +138,11 @@ def figures(source: Path, mapping: Path, truth: Truth, control: str | None) -> d
         return told | {"crashed": f"{type(error).__name__}: {error}"}
     seconds = time.perf_counter() - begin
     return told | {
-        "truths": compared(found, truth), "equations": found.model.equations(),
-        "notes": list(found.notes), "seconds": seconds,
-    }  # fmt: skip
+        "truths": compared(found, truth),
+        "equations": found.model.equations(),
+        "notes": list(found.notes),
+        "seconds": seconds,
+    }
 
 
 def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]:
@@ -128,12 +154,15 @@ def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]
     for start in np.arange(0.0, since[-1] - SEGMENT_S, SEGMENT_S):
         others = recording.pose.rows((since < start) | (since >= start + SEGMENT_S))
         found = identify(
-            replace(recording, pose=others), spec, alpha="auto", train_until=2.0 * since[-1]
+            replace(recording, pose=others),
+            spec,
+            alpha="auto",
+            train_until=2.0 * since[-1],
         )
         drive = Drive(recording, spec)
         chosen = windows(
             drive, found.calibration, start, start + SEGMENT_S, HORIZON_S, SPACING_S
-        )  # fmt: skip
+        )
         if not len(chosen.start_t):  # its clocks were taken to share nothing
             errors.append((np.inf,) * 3)
             continue
@@ -142,14 +171,19 @@ def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]
         errors.append(off(chosen.start if control == "standing" else ends, chosen))
     error, share, heading = (float(mean) for mean in np.mean(errors, axis=0))
     return {
-        "error_m": error, "share_of_path": share, "heading_error_rad": heading,
-        "errors_m": [each[0] for each in errors], "path_m": float(np.mean(paths)) if paths else 0.0,
-    }  # fmt: skip
+        "error_m": error,
+        "share_of_path": share,
+        "heading_error_rad": heading,
+        "errors_m": [each[0] for each in errors],
+        "path_m": float(np.mean(paths)) if paths else 0.0,
+    }
 
 
 def table(result: dict[str, Any]) -> str:
     """The figures for people."""
-    lines = [f"{'drive':<34} {'error':>9} {'of path':>8} {'textbook':>9} {'twist':>7} {'95 %':>6}"]
+    lines = [
+        f"{'drive':<34} {'error':>9} {'of path':>8} {'textbook':>9} {'twist':>7} {'95 %':>6}"
+    ]
     for name, told in (result["drives"] | result["own_robots"]).items():
         if sentence := told.get("refused", told.get("crashed")):
             lines.append(f"{name:<34} {sentence}")
@@ -172,7 +206,10 @@ def main() -> int:
     real = [name for name in options.only if name in DRIVES]
     if real and not options.recordings.is_dir():
         place = options.recordings
-        print(f"{place}: no such folder of recordings; give --recordings.", file=sys.stderr)
+        print(
+            f"{place}: no such folder of recordings; give --recordings.",
+            file=sys.stderr,
+        )
         return 2
     result: dict[str, Any] = {"drives": {}, "left_out": {}, "own_robots": {}}
     for name in real:
@@ -186,7 +223,9 @@ def main() -> int:
             source = Path(folder) / name
             mapping = foreign_drive(ROBOTS[name], SEED).write(source)
             truth = ROBOTS[name].truth
-            result["own_robots"][name] = figures(source, mapping, truth, options.control)
+            result["own_robots"][name] = figures(
+                source, mapping, truth, options.control
+            )
     answer(result, missed_of(result), table(result), options.json)
 
 

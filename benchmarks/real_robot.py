@@ -37,11 +37,17 @@ DEFAULT = RECORDINGS / "xtark_ackermann" / "random_drive_45s"
 
 def arguments() -> argparse.Namespace:
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--recording", type=Path, default=DEFAULT, help="folder or .npz")
     parser.add_argument(
-        "--train-until", type=float, help="end of the training part, seconds from the start"
+        "--recording", type=Path, default=DEFAULT, help="folder or .npz"
     )
-    parser.add_argument("--robot", default="ackermann", help="name or YAML file of the robot")
+    parser.add_argument(
+        "--train-until",
+        type=float,
+        help="end of the training part, seconds from the start",
+    )
+    parser.add_argument(
+        "--robot", default="ackermann", help="name or YAML file of the robot"
+    )
     return parser.parse_args()
 
 
@@ -58,9 +64,12 @@ def under(
         coefficients = np.roll(coefficients, 1, axis=0)
     model = replace(found.model, coefficients=coefficients)
     held_out = open_loop_error(
-        model, found.calibration, Drive(recording, robot), found.train_until_s,
+        model,
+        found.calibration,
+        Drive(recording, robot),
+        found.train_until_s,
         float(recording.pose.t[-1]),
-    )  # fmt: skip
+    )
     return replace(found, model=model, held_out=held_out)
 
 
@@ -101,10 +110,19 @@ def results(found: Identified, recording: Path, seconds: float) -> dict[str, Any
 
 
 def table(result: dict[str, Any]) -> str:
-    rows = [f"{name:<26} {value:.4g}" for name, value in result.items() if isinstance(value, float)]
-    rows += [f"{name:<26} {result[name]}" for name in ("windows", "terms_kept", "wheels_swapped")]
+    rows = [
+        f"{name:<26} {value:.4g}"
+        for name, value in result.items()
+        if isinstance(value, float)
+    ]
+    rows += [
+        f"{name:<26} {result[name]}"
+        for name in ("windows", "terms_kept", "wheels_swapped")
+    ]
     lists = [f"  {line}" for name in ("equations", "notes") for line in result[name]]
-    return "\n".join([f"recording {result['recording']}", *rows, "model and notes", *lists])
+    return "\n".join(
+        [f"recording {result['recording']}", *rows, "model and notes", *lists]
+    )
 
 
 def main() -> int:

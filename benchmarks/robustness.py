@@ -103,14 +103,19 @@ def ranges(
         given["lidar"]["noise_std"] = tuple(max(end, lidar_noise) for end in std)
     elif perturbation == "drop-out":
         lost = most(whole.lidar, ["dropout", "dropout_far"])
-        given["lidar"] = {name: (min(span[0], 1.0 / len(lost)),) * 2 for name, span in lost.items()}
+        given["lidar"] = {
+            name: (min(span[0], 1.0 / len(lost)),) * 2 for name, span in lost.items()
+        }
     elif perturbation == "latency":
         given |= most(whole, ["action_latency", "observation_latency"])
     elif perturbation == "response":
         kinematics = whole.kinematics
         low, high = (1.0 + times * (end - 1.0) for end in kinematics.scale)
         slow = 1.0 + times * (max(kinematics.response[1], RESPONSE) - 1.0)
-        given["kinematics"] = {"scale": (max(low, 0.05), high), "response": (slow, slow)}
+        given["kinematics"] = {
+            "scale": (max(low, 0.05), high),
+            "response": (slow, slow),
+        }
     elif perturbation == "drift":
         levels = ["odom_linear", "odom_angular", "position_drift", "heading_drift"]
         given["odometry"] = most(whole.odometry, levels)
@@ -163,9 +168,13 @@ def reached(job: Job, perturbation: str | None, times: float) -> tuple[int, int]
     if perturbation == "footprint":
         simulated = grown(model, 1.0 + times * FOOTPRINT)
     elif perturbation is not None:
-        drawn = ranges(of_training(job.robot), perturbation, times, model.lidar.noise_std)
+        drawn = ranges(
+            of_training(job.robot), perturbation, times, model.lidar.noise_std
+        )
     backend = SimBackend(simulated, world, estimator=True, randomisation=drawn)
-    if perturbation == "footprint":  # in the scenes of the robot that it is believed to be
+    if (
+        perturbation == "footprint"
+    ):  # in the scenes of the robot that it is believed to be
         backend.simulator.episodes = EpisodeSampler(model, world)
     gated = GatedBackend(backend, model, job.robot)
     env = gymnasium.make(NAVIGATION, backend=gated, model=model, world=world, task=task)
@@ -200,7 +209,10 @@ def measure(jobs: Sequence[Job]) -> list[dict[str, dict[str, list[float]]]]:
         driven[job.robot] = driven.get(job.robot, 0) + job.episodes
     return [
         {
-            robot: {each: (some[:, k] / driven[robot]).tolist() for each, some in own.items()}
+            robot: {
+                each: (some[:, k] / driven[robot]).tolist()
+                for each, some in own.items()
+            }
             for robot, own in counts.items()
         }
         for k in range(2)
@@ -208,18 +220,22 @@ def measure(jobs: Sequence[Job]) -> list[dict[str, dict[str, list[float]]]]:
 
 
 def losses(
-    success: Mapping[str, Mapping[str, Sequence[float]]], multiples: Sequence[float] = MULTIPLES
+    success: Mapping[str, Mapping[str, Sequence[float]]],
+    multiples: Sequence[float] = MULTIPLES,
 ) -> dict[str, dict[str, float]]:
     """Points of success lost at the declared range: robot -> perturbation -> value."""
     at = 1 + multiples.index(DECLARED)
     return {
-        robot: {each: round(100.0 * (some[0] - some[at]), 3) for each, some in own.items()}
+        robot: {
+            each: round(100.0 * (some[0] - some[at]), 3) for each, some in own.items()
+        }
         for robot, own in success.items()
     }
 
 
 def missed(
-    success: Mapping[str, Mapping[str, Sequence[float]]], multiples: Sequence[float] = MULTIPLES
+    success: Mapping[str, Mapping[str, Sequence[float]]],
+    multiples: Sequence[float] = MULTIPLES,
 ) -> list[str]:
     """A sentence for each bar that was missed."""
     said = []
@@ -230,32 +246,43 @@ def missed(
     for robot, own in losses(success, multiples).items():
         for each, lost in own.items():
             if not lost <= MOST_LOSS + 1e-9:
-                said.append(f"{robot}: {each} takes {lost:.1f} points, more than {MOST_LOSS:g}")
+                said.append(
+                    f"{robot}: {each} takes {lost:.1f} points, more than {MOST_LOSS:g}"
+                )
     return said if any(success.values()) else ["no policy was driven"]
 
 
 def worst(lost: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     """The greatest loss of all, and to what."""
     points, robot, each = max(
-        (value, robot, each) for robot, own in lost.items() for each, value in own.items()
+        (value, robot, each)
+        for robot, own in lost.items()
+        for each, value in own.items()
     )
     return {"points": points, "robot": robot, "perturbation": each}
 
 
 def draw(
-    success: Mapping[str, Mapping[str, Sequence[float]]], file: Path,
+    success: Mapping[str, Mapping[str, Sequence[float]]],
+    file: Path,
     multiples: Sequence[float] = MULTIPLES,
-) -> None:  # fmt: skip
+) -> None:
     """One panel for each perturbation: success over multiples of the declared range, by robot."""
     amounts = [declared(of_training(robot)) for robot in success]
-    perturbations = list(dict.fromkeys(each for own in success.values() for each in own))
+    perturbations = list(
+        dict.fromkeys(each for own in success.values() for each in own)
+    )
     rows, where = -(-len(perturbations) // 3), np.array([0.0, *multiples])
     figure, grid = style.panels(rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True)
     for axes, each in zip(grid, perturbations, strict=False):
         for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
-            share = 100.0 * np.array(own[each], np.float64)  # None where it was not driven
+            share = 100.0 * np.array(
+                own[each], np.float64
+            )  # None where it was not driven
             driven = ~np.isnan(share)
-            axes.plot(where[driven], share[driven], marker=marker, markersize=4, label=robot)
+            axes.plot(
+                where[driven], share[driven], marker=marker, markersize=4, label=robot
+            )
         axes.axvline(DECLARED, color=style.OTHER, linestyle="--", linewidth=1.0)
         told = " / ".join(dict.fromkeys(some[each] for some in amounts))
         axes.set_title(f"{each}\n{told}")
@@ -264,7 +291,9 @@ def draw(
         axes.set_xticks(where)
     for axes in grid[::3]:
         axes.set_ylabel("success [%]")
-    shares = [share for own in success.values() for some in own.values() for share in some]
+    shares = [
+        share for own in success.values() for some in own.values() for share in some
+    ]
     least = 100.0 * np.nanmin(np.array(shares, np.float64))
     grid[0].set_ylim(max(0.0, 5.0 * np.floor(least / 5.0) - 5.0), 102.0)
     write_bytes(file, style.png(figure, grid[0]))
@@ -282,7 +311,9 @@ def measured_in(results: Path) -> dict[str, dict[str, list[float]]]:
 
 
 def table_of(
-    success: Mapping[str, Mapping[str, Sequence[float]]], multiples: Sequence[float], wall_s: float
+    success: Mapping[str, Mapping[str, Sequence[float]]],
+    multiples: Sequence[float],
+    wall_s: float,
 ) -> str:
     """The figures for people."""
     heads = "".join(f"{f'x {times:g}':>8}" for times in (0.0, *multiples))
@@ -298,34 +329,59 @@ def table_of(
 def main() -> None:
     """Prints a table, or one JSON object."""
     parser, robots = parser_of(__doc__, CONTROLS), shipped_policies()
-    parser.add_argument("--episodes", type=int, default=40, help="in each world, of each point")
+    parser.add_argument(
+        "--episodes", type=int, default=40, help="in each world, of each point"
+    )
     parser.add_argument("--robots", nargs="+", choices=robots, default=robots)
     parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
-    parser.add_argument("--only", nargs="+", choices=PERTURBATIONS, default=list(PERTURBATIONS))
-    parser.add_argument("--multiples", nargs="+", type=float, default=MULTIPLES, metavar="M",
-                        help="of the declared range, which is measured in any case")  # fmt: skip
+    parser.add_argument(
+        "--only", nargs="+", choices=PERTURBATIONS, default=list(PERTURBATIONS)
+    )
+    parser.add_argument(
+        "--multiples",
+        nargs="+",
+        type=float,
+        default=MULTIPLES,
+        metavar="M",
+        help="of the declared range, which is measured in any case",
+    )
     parser.add_argument("--picture", type=Path, help="draw the curves into this file")
-    parser.add_argument("--of", type=Path, metavar="RESULTS",
-                        help="draw the picture of these runs, and drive nothing")  # fmt: skip
+    parser.add_argument(
+        "--of",
+        type=Path,
+        metavar="RESULTS",
+        help="draw the picture of these runs, and drive nothing",
+    )
     given = parser.parse_args()
     if given.of:
-        draw(measured_in(given.of), given.picture or parser.error("--of needs --picture"))
+        draw(
+            measured_in(given.of), given.picture or parser.error("--of needs --picture")
+        )
         return
     begin = time.perf_counter()
     multiples = tuple(sorted({DECLARED, *given.multiples}))
     job = partial(
-        Job, episodes=given.episodes, perturbations=tuple(given.only), multiples=multiples,
+        Job,
+        episodes=given.episodes,
+        perturbations=tuple(given.only),
+        multiples=multiples,
         control=given.control,
-    )  # fmt: skip
-    success, believed = measure([job(*each) for each in product(given.robots, given.worlds)])
+    )
+    success, believed = measure(
+        [job(*each) for each in product(given.robots, given.worlds)]
+    )
     if given.picture:
         draw(success, given.picture, multiples)
     lost = losses(success, multiples)
     result = {
         "declared": {robot: declared(of_training(robot)) for robot in success},
-        "multiples": [0.0, *multiples], "success": success, "believed": believed,
-        "lost_points": lost, "worst": worst(lost), "episodes": given.episodes * len(given.worlds),
-    }  # fmt: skip
+        "multiples": [0.0, *multiples],
+        "success": success,
+        "believed": believed,
+        "lost_points": lost,
+        "worst": worst(lost),
+        "episodes": given.episodes * len(given.worlds),
+    }
     table = table_of(success, multiples, time.perf_counter() - begin)
     answer(result, missed(success, multiples), table, given.json)
 

@@ -84,7 +84,9 @@ class Listener:
                 self.driven[name] = max(self.driven[name], gone)
 
         for kind, topic, take in ((LaserScan, "scan", scan), (Odometry, "odom", odom)):
-            self._node.create_subscription(kind, f"{name}/{topic}", take, qos.SENSOR, raw=True)
+            self._node.create_subscription(
+                kind, f"{name}/{topic}", take, qos.SENSOR, raw=True
+            )
 
     def spin(self, seconds: float, until_all: bool = False) -> None:
         """Listens for a time, or until every robot was heard."""
@@ -120,7 +122,8 @@ def command(robots: int) -> None:
     """Commands every robot, until its parent is gone."""
     node = Node("commander", context=open_context(), start_parameter_services=False)
     topics = [
-        node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND) for k in range(robots)
+        node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND)
+        for k in range(robots)
     ]
     message, parent = wire.twist_to_bytes(np.array(COMMAND)), os.getppid()
     while os.getppid() == parent:
@@ -160,14 +163,21 @@ def world_file(folder: Path, robots: int) -> Path:
     """An empty field with room for all."""
     side = SIDE_PER_ROBOT_M * robots**0.5
     file = folder / "field.yaml"
-    field = {"name": "field", "size": [side, side], "clearance": 0.2, "goal_distance": [1.0, side]}
+    field = {
+        "name": "field",
+        "size": [side, side],
+        "clearance": 0.2,
+        "goal_distance": [1.0, side],
+    }
     file.write_text(dump_yaml(field), encoding="utf-8")
     return file
 
 
 def cpu_seconds(pid: int) -> float:
     """Processor time that a process and all its threads have used."""
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    fields = (
+        Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    )
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
@@ -180,11 +190,16 @@ def rss_mb(pid: int) -> float:
 @contextmanager
 def part(domain_id: int, *options: str) -> Iterator[subprocess.Popen[str]]:
     """This script in a process of its own, as listener or commander."""
-    environment = {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    environment = {
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
     with subprocess.Popen(
         [sys.executable, __file__, *options],
-        env=os.environ | environment, stdout=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
         try:
             yield process
         finally:
@@ -205,13 +220,27 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
         }
         fleet, driven = str(robots), str(0 if control == "standing" else robots)
         heard = str(robots - 1 if control == "deaf" else robots)
-        options = ("--seconds", str(seconds), "--patience", str(patience_s), "--heard", heard)
+        options = (
+            "--seconds",
+            str(seconds),
+            "--patience",
+            str(patience_s),
+            "--heard",
+            heard,
+        )
         with (
-            NodeProcess("simulator_node", Path(name), parameters, domain_id) as simulator,
+            NodeProcess(
+                "simulator_node", Path(name), parameters, domain_id
+            ) as simulator,
             part(domain_id, "--part", "command", "--robots", driven),
-            part(domain_id, "--part", "listen", "--robots", fleet, *options) as listener,
+            part(
+                domain_id, "--part", "listen", "--robots", fleet, *options
+            ) as listener,
         ):
-            if listener.stdout is None or listener.stdout.readline().strip() != "counting":
+            if (
+                listener.stdout is None
+                or listener.stdout.readline().strip() != "counting"
+            ):
                 simulator.check()
                 raise RuntimeError("the listener ended without a result")
             simulator.check()
@@ -219,7 +248,10 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
             each = json.loads(listener.stdout.readline())
             cores = (cpu_seconds(simulator.pid) - before) / (time.monotonic() - began)
             memory = rss_mb(simulator.pid)
-    each = {name: {key: round(v, 3) for key, v in told.items()} for name, told in each.items()}
+    each = {
+        name: {key: round(v, 3) for key, v in told.items()}
+        for name, told in each.items()
+    }
     scan, odom, driven_m = (
         min(told[key] for told in each.values()) for key in ("scan", "odom", "driven_m")
     )
@@ -249,20 +281,29 @@ def smaller(failed: Run, seconds: float, patience_s: float) -> Run:
 
 def bars(run: Run) -> list[str]:
     """A sentence for each bar that was missed, with the robot that misses it most."""
-    missed, least = [], {"scan": SHARE * SCAN_HZ, "odom": SHARE * ODOM_HZ, "driven_m": DRIVEN_M}
+    missed, least = (
+        [],
+        {"scan": SHARE * SCAN_HZ, "odom": SHARE * ODOM_HZ, "driven_m": DRIVEN_M},
+    )
     for key, bar in least.items():
         figure, worst = min((told[key], name) for name, told in run.each.items())
         if not figure >= bar:
-            missed.append(f"{worst} of {run.robots}: {key} {figure:g}, must be {bar:g} at least")
+            missed.append(
+                f"{worst} of {run.robots}: {key} {figure:g}, must be {bar:g} at least"
+            )
     return missed
 
 
 def main() -> None:
     """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--seconds", type=float, default=10.0, help="to listen to each fleet")
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, help="to listen to each fleet"
+    )
     parser.add_argument("--robots", type=int, help="this size alone")
-    parser.add_argument("--patience", type=float, default=90.0, help="for the first messages [s]")
+    parser.add_argument(
+        "--patience", type=float, default=90.0, help="for the first messages [s]"
+    )
     parser.add_argument("--part", choices=("command", "listen"), help=argparse.SUPPRESS)
     parser.add_argument("--heard", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -278,7 +319,9 @@ def main() -> None:
             else measure(robots, given.seconds, given.patience, given.control)
         )
         result = asdict(run)
-        table = "".join(f"{key:<12}{value}\n" for key, value in result.items() if key != "each")
+        table = "".join(
+            f"{key:<12}{value}\n" for key, value in result.items() if key != "each"
+        )
         answer(result, bars(run), table, given.json)
 
 

@@ -50,16 +50,24 @@ ROBOT, BEAMS = "ackermann", 720
 WORLD = {
     "name": "ten circles",
     "size": [6.0, 6.0],
-    "obstacles": [{"shapes": [{"kind": "circle", "radius": 0.15}], "count": 10, "gap": 0.3}],
+    "obstacles": [
+        {"shapes": [{"kind": "circle", "radius": 0.15}], "count": 10, "gap": 0.3}
+    ],
     "clearance": 0.3,
     "goal_distance": [2.0, 4.0],
 }
 DEPTH, PATIENCE_S = 10, 60.0
-CONTROLS = {"slow": "speed: a step rests", "standing": "the commands: the robot does not drive"}
+CONTROLS = {
+    "slow": "speed: a step rests",
+    "standing": "the commands: the robot does not drive",
+}
 REST_S, DRIVEN_M = 0.003, 0.1
 RATIOS = {"rclpy": 0.7, "standing": 0.5, "events": 0.5}
 """The least, by the executor of the bare pair."""
-EXECUTORS: dict[str, Any] = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
+EXECUTORS: dict[str, Any] = {
+    "rclpy": SingleThreadedExecutor,
+    "standing": StandingExecutor,
+}
 if find_spec("rclpy.experimental"):  # since Kilted
     EXECUTORS["events"] = import_module("rclpy.experimental").EventsExecutor
 Exchange = Callable[[], Callable[[], object] | None]
@@ -72,7 +80,9 @@ class Bare:
     def __init__(self, name: str, namespace: str, executor: str) -> None:
         context = Context()
         context.init(None)
-        self.node = Node(name, namespace=namespace, context=context, start_parameter_services=False)
+        self.node = Node(
+            name, namespace=namespace, context=context, start_parameter_services=False
+        )
         self._executor = EXECUTORS[executor](context=context)
         self._executor.add_node(self.node)
 
@@ -123,7 +133,9 @@ def near_end(namespace: str, executor: str) -> None:
         commands.publish(command)
         end.spin_until(lambda: len(received) >= 2)
 
-    time.sleep(1.0)  # the first answers may be lost, while the far end does not yet know of it
+    time.sleep(
+        1.0
+    )  # the first answers may be lost, while the far end does not yet know of it
     for line in sys.stdin:
         sys.stdout.write(json.dumps(timed(exchange, int(line))) + "\n")
         sys.stdout.flush()
@@ -136,7 +148,15 @@ ENDS = {"far": far_end, "near": near_end}
 def bare_echo(domain_id: int, executor: str) -> Iterator[Chunk]:
     """A function that makes round trips between two processes, as ROS 2 makes them by itself."""
     namespace = f"bare_{os.getpid()}"
-    order = [sys.executable, __file__, "--executor", executor, "--namespace", namespace, "--end"]
+    order = [
+        sys.executable,
+        __file__,
+        "--executor",
+        executor,
+        "--namespace",
+        namespace,
+        "--end",
+    ]
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"} | os.environ
     environment["ROS_DOMAIN_ID"] = str(domain_id)
     with (
@@ -183,7 +203,9 @@ class Driving:
 
     def step(self) -> Callable[[], object] | None:
         """One step; gives what begins a new episode where one has ended."""
-        action = self._actions.uniform(-1.0, 1.0, self._env.action_space.shape).astype(np.float32)
+        action = self._actions.uniform(-1.0, 1.0, self._env.action_space.shape).astype(
+            np.float32
+        )
         if self._stands:
             action = standing_action(self._env)
         _, _, ended, cut, info = self._env.step(action)
@@ -200,7 +222,9 @@ class Driving:
 
 
 @contextmanager
-def lockstep_env(domain_id: int, folder: Path, control: str | None) -> Iterator[Driving]:
+def lockstep_env(
+    domain_id: int, folder: Path, control: str | None
+) -> Iterator[Driving]:
     """An env that drives in lock-step with a simulator in a process of its own."""
     register_envs()
     file = folder / "world.yaml"
@@ -208,9 +232,17 @@ def lockstep_env(domain_id: int, folder: Path, control: str | None) -> Iterator[
     parameters = {"model": ROBOT, "world": str(file), "mode": "lockstep"}
     namespace = f"lockstep_{os.getpid()}"  # whoever else may be in that domain
     with NodeProcess("simulator_node", folder, parameters, domain_id, namespace):
-        options = {"domain_id": domain_id, "namespace": namespace, "timeout_s": PATIENCE_S}
+        options = {
+            "domain_id": domain_id,
+            "namespace": namespace,
+            "timeout_s": PATIENCE_S,
+        }
         env = gymnasium.make(
-            NAVIGATION, backend="dds", model=ROBOT, world=str(file), backend_options=options
+            NAVIGATION,
+            backend="dds",
+            model=ROBOT,
+            world=str(file),
+            backend_options=options,
         )
         env.reset(seed=0)
         yield Driving(env, control)
@@ -229,7 +261,9 @@ def timed(exchange: Exchange, count: int) -> list[float]:
     return times
 
 
-def measure(chunks: int, size: int, executor: str, control: str | None) -> dict[str, float]:
+def measure(
+    chunks: int, size: int, executor: str, control: str | None
+) -> dict[str, float]:
     """Steps and echoes per second over all chunks, and how long a step takes."""
     domain_id = free_domain_id()
     with (
@@ -269,7 +303,9 @@ def main() -> None:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--chunks", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
-    parser.add_argument("--executor", choices=EXECUTORS, default="rclpy", help="of the bare pair")
+    parser.add_argument(
+        "--executor", choices=EXECUTORS, default="rclpy", help="of the bare pair"
+    )
     parser.add_argument("--end", choices=ENDS, help=argparse.SUPPRESS)
     parser.add_argument("--namespace", help=argparse.SUPPRESS)
     given = parser.parse_args()

@@ -115,16 +115,21 @@ def drive(
         some = slice(first, first + plan.at_once)
         with tempfile.TemporaryDirectory() as folder:
             more, late = shield_over_dds.drive(
-                places[some], jobs[some], given, Path(folder),
+                places[some],
+                jobs[some],
+                given,
+                Path(folder),
                 lambda line: sys.stderr.write(f"{line}\n"),
-            )  # fmt: skip
+            )
         outcomes += more
         held_up.add(late)
     return outcomes, asdict(held_up)
 
 
 def summary(
-    shielded: Sequence[Outcome], bare: Sequence[Outcome], kept_up: Sequence[Mapping[str, float]]
+    shielded: Sequence[Outcome],
+    bare: Sequence[Outcome],
+    kept_up: Sequence[Mapping[str, float]],
 ) -> dict[str, Any]:
     """The figures, for the JSON object."""
     held_up = {name: sum(each[name] for each in kept_up if each) for name in HELD_UP}
@@ -160,7 +165,9 @@ def summary(
             world: {
                 "episodes": sum(one.where[1] == world for one in tried),
                 "contacts": sum(one.where[1] == world for one in touched),
-                "goals_reached": sum(one.reached and one.where[1] == world for one in goals),
+                "goals_reached": sum(
+                    one.reached and one.where[1] == world for one in goals
+                ),
                 "goals_reached_without": sum(
                     one.reached and one.where[1] == world for one in goals_without
                 ),
@@ -181,15 +188,37 @@ def missed(result: Mapping[str, Any], asked: int) -> list[str]:
         ("contacts of robots in motion", result["contacts"], "at most", 0),
         ("episodes driven", result["episodes"], "at least", max(asked, 1)),
         ("path driven [m]", result["path_m"], "at least", LEAST_PATH * asked),
-        ("share of the time for which the robots were held up", result["held_up_share"], "at most",
-         MOST_HELD_UP),
-        ("latched stops", result["latched"], "at most", math.ceil(MOST_LATCHED * asked)),
-        ("contacts without the shield", result["contacts_without"], "at least",
-         max(1.0, LEAST_CONTACTS_WITHOUT * tried)),
-        ("goals reached", result["goals_reached"], "at least", max(1.0, LEAST_GOALS * reached)),
-        ("braking distance in parts of what the shield keeps free", result["braking"], "at most",
-         1.0),
-    ]  # fmt: skip
+        (
+            "share of the time for which the robots were held up",
+            result["held_up_share"],
+            "at most",
+            MOST_HELD_UP,
+        ),
+        (
+            "latched stops",
+            result["latched"],
+            "at most",
+            math.ceil(MOST_LATCHED * asked),
+        ),
+        (
+            "contacts without the shield",
+            result["contacts_without"],
+            "at least",
+            max(1.0, LEAST_CONTACTS_WITHOUT * tried),
+        ),
+        (
+            "goals reached",
+            result["goals_reached"],
+            "at least",
+            max(1.0, LEAST_GOALS * reached),
+        ),
+        (
+            "braking distance in parts of what the shield keeps free",
+            result["braking"],
+            "at most",
+            1.0,
+        ),
+    ]
     return [
         f"{what}: {value:g}, the bar is {side} {bar:g}"
         for what, value, side, bar in bars
@@ -216,9 +245,13 @@ def table_of(result: Mapping[str, Any]) -> str:
 def main() -> None:
     """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--episodes", type=int, default=300, help=f"of {ADVERSARY_S:g} s each")
+    parser.add_argument(
+        "--episodes", type=int, default=300, help=f"of {ADVERSARY_S:g} s each"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--in-process", action="store_true", help="without DDS, with drawn delays")
+    parser.add_argument(
+        "--in-process", action="store_true", help="without DDS, with drawn delays"
+    )
     names = [f"{robot}/{world}" for robot in ROBOTS for world in WORLDS]
     more = [f"{OUTLINED}/{world}" for world in WORLDS]
     about = f"only there; repeatable; those of the {OUTLINED} go in process alone"
@@ -229,14 +262,18 @@ def main() -> None:
     given = parser.parse_args()
     if not given.in_process and set(more) & set(given.place or ()):
         parser.error(f"the {OUTLINED} drives in process alone; add --in-process")
-    plan = Plan(given.episodes, given.seed, given.in_process, given.control or "", given.at_once)
+    plan = Plan(
+        given.episodes, given.seed, given.in_process, given.control or "", given.at_once
+    )
     places = [Place(*name.split("/")) for name in given.place or names]
     with_it, without = plan.jobs(len(places))
     shielded, first = drive(plan, places, with_it, plan.shield)
     bare, second = drive(plan, places, without, None)
     result = summary(shielded, bare, (first, second))
     result["driven"] = "in process" if plan.in_process else "over DDS"
-    result["braking"] = round(max(braking_used(place.robot, plan.shield) for place in places), 3)
+    result["braking"] = round(
+        max(braking_used(place.robot, plan.shield) for place in places), 3
+    )
     result["load"] = round(os.getloadavg()[0], 1)
     answer(result, missed(result, plan.episodes), table_of(result), given.json)
 

@@ -45,7 +45,12 @@ CONTROLS = {
     "standing": "the gate's consent: the robot in real time never moves",
     "leak": "order: each episode leaves a file open",
 }
-MOST = {"unexplained_stops": 0, "rss_growth_mb": 10.0, "fds_growth": 0, "threads_growth": 0}
+MOST = {
+    "unexplained_stops": 0,
+    "rss_growth_mb": 10.0,
+    "fds_growth": 0,
+    "threads_growth": 0,
+}
 LEAST = {"resets": 1, "steps": 1}
 LEAST_PER_MINUTE = {"driven_m": 2.0, "goals_reached": 1}
 DRIVEN_M = 0.2
@@ -81,7 +86,9 @@ class Drive:
     def _look(self, message: Odometry) -> None:
         pose = conversions.odometry_from_ros(message)[0]
         before, self._place = self._place, pose[:2]
-        self.driven_m += 0.0 if before is None else float(np.hypot(*(pose[:2] - before)))
+        self.driven_m += (
+            0.0 if before is None else float(np.hypot(*(pose[:2] - before)))
+        )
         goal, now = GOALS[self.goals % len(GOALS)], time.monotonic()
         if np.hypot(*(pose[:2] - goal)) < NEAR_M:
             self.goals += 1
@@ -105,7 +112,11 @@ class Drive:
         if self._answer is not None and self._answer.done():
             self.armed = bool(self._answer.result().success)
             self._answer = None
-        if not self.armed and now - self._asked_s > 1.0 and self._arm.service_is_ready():
+        if (
+            not self.armed
+            and now - self._asked_s > 1.0
+            and self._arm.service_is_ready()
+        ):
             self._asked_s, self._answer = now, self._arm.call_async(Trigger.Request())
 
     def spin(self) -> None:
@@ -135,7 +146,11 @@ class Episodes:
         register_envs()
         options = {"domain_id": domain_id, "timeout_s": PATIENCE_S}
         self.env = gymnasium.make(
-            NAVIGATION, backend="dds", model=ROBOT, world="arena", backend_options=options
+            NAVIGATION,
+            backend="dds",
+            model=ROBOT,
+            world="arena",
+            backend_options=options,
         )
         self.resets, self.steps, self._left = 0, 0, 0
         self._rng = np.random.default_rng(0)
@@ -149,7 +164,9 @@ class Episodes:
                 self._opened.append(open("/dev/null"))  # noqa: SIM115  (it is to leak)
             self._left = STEPS_PER_EPISODE
             return
-        action = self._rng.uniform(-1.0, 1.0, self.env.action_space.shape).astype(np.float32)
+        action = self._rng.uniform(-1.0, 1.0, self.env.action_space.shape).astype(
+            np.float32
+        )
         _, _, ended, cut, info = self.env.step(action)
         self.steps += 1
         before, self._place = self._place, info["pose"][:2]
@@ -184,9 +201,11 @@ def begin(stack: ExitStack, control: str | None) -> Soak:
         "policy_node": ("policy_node", {"model": ROBOT}, field),
         "command_gate": ("command_gate", gate, field),
         "lockstep_simulator_node": (
-            "simulator_node", {"model": ROBOT, "world": "arena", "mode": "lockstep"}, track,
+            "simulator_node",
+            {"model": ROBOT, "world": "arena", "mode": "lockstep"},
+            track,
         ),
-    }  # fmt: skip
+    }
     processes = {
         name: stack.enter_context(NodeProcess(node, folder / name, given, domain))
         for name, (node, given, domain) in parts.items()
@@ -204,7 +223,9 @@ def begin(stack: ExitStack, control: str | None) -> Soak:
     def uses() -> dict[str, Use]:
         for process in processes.values():
             process.check()
-        return {name: use_of(p.pid) for name, p in processes.items()} | {"env": use_of()}
+        return {name: use_of(p.pid) for name, p in processes.items()} | {
+            "env": use_of()
+        }
 
     return Soak(drive, episodes, uses)
 
@@ -222,7 +243,9 @@ def run(soak: Soak, seconds: float) -> list[dict[str, Use]]:
     return samples
 
 
-def growth(samples: list[dict[str, Use]], of: Callable[[Use], float]) -> dict[str, float]:
+def growth(
+    samples: list[dict[str, Use]], of: Callable[[Use], float]
+) -> dict[str, float]:
     """By process: the least of the last tenth minus the least of the first tenth of the samples.
 
     The least, since a garbage collector lets memory swing.
@@ -256,10 +279,14 @@ def measure(minutes: float, warm_up: float, control: str | None) -> dict[str, An
         return {
             "rss_growth_mb": round(max(memory.values()), 2),
             "fds_growth": int(max(growth(samples, lambda use: use.files).values())),
-            "threads_growth": int(max(growth(samples, lambda use: use.threads).values())),
+            "threads_growth": int(
+                max(growth(samples, lambda use: use.threads).values())
+            ),
             "unexplained_stops": sum(stops.values()),
             "stops": stops,
-            "rss_growth_mb_by_process": {name: round(v, 2) for name, v in memory.items()},
+            "rss_growth_mb_by_process": {
+                name: round(v, 2) for name, v in memory.items()
+            },
             **{name: round(now - known[name], 3) for name, now in counts(soak).items()},
             "minutes": minutes,
         }
@@ -283,18 +310,26 @@ def bars(result: dict[str, Any]) -> list[str]:
     least["goals_reached"] = int(least["goals_reached"])  # of whole minutes
     least["driven_in_episodes_m"] = DRIVEN_M
     return [
-        *(f"{name} {result[name]}: must be {bar} at most"
-          for name, bar in MOST.items() if not result[name] <= bar),
-        *(f"{name} {result[name]}: must be {bar:g} at least"
-          for name, bar in least.items() if not result[name] >= bar),
-    ]  # fmt: skip
+        *(
+            f"{name} {result[name]}: must be {bar} at most"
+            for name, bar in MOST.items()
+            if not result[name] <= bar
+        ),
+        *(
+            f"{name} {result[name]}: must be {bar:g} at least"
+            for name, bar in least.items()
+            if not result[name] >= bar
+        ),
+    ]
 
 
 def main() -> None:
     """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--warm-up", type=float, default=1.0, help="minutes before it counts")
+    parser.add_argument(
+        "--warm-up", type=float, default=1.0, help="minutes before it counts"
+    )
     given = parser.parse_args()
     result = measure(given.minutes, given.warm_up, given.control)
     table = "".join(f"{key:<28}{value}\n" for key, value in result.items())

@@ -47,7 +47,11 @@ CASES: dict[str, dict[str, Any]] = {
     "arena, same step": {"model": "ackermann", "autoreset_mode": "SameStep"},
     "room": {"model": "mecanum", "world": "room"},
     "crowd": {"model": "differential", "world": "crowd"},
-    "randomised": {"model": "differential", "world": "clutter", "randomisation": "strong"},
+    "randomised": {
+        "model": "differential",
+        "world": "clutter",
+        "randomisation": "strong",
+    },
     "team": {"model": "differential", "world": "arena", "task": "cooperative_reaching"},
 }
 """Arguments of `BridgeVectorEnv`."""
@@ -158,7 +162,10 @@ def run(
 ) -> dict[str, Any]:
     """The cases in turn, the first round to warm up and for the memory to settle."""
     allowed = 10**9 if control == "endless" else limit
-    cases = {name: begun(CASES[name], seed + 1000 * k, allowed) for k, name in enumerate(names)}
+    cases = {
+        name: begun(CASES[name], seed + 1000 * k, allowed)
+        for k, name in enumerate(names)
+    }
     found = {name: case.found for name, case in cases.items()}
     rng, begin = np.random.default_rng(seed), time.perf_counter()
     memory: list[float] = []
@@ -196,7 +203,9 @@ def stuck_in(one: Findings, limit: int) -> list[str]:
 
 def missed_of(result: dict[str, Any]) -> list[str]:
     """The bars that a soak missed."""
-    missed = [f"{name}: {line}" for name, lines in result["stuck"].items() for line in lines]
+    missed = [
+        f"{name}: {line}" for name, lines in result["stuck"].items() for line in lines
+    ]
     missed += [
         f"{name}: {one['nans']} numbers that are not finite"
         for name, one in result["cases"].items()
@@ -293,11 +302,17 @@ def main() -> None:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """What may be given beside the options that all benchmarks have."""
-    parser.add_argument("--steps", type=int, default=20_000_000, help="env steps in all")
+    parser.add_argument(
+        "--steps", type=int, default=20_000_000, help="env steps in all"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--limit", type=int, default=LIMIT, help="steps of the longest episode")
-    parser.add_argument("--resets", type=int, default=0, help="resets of a single env instead")
+    parser.add_argument(
+        "--limit", type=int, default=LIMIT, help="steps of the longest episode"
+    )
+    parser.add_argument(
+        "--resets", type=int, default=0, help="resets of a single env instead"
+    )
 
 
 if __name__ == "__main__":

@@ -38,17 +38,28 @@ CONTROLS = {
     "slow": "overhead: each step over the standard rests",
     "coarse": "the bundle: it is given observations in steps of a hundredth",
 }
-BARS = {"sim_conformance_failed": 0, "client_overhead": 0.1, "leapp_max_abs_difference": 1e-6}
+BARS = {
+    "sim_conformance_failed": 0,
+    "client_overhead": 0.1,
+    "leapp_max_abs_difference": 1e-6,
+}
 ROBOT, WORLD, CLAIMED = "ackermann", "circles", "NAMED_POSES"
 REST_S, PATIENCE_S, WARM = 0.002, 300.0, 50
 OBSERVATIONS, POLICY = 64, "differential"
 
 
 @contextmanager
-def simulator(domain_id: int, folder: Path, namespace: str, mode: str) -> Iterator[None]:
+def simulator(
+    domain_id: int, folder: Path, namespace: str, mode: str
+) -> Iterator[None]:
     """A simulator node in a process of its own, which listens to a Twist."""
     folder.mkdir(exist_ok=True)
-    given = {"model": ROBOT, "world": WORLD, "mode": mode, "enable_stamped_cmd_vel": False}
+    given = {
+        "model": ROBOT,
+        "world": WORLD,
+        "mode": mode,
+        "enable_stamped_cmd_vel": False,
+    }
     with NodeProcess("simulator_node", folder, given, domain_id, namespace):
         yield
 
@@ -67,7 +78,11 @@ def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, 
             failed = failures(client, "empty", claimed)
         finally:
             client.close()
-    return {"sim_features": len(told), "sim_conformance_failed": len(failed), "failed": failed}
+    return {
+        "sim_features": len(told),
+        "sim_conformance_failed": len(failed),
+        "failed": failed,
+    }
 
 
 def stepper(env: gymnasium.Env, rest_s: float) -> Callable[[int], list[float]]:
@@ -77,7 +92,9 @@ def stepper(env: gymnasium.Env, rest_s: float) -> Callable[[int], list[float]]:
     def steps(count: int) -> list[float]:
         times = []
         for _ in range(count):
-            action = random.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+            action = random.uniform(-1.0, 1.0, env.action_space.shape).astype(
+                np.float32
+            )
             begin = time.perf_counter()
             _, _, ended, cut, _ = env.step(action)
             if rest_s:
@@ -100,11 +117,19 @@ def overhead(
         for name in ("simulator_node", "simulation_interfaces"):
             space = f"{name}_{os.getpid()}"
             stack.enter_context(simulator(domain_id, folder / name, space, "lockstep"))
-            options = {"domain_id": domain_id, "namespace": space, "timeout_s": PATIENCE_S}
+            options = {
+                "domain_id": domain_id,
+                "namespace": space,
+                "timeout_s": PATIENCE_S,
+            }
             env = gymnasium.make(
-                NAVIGATION, backend="dds", model=ROBOT, world=WORLD, simulator=name,
+                NAVIGATION,
+                backend="dds",
+                model=ROBOT,
+                world=WORLD,
+                simulator=name,
                 backend_options={**options, "stamped": False},
-            )  # fmt: skip
+            )
             stack.callback(env.close)
             env.reset(seed=0)
             rests = control == "slow" and name == "simulation_interfaces"
@@ -118,8 +143,9 @@ def overhead(
     own, standard = (float(np.median(times[name])) for name in times)
     return {
         "client_overhead": round(standard / own - 1.0, 4),
-        "own_step_ms": round(own * 1e3, 4), "standard_step_ms": round(standard * 1e3, 4),
-    }  # fmt: skip
+        "own_step_ms": round(own * 1e3, 4),
+        "standard_step_ms": round(standard * 1e3, 4),
+    }
 
 
 def leapp(folder: Path, control: str | None) -> dict[str, float]:
@@ -135,15 +161,18 @@ def leapp(folder: Path, control: str | None) -> dict[str, float]:
     manager = InferenceManager(str(export_bundle(policy, folder / "bundle")))
     layout, random = policy.contract.observation, np.random.default_rng(0)
     scans = random.uniform(0.0, 1.0, (OBSERVATIONS, layout.scan_parts))
-    rest = random.uniform(layout.rest_low, layout.rest_high, (OBSERVATIONS, len(layout.rest_low)))
+    rest = random.uniform(
+        layout.rest_low, layout.rest_high, (OBSERVATIONS, len(layout.rest_low))
+    )
     gap, zero = 0.0, np.zeros(1)
     for row in np.concatenate([scans, rest], axis=1).astype(np.float32):
         scan, goal, velocity = np.split(row, [layout.scan_parts, layout.scan_parts + 3])
         pieces = {
-            "scan": scan, "goal": goal,
+            "scan": scan,
+            "goal": goal,
             "linear_velocity": np.concatenate([velocity[:2], zero]),
             "angular_velocity": np.concatenate([zero, zero, velocity[2:]]),
-        }  # fmt: skip
+        }
         if control == "coarse":
             pieces = {name: each.round(2) for name, each in pieces.items()}
         given = {
@@ -151,7 +180,9 @@ def leapp(folder: Path, control: str | None) -> dict[str, float]:
             for name, each in pieces.items()
         }
         theirs = manager(given)
-        for name, ours in zip(("action", "command"), policy.run(row[None]), strict=True):
+        for name, ours in zip(
+            ("action", "command"), policy.run(row[None]), strict=True
+        ):
             gap = max(gap, float(np.abs(theirs[f"policy/{name}"].numpy() - ours).max()))
     return {"leapp_max_abs_difference": gap}
 
@@ -183,7 +214,9 @@ def measure(given: Any) -> dict[str, Any]:
             result |= dict.fromkeys(SIMULATION, np.nan) | {"failed": [NOT_BUILT]}
         elif "simulation_interfaces" in given.parts:
             result |= conformance(domain_id, folder, given.control)
-            result |= overhead(domain_id, folder, given.control, given.chunks, given.size)
+            result |= overhead(
+                domain_id, folder, given.control, given.chunks, given.size
+            )
         if "leapp" in given.parts:
             result |= leapp(folder, given.control)
         if "nav2" in given.parts:
@@ -195,12 +228,16 @@ def main() -> None:
     """Prints a table, or one JSON object; ends with 1 where a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--parameters", type=Path, help="another parameter file of Nav2")
+    parser.add_argument(
+        "--parameters", type=Path, help="another parameter file of Nav2"
+    )
     parser.add_argument("--chunks", type=int, default=30)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
     given = parser.parse_args()
     result = measure(given)
-    table = "".join(f"{key:<28}{value}\n" for key, value in result.items() if key != "failed")
+    table = "".join(
+        f"{key:<28}{value}\n" for key, value in result.items() if key != "failed"
+    )
     answer(result, missed_of(result), table, given.json)
 
 

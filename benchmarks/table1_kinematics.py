@@ -82,7 +82,9 @@ def drive(robot: Subject, seed: int) -> Samples:
     """A drive whose inputs change at random every step; the pose moves along exact arcs."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(
-        robot.spec.command_low, robot.spec.command_high, (STEPS, len(robot.spec.command))
+        robot.spec.command_low,
+        robot.spec.command_high,
+        (STEPS, len(robot.spec.command)),
     )
     moved = geometry.exp(robot.twist(x) * DT)
     t = np.arange(STEPS) * DT
@@ -94,7 +96,9 @@ def errors(model: TaylorModel, robot: Subject, seed: int) -> tuple[Array, Array]
     x = drive(robot, seed).x
     truth, guess = robot.twist(x) * DT, model.rates(x) * DT
     a, b = geometry.exp(truth), geometry.exp(guess)
-    difference = np.concatenate([b[:, :2] - a[:, :2], guess[:, 2:] - truth[:, 2:]], axis=1)
+    difference = np.concatenate(
+        [b[:, :2] - a[:, :2], guess[:, 2:] - truth[:, 2:]], axis=1
+    )
     return rms(difference), rms(guess - truth)
 
 
@@ -103,7 +107,9 @@ def rms(values: Array) -> Array:
     return np.sqrt((values**2).mean(axis=0))
 
 
-def batch(model: TaylorModel, dtype: type, robots: int, robot: Subject) -> tuple[Any, ...]:
+def batch(
+    model: TaylorModel, dtype: type, robots: int, robot: Subject
+) -> tuple[Any, ...]:
     """Arguments of `kernels.run` for robots at the origin under random inputs."""
     terms = kernels.term_arrays(model)
     rng = np.random.default_rng(3)
@@ -139,7 +145,10 @@ def single_rate(model: TaylorModel, robot: Subject) -> float:
     rng = np.random.default_rng(4)
     low, high = robot.spec.command_low, robot.spec.command_high
     commands = rng.uniform(low, high, (1, SINGLE_STEPS, len(low)))
-    poses, states = np.zeros((1, SINGLE_STEPS + 1, 3)), np.zeros((1, SINGLE_STEPS + 1, 0))
+    poses, states = (
+        np.zeros((1, SINGLE_STEPS + 1, 3)),
+        np.zeros((1, SINGLE_STEPS + 1, 0)),
+    )
     terms = kernels.term_arrays(model)
     return SINGLE_STEPS / best(
         lambda: kernels.rollout(poses, states, commands, terms, kernels.SERIES, DT)
@@ -173,7 +182,9 @@ def without(model: TaylorModel, control: str | None) -> TaylorModel:
         digits = [float(f"{value:.2g}") for value in coefficients.ravel()]
         coefficients = np.array(digits).reshape(coefficients.shape)
     elif control == "nan":
-        coefficients[np.nonzero(coefficients)[0][0], np.nonzero(coefficients)[1][0]] = np.nan
+        coefficients[np.nonzero(coefficients)[0][0], np.nonzero(coefficients)[1][0]] = (
+            np.nan
+        )
     return replace(model, coefficients=coefficients)
 
 
@@ -186,7 +197,10 @@ def measure(name: str, control: str | None) -> dict[str, Any]:
     if control == "slow":
         single = batched = python_rate(robot)
     else:
-        single, batched = single_rate(model, robot), batched_rate(model, np.float64, robot)
+        single, batched = (
+            single_rate(model, robot),
+            batched_rate(model, np.float64, robot),
+        )
     return {
         "rmse_x_m": float(step[0]),
         "rmse_y_m": float(step[1]),
@@ -214,35 +228,56 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         if not error <= FLOAT32_M:
             missed.append(f"{name}: float32 is off by {error:.2e} m, bar {FLOAT32_M:g}")
         for key, bar in (
-            ("steps_per_s_single", FASTER_ALONE), ("steps_per_s_batched", FASTER_TOGETHER),
-        ):  # fmt: skip
+            ("steps_per_s_single", FASTER_ALONE),
+            ("steps_per_s_batched", FASTER_TOGETHER),
+        ):
             if not robot[key] >= bar * python:
                 times = robot[key] / python
-                missed.append(f"{name}: {key} is {times:.3g} times plain Python's, bar {bar:g}")
+                missed.append(
+                    f"{name}: {key} is {times:.3g} times plain Python's, bar {bar:g}"
+                )
     return missed
 
 
 def order4_heading() -> float:
     """RMSE of the heading per step of an Ackermann model with the terms up to order 4 [rad]."""
     robot = subject("ackermann")
-    return float(errors(fit(drive(robot, 1), robot.spec, order=4).model, robot, 2)[0][2])
+    return float(
+        errors(fit(drive(robot, 1), robot.spec, order=4).model, robot, 2)[0][2]
+    )
 
 
 def table(result: dict[str, Any]) -> str:
     """The figures beside the paper's."""
-    head = ("robot", "", "x [m]", "y [m]", "heading [rad]", "terms", "single /s", "batched /s")
+    head = (
+        "robot",
+        "",
+        "x [m]",
+        "y [m]",
+        "heading [rad]",
+        "terms",
+        "single /s",
+        "batched /s",
+    )
     row = "{:<14}{:<7}{:>10}{:>10}{:>15}{:>9}{:>12}{:>12}\n"
     text = row.format(*head)
     for name, r in result["robots"].items():
         mine = [f"{r[key]:.2e}" for key in ("rmse_x_m", "rmse_y_m", "rmse_heading_rad")]
-        rates = [f"{r[key]:.2e}" for key in ("steps_per_s_single", "steps_per_s_batched")]
-        text += row.format(name, "ours", *mine, f"{r['terms_kept']}/{r['terms_total']}", *rates)
+        rates = [
+            f"{r[key]:.2e}" for key in ("steps_per_s_single", "steps_per_s_batched")
+        ]
         text += row.format(
-            "", "paper", *(f"{v:.2e}" for v in PAPER[name][:3]), "", f"{PAPER[name][3]:.2e}", ""
+            name, "ours", *mine, f"{r['terms_kept']}/{r['terms_total']}", *rates
         )
-    text += (
-        f"Ackermann heading with order 4: {result['ackermann_order4_rmse_heading_rad']:.2e} rad\n"
-    )
+        text += row.format(
+            "",
+            "paper",
+            *(f"{v:.2e}" for v in PAPER[name][:3]),
+            "",
+            f"{PAPER[name][3]:.2e}",
+            "",
+        )
+    text += f"Ackermann heading with order 4: {result['ackermann_order4_rmse_heading_rad']:.2e} rad\n"
     text += f"plain Python: {result['python_reference_steps_per_s']:.2e} steps/s\n"
     return text
 

@@ -41,7 +41,11 @@ COARSE = Density(distances=3, rotations=8)
 
 
 def timed(
-    spec: LidarSpec, table: LidarTable, drawn: list[Batch], repeats: int, control: str | None
+    spec: LidarSpec,
+    table: LidarTable,
+    drawn: list[Batch],
+    repeats: int,
+    control: str | None,
 ) -> dict[str, list[float]]:
     """Times of one batch [s], of several in a row: exact, baked, and only filling the output."""
     out = np.empty((len(drawn[0].lidar), spec.beams), np.float32)
@@ -81,7 +85,9 @@ def measure(
     if control == "nan":
         baked[0][0, 0] = np.nan
     rmse, area = errors(baked, exact, spec)
-    plain = [scan(table, "exact", nearest_row(batch, table, spec), spec) for batch in drawn]
+    plain = [
+        scan(table, "exact", nearest_row(batch, table, spec), spec) for batch in drawn
+    ]
     plain_rmse, plain_area = errors(plain, exact, spec)
     times = timed(spec, table, drawn, repeats, control)
     seconds, batch = medians(times), len(drawn[0].lidar)
@@ -105,7 +111,8 @@ def judge(scene: dict[str, Any], write_limit: float) -> None:
         "share_of_write_limit": scene["share_of_write_limit"] >= SHARE,
         "rmse": scene["rmse_m"] <= RMSE_M,
         "rmse_of_nearest_row": scene["rmse_m"] <= PART * scene["nearest_row_rmse_m"],
-        "area_of_nearest_row": scene["area_rmse_m2"] <= PART * scene["nearest_row_area_rmse_m2"],
+        "area_of_nearest_row": scene["area_rmse_m2"]
+        <= PART * scene["nearest_row_area_rmse_m2"],
     }
 
 
@@ -128,9 +135,13 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed
 
 
-def run(spec: LidarSpec, scans: int, repeats: int, control: str | None) -> dict[str, Any]:
+def run(
+    spec: LidarSpec, scans: int, repeats: int, control: str | None
+) -> dict[str, Any]:
     """All figures, see the head of this file."""
-    bake(spec, SCENES["mixture"], Density(distances=3, rotations=1))  # compiled before it is timed
+    bake(
+        spec, SCENES["mixture"], Density(distances=3, rotations=1)
+    )  # compiled before it is timed
     found = {name: measure(spec, name, scans, repeats, control) for name in SCENES}
     write_limit = float(
         np.median([rate for _, about in found.values() for rate in about["writes"]])
@@ -154,15 +165,32 @@ def table_of(result: dict[str, Any]) -> str:
     """The figures beside the paper's."""
     row = "{:<9}{:<13}{:>10}{:>10}{:>8}{:>11}{:>12}{:>9}{:>8}\n"
     text = row.format(
-        "scene", "", "exact/s", "baked/s", "of write", "RMSE [m]", "area [m2]", "table", "bake"
+        "scene",
+        "",
+        "exact/s",
+        "baked/s",
+        "of write",
+        "RMSE [m]",
+        "area [m2]",
+        "table",
+        "bake",
     )
     for name, s in result["scenes"].items():
         text += row.format(
-            name, "ours", f"{s['exact_scans_per_s']:.2e}", f"{s['baked_scans_per_s']:.2e}",
-            f"{s['share_of_write_limit']:.0%}", f"{s['rmse_m']:.2e}", f"{s['area_rmse_m2']:.2e}",
-            f"{result['table_bytes'][name] / 1e6:.1f} MB", f"{result['bake_s'][name]:.1f} s",
-        )  # fmt: skip
-        plain = (f"{s['nearest_row_rmse_m']:.2e}", f"{s['nearest_row_area_rmse_m2']:.2e}")
+            name,
+            "ours",
+            f"{s['exact_scans_per_s']:.2e}",
+            f"{s['baked_scans_per_s']:.2e}",
+            f"{s['share_of_write_limit']:.0%}",
+            f"{s['rmse_m']:.2e}",
+            f"{s['area_rmse_m2']:.2e}",
+            f"{result['table_bytes'][name] / 1e6:.1f} MB",
+            f"{result['bake_s'][name]:.1f} s",
+        )
+        plain = (
+            f"{s['nearest_row_rmse_m']:.2e}",
+            f"{s['nearest_row_area_rmse_m2']:.2e}",
+        )
         text += row.format("", "nearest row", "", "", "", *plain, "", "")
         if result["lidar"] == "paper":
             theirs = [f"{value:.2e}" for value in PAPER[name]]
@@ -180,7 +208,9 @@ def main() -> None:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--lidar", default="paper", help="a shipped one, or a file")
     parser.add_argument("--scans", type=int, default=4096, help="scans of each scene")
-    parser.add_argument("--repeats", type=int, default=200, help="timed batches of each scene")
+    parser.add_argument(
+        "--repeats", type=int, default=200, help="timed batches of each scene"
+    )
     given = parser.parse_args()
     result = run(load_lidar(given.lidar), given.scans, given.repeats, given.control)
     answer(result, missed_of(result), table_of(result), given.json)

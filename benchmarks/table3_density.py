@@ -33,7 +33,9 @@ def measure(name: str, scans: int, control: str | None) -> dict[str, dict[str, f
     found: dict[str, dict[str, float]] = {"ours": {}, "nearest_row": {}}
     exact = None
     for distances, rotations in DENSITIES:
-        table = bake(SPEC, SCENES[name], Density(distances=distances, rotations=rotations))
+        table = bake(
+            SPEC, SCENES[name], Density(distances=distances, rotations=rotations)
+        )
         exact = exact or [scan(table, "exact", batch) for batch in drawn]
         key = f"{distances}x{rotations}"
         baked = [scan(table, "baked", batch) for batch in drawn]
@@ -54,7 +56,9 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         for name in SCENES:
             ours, plain = result[key][name], result["nearest_row"][key][name]
             if not ours <= PART * plain:
-                missed.append(f"{name}, {key}: {ours:.4f} m2, bar a third of {plain:.4f}")
+                missed.append(
+                    f"{name}, {key}: {ours:.4f} m2, bar a third of {plain:.4f}"
+                )
     ours, plain = (result["times_worse"][way] for way in ("ours", "nearest_row"))
     missed += [
         f"ours gets {factor:.2f} times worse at {key}, bar {LITTLE:g}"
@@ -63,7 +67,9 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     ]
     half = f"{DENSITIES[1][0]}x{DENSITIES[1][1]}"
     if not plain[half] >= MUCH:
-        missed.append(f"a plain look-up gets {plain[half]:.2f} times worse at {half}, bar {MUCH:g}")
+        missed.append(
+            f"a plain look-up gets {plain[half]:.2f} times worse at {half}, bar {MUCH:g}"
+        )
     return missed
 
 
@@ -77,7 +83,9 @@ def run(scans: int, control: str | None) -> dict[str, Any]:
     }
     factors = {
         way: {
-            key: float(np.mean([each[key][name] / each[keys[0]][name] for name in SCENES]))
+            key: float(
+                np.mean([each[key][name] / each[keys[0]][name] for name in SCENES])
+            )
             for key in keys[1:]
         }
         for way, each in tables.items()
@@ -99,9 +107,12 @@ def table_of(result: dict[str, Any]) -> str:
             key = f"{distances}x{rotations}"
             factor = result["times_worse"][way].get(key)
             errors_ = [f"{tables[key][name]:.2e}" for name in SCENES]
-            text += row.format(way, key, *errors_, "" if factor is None else f"{factor:.2f}")
+            text += row.format(
+                way, key, *errors_, "" if factor is None else f"{factor:.2f}"
+            )
     return (
-        text + f"paper: half the distances cost {PAPER_FACTOR} times, half the rotations little\n"
+        text
+        + f"paper: half the distances cost {PAPER_FACTOR} times, half the rotations little\n"
     )
 
 

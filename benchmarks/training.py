@@ -22,13 +22,22 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.policy.evaluation import FIRST_SEED, Summary, drive_worlds, summarise
+from nics_drl_bridge.policy.evaluation import (
+    FIRST_SEED,
+    Summary,
+    drive_worlds,
+    summarise,
+)
 from nics_drl_bridge.policy.train import line_of, train
 from nics_drl_bridge.policy.train_algorithms import act_of
 from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
 
 WORLD = "circles"
-BARS = {"differential": (0.95, 15.0), "ackermann": (0.95, 45.0), "mecanum": (0.95, 25.0)}
+BARS = {
+    "differential": (0.95, 15.0),
+    "ackermann": (0.95, 45.0),
+    "mecanum": (0.95, 25.0),
+}
 """Least success and longest time [s]."""
 SPEED_BAR = 100_000.0
 """Least environment steps per second of training. The share of the time that goes to the simulator
@@ -77,7 +86,12 @@ def measure(settings: TrainingSettings, seed: int, episodes: int) -> Run:
     with tempfile.TemporaryDirectory() as folder:
         trained = train(settings, seed, Path(folder))
     env = BridgeVectorEnv(
-        episodes, model, WORLD, settings.task, settings.task_options, settings.max_episode_steps
+        episodes,
+        model,
+        WORLD,
+        settings.task,
+        settings.task_options,
+        settings.max_episode_steps,
     )
     act, acting = act_of(trained.algorithm), [0.0]
 
@@ -117,7 +131,11 @@ def worst(runs: list[Run]) -> dict[str, Any]:
     least = min(figures, key=lambda one: one["success_rate"])
     greatest = ("wall_s", "env_steps", "env_share_of_wall")
     slowest = {"steps_per_s": min(one["steps_per_s"] for one in figures)}
-    return {**least, **{name: max(one[name] for one in figures) for name in greatest}, **slowest}
+    return {
+        **least,
+        **{name: max(one[name] for one in figures) for name in greatest},
+        **slowest,
+    }
 
 
 def missed(robot: str, figures: dict[str, Any]) -> list[str]:
@@ -129,7 +147,9 @@ def missed(robot: str, figures: dict[str, Any]) -> list[str]:
             f"less than {success:.0%}"
         )
     if not figures["wall_s"] <= limit_s:
-        said.append(f"{robot}: it took {figures['wall_s']:.0f} s, more than {limit_s:.0f} s")
+        said.append(
+            f"{robot}: it took {figures['wall_s']:.0f} s, more than {limit_s:.0f} s"
+        )
     if not figures["steps_per_s"] >= SPEED_BAR:
         speed = f"{figures['steps_per_s']:,.0f} steps per second, less than {SPEED_BAR:,.0f}"
         said.append(f"{robot}: it learned from {speed}")
@@ -140,9 +160,13 @@ def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--robot", choices=sorted(BARS), default="differential")
-    parser.add_argument("--lidar", help="instead of the robot's own, a shipped one or a file")
+    parser.add_argument(
+        "--lidar", help="instead of the robot's own, a shipped one or a file"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seeds", type=int, nargs="+", help="several seeds instead of one")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", help="several seeds instead of one"
+    )
     parser.add_argument("--episodes", type=int, default=500)
     given = parser.parse_args()
     settings = load_training(f"navigation_{given.robot}")

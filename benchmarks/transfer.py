@@ -31,9 +31,15 @@ CONTROLS = {
     "standing": "a policy that stands still",
 }
 FLOORS = {
-    "circles": 0.97, "doorway": 0.97, "arena": 0.97, "empty": 0.97,
-    "clutter": 0.95, "corridor": 0.95, "crowd": 0.95, "room": 0.95,
-}  # fmt: skip
+    "circles": 0.97,
+    "doorway": 0.97,
+    "arena": 0.97,
+    "empty": 0.97,
+    "clutter": 0.95,
+    "corridor": 0.95,
+    "crowd": 0.95,
+    "room": 0.95,
+}
 """Least success in process, by world: what fails everywhere alike has not been transferred."""
 BELIEF = 0.05
 """More than this share of the episodes may not be successes to the robot alone."""
@@ -53,18 +59,29 @@ def conditions(robot: str) -> Conditions:
 
 
 def measure(
-    robots: list[str], worlds: list[str], places: list[str], episodes: int, folder: Path,
+    robots: list[str],
+    worlds: list[str],
+    places: list[str],
+    episodes: int,
+    folder: Path,
     control: str | None,
-) -> Found:  # fmt: skip
+) -> Found:
     """What `nics evaluate` found: robot -> world -> place -> figures."""
     runs = {}
     for robot, world in product(robots, worlds):
         given: Any = world, episodes, FIRST_SEED, folder / robot / world
-        under: Any = {"control": control, "conditions": conditions(robot), "places": places}
+        under: Any = {
+            "control": control,
+            "conditions": conditions(robot),
+            "places": places,
+        }
         runs[f"{robot}/{world}"] = Run(robot, robot, *given, **under)
 
     def tell(name: str, figures: dict[str, Any]) -> None:
-        shares = (f"{place} {100 * each['success'][0]:.1f} %" for place, each in figures.items())
+        shares = (
+            f"{place} {100 * each['success'][0]:.1f} %"
+            for place, each in figures.items()
+        )
         sys.stderr.write(f"{name}: {', '.join(shares)}\n")
 
     found: Found = {}
@@ -90,13 +107,16 @@ def apart(found: Found) -> dict[str, Any]:
     return {
         robot: {
             world: {
-                place: round(100.0 * (each["success"][0] - places[FAST]["success"][0]), 3)
-                for place, each in places.items() if place != FAST and FAST in places
+                place: round(
+                    100.0 * (each["success"][0] - places[FAST]["success"][0]), 3
+                )
+                for place, each in places.items()
+                if place != FAST and FAST in places
             }
             for world, places in worlds.items()
         }
         for robot, worlds in found.items()
-    }  # fmt: skip
+    }
 
 
 def missed(found: Found) -> list[str]:
@@ -112,12 +132,17 @@ def missed(found: Found) -> list[str]:
     return said if any(found.values()) else ["no robot was driven"]
 
 
-def _missed_success(who: str, fast: float, floor: float, places: dict[str, Any]) -> list[str]:
+def _missed_success(
+    who: str, fast: float, floor: float, places: dict[str, Any]
+) -> list[str]:
     said = []
     if not fast >= floor - 1e-9:
         said.append(f"{who}: {fast:.1%} success in process, less than {floor:.0%}")
     for place, bar in BARS.items():
-        if place in places and not abs(off := places[place]["success"][0] - fast) <= bar + 1e-9:
+        if (
+            place in places
+            and not abs(off := places[place]["success"][0] - fast) <= bar + 1e-9
+        ):
             said.append(
                 f"{who}: success {LABELS[place]} is {100 * abs(off):.1f} points off that in "
                 f"process, more than {100 * bar:g}"
@@ -159,11 +184,18 @@ def main() -> None:
     parser, robots = parser_of(__doc__, CONTROLS), shipped_policies()
     parser.add_argument("--episodes", type=int, default=100, help="in each place")
     parser.add_argument("--robots", nargs="+", choices=robots, default=robots)
-    parser.add_argument("--worlds", nargs="+", choices=list(FLOORS), default=list(FLOORS))
     parser.add_argument(
-        "--in", nargs="+", dest="places", choices=PLACES, default=list(PLACES), metavar="PLACE",
+        "--worlds", nargs="+", choices=list(FLOORS), default=list(FLOORS)
+    )
+    parser.add_argument(
+        "--in",
+        nargs="+",
+        dest="places",
+        choices=PLACES,
+        default=list(PLACES),
+        metavar="PLACE",
         help=f"some of {', '.join(PLACES)}",
-    )  # fmt: skip
+    )
     given = parser.parse_args()
     begin, chosen = time.perf_counter(), (given.robots, given.worlds, given.places)
     with tempfile.TemporaryDirectory() as folder:

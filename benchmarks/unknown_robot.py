@@ -58,16 +58,27 @@ OPEN_PLACE = {"size": [30.0, 30.0], "pillars": []}
 FIELD = {
     "size": [12.0, 12.0],
     "pillars": [
-        [2.5, 1.5, 0.3], [-2.0, 2.8, 0.2], [3.6, -2.2, 0.35], [-3.4, -2.6, 0.3], [0.6, 4.0, 0.25],
-        [-4.2, 1.0, 0.2], [0.4, -3.6, 0.35], [4.2, 3.9, 0.2], [-1.4, -1.3, 0.2], [2.0, -4.6, 0.2],
+        [2.5, 1.5, 0.3],
+        [-2.0, 2.8, 0.2],
+        [3.6, -2.2, 0.35],
+        [-3.4, -2.6, 0.3],
+        [0.6, 4.0, 0.25],
+        [-4.2, 1.0, 0.2],
+        [0.4, -3.6, 0.35],
+        [4.2, 3.9, 0.2],
+        [-1.4, -1.3, 0.2],
+        [2.0, -4.6, 0.2],
     ],
-}  # fmt: skip
+}
 WORLD = {
     "name": "field",
     "size": [12.0, 12.0],
     "obstacles": [
         {
-            "shapes": [{"kind": "circle", "radius": 0.2}, {"kind": "circle", "radius": 0.35}],
+            "shapes": [
+                {"kind": "circle", "radius": 0.2},
+                {"kind": "circle", "radius": 0.35},
+            ],
             "count": 10,
             "gap": 1.2,
         }
@@ -82,8 +93,20 @@ ROBOT = {
     "lidar": "rplidar_a2",
     "parameters": {"track": 0.57, "wheel_radius": 0.165},
     "command": [
-        {"name": "forward_command", "unit": "m/s", "min": -0.8, "max": 0.8, "cmd_vel": "linear.x"},
-        {"name": "turn_command", "unit": "rad/s", "min": -1.2, "max": 1.2, "cmd_vel": "angular.z"},
+        {
+            "name": "forward_command",
+            "unit": "m/s",
+            "min": -0.8,
+            "max": 0.8,
+            "cmd_vel": "linear.x",
+        },
+        {
+            "name": "turn_command",
+            "unit": "rad/s",
+            "min": -1.2,
+            "max": 1.2,
+            "cmd_vel": "angular.z",
+        },
     ],
 }
 LIMITS = {
@@ -99,9 +122,15 @@ def arguments() -> argparse.Namespace:
     """Returns the options of the command line."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--goals", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0, help="of goals, noise and the training")
-    parser.add_argument("--minutes", type=float, default=0.0, help="drive on, re-arming every 5")
-    parser.add_argument("--folder", type=Path, help="keep all files there, and use what is there")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of goals, noise and the training"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=0.0, help="drive on, re-arming every 5"
+    )
+    parser.add_argument(
+        "--folder", type=Path, help="keep all files there, and use what is there"
+    )
     return parser.parse_args()
 
 
@@ -128,11 +157,17 @@ class Workshop:
         """Runs a `nics` command in the folder; returns what it printed."""
         command = [str(Path(sys.executable).with_name("nics")), *words]
         done = subprocess.run(
-            command, cwd=self.folder, env=self._environment, capture_output=True, text=True
+            command,
+            cwd=self.folder,
+            env=self._environment,
+            capture_output=True,
+            text=True,
         )
         (self.folder / f"{words[0]}.log").write_text(done.stdout + done.stderr)
         if done.returncode != 0:
-            raise SystemExit(f"nics {' '.join(words)} ended with {done.returncode}: {done.stderr}")
+            raise SystemExit(
+                f"nics {' '.join(words)} ended with {done.returncode}: {done.stderr}"
+            )
         return done.stdout
 
     @contextmanager
@@ -158,9 +193,17 @@ class Workshop:
             return
         with self.driver("open_place.json"):
             self.nics(
-                "record", "--robot", "robot.yaml", "--out", "drive", "--bound", "5",
-                "--duration", "90", "--yes",
-            )  # fmt: skip
+                "record",
+                "--robot",
+                "robot.yaml",
+                "--out",
+                "drive",
+                "--bound",
+                "5",
+                "--duration",
+                "90",
+                "--yes",
+            )
 
     def generate(self) -> str:
         """Generates the simulator; returns the report."""
@@ -172,9 +215,16 @@ class Workshop:
         """Trains the policy; returns its file."""
         if not (self.folder / "policies").exists():
             self.nics(
-                "train", "--robot", "rover", "--world", "field.yaml", "--seeds", str(self._seed),
-                "--out", "policies",
-            )  # fmt: skip
+                "train",
+                "--robot",
+                "rover",
+                "--world",
+                "field.yaml",
+                "--seeds",
+                str(self._seed),
+                "--out",
+                "policies",
+            )
         return self.folder / "policies" / f"seed_{self._seed}" / "policy.onnx"
 
 
@@ -212,7 +262,9 @@ class Operator(Node):
     def _on_pose(self, message: PoseStamped) -> None:
         turned = message.pose.orientation
         heading = 2.0 * math.atan2(turned.z, turned.w)
-        self.pose = np.array([message.pose.position.x, message.pose.position.y, heading])
+        self.pose = np.array(
+            [message.pose.position.x, message.pose.position.y, heading]
+        )
 
     def _on_touch(self, message: Bool) -> None:
         self.touched |= message.data
@@ -264,8 +316,14 @@ class Operator(Node):
         while True:
             goal = self._rng.uniform(-0.5, 0.5, 2) * (self._size - 2.0 * GOAL_CLEARANCE)
             far = float(np.linalg.norm(goal - self.pose[:2]))
-            gaps = np.linalg.norm(self._pillars[:, :2] - goal, axis=1) - self._pillars[:, 2]
-            if GOAL_DISTANCE[0] <= far <= GOAL_DISTANCE[1] and gaps.min() >= GOAL_CLEARANCE:
+            gaps = (
+                np.linalg.norm(self._pillars[:, :2] - goal, axis=1)
+                - self._pillars[:, 2]
+            )
+            if (
+                GOAL_DISTANCE[0] <= far <= GOAL_DISTANCE[1]
+                and gaps.min() >= GOAL_CLEARANCE
+            ):
                 return goal
 
     def send_goal(self, goal: Array) -> None:
@@ -324,7 +382,11 @@ class Drives:
     @property
     def success(self) -> float:
         """Share of the goals that were truly reached."""
-        return float(np.mean([away <= TRUE_RADIUS for away in self.away])) if self.away else 0.0
+        return (
+            float(np.mean([away <= TRUE_RADIUS for away in self.away]))
+            if self.away
+            else 0.0
+        )
 
 
 def drive_to_goals(operator: Operator, goals: int, minutes: float) -> Drives:
@@ -361,7 +423,8 @@ def time_to_stop_when_held(operator: Operator) -> float:
     operator.send_goal(operator.draw_goal())
     began_s = time.monotonic()
     drives = operator.wait_until(
-        lambda: sum(moves for at, moves in operator.commanded if at > began_s) > 40, 20.0
+        lambda: sum(moves for at, moves in operator.commanded if at > began_s) > 40,
+        20.0,
     )
     if not drives:
         return math.nan
@@ -373,7 +436,9 @@ def time_to_stop_when_held(operator: Operator) -> float:
     return moved[-1] - held_s
 
 
-def run_bridge(workshop: Workshop, policy: Path, domain_id: int, control: str | None) -> ExitStack:
+def run_bridge(
+    workshop: Workshop, policy: Path, domain_id: int, control: str | None
+) -> ExitStack:
     """Starts gate, estimator and policy as `vehicle.launch.py` does; returns what ends them."""
     shared = {"model": str(workshop.folder / "rover"), "enable_stamped_cmd_vel": True}
     gate = shared | {"limits": str(workshop.folder / "limits.yaml")}
@@ -404,7 +469,10 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }
     rclpy.init()
     operator = Operator(FIELD, options.seed)
-    with workshop.driver("field.json"), run_bridge(workshop, policy, domain_id, options.control):
+    with (
+        workshop.driver("field.json"),
+        run_bridge(workshop, policy, domain_id, options.control),
+    ):
         if not operator.wait_until(lambda: operator.pose is not None, 30.0):
             raise SystemExit("the robot's driver is silent; see driver.log.")
         if not operator.wait_until(operator.is_policy_there, 120.0):
@@ -428,7 +496,9 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     """Returns a sentence for each bar that was missed."""
     missed = []
     if not result["success"] >= SUCCESS_BAR:
-        missed.append(f"success {result['success']:.3f} by true pose, bar {SUCCESS_BAR:g}")
+        missed.append(
+            f"success {result['success']:.3f} by true pose, bar {SUCCESS_BAR:g}"
+        )
     if result["touched"]:
         missed.append("the robot touched something")
     if result["refusals"]:

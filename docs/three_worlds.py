@@ -23,17 +23,28 @@ from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.watch.record import Pixels, beside, write_gif
 
 POLICY, WORLD, SEEDS = "differential", "clutter", (1_000_002, 1_000_004, 1_000_005)
-OUT, SIDE, HEAD, FPS, STANDS = Path(__file__).with_name("three_worlds.gif"), 300, 26, 12, 8
+OUT, SIDE, HEAD, FPS, STANDS = (
+    Path(__file__).with_name("three_worlds.gif"),
+    300,
+    26,
+    12,
+    8,
+)
 
 
-def drawn(env: BridgeEnv, picture: WorldPicture, place: str, episode: Episode) -> Iterator[Pixels]:
+def drawn(
+    env: BridgeEnv, picture: WorldPicture, place: str, episode: Episode
+) -> Iterator[Pixels]:
     """Pictures of an episode; what the lidar saw is computed from where the robot was."""
     font = ImageFont.load_default(15)
     for k, pose in enumerate(episode.path):
         env.reset(seed=episode.seed, options={"start": pose})
         shot = picture.draw(env.snapshot(), [episode.path[: k + 1, :2]])
         image = Image.new("RGB", (SIDE, SIDE + HEAD), "white")
-        image.paste(Image.fromarray(shot).resize((SIDE, SIDE), Image.Resampling.LANCZOS), (0, HEAD))
+        image.paste(
+            Image.fromarray(shot).resize((SIDE, SIDE), Image.Resampling.LANCZOS),
+            (0, HEAD),
+        )
         end = f": {episode.result}" if k == len(episode.path) - 1 else ""
         title = f"{LABELS[place]}{end}"
         ImageDraw.Draw(image).text((SIDE / 2, 5), title, "#17202a", font, anchor="ma")
@@ -53,11 +64,15 @@ def main() -> None:
     with closing(BridgeEnv(model=POLICY, world=WORLD)) as env:
         picture = WorldPicture(env.model, env.world)
         for n in range(len(SEEDS)):
-            rows = [list(drawn(env, picture, place, some[n])) for place, some in runs.items()]
+            rows = [
+                list(drawn(env, picture, place, some[n]))
+                for place, some in runs.items()
+            ]
             last = [row[-1] for row in rows]
             for shown in (*zip_longest(*rows), *[last] * STANDS):
                 held = [
-                    one if one is not None else end for one, end in zip(shown, last, strict=True)
+                    one if one is not None else end
+                    for one, end in zip(shown, last, strict=True)
                 ]
                 frames.append(beside(held))
     write_gif(OUT, frames, FPS)

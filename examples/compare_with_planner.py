@@ -21,10 +21,14 @@ def main() -> None:
         envs = BridgeVectorEnv(len(EPISODES), model, "clutter", task)
         success = drive_worlds(envs, policy.act, EPISODES).success
         found.append(rate(int(success.sum()), len(EPISODES)))
-        print(f"{name}: {found[-1].value:.0%} ({found[-1].low:.0%} to {found[-1].high:.0%})")
+        print(
+            f"{name}: {found[-1].value:.0%} ({found[-1].low:.0%} to {found[-1].high:.0%})"
+        )
 
     figure, (axes,) = panels(1, 1, (5.5, 3.6))
-    value, low, high = 100.0 * np.array([(one.value, one.low, one.high) for one in found]).T
+    value, low, high = (
+        100.0 * np.array([(one.value, one.low, one.high) for one in found]).T
+    )
     axes.bar(POLICIES, value, yerr=[value - low, high - value], capsize=6)
     axes.set(title="100 episodes in clutter", ylabel="success [%]", ylim=(0, 105))
     Path("compare_with_planner.png").write_bytes(png(figure))

@@ -33,10 +33,15 @@ def network():
         helper.make_node("Tanh", ["raw"], ["action"]),
     ]
     ends = {"scan": ["n", 36], "goal": ["n", 2], "action": ["n", 2]}
-    infos = [helper.make_tensor_value_info(n, TensorProto.FLOAT, of) for n, of in ends.items()]
+    infos = [
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, of)
+        for n, of in ends.items()
+    ]
     initial = [numpy_helper.from_array(weights, "weights")]
     graph = helper.make_graph(nodes, "theirs", infos[:2], infos[2:], initial)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    return helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    )
 
 
 def main():

@@ -26,7 +26,12 @@ def main() -> None:
     options = {"domain_id": domain_id, "timeout_s": 120.0}
     with NodeProcess("simulator_node", Path("logs"), parameters, domain_id):
         there = gymnasium.make(
-            ENV, backend="dds", model=model, world=WORLD, task=task, backend_options=options
+            ENV,
+            backend="dds",
+            model=model,
+            world=WORLD,
+            task=task,
+            backend_options=options,
         )
         outside = drive(there, policy, SEED)
         there.close()

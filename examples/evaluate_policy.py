@@ -24,7 +24,9 @@ def main() -> None:
     outcomes = drive_worlds(envs, policy.act, range(FIRST_SEED, FIRST_SEED + 200))
     print(line_of(summarise(outcomes, model.control_period)))
 
-    env = gymnasium.make("NicsBridge/Navigation-v0", model=model, world=world, task=task)
+    env = gymnasium.make(
+        "NicsBridge/Navigation-v0", model=model, world=world, task=task
+    )
     episodes = drive_all(env, policy, range(FIRST_SEED, FIRST_SEED + 6))
     picture = trajectories({"policy": episodes}, world, model.robot.footprint_radius)
     Path("evaluate_policy.png").write_bytes(picture)

@@ -12,7 +12,9 @@ from nics_drl_bridge.report.pictures import panels, png
 
 def main() -> None:
     robot, world = load_robot("differential"), load_world("arena")
-    recording = textbook.record(robot, np.random.default_rng(0))  # or read_recording(path)
+    recording = textbook.record(
+        robot, np.random.default_rng(0)
+    )  # or read_recording(path)
     model, _ = generate(recording, robot, load_lidar("paper"), world.shapes)
     print(model.report)
     save_model(model, "my_robot")
@@ -28,7 +30,12 @@ def main() -> None:
 
     figure, (axes,) = panels(1, 1, (5.0, 5.0))
     axes.plot(*np.stack(paths)[..., :2].transpose(2, 0, 1))
-    axes.set(title="64 worlds, one robot each", aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axes.set(
+        title="64 worlds, one robot each",
+        aspect="equal",
+        xlabel="x [m]",
+        ylabel="y [m]",
+    )
     Path("generate_from_recording.png").write_bytes(png(figure))
 
 

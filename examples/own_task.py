@@ -18,7 +18,9 @@ class Patrol(Task):
     rounds: int = 3  # so many arrivals are a success
 
     @property
-    def observation_space(self):  # the scan, then distance, cosine, sine of the goal's bearing
+    def observation_space(
+        self,
+    ):  # the scan, then distance, cosine, sine of the goal's bearing
         return self.box([0, -1, -1], [1000, 1, 1])
 
     def reset(self, episodes):
@@ -27,9 +29,14 @@ class Patrol(Task):
         return {"goal": goal, "back": back, "arrivals": count, "arrived": count > 0}
 
     def update(self, before, after, memory):  # whoever is there turns back
-        memory["arrived"][...] = there = distance(after.pose, memory["goal"]) < self.radius
+        memory["arrived"][...] = there = (
+            distance(after.pose, memory["goal"]) < self.radius
+        )
         memory["arrivals"] += there
-        memory["goal"][there], memory["back"][there] = memory["back"][there], memory["goal"][there]
+        memory["goal"][there], memory["back"][there] = (
+            memory["back"][there],
+            memory["goal"][there],
+        )
 
     def observation(self, view, memory):
         seen = [self.free_share(view.ranges), bearing(view.pose, memory["goal"])]
@@ -44,15 +51,23 @@ class Patrol(Task):
 
     def info(self, view, memory):  # what an evaluation reads
         arrivals, touches = memory["arrivals"].copy(), self.touches(view.ranges)
-        return {"is_success": arrivals >= self.rounds, "collision": touches, "arrivals": arrivals}
+        return {
+            "is_success": arrivals >= self.rounds,
+            "collision": touches,
+            "arrivals": arrivals,
+        }
 
 
 def main():  # by a policy that turns to the goal, and drives where that is ahead
     robot, world = load_robot("differential"), load_world("empty")
-    policy = SimpleNamespace(act=lambda seen: np.float32([max(seen[-2], 0) - 1, seen[-1]]))
+    policy = SimpleNamespace(
+        act=lambda seen: np.float32([max(seen[-2], 0) - 1, seen[-1]])
+    )
     run = drive(make(task=Patrol, model="differential", world=world), policy, seed=1)
     print(f"{run.result} after {run.steps} steps")
-    Path("own_task.png").write_bytes(trajectories({"path": [run]}, world, robot.footprint_radius))
+    Path("own_task.png").write_bytes(
+        trajectories({"path": [run]}, world, robot.footprint_radius)
+    )
 
 
 if __name__ == "__main__":

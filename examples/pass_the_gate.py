@@ -16,7 +16,9 @@ FULL_SPEED = np.array([0.5, 0.0])  # m/s, rad/s
 
 def main() -> None:
     model, world = open_model("differential"), load_world("empty")
-    gated = GatedBackend(SimBackend(model, world, estimator=True), model, "differential")
+    gated = GatedBackend(
+        SimBackend(model, world, estimator=True), model, "differential"
+    )
     gated.reset(Start(0, np.zeros(3)))
     rows = []
     for _ in range(100):
@@ -24,7 +26,9 @@ def main() -> None:
         rows.append((view.ranges.min(), view.twist[..., 0].item(), facts["shielded"]))
     nearest, speed, shielded = np.array(rows, float).T
     stopped = gated.step(np.array([np.nan, 0.0]))[1]["stopped_by"]
-    print(f"the shield left {nearest[-1]:.2f} m between lidar and wall, at {speed[-1]:.2f} m/s")
+    print(
+        f"the shield left {nearest[-1]:.2f} m between lidar and wall, at {speed[-1]:.2f} m/s"
+    )
     print(f"a command that is no number is stopped by the rule {stopped!r}")
 
     figure, (axes,) = panels(1, 1, (6.5, 3.6))

@@ -25,11 +25,17 @@ def main() -> None:
         envs = BridgeVectorEnv(len(EPISODES), model, "circles", task, **simulation)
         success = drive_worlds(envs, policy.act, EPISODES).success
         found.append(rate(int(success.sum()), len(EPISODES)))
-        print(f"{name}: {found[-1].value:.0%} ({found[-1].low:.0%} to {found[-1].high:.0%})")
+        print(
+            f"{name}: {found[-1].value:.0%} ({found[-1].low:.0%} to {found[-1].high:.0%})"
+        )
 
     figure, (axes,) = panels(1, 1, (5.5, 3.6))
-    value, low, high = 100.0 * np.array([(one.value, one.low, one.high) for one in found]).T
-    axes.errorbar(list(CONDITIONS), value, yerr=[value - low, high - value], fmt="o", capsize=6)
+    value, low, high = (
+        100.0 * np.array([(one.value, one.low, one.high) for one in found]).T
+    )
+    axes.errorbar(
+        list(CONDITIONS), value, yerr=[value - low, high - value], fmt="o", capsize=6
+    )
     axes.set(title="100 episodes in circles", ylabel="success [%]", ylim=(0, 105))
     Path("perturb.png").write_bytes(png(figure))
 

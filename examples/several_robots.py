@@ -35,7 +35,9 @@ def main() -> None:
         ended = terminated or truncated
     print(f"{len(pictures)} steps, reached: {bool(np.all(info['is_success']))}")
     shown = [pictures[k] for k in (0, len(pictures) // 2, -1)]
-    Image.fromarray(np.concatenate(shown, axis=1)).quantize(64).save("several_robots.png")
+    Image.fromarray(np.concatenate(shown, axis=1)).quantize(64).save(
+        "several_robots.png"
+    )
 
 
 if __name__ == "__main__":

@@ -12,13 +12,17 @@ OUT = Path("runs/example")
 
 def main() -> None:
     changes = {"steps": STEPS, "worlds": {"arena": 128}}
-    settings = chosen_settings("navigation", "demo", changes)  # config/training/demo.yaml
+    settings = chosen_settings(
+        "navigation", "demo", changes
+    )  # config/training/demo.yaml
     curve = []
 
     def tell(progress: train.checkpoints.Progress) -> None:
         curve.append(Point(progress.steps, progress.success, progress.collision))
 
-    result = train.run(train.TrainOrder(settings, seeds=[0], out=OUT, episodes=100), tell)[0]
+    result = train.run(
+        train.TrainOrder(settings, seeds=[0], out=OUT, episodes=100), tell
+    )[0]
     print(f"{result.trained.steps} steps: {train.line_of(result.summaries['arena'])}")
     print(f"the policy is {OUT}/seed_0/policy.onnx")
     Path("train_policy.png").write_bytes(training_curve(curve))

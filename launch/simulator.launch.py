@@ -7,7 +7,12 @@ from nics_drl_bridge.nodes import launching
 
 
 def generate_launch_description():
-    arguments = [*launching.common("true"), *launching.of_nodes(), *launching.of_simulator()]
+    arguments = [
+        *launching.common("true"),
+        *launching.of_nodes(),
+        *launching.of_simulator(),
+    ]
     return launching.launched(
-        [launching.simulator, launching.description], [*arguments, *launching.of_description()]
+        [launching.simulator, launching.description],
+        [*arguments, *launching.of_description()],
     )

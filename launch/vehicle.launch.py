@@ -10,7 +10,12 @@ from nics_drl_bridge.nodes import launching
 
 
 def generate_launch_description():
-    arguments = [*launching.common("false"), *launching.of_nodes(), *launching.of_bridge()]
+    arguments = [
+        *launching.common("false"),
+        *launching.of_nodes(),
+        *launching.of_bridge(),
+    ]
     return launching.launched(
-        [launching.bridge, launching.description], [*arguments, *launching.of_description()]
+        [launching.bridge, launching.description],
+        [*arguments, *launching.of_description()],
     )

@@ -32,19 +32,36 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
-    "FastSimulator", "__version__", "generate", "load_model", "load_policy", "load_recording",
-    "load_robot", "load_world", "load_worlds", "make", "make_vec", "open_model", "read_recording",
-    "read_sdf", "save_model", "save_recording",
-]  # fmt: skip
+    "FastSimulator",
+    "__version__",
+    "generate",
+    "load_model",
+    "load_policy",
+    "load_recording",
+    "load_robot",
+    "load_world",
+    "load_worlds",
+    "make",
+    "make_vec",
+    "open_model",
+    "read_recording",
+    "read_sdf",
+    "save_model",
+    "save_recording",
+]
 
 _NAMES = {
     "env.registry": ("make", "make_vec"),
     "generator": ("generate", "load_model", "open_model", "save_model"),
-    "policy.policy_file": ("load_policy",), "recording.readers": ("read_recording",),
-    "recording.recording": ("load_recording", "save_recording"), "robot.spec": ("load_robot",),
-    "sim.sdf": ("read_sdf",), "sim.simulator": ("FastSimulator",), "sim.world": ("load_world",),
+    "policy.policy_file": ("load_policy",),
+    "recording.readers": ("read_recording",),
+    "recording.recording": ("load_recording", "save_recording"),
+    "robot.spec": ("load_robot",),
+    "sim.sdf": ("read_sdf",),
+    "sim.simulator": ("FastSimulator",),
+    "sim.world": ("load_world",),
     "sim.world_set": ("load_worlds",),
-}  # fmt: skip
+}
 _HOMES = {name: home for home, names in _NAMES.items() for name in names}
 
 

@@ -17,7 +17,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 ROBOT_WORDS = ("robot", "model")
 LARGEST_COUNT = 2**31 - 1
-KINDS: dict[str, tuple[tuple[type, ...], str]] = {  # annotation -> types, name in errors
+KINDS: dict[
+    str, tuple[tuple[type, ...], str]
+] = {  # annotation -> types, name in errors
     "bool": ((bool,), "True or False"),
     "int": ((int,), "a whole number"),
     "float": ((int, float), "a finite number"),
@@ -47,7 +49,9 @@ def check_kind(what: str, value: Any, annotation: Any) -> None:
 
     Other annotations are not checked. A bool is no number, and a number is finite.
     """
-    kind, optional, _ = str(getattr(annotation, "__name__", annotation)).partition(" | None")
+    kind, optional, _ = str(getattr(annotation, "__name__", annotation)).partition(
+        " | None"
+    )
     if kind not in KINDS or (optional and value is None):
         return
     types, name = KINDS[kind]
@@ -64,16 +68,22 @@ def check_count(what: str, value: Any) -> None:
     """Raises ConfigError unless a value is a whole number of at least 1."""
     check_kind(what, value, int)
     if not 1 <= value <= LARGEST_COUNT:
-        raise ConfigError(f"{what}={shown(value)}: must be a whole number of at least 1.")
+        raise ConfigError(
+            f"{what}={shown(value)}: must be a whole number of at least 1."
+        )
 
 
 def check_options(what: str, value: Any) -> None:
     """Raises ConfigError unless a value is a dictionary whose keys are names, or None."""
     if value is not None and not isinstance(value, Mapping):
-        raise ConfigError(f"{what}={shown(value)}: must be a dict of options by name, or None.")
+        raise ConfigError(
+            f"{what}={shown(value)}: must be a dict of options by name, or None."
+        )
     for name in value or ():
         if not isinstance(name, str):
-            raise ConfigError(f"{what}: the key {shown(name)} must be the name of an option.")
+            raise ConfigError(
+                f"{what}: the key {shown(name)} must be the name of an option."
+            )
 
 
 def check_path(what: str, value: Any) -> None:
@@ -100,7 +110,9 @@ def refuse_unknown(place: str, given: Iterable[str], known: Iterable[str]) -> No
             raise ConfigError(f"{place}: unknown argument {name!r}; {hint}")
 
 
-def in_own_word(place: str, own: str, named: dict[str, Any], positional: Any = None) -> None:
+def in_own_word(
+    place: str, own: str, named: dict[str, Any], positional: Any = None
+) -> None:
     """Renames the argument `robot` or `model`, in place, to a function's own word for it.
 
     `positional` is the value of its own that was given without a name. Raises ConfigError for two
@@ -115,7 +127,9 @@ def in_own_word(place: str, own: str, named: dict[str, Any], positional: Any = N
         return
     if first is not None and not _same(first, value):
         both = f"{own}={shown(first)} and {other}={shown(value)}"
-        raise ConfigError(f"{place}: {both} name two robots by two words for one thing; give one.")
+        raise ConfigError(
+            f"{place}: {both} name two robots by two words for one thing; give one."
+        )
     if positional is None:
         named[own] = value
 
@@ -143,7 +157,9 @@ def checked_arguments(
         if passes_to is not None:
             further = signature(passes_to).parameters
             known |= keywords_of(passes_to) - set(without)
-            annotations = {name: each.annotation for name, each in further.items()} | annotations
+            annotations = {
+                name: each.annotation for name, each in further.items()
+            } | annotations
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:

@@ -21,7 +21,9 @@ from nics_drl_bridge.errors import ConfigError, nearest, shortened
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
 MAX_BYTES = 2**20  # maximum size of a YAML file
-MAX_VALUES = 50_000  # keys, values and lists; an alias counts as everything it stands for
+MAX_VALUES = (
+    50_000  # keys, values and lists; an alias counts as everything it stands for
+)
 _LONGEST_PROBLEM = 200
 
 
@@ -43,9 +45,15 @@ def _within(most: float, needed: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-Heading = Annotated[float, _within(6.3, "in radians, within 2 pi (degrees look like this)")]
-_Near = Annotated[float, _within(10.0, "in metres, within 10 (millimetres look like this)")]
-Mount = tuple[_Near, _Near, Heading]  # x, y [m] and heading [rad] of a sensor in `base_link`
+Heading = Annotated[
+    float, _within(6.3, "in radians, within 2 pi (degrees look like this)")
+]
+_Near = Annotated[
+    float, _within(10.0, "in metres, within 10 (millimetres look like this)")
+]
+Mount = tuple[
+    _Near, _Near, Heading
+]  # x, y [m] and heading [rad] of a sensor in `base_link`
 
 
 class Schema(BaseModel):
@@ -64,16 +72,22 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
     except ValidationError as error:
         raise ConfigError(f"{source}: {_sentence(error, schema)}") from None
     for place, given in _coerced_to_numbers(data, found):
-        raise ConfigError(f"{source}: key {place!r}: should be a number, not {given!r}.")
+        raise ConfigError(
+            f"{source}: key {place!r}: should be a number, not {given!r}."
+        )
     return found
 
 
-def _coerced_to_numbers(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+def _coerced_to_numbers(
+    given: Any, found: Any, place: str = ""
+) -> Iterator[tuple[str, Any]]:
     """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
     pairs: list[tuple[Any, Any, Any]] = []
     if isinstance(given, dict):
         parts = found if isinstance(found, dict) else getattr(found, "__dict__", {})
-        pairs = [(key, value, parts[key]) for key, value in given.items() if key in parts]
+        pairs = [
+            (key, value, parts[key]) for key, value in given.items() if key in parts
+        ]
     elif isinstance(found, (tuple, list)) and isinstance(given, (tuple, list)):
         pairs = [(k, *both) for k, both in enumerate(zip(given, found, strict=False))]
     elif isinstance(given, (str, bool)) and type(found) in (int, float):
@@ -82,7 +96,10 @@ def _coerced_to_numbers(given: Any, found: Any, place: str = "") -> Iterator[tup
         yield from _coerced_to_numbers(value, made, f"{place}.{key}")
 
 
-_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")  # keys of a model, of a dataclass
+_UNKNOWN = (
+    "extra_forbidden",
+    "unexpected_keyword_argument",
+)  # keys of a model, of a dataclass
 _NO_KEYS = ("model_type", "model_attributes_type", "dict_type", "dataclass_type")
 _NO_LIST, _COUNT = ("tuple_type", "list_type"), ("too_short", "too_long")
 _SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory in full
@@ -99,7 +116,10 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
         hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
         return f"unknown key {key!r}; {hint}"
     if first["type"] == "union_tag_invalid":
-        tag, known = first["ctx"]["tag"], re.findall("'([^']*)'", first["ctx"]["expected_tags"])
+        tag, known = (
+            first["ctx"]["tag"],
+            re.findall("'([^']*)'", first["ctx"]["expected_tags"]),
+        )
         return f"key {key!r}: unknown kind {tag!r}; {nearest(tag, known)}"
     if first["type"] == "union_tag_not_found":
         return f"the key '{key}.kind' is missing; add it."
@@ -113,7 +133,9 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     if first["type"] in _NO_LIST:
         return f"key {key!r}: must be a list, as [a, b], not {_SHORT.repr(first['input'])}."
     if first["type"] in _COUNT:
-        least, most, found = map(first["ctx"].get, ("min_length", "max_length", "actual_length"))
+        least, most, found = map(
+            first["ctx"].get, ("min_length", "max_length", "actual_length")
+        )
         told = f"at most {most}" if least is None else f"at least {least}"
         return f"key {key!r}: number of entries must be {told}, not {found}."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
@@ -135,7 +157,9 @@ def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list
         else:
             kinds = (getattr(one, "model_fields", {}).get("kind") for one in candidates)
             named = zip(candidates, kinds, strict=True)
-            current = next((one for one, kind in named if kind and kind.default == part), current)
+            current = next(
+                (one for one, kind in named if kind and kind.default == part), current
+            )
     return list(_annotations_of(current))
 
 
@@ -191,7 +215,9 @@ def share_folder() -> Path:
     for folder in (checkout, *(parent / "share" / PACKAGE for parent in others)):
         if (folder / "config" / "robots").is_dir():
             return folder
-    raise ConfigError("the package's config folder was not found; install it with pip or colcon.")
+    raise ConfigError(
+        "the package's config folder was not found; install it with pip or colcon."
+    )
 
 
 def shipped_names(kind: str) -> list[str]:
@@ -209,13 +235,17 @@ def find_config(name: str | Path, kind: str, also: Iterable[str] = ()) -> Path:
     if path.is_file():
         return path
     hint = nearest(name, (*shipped_names(kind), *also))
-    word = {"training": "settings", "limits": "limits"}.get(kind, kind.removesuffix("s"))
+    word = {"training": "settings", "limits": "limits"}.get(
+        kind, kind.removesuffix("s")
+    )
     unknown = f"unknown {word} {name!r}"
     raise ConfigError(f"{unknown}; {hint} (or give the path of a YAML file).")
 
 
 # libyaml's parser is four times faster; its nodes are composed in Python in any case.
-_BASES: Any = (Composer, yaml.CSafeLoader) if yaml.__with_libyaml__ else (yaml.SafeLoader,)
+_BASES: Any = (
+    (Composer, yaml.CSafeLoader) if yaml.__with_libyaml__ else (yaml.SafeLoader,)
+)
 
 
 class _Loader(*_BASES):  # type: ignore[misc]
@@ -233,14 +263,26 @@ class _Loader(*_BASES):  # type: ignore[misc]
         before, self._depth = self._values, self._depth + 1
         self._values += self._sizes.get(event.anchor, 1) if is_alias else 1
         if self._depth > MAX_DEPTH:
-            self._refuse(event, f"it is nested more than {MAX_DEPTH} levels deep; flatten it")
+            self._refuse(
+                event, f"it is nested more than {MAX_DEPTH} levels deep; flatten it"
+            )
         if self._values > MAX_VALUES:
-            self._refuse(event, f"it holds more than {MAX_VALUES} values, with all its aliases")
+            self._refuse(
+                event, f"it holds more than {MAX_VALUES} values, with all its aliases"
+            )
         if getattr(event, "tag", None) is not None:
             tag = reprlib.repr(event.tag.replace("tag:yaml.org,2002:", "!!"))
-            self._refuse(event, f"the tag {tag} is not read here; write the value alone")
-        if is_alias and event.anchor in self.anchors and event.anchor not in self._sizes:
-            self._refuse(event, f"the alias {reprlib.repr(event.anchor)} stands within itself")
+            self._refuse(
+                event, f"the tag {tag} is not read here; write the value alone"
+            )
+        if (
+            is_alias
+            and event.anchor in self.anchors
+            and event.anchor not in self._sizes
+        ):
+            self._refuse(
+                event, f"the alias {reprlib.repr(event.anchor)} stands within itself"
+            )
         node = super().compose_node(parent, index)
         if event.anchor is not None:
             self._sizes[event.anchor] = self._values - before
@@ -255,7 +297,9 @@ class _Loader(*_BASES):  # type: ignore[misc]
             if not isinstance(key, yaml.ScalarNode):
                 self._refuse(key, "a key must be one word or number")
             if key.value in seen:
-                self._refuse(key, f"the key {reprlib.repr(key.value)} stands twice; keep one")
+                self._refuse(
+                    key, f"the key {reprlib.repr(key.value)} stands twice; keep one"
+                )
             seen.add(key.value)
         return dict(super().construct_mapping(node, deep=deep))
 
@@ -285,7 +329,11 @@ _FLOAT = re.compile(
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
 )
 _Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in some if tag in (f"{_TAG}null", f"{_TAG}merge")]
+    first: [
+        (tag, pattern)
+        for tag, pattern in some
+        if tag in (f"{_TAG}null", f"{_TAG}merge")
+    ]
     for first, some in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 for _kind, _type, _pattern, _first in (
@@ -300,7 +348,9 @@ for _kind, _type, _pattern, _first in (
 def parse_yaml(text: str, source: str) -> dict[str, Any]:
     """Reads a YAML mapping from the text of `source`; ConfigError if it is none, or too large."""
     if len(text) > MAX_BYTES:
-        reason = f"is larger than {MAX_BYTES // 2**20} MB; give a configuration instead."
+        reason = (
+            f"is larger than {MAX_BYTES // 2**20} MB; give a configuration instead."
+        )
         raise ConfigError(f"{source}: {reason}")
     try:
         data = _Loader(text).get_single_data()
@@ -309,9 +359,13 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         last = text.rstrip().count("\n")  # a mark may lie beyond the end
         line = f", line {min(mark.line, last) + 1}" if mark else ""
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        raise ConfigError(f"{source}{line}: {shortened(problem, _LONGEST_PROBLEM)}.") from None
+        raise ConfigError(
+            f"{source}{line}: {shortened(problem, _LONGEST_PROBLEM)}."
+        ) from None
     if data is None:
-        raise ConfigError(f"{source}: the file is empty; it must hold `key: value` lines.")
+        raise ConfigError(
+            f"{source}: the file is empty; it must hold `key: value` lines."
+        )
     if not isinstance(data, dict):
         raise ConfigError(f"{source}: the top level must be `key: value` lines.")
     return data
@@ -319,4 +373,6 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
 
 def dump_yaml(data: Any) -> str:
     """Writes plain data as YAML that `parse_yaml` reads back to the same numbers."""
-    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))
+    return str(
+        yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    )

@@ -5,7 +5,9 @@ from collections.abc import Iterable
 
 MISSING_ROS = "needs the module {module!r}; source your ROS 2 installation, or "
 MISSING_ROS += "pip install 'nics_drl_bridge[ros]'."
-LONGEST = 800  # maximum length of a sentence [characters]; a longer one loses its middle
+LONGEST = (
+    800  # maximum length of a sentence [characters]; a longer one loses its middle
+)
 LONGEST_NAME = 100  # characters of a name that are compared with the known names
 
 
@@ -14,7 +16,11 @@ def shortened(text: str, most: int) -> str:
     if len(text) > most:
         text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
     text = " ".join(text.split())
-    return text if text.isprintable() else "".join(c if c.isprintable() else "?" for c in text)
+    return (
+        text
+        if text.isprintable()
+        else "".join(c if c.isprintable() else "?" for c in text)
+    )
 
 
 class BridgeError(Exception):
@@ -53,7 +59,11 @@ class PolicyError(BridgeError):
         super().__init__(f"{source}: field {self.field!r}: {self.reason}")
 
     def __reduce__(self) -> "tuple[type[PolicyError], tuple[str, str, str]]":
-        return type(self), (self.source, self.field, self.reason)  # so that it can be pickled
+        return type(self), (
+            self.source,
+            self.field,
+            self.reason,
+        )  # so that it can be pickled
 
 
 class StaleDataError(BackendError):
@@ -69,7 +79,11 @@ class StaleDataError(BackendError):
         )
 
     def __reduce__(self) -> "tuple[type[StaleDataError], tuple[str, float, float]]":
-        return type(self), (self.topic, self.age_s, self.limit_s)  # so that it can be pickled
+        return type(self), (
+            self.topic,
+            self.age_s,
+            self.limit_s,
+        )  # so that it can be pickled
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -13,7 +13,13 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, requires, version
+from importlib.metadata import (
+    EntryPoint,
+    PackageNotFoundError,
+    entry_points,
+    requires,
+    version,
+)
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from traceback import extract_tb, walk_tb
@@ -24,11 +30,23 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
 INSTALL = {  # libraries, and the extra of this package that brings each
-    "filelock": "train", "imageio_ffmpeg": "video", "leapp": "leapp", "mcap": "bags",
-    "mujoco": "mujoco", "onnx": "deploy", "onnxruntime": "deploy", "onnxscript": "train",
-    "pettingzoo": "multi", "ray": "train,distributed", "rerun": "video", "rosbags": "bags",
-    "stable_baselines3": "train", "tensorboard": "train", "torch": "train", "websockets": "view",
-}  # fmt: skip
+    "filelock": "train",
+    "imageio_ffmpeg": "video",
+    "leapp": "leapp",
+    "mcap": "bags",
+    "mujoco": "mujoco",
+    "onnx": "deploy",
+    "onnxruntime": "deploy",
+    "onnxscript": "train",
+    "pettingzoo": "multi",
+    "ray": "train,distributed",
+    "rerun": "video",
+    "rosbags": "bags",
+    "stable_baselines3": "train",
+    "tensorboard": "train",
+    "torch": "train",
+    "websockets": "view",
+}
 TRAINING = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 
 
@@ -36,7 +54,9 @@ TRAINING = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 def known(group: str) -> dict[str, EntryPoint]:
     """The extensions of a group by name, sorted; one of another package goes before one of ours."""
     found = entry_points(group=f"{PACKAGE}.{group}")
-    ours_first = sorted(found, key=lambda each: (each.name, not each.value.startswith(PACKAGE)))
+    ours_first = sorted(
+        found, key=lambda each: (each.name, not each.value.startswith(PACKAGE))
+    )
     return {each.name: each for each in ours_first}
 
 
@@ -55,7 +75,9 @@ def load(group: str, name: str) -> Any:
     extensions = known(group)
     if name not in extensions:
         names = (*extensions, *imported)
-        raise ConfigError(f"unknown {group.rstrip('s')} {name!r}; {nearest(name, names)}")
+        raise ConfigError(
+            f"unknown {group.rstrip('s')} {name!r}; {nearest(name, names)}"
+        )
     with needed_by(f"{group.rstrip('s')} {name!r}"):
         return extensions[name].load()
 
@@ -93,7 +115,9 @@ def missing(module: str) -> str:
     if library.endswith(ROS):
         return MISSING_ROS.format(module=module)
     if library in INSTALL:
-        return f"needs the module {module!r}; pip install '{PACKAGE}[{INSTALL[library]}]'."
+        return (
+            f"needs the module {module!r}; pip install '{PACKAGE}[{INSTALL[library]}]'."
+        )
     return f"needs the module {module!r}; install it."
 
 
@@ -116,10 +140,14 @@ def unmet(error: ImportError) -> str | None:
 
     A system's own packages are often older than what this one needs, and pip was not asked.
     """
-    if (error.name or "").partition(".")[0] == PACKAGE and isinstance(error, ModuleNotFoundError):
+    if (error.name or "").partition(".")[0] == PACKAGE and isinstance(
+        error, ModuleNotFoundError
+    ):
         return None
     if wrong := dict(_wrong()):
-        told = ", ".join(f"{needed} ({found or 'missing'})" for needed, found in wrong.items())
+        told = ", ".join(
+            f"{needed} ({found or 'missing'})" for needed, found in wrong.items()
+        )
         return f"needs {told}; pip install {' '.join(map(repr, wrong))}."
     return missing(error.name or "") if isinstance(error, ModuleNotFoundError) else None
 
@@ -138,23 +166,34 @@ def _wrong() -> Iterator[tuple[str, str]]:
             found = ""
         numbers = _numbers(found)
         for sign, bound in re.findall(r"(>=|<)([\d.]+)", bounds):
-            fits = numbers >= _numbers(bound) if sign == ">=" else numbers < _numbers(bound)
+            fits = (
+                numbers >= _numbers(bound)
+                if sign == ">="
+                else numbers < _numbers(bound)
+            )
             if not (found and fits):
                 yield needed, found
                 break
 
 
 def _numbers(release: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", release.partition("+")[0])[:3])
+    return tuple(
+        int(part) for part in re.findall(r"\d+", release.partition("+")[0])[:3]
+    )
 
 
 def own_fault(error: BaseException) -> str | None:
     """A clause about an error that a user's own task raised, with its place; else None."""
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
-        task, module = type(frame.f_locals.get("self")), str(frame.f_globals.get("__name__"))
+        task, module = (
+            type(frame.f_locals.get("self")),
+            str(frame.f_globals.get("__name__")),
+        )
         if hasattr(task, "step_into") and not module.startswith(f"{PACKAGE}."):
             place = f"{frame.f_code.co_filename}:{line}, in {frame.f_code.co_name}"
-            return str(ConfigError(f"task {task.__name__}: {place}: {error!r}; mend it."))
+            return str(
+                ConfigError(f"task {task.__name__}: {place}: {error!r}; mend it.")
+            )
     return None
 
 
@@ -171,14 +210,20 @@ def module_at(place: str, what: str) -> Any:
 
 def _load(path: Path, what: str) -> Any:
     if not path.is_file():
-        raise ConfigError(f"{what} {str(path)!r}: no such file; give path/to/file.py:ClassName.")
-    digest = hashlib.sha256(str(path.resolve()).encode() + path.read_bytes()).hexdigest()[:16]
+        raise ConfigError(
+            f"{what} {str(path)!r}: no such file; give path/to/file.py:ClassName."
+        )
+    digest = hashlib.sha256(
+        str(path.resolve()).encode() + path.read_bytes()
+    ).hexdigest()[:16]
     name = f"{PACKAGE}_{what}_{digest}"
     if name in sys.modules:
         return sys.modules[name]
     spec = spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise ConfigError(f"{what} {str(path)!r}: can't be imported; it must be a Python file.")
+        raise ConfigError(
+            f"{what} {str(path)!r}: can't be imported; it must be a Python file."
+        )
     module = sys.modules[name] = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
@@ -192,7 +237,9 @@ def _load(path: Path, what: str) -> Any:
 
 def _unfit(path: Path, what: str, error: Exception) -> str:
     frames = extract_tb(error.__traceback__)
-    lines = [frame.lineno for frame in frames if Path(frame.filename) == path.absolute()]
+    lines = [
+        frame.lineno for frame in frames if Path(frame.filename) == path.absolute()
+    ]
     line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]
     place = f"{path}, line {line}" if line else str(path)
     reason = " ".join(str(error).split())

@@ -80,7 +80,9 @@ def _begin_file(path: Path) -> tuple[Path, int]:
     """Makes a hidden file beside a path; returns it with its descriptor, which holds the lock."""
     while True:
         temporary = hidden_name(path, UNFINISHED)
-        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
+        descriptor = os.open(
+            temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666
+        )
         if _lock_new(temporary, descriptor):
             return temporary, descriptor
         os.close(descriptor)
@@ -104,7 +106,9 @@ def _lock_new(path: Path, descriptor: int) -> bool:
     """Locks what was just made; False if somebody took it for a leftover and removed it."""
     if fcntl is None:
         return True
-    with suppress(OSError):  # a file system without locks, on which nothing is removed either
+    with suppress(
+        OSError
+    ):  # a file system without locks, on which nothing is removed either
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))
@@ -190,7 +194,9 @@ def check_folder(path: str | Path, marker: str) -> Path:
     """Resolves a path, creating nothing; ConfigError if `whole_folder` could not create it."""
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
-        raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
+        raise ConfigError(
+            f"{path}: is a file, not a folder; give the name of a folder."
+        )
     if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
         fix = "give a new folder, or empty this one."
         raise ConfigError(f"{path}: holds other files and no {marker!r}; {fix}")
@@ -202,7 +208,9 @@ def check_above(path: Path) -> None:
     """Raises ConfigError if a path can't be created, without creating anything."""
     above = next(parent for parent in path.resolve().parents if parent.exists())
     if not above.is_dir():
-        raise ConfigError(f"{path}: {above} is a file, not a folder; choose another place.")
+        raise ConfigError(
+            f"{path}: {above} is a file, not a folder; choose another place."
+        )
     if not os.access(above, os.W_OK | os.X_OK):
         raise ConfigError(f"{path}: {above} can't be written to; choose another place.")
 
@@ -279,7 +287,12 @@ def _exchange(one: Path, other: Path) -> bool:
     library = ctypes.CDLL(None, use_errno=True) if _POSIX else None
     if (rename := getattr(library, "renameat2", None)) is None:
         return False
-    if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
+    if (
+        rename(
+            _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
+        )
+        == 0
+    ):
         return True
     code = ctypes.get_errno()
     if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOENT):
@@ -293,8 +306,12 @@ def sync_folder(folder: Path) -> None:
         _fsync(file)
 
 
-SUMS = "SHA256SUMS"  # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
-MOST_BYTES = 256 * 2**20  # of a file of arrays: a day of driving, or a table of a thousand shapes
+SUMS = (
+    "SHA256SUMS"  # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
+)
+MOST_BYTES = (
+    256 * 2**20
+)  # of a file of arrays: a day of driving, or a table of a thousand shapes
 _SEAL = b"sha256 "
 _PART = 2**20
 
@@ -347,7 +364,9 @@ def names_in_sums(folder: Path) -> set[str]:
 
 def write_sums(folder: Path) -> None:
     """Writes the SHA-256 of every file in a folder and below to its `SHA256SUMS`."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / SUMS)
+    files = sorted(
+        path for path in folder.rglob("*") if path.is_file() and path != folder / SUMS
+    )
     names = [path.relative_to(folder).as_posix() for path in files]
     write_parts(folder / SUMS, [_line_of(folder, name) for name in names])
 
@@ -363,9 +382,15 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
     expected = {name: _line_of(folder, name) for name in names}
     for name, line in expected.items():
         free = name == editable
-        if line in listed or (free and not any(one.endswith(line[64:]) for one in listed)):
+        if line in listed or (
+            free and not any(one.endswith(line[64:]) for one in listed)
+        ):
             continue
-        own = f"if you changed it yourself, remove its line from {SUMS}, otherwise " if free else ""
+        own = (
+            f"if you changed it yourself, remove its line from {SUMS}, otherwise "
+            if free
+            else ""
+        )
         reason = f"does not match its checksum in {SUMS}; {own}generate the model anew."
         raise ModelError(f"{folder / name}: {reason}")
     for line in listed:

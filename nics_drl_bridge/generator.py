@@ -11,7 +11,14 @@ from pydantic import Field
 
 from nics_drl_bridge import files
 from nics_drl_bridge.arguments import check_path, checked_arguments, shown
-from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, shipped_names, validate
+from nics_drl_bridge.config import (
+    Schema,
+    dump_yaml,
+    parse_yaml,
+    read_text,
+    shipped_names,
+    validate,
+)
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError, nearest
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
@@ -33,11 +40,22 @@ FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
 MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
-REPORT_PAGE, PICTURES_FOLDER = "report.html", "pictures"  # what `nics generate` draws of a fit
+REPORT_PAGE, PICTURES_FOLDER = (
+    "report.html",
+    "pictures",
+)  # what `nics generate` draws of a fit
 PICTURES = (
-    "accuracy", "alignment", "bursts", "inputs", "mounting", "noise", "paths", "residuals",
-    "timing", "wheels",
-)  # fmt: skip
+    "accuracy",
+    "alignment",
+    "bursts",
+    "inputs",
+    "mounting",
+    "noise",
+    "paths",
+    "residuals",
+    "timing",
+    "wheels",
+)
 DRAWN_FILES = (REPORT_PAGE, *(f"{PICTURES_FOLDER}/{name}.png" for name in PICTURES))
 CONTROL_PERIOD_S = 0.1
 MOTORS = "inputs", "limits"  # of a calibration
@@ -51,13 +69,19 @@ class SimulatorModel:
 
     robot: RobotSpec
     kinematics: TaylorModel  # fitted and pruned
-    calibration: Calibration  # clock offset, latency, sensor frames, noise of the recording
+    calibration: (
+        Calibration  # clock offset, latency, sensor frames, noise of the recording
+    )
     lidar: LidarSpec
     table: LidarTable  # baked ranges of the obstacles' shapes and of the robot itself
     noise: Noise = field(default_factory=Noise)  # of sensors and motion
-    control_period: float = CONTROL_PERIOD_S  # between commands; a whole number of `kinematics.dt`
+    control_period: float = (
+        CONTROL_PERIOD_S  # between commands; a whole number of `kinematics.dt`
+    )
     report: str = ""  # how the model was made, as readable text
-    latency: Latency = field(default_factory=Latency)  # of scan and odometry, where it was shown
+    latency: Latency = field(
+        default_factory=Latency
+    )  # of scan and odometry, where it was shown
     sensors: tuple[Sensor, ...] = ()  # that the robot has beside its lidar
     gyro: bool = False  # a gyro turned the recorded poses, or confirmed how they turned
 
@@ -65,11 +89,18 @@ class SimulatorModel:
         robot, known = self.robot, (self.kinematics.variables, self.kinematics.dofs)
         needed = robot.variable_names, robot.dof_names
         if known != needed:
-            reason = f"the robot {robot.name!r} needs {needed}; generate the model anew."
-            raise ModelError(f"the kinematics have variables and rates {known}, {reason}")
+            reason = (
+                f"the robot {robot.name!r} needs {needed}; generate the model anew."
+            )
+            raise ModelError(
+                f"the kinematics have variables and rates {known}, {reason}"
+            )
         check_sensors(self.sensors, (self.lidar.frame,))
         period, dt = self.control_period, self.kinematics.dt
-        if not 0.5 < period / dt < np.inf or abs(period / dt - round(period / dt)) > 1e-6:
+        if (
+            not 0.5 < period / dt < np.inf
+            or abs(period / dt - round(period / dt)) > 1e-6
+        ):
             reason = f"is no multiple of the model's step {dt} s; change one of them."
             raise ModelError(f"control_period {period} s {reason}")
 
@@ -84,18 +115,27 @@ class SimulatorModel:
     def text(self) -> str:
         """The content of `model.yaml`."""
         # The kinematics hold what motors do, of which an identification's calibration has a copy.
-        calibration = {k: v for k, v in asdict(self.calibration).items() if k not in MOTORS}
-        kinematics = self.kinematics.named.model_dump(exclude_none=True, exclude_defaults=True)
+        calibration = {
+            k: v for k, v in asdict(self.calibration).items() if k not in MOTORS
+        }
+        kinematics = self.kinematics.named.model_dump(
+            exclude_none=True, exclude_defaults=True
+        )
         data = {
-            "format": FORMAT, "control_period": self.control_period,
-            "robot": self.robot.model_dump(mode="json"), "kinematics": kinematics,
-            "calibration": calibration, "lidar": self.lidar.model_dump(mode="json"),
+            "format": FORMAT,
+            "control_period": self.control_period,
+            "robot": self.robot.model_dump(mode="json"),
+            "kinematics": kinematics,
+            "calibration": calibration,
+            "lidar": self.lidar.model_dump(mode="json"),
             "noise": self.noise.model_dump(mode="json"),
-        }  # fmt: skip
+        }
         if self.latency.measured:
             data["latency"] = self.latency.model_dump(mode="json")
         if self.sensors:
-            data["sensors"] = [sensor.model_dump(mode="json") for sensor in self.sensors]
+            data["sensors"] = [
+                sensor.model_dump(mode="json") for sensor in self.sensors
+            ]
         if self.gyro:
             data["gyro"] = True
         return dump_yaml(data)
@@ -121,11 +161,17 @@ class _File(Schema):
 
 @checked_arguments("generate")
 def generate(
-    recording: Recording | Sequence[Recording], robot: RobotSpec | SimulatorModel | str | Path,
-    lidar: LidarSpec | str | Path | None = None, shapes: Sequence[Shape] = (),
-    order: fit.Order = "auto", alpha: fit.Alpha = "auto", assume: bool = False,
-    strict: bool = False, anyway: bool = False, sensors: Sequence[Sensor] = (),
-) -> tuple[SimulatorModel, Identified]:  # fmt: skip
+    recording: Recording | Sequence[Recording],
+    robot: RobotSpec | SimulatorModel | str | Path,
+    lidar: LidarSpec | str | Path | None = None,
+    shapes: Sequence[Shape] = (),
+    order: fit.Order = "auto",
+    alpha: fit.Alpha = "auto",
+    assume: bool = False,
+    strict: bool = False,
+    anyway: bool = False,
+    sensors: Sequence[Sensor] = (),
+) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
     Several recordings of one robot are fitted together (`identify.joined`). The robot (or `model`)
@@ -145,18 +191,32 @@ def generate(
         lidar = lidar_of(robot, None if lidar is None else str(lidar))
     if not isinstance(recording, Recording):
         recording = join_recordings(recording, robot)
-    identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
+    identified = identify(
+        recording, robot, order=order, alpha=alpha, assume=assume, strict=strict
+    )
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
-    robot = identified.drive.spec  # the state of a textbook that was written may be another
+    robot = (
+        identified.drive.spec
+    )  # the state of a textbook that was written may be another
     # The usual period [s], or that of a slower lidar: nothing new is seen before its next scan.
-    steps, dt = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / identified.model.dt, identified.model.dt
+    steps, dt = (
+        max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / identified.model.dt,
+        identified.model.dt,
+    )
     model = SimulatorModel(
-        robot, identified.model, replace(identified.calibration, inputs=(), limits={}), lidar,
-        bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
-        round(round(steps) * dt, 9), fit_report(recording.source, robot, identified),
-        recording.latency, tuple(sensors), identified.recording.gyro is not None,
-    )  # fmt: skip
+        robot,
+        identified.model,
+        replace(identified.calibration, inputs=(), limits={}),
+        lidar,
+        bake(lidar, (*shapes, footprint_shape(robot))),
+        identified.noise,
+        round(round(steps) * dt, 9),
+        fit_report(recording.source, robot, identified),
+        recording.latency,
+        tuple(sensors),
+        identified.recording.gyro is not None,
+    )
     return model, identified
 
 
@@ -167,7 +227,9 @@ def _check_given(recording: object, shapes: object, sensors: object) -> None:
         needed = "a Recording, as read_recording(path) gives, or a list of them"
         raise ConfigError(f"generate: recording={shown(recording)}: must be {needed}.")
     for name, given in (("shapes", shapes), ("sensors", sensors)):
-        fits = isinstance(given, list | tuple) and all(isinstance(one, Schema) for one in given)
+        fits = isinstance(given, list | tuple) and all(
+            isinstance(one, Schema) for one in given
+        )
         if not fits:
             needed = f"a list of {name} of this package"
             raise ConfigError(f"generate: {name}={shown(given)}: must be {needed}.")
@@ -209,12 +271,16 @@ def builtin_model(robot: str, content: str = "") -> SimulatorModel:
     """
     spec = load_robot(robot)
     if Path(robot, MODEL_FILE).is_file():
-        sys.stderr.write(f"nics_drl_bridge: {robot!r} is shipped; the folder is ./{robot}\n")
+        sys.stderr.write(
+            f"nics_drl_bridge: {robot!r} is shipped; the folder is ./{robot}\n"
+        )
     drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
     return generate(drive, spec, lidar_of(spec), ())[0]
 
 
-def open_model(name: str | Path | SimulatorModel, lidar: str | None = None) -> SimulatorModel:
+def open_model(
+    name: str | Path | SimulatorModel, lidar: str | None = None
+) -> SimulatorModel:
     """Opens a model by a shipped robot (`ackermann`), by folder (`./mine`), or by a robot's YAML.
 
     A `lidar`, shipped or a YAML file, takes the place of the model's own. A model that is open
@@ -229,7 +295,9 @@ def open_model(name: str | Path | SimulatorModel, lidar: str | None = None) -> S
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     if isinstance(name, SimulatorModel):
         return name
-    if Path(name).is_dir() and name not in shipped_names("robots"):  # never so for a Path
+    if Path(name).is_dir() and name not in shipped_names(
+        "robots"
+    ):  # never so for a Path
         return load_model(name)
     if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
@@ -246,7 +314,9 @@ def open_model(name: str | Path | SimulatorModel, lidar: str | None = None) -> S
 def check_place(folder: str | Path) -> None:
     """Raises ConfigError, before the work of a fit, if `save_model` can't write to a folder."""
     if str(folder) in shipped_names("robots"):
-        raise ConfigError(f"{folder}: a shipped robot has this name; name another folder.")
+        raise ConfigError(
+            f"{folder}: a shipped robot has this name; name another folder."
+        )
     files.check_folder(folder, MODEL_FILE)
 
 
@@ -270,28 +340,42 @@ def load_model(folder: str | Path) -> SimulatorModel:
     folder = Path(folder)
     path = folder / MODEL_FILE
     if not path.is_file():
-        raise ModelError(f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`.")
+        raise ModelError(
+            f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`."
+        )
     inode = folder.stat().st_ino
     data = parse_yaml(read_text(path), str(path))
     if data.get("format") != FORMAT:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
         raise ModelError(f"{path}: {reason}; generate the model anew.")
     files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
-    if isinstance(data.get("robot"), dict):  # files without the key are older than its default
+    if isinstance(
+        data.get("robot"), dict
+    ):  # files without the key are older than its default
         data["robot"].setdefault("angular_is", "steering")
     file = validate(data, _File, str(path))
     for key in fields(Calibration):  # its defaults are those of a robot that needs none
         if key.name not in (*data["calibration"], *MOTORS):
-            raise ConfigError(f"{path}: the key 'calibration.{key.name}' is missing; add it.")
+            raise ConfigError(
+                f"{path}: the key 'calibration.{key.name}' is missing; add it."
+            )
     table = LidarTable.load(folder / TABLE_FOLDER, checked=True)
     report = read_text(folder / REPORT_FILE)
     if folder.stat().st_ino != inode:
         raise ModelError(f"{folder}: was replaced while it was read; open it again.")
     try:
         return SimulatorModel(
-            file.robot, file.kinematics.model(), file.calibration, file.lidar, table, file.noise,
-            file.control_period, report, file.latency, file.sensors,
+            file.robot,
+            file.kinematics.model(),
+            file.calibration,
+            file.lidar,
+            table,
+            file.noise,
+            file.control_period,
+            report,
+            file.latency,
+            file.sensors,
             file.gyro,
-        )  # fmt: skip
+        )
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None

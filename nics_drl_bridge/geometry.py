@@ -20,7 +20,10 @@ def wrap_angle(angle: ArrayLike) -> Array:
 
 def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
     """Rotates plane vectors (..., 2) by angles (...) [rad], counter-clockwise."""
-    vector, angle = np.asarray(vector, dtype=np.float64), np.asarray(angle, dtype=np.float64)
+    vector, angle = (
+        np.asarray(vector, dtype=np.float64),
+        np.asarray(angle, dtype=np.float64),
+    )
     c, s = np.cos(angle), np.sin(angle)
     x, y = vector[..., 0], vector[..., 1]
     return np.stack([c * x - s * y, s * x + c * y], axis=-1)
@@ -28,7 +31,10 @@ def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
 
 def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
     """The pose that lies at `relative` as seen from `pose`; both (..., 3): x, y, heading."""
-    pose, relative = np.asarray(pose, dtype=np.float64), np.asarray(relative, dtype=np.float64)
+    pose, relative = (
+        np.asarray(pose, dtype=np.float64),
+        np.asarray(relative, dtype=np.float64),
+    )
     position = pose[..., :2] + rotate(relative[..., :2], pose[..., 2])
     heading = wrap_angle(pose[..., 2] + relative[..., 2])
     return np.concatenate([position, heading[..., None]], axis=-1)
@@ -36,9 +42,14 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
 
 def between(pose: ArrayLike, other: ArrayLike) -> Array:
     """The pose `other` as seen from `pose`; both (..., 3). `compose(pose, result) == other`."""
-    pose, other = np.asarray(pose, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    pose, other = (
+        np.asarray(pose, dtype=np.float64),
+        np.asarray(other, dtype=np.float64),
+    )
     position = rotate(other[..., :2] - pose[..., :2], -pose[..., 2])
-    return np.concatenate([position, wrap_angle(other[..., 2] - pose[..., 2])[..., None]], axis=-1)
+    return np.concatenate(
+        [position, wrap_angle(other[..., 2] - pose[..., 2])[..., None]], axis=-1
+    )
 
 
 def exp(twist: ArrayLike) -> Array:
@@ -85,7 +96,9 @@ def edges_cross(corners: Array) -> bool:
 
     def side(points: Array) -> Array:
         along, to = (stop - start)[:, None], points[None] - start[:, None]
-        return np.asarray(np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]))
+        return np.asarray(
+            np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+        )
 
     low, high = np.minimum(start, stop), np.maximum(start, stop)
     boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
@@ -111,7 +124,9 @@ def depths(points: Array, corners: Array) -> Array:
     crosses = above != np.roll(above, -1, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         where = apart[..., 0] - apart[..., 1] * side[:, 0] / side[:, 1]
-    return np.asarray(np.where((crosses & (where < 0.0)).sum(axis=1) % 2 == 1, away, -away))
+    return np.asarray(
+        np.where((crosses & (where < 0.0)).sum(axis=1) % 2 == 1, away, -away)
+    )
 
 
 @dataclass(frozen=True)
@@ -119,12 +134,17 @@ class Bicycle:
     """Geometry of a robot that steers; `base_link` is the middle of the unsteered axle."""
 
     wheelbase: float  # [m]
-    front_drive: bool = False  # the speed is that of the steered wheel, along its own direction
+    front_drive: bool = (
+        False  # the speed is that of the steered wheel, along its own direction
+    )
 
     def twist(self, speed: Array, angle: Array) -> Array:
         """Returns the body twist (..., 3) of speeds [m/s] and steering angles [rad] (...)."""
         if self.front_drive:
-            forward, turn = speed * np.cos(angle), speed * np.sin(angle) / self.wheelbase
+            forward, turn = (
+                speed * np.cos(angle),
+                speed * np.sin(angle) / self.wheelbase,
+            )
         else:
             forward, turn = speed, speed * np.tan(angle) / self.wheelbase
         return np.stack([forward, np.zeros_like(forward), turn], axis=-1)
@@ -135,4 +155,6 @@ class Bicycle:
         across = self.wheelbase * turn  # speed of the front wheel to the left
         sign = np.sign(forward)
         angle = np.arctan2(across * sign, np.abs(forward))
-        return (sign * np.hypot(forward, across) if self.front_drive else forward), angle
+        return (
+            sign * np.hypot(forward, across) if self.front_drive else forward
+        ), angle

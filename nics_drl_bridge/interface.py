@@ -21,7 +21,9 @@ class RobotView:
 
     pose: Array  # (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`
     twist: Array  # (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`
-    ranges: NDArray[np.float32]  # (..., B) [m], REP-117: `inf` no return, `-inf` too close
+    ranges: NDArray[
+        np.float32
+    ]  # (..., B) [m], REP-117: `inf` no return, `-inf` too close
     stamp_s: float
     scan_age_s: float
     odom_age_s: float
@@ -32,7 +34,10 @@ class RobotView:
 
 def stacked(views: Sequence[RobotView]) -> RobotView:
     """Stacks the views of M robots into one with a leading (M,); stamp and ages are the maxima."""
-    sensed = {name: np.stack([view.sensed[name] for view in views]) for name in views[0].sensed}
+    sensed = {
+        name: np.stack([view.sensed[name] for view in views])
+        for name in views[0].sensed
+    }
     known: dict[str, Any] = {"sensed": sensed}
     for name in ("pose", "twist", "ranges"):
         known[name] = np.stack([getattr(view, name) for view in views])
@@ -55,8 +60,12 @@ class BackendFacts(TypedDict, total=False):
     true_pose: Array  # (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team
     true_collision: bool | NDArray[np.bool_]  # True after a contact; (M,) of a team
     bodies: Array  # (K, 7) obstacles where they are now, see `sim.scenes.Scene`
-    randomisation: dict[str, Any]  # name -> value that was drawn for the episode, where any was
-    scenes: Callable[[ArrayLike], Any]  # gives scenes for seeds (n,), if the world alone does not
+    randomisation: dict[
+        str, Any
+    ]  # name -> value that was drawn for the episode, where any was
+    scenes: Callable[
+        [ArrayLike], Any
+    ]  # gives scenes for seeds (n,), if the world alone does not
 
 
 @runtime_checkable

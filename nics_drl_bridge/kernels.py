@@ -48,9 +48,13 @@ _ALIAS = re.compile(r"\bas\s+\w+")
 
 
 def kernel(
-    function: Callable[..., Any] | None = None, *, allocates: bool = False, contracts: bool = False,
-    inline: bool = False, view: bool = False,
-) -> Callable[..., Any]:  # fmt: skip
+    function: Callable[..., Any] | None = None,
+    *,
+    allocates: bool = False,
+    contracts: bool = False,
+    inline: bool = False,
+    view: bool = False,
+) -> Callable[..., Any]:
     """Compiles a function with numba when it is first called, or loads what was compiled before.
 
     It runs without the interpreter's lock; a division by zero gives inf or NaN. It `allocates` if
@@ -59,7 +63,9 @@ def kernel(
     A `view` returns parts of its arguments' arrays, for which it is written into its callers.
     """
     if function is None:
-        return partial(kernel, allocates=allocates, contracts=contracts, inline=inline, view=view)
+        return partial(
+            kernel, allocates=allocates, contracts=contracts, inline=inline, view=view
+        )
     options: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
     options |= {"boundscheck": None, "no_cfunc_wrapper": True}
     options |= {} if allocates else {"_nrt": False}
@@ -81,7 +87,9 @@ def prefetch(_typing: Any, array: Any, index: Any) -> Any:
         place = builder.bitcast(builder.gep(data, [args[1]]), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, whole, whole, whole])
         ask = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        builder.call(ask, [place, whole(0), whole(3), whole(1)])  # to read; to keep; of the data
+        builder.call(
+            ask, [place, whole(0), whole(3), whole(1)]
+        )  # to read; to keep; of the data
         return context.get_dummy_value()
 
     return types.void(array, types.intp), generate
@@ -122,27 +130,43 @@ class _InnerCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
         library._final_module = llvm.parse_bitcode(bitcode)
         library._finalize_final_module()
         return compile_result(
-            typing_context=target_context.typing_context, target_context=target_context,
-            entry_point=target_context.get_executable(library, fndesc, env), signature=signature,
-            library=library, fndesc=fndesc, environment=env, objectmode=False, lifted=(),
-            reload_init=reload_init, referenced_envs=envs,
-        )  # fmt: skip
+            typing_context=target_context.typing_context,
+            target_context=target_context,
+            entry_point=target_context.get_executable(library, fndesc, env),
+            signature=signature,
+            library=library,
+            fndesc=fndesc,
+            environment=env,
+            objectmode=False,
+            lifted=(),
+            reload_init=reload_init,
+            referenced_envs=envs,
+        )
 
 
 class _Compiler(Compiler):  # type: ignore[misc]
     def define_pipelines(self) -> Any:
         state = self.state
         if state.flags.no_cpython_wrapper:
-            state.library = _InnerLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+            state.library = _InnerLibrary(
+                state.targetctx.codegen(), state.func_id.func_qualname
+            )
         return super().define_pipelines()
 
 
 class _Kernel(CPUDispatcher):  # type: ignore[misc]
     """numba's dispatcher; callable from Python, a third of compiling, only where that calls it."""
 
-    def __init__(self, function: Callable[..., Any], targetoptions: dict[str, Any]) -> None:
-        super().__init__(function, targetoptions=targetoptions, pipeline_class=_Compiler)
-        self._cache, self._inner_cache = _Cache(function), _InnerCache(function, ".inner")
+    def __init__(
+        self, function: Callable[..., Any], targetoptions: dict[str, Any]
+    ) -> None:
+        super().__init__(
+            function, targetoptions=targetoptions, pipeline_class=_Compiler
+        )
+        self._cache, self._inner_cache = (
+            _Cache(function),
+            _InnerCache(function, ".inner"),
+        )
         self._inner, self._inner_only = False, set[tuple[Any, ...]]()
 
     @property
@@ -183,7 +207,10 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
     def _load_index(self) -> dict[Any, Any]:
         try:
             return dict(super()._load_index())
-        except (AttributeError, ImportError):  # a class of some arguments is no longer there
+        except (
+            AttributeError,
+            ImportError,
+        ):  # a class of some arguments is no longer there
             return {}
 
     def save(self, key: Any, data: Any) -> None:
@@ -198,7 +225,12 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
         """Returns the data of a key, or None if there are none: others' would crash."""
         try:
             version, owner, data = super().load(key)
-        except (AttributeError, ImportError, TypeError, ValueError):  # none, or of other versions
+        except (
+            AttributeError,
+            ImportError,
+            TypeError,
+            ValueError,
+        ):  # none, or of other versions
             return None
         return data if (version, owner) == (self._version, key) else None
 
@@ -246,7 +278,9 @@ def _read(file: Path) -> str:
 def imports_of(file: Path) -> tuple[Path, ...]:
     """The modules that a file imports, wherever it does: of the package and of its own folders."""
     own = file.is_relative_to(PACKAGE)
-    top = next(folder for folder in file.parents if not (folder / "__init__.py").is_file())
+    top = next(
+        folder for folder in file.parents if not (folder / "__init__.py").is_file()
+    )
     found = list[Path]()
     text = re.sub(r"#[^\n]*|\\\n", " ", _read(file))
     for origin, names, plain in _IMPORT.findall(text):
@@ -258,7 +292,10 @@ def imports_of(file: Path) -> tuple[Path, ...]:
             elif own and name == module:
                 continue
             place = root.joinpath(*name.split("."))
-            found += [place, *(place / each for each in re.findall(r"\w+", _ALIAS.sub("", names)))]
+            found += [
+                place,
+                *(place / each for each in re.findall(r"\w+", _ALIAS.sub("", names))),
+            ]
             found += [place / "__init__"] if root != PACKAGE.parent and not own else []
     files = (place.with_suffix(".py") for place in found if place not in {top, PACKAGE})
     return tuple(file for file in files if file.is_file())

@@ -15,10 +15,18 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 
 (
-    SCENE_STREAM, ODOMETRY_STREAM, RANGE_STREAM, DRIFT_STREAM, DROPOUT_STREAM, GHOST_STREAM,
-    RANDOMISATION_STREAM, MOTION_STREAM, EPISODE_STREAM, MEMBER_STREAM,
+    SCENE_STREAM,
+    ODOMETRY_STREAM,
+    RANGE_STREAM,
+    DRIFT_STREAM,
+    DROPOUT_STREAM,
+    GHOST_STREAM,
+    RANDOMISATION_STREAM,
+    MOTION_STREAM,
+    EPISODE_STREAM,
+    MEMBER_STREAM,
     PLANNER_STREAM,
-) = range(1, 12)  # fmt: skip
+) = range(1, 12)
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 RUN, POOL_SIZE = 32, 2**16
@@ -110,7 +118,9 @@ def normal_of(run, j):  # type: ignore[no-untyped-def]
     The sum of two normal numbers, from a pool (Wallace 1996), is normal. Signs of their own leave
     no two draws correlated.
     """
-    total = np.float32(np.int16(POOL[run[1] + np.uintp(j)] + POOL[run[2] + np.uintp(j)]))
+    total = np.float32(
+        np.int16(POOL[run[1] + np.uintp(j)] + POOL[run[2] + np.uintp(j)])
+    )
     sign = np.int32(run[0] << np.uint32(j)) & np.int32(-(2**31))
     return np.int32(total.view(np.int32) ^ sign).view(np.float32)
 

@@ -13,9 +13,15 @@ _SHORT = reprlib.Repr()
 _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
 
 
-def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDArray[np.int64]:
+def checked_seeds(
+    seeds: ArrayLike | Any, greatest: int = GREATEST_SEED
+) -> NDArray[np.int64]:
     """Returns seeds as (n,); ConfigError if one is negative, too large or not an integer."""
-    if isinstance(seeds, np.ndarray) and seeds.dtype == np.int64 and greatest == GREATEST_SEED:
+    if (
+        isinstance(seeds, np.ndarray)
+        and seeds.dtype == np.int64
+        and greatest == GREATEST_SEED
+    ):
         numbers = np.atleast_1d(seeds)
         if not (numbers < 0).any():
             return numbers
@@ -25,5 +31,7 @@ def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDAr
         if not (whole and 0 <= seed <= greatest):
             written = not isinstance(seed, int) or seed.bit_length() < 1000
             shown = _SHORT.repr(seed) if written else "of very many digits"
-            raise ConfigError(f"seed {shown}: must be a whole number from 0 to {greatest}.")
+            raise ConfigError(
+                f"seed {shown}: must be a whole number from 0 to {greatest}."
+            )
     return np.asarray([int(seed) for seed in given], dtype=np.int64)

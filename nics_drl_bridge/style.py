@@ -16,16 +16,37 @@ PURPLE, SKY, BLACK = "#CC79A7", "#56B4E9", "#000000"
 SERIES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 MEASURED, MODEL, GOAL = BLUE, VERMILION, ORANGE
 OTHER, DARK, EDGE = "#8d99ae", "#333333", "#c5cbd3"
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")  # of `SERIES`, as told apart without colours
+MARKERS = (
+    "o",
+    "s",
+    "^",
+    "D",
+    "v",
+    "P",
+    "X",
+)  # of `SERIES`, as told apart without colours
 RC: dict[Any, Any] = {
-    "axes.axisbelow": True, "axes.edgecolor": OTHER, "axes.grid": True,
-    "axes.labelcolor": DARK, "axes.labelsize": 9.5,
-    "axes.prop_cycle": cycler(color=SERIES), "axes.spines.right": False, "axes.spines.top": False,
-    "axes.titlecolor": DARK, "axes.titlesize": 10.0, "font.size": 10.0,
-    "grid.alpha": 0.3, "legend.fontsize": 9.0, "legend.frameon": False, "savefig.dpi": 110.0,
-    "text.color": DARK, "xtick.color": DARK, "xtick.labelsize": 9.0, "ytick.color": DARK,
+    "axes.axisbelow": True,
+    "axes.edgecolor": OTHER,
+    "axes.grid": True,
+    "axes.labelcolor": DARK,
+    "axes.labelsize": 9.5,
+    "axes.prop_cycle": cycler(color=SERIES),
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": DARK,
+    "axes.titlesize": 10.0,
+    "font.size": 10.0,
+    "grid.alpha": 0.3,
+    "legend.fontsize": 9.0,
+    "legend.frameon": False,
+    "savefig.dpi": 110.0,
+    "text.color": DARK,
+    "xtick.color": DARK,
+    "xtick.labelsize": 9.0,
+    "ytick.color": DARK,
     "ytick.labelsize": 9.0,
-}  # fmt: skip
+}
 LETTERS_PER_IN = 10.5  # of a title
 
 
@@ -42,7 +63,9 @@ def panels(
 ) -> tuple[Figure, list[Axes]]:
     """Returns a figure of a size [inch], and its axes in rows."""
     figure = Figure(figsize=size, layout="constrained")
-    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).ravel())
+    return figure, list(
+        figure.subplots(rows, columns, squeeze=False, **options).ravel()
+    )
 
 
 @styled()
@@ -63,7 +86,10 @@ def png(figure: Figure, legend: Axes | None = None) -> bytes:
             axes.set_title("\n".join(title))
     if legend is not None:
         handles, labels = legend.get_legend_handles_labels()
-        room, each = LETTERS_PER_IN * figure.get_figwidth(), [len(label) + 5 for label in labels]
+        room, each = (
+            LETTERS_PER_IN * figure.get_figwidth(),
+            [len(label) + 5 for label in labels],
+        )
         columns = len(labels) if sum(each) <= room else max(1, int(room / max(each)))
         figure.legend(handles, labels, loc="outside upper center", ncols=columns)
     buffer = io.BytesIO()

@@ -36,5 +36,7 @@ def run_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
     """Limits a function to one BLAS thread: for thousands of small problems, ten times as fast."""
-    limited: Callable[P, R] = threadpool_limits.wrap(limits=1, user_api="blas")(function)
+    limited: Callable[P, R] = threadpool_limits.wrap(limits=1, user_api="blas")(
+        function
+    )
     return limited

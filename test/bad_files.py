@@ -53,7 +53,9 @@ TEXTS: dict[str, Callable[[Path], object]] = {
     "deeply nested in brackets": _text(lambda _: b"a: " + b"[" * DEEP + b"]" * DEEP),
     "deeply nested in braces": _text(lambda _: b"a: " + b"{b: " * DEEP + b"}" * DEEP),
     "deeply indented": _text(
-        lambda _: b"".join(b" " * n + b"a:\n" for n in range(200)) + b" " * 200 + b"a: 1\n"
+        lambda _: (
+            b"".join(b" " * n + b"a:\n" for n in range(200)) + b" " * 200 + b"a: 1\n"
+        )
     ),
     "a list": _text(lambda _: b"- 1\n- 2\n"),
     "one word": _text(lambda _: b"word\n"),
@@ -67,10 +69,14 @@ TEXTS: dict[str, Callable[[Path], object]] = {
             )
         )
     ),
-    "an object of Python": _text(lambda _: b"a: !!python/object/apply:os.system ['true']\n"),
+    "an object of Python": _text(
+        lambda _: b"a: !!python/object/apply:os.system ['true']\n"
+    ),
     "two documents": _text(lambda whole: whole + b"\n---\n" + whole),
     "an unknown key": _text(lambda whole: whole.rstrip() + b"\nunheard_of: 1\n"),
-    "a very long line": _text(lambda whole: whole.rstrip() + b"\nlong: " + b"x" * LARGE + b"\n"),
+    "a very long line": _text(
+        lambda whole: whole.rstrip() + b"\nlong: " + b"x" * LARGE + b"\n"
+    ),
     "an unclosed quote": _text(lambda whole: whole + b'\nb: "never\n'),
     "an alias of itself": _text(lambda _: b"a: &a [*a]\n"),
     "a merge of nothing": _text(lambda whole: whole.rstrip() + b"\n<<: 3\n"),
@@ -81,8 +87,32 @@ TEXTS: dict[str, Callable[[Path], object]] = {
 """Of YAML files."""
 
 VALUES = (
-    "word", "no", "010", "0x1F", "1_000", "12:30", ".nan", ".inf", "-.inf", "-1", "0", "1e300",
-    "-1e300", "1e-300", "99999999999999999999999999", "null", "[]", "{}", "[1, 2]", "[.nan]",
-    "{a: 1}", "true", "''", "'1.0'", "2020-01-01", "1.0 m", "[[[]]]",
-)  # fmt: skip
+    "word",
+    "no",
+    "010",
+    "0x1F",
+    "1_000",
+    "12:30",
+    ".nan",
+    ".inf",
+    "-.inf",
+    "-1",
+    "0",
+    "1e300",
+    "-1e300",
+    "1e-300",
+    "99999999999999999999999999",
+    "null",
+    "[]",
+    "{}",
+    "[1, 2]",
+    "[.nan]",
+    "{a: 1}",
+    "true",
+    "''",
+    "'1.0'",
+    "2020-01-01",
+    "1.0 m",
+    "[[[]]]",
+)
 """Put in the place of any value of a YAML file."""

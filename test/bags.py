@@ -65,11 +65,15 @@ def ackermann_stamped(t: float | None, speed: float, steering: float) -> Any:
 
 def turned(heading: float) -> Any:
     half = heading / 2.0
-    return new("geometry_msgs/Quaternion", 0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
+    return new(
+        "geometry_msgs/Quaternion", 0.0, 0.0, float(np.sin(half)), float(np.cos(half))
+    )
 
 
 def pose(x: float, y: float, heading: float) -> Any:
-    return new("geometry_msgs/Pose", new("geometry_msgs/Point", x, y, 0.0), turned(heading))
+    return new(
+        "geometry_msgs/Pose", new("geometry_msgs/Point", x, y, 0.0), turned(heading)
+    )
 
 
 def pose_stamped(t: float | None, *place: float) -> Any:
@@ -90,9 +94,18 @@ def odometry(t: float | None, *place: float) -> Any:
 def scan(t: float | None, beams: int = 4, time_increment: float = 0.0) -> Any:
     ranges = np.ones(beams, np.float32)
     return new(
-        "sensor_msgs/LaserScan", header(t, "laser"), -1.0, 1.0, 2.0 / (beams - 1),
-        time_increment, 0.1, 0.05, 3.0, ranges, np.zeros(0, np.float32),
-    )  # fmt: skip
+        "sensor_msgs/LaserScan",
+        header(t, "laser"),
+        -1.0,
+        1.0,
+        2.0 / (beams - 1),
+        time_increment,
+        0.1,
+        0.05,
+        3.0,
+        ranges,
+        np.zeros(0, np.float32),
+    )
 
 
 def transform(
@@ -108,18 +121,32 @@ def transforms(*some: Any) -> Any:
 
 
 def joints(
-    t: float | None, names: list[str], position: Iterable[float], velocity: Iterable[float]
+    t: float | None,
+    names: list[str],
+    position: Iterable[float],
+    velocity: Iterable[float],
 ) -> Any:
     return new(
-        kinds.JOINTS, header(t, ""), names, np.array(position), np.array(velocity), np.zeros(0)
+        kinds.JOINTS,
+        header(t, ""),
+        names,
+        np.array(position),
+        np.array(velocity),
+        np.zeros(0),
     )
 
 
 def imu(t: float | None, ax: float, ay: float, turn: float) -> Any:
     return new(
-        kinds.IMU, header(t), turned(0.0), np.zeros(9), vector(z=turn), np.zeros(9),
-        vector(ax, ay, 9.81), np.zeros(9),
-    )  # fmt: skip
+        kinds.IMU,
+        header(t),
+        turned(0.0),
+        np.zeros(9),
+        vector(z=turn),
+        np.zeros(9),
+        vector(ax, ay, 9.81),
+        np.zeros(9),
+    )
 
 
 def place_at(t: float) -> tuple[float, float, float]:
@@ -139,7 +166,8 @@ def commands(delay: float = 0.0) -> list[Row]:
 def poses(delay: float = 0.0, offset: float = 0.0) -> list[Row]:
     """Poses whose headers are of a clock that is `offset` ahead, 2 ms before their receipt."""
     return [
-        (delay + t, pose_stamped(delay + t + offset - 0.002, *place_at(delay + t))) for t in times()
+        (delay + t, pose_stamped(delay + t + offset - 0.002, *place_at(delay + t)))
+        for t in times()
     ]
 
 

@@ -15,7 +15,9 @@ import pytest
 
 DEADLINE_S = 60.0
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
+CHROMIUM = os.environ.get("CHROMIUM") or next(
+    filter(None, map(shutil.which, NAMES)), None
+)
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)"
 )
@@ -34,10 +36,17 @@ class Browser:
     """Headless Chromium by its DevTools protocol; `complaints` are errors of the page."""
 
     FLAGS = (
-        "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-        "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        "--remote-debugging-port=0", "about:blank",
-    )  # fmt: skip
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--remote-debugging-port=0",
+        "about:blank",
+    )
 
     def __init__(self, folder) -> None:
         from websockets.sync.client import connect
@@ -70,12 +79,19 @@ class Browser:
     SHOWN = "!!(window.nics && nics.counters.draws > 2)"
 
     def resize(self, width: int, height: int) -> None:
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 760}
+        size = {
+            "width": width,
+            "height": height,
+            "deviceScaleFactor": 1,
+            "mobile": width < 760,
+        }
         self.call("Emulation.setDeviceMetricsOverride", **size)
 
     def open(self, url: str, width: int, height: int, ready: str = SHOWN) -> None:
         self.resize(width, height)
-        self.call("Page.navigate", url="about:blank")  # ends what shows an earlier server
+        self.call(
+            "Page.navigate", url="about:blank"
+        )  # ends what shows an earlier server
         self.ask("0")
         self.events.clear()
         self.call("Page.navigate", url=url)
@@ -101,7 +117,10 @@ class Browser:
             for event in self.events
             if event["method"] == "Runtime.exceptionThrown"
             or event.get("params", {}).get("entry", {}).get("level") in bad
-            or (event["method"] == "Runtime.consoleAPICalled" and event["params"]["type"] in bad)
+            or (
+                event["method"] == "Runtime.consoleAPICalled"
+                and event["params"]["type"] in bad
+            )
         ]
 
     def close(self) -> None:
@@ -114,7 +133,9 @@ class Browser:
         """What a page complains about, lacks, or does not fit into the width of a window."""
         self.open(url, *sizes[0], ready="document.readyState === 'complete'")
         found = self.complaints
-        broken = "[...document.images].filter(i => i.complete && !i.naturalWidth).length"
+        broken = (
+            "[...document.images].filter(i => i.complete && !i.naturalWidth).length"
+        )
         if self.ask(broken):
             found.append(f"{url}: a picture that is not there")
         for width, height in sizes:

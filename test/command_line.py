@@ -18,7 +18,12 @@ PATIENT_S = 1e6  # no line about long work between what a test reads
 
 def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Exit code and output of a command in a folder."""
-    argv, out, err, here = ["nics", *map(str, words)], io.StringIO(), io.StringIO(), os.getcwd()
+    argv, out, err, here = (
+        ["nics", *map(str, words)],
+        io.StringIO(),
+        io.StringIO(),
+        os.getcwd(),
+    )
     os.chdir(cwd)
     try:
         with (
@@ -29,7 +34,9 @@ def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
         ):
             main()
     except SystemExit as end:
-        return subprocess.CompletedProcess(argv, end.code, out.getvalue(), err.getvalue())
+        return subprocess.CompletedProcess(
+            argv, end.code, out.getvalue(), err.getvalue()
+        )
     finally:
         os.chdir(here)
     raise AssertionError("a command ends with an exit code")

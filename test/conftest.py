@@ -41,7 +41,9 @@ def pytest_report_header() -> str:
         return f"ROS 2: rclpy is there but can't be imported ({reason[0]})"
     distribution, _, middleware = asked.stdout.rstrip("\n").partition(" ")
     release = _rclpy_version()
-    distribution = distribution or DISTRIBUTIONS.get(release.split(".")[0], "unknown distribution")
+    distribution = distribution or DISTRIBUTIONS.get(
+        release.split(".")[0], "unknown distribution"
+    )
     return f"ROS 2: {distribution}, rclpy {release}, {middleware}"
 
 

@@ -54,7 +54,9 @@ def thin(rng: np.random.Generator, corners: int, reach: float = 0.4) -> Polygon:
 
 def off_centre(rng: np.random.Generator, corners: int, reach: float = 0.4) -> Polygon:
     """Its origin lies outside of it."""
-    return Polygon(points=star(rng, corners, reach / 2.0).outline + np.array([0.6 * reach, 0]))
+    return Polygon(
+        points=star(rng, corners, reach / 2.0).outline + np.array([0.6 * reach, 0])
+    )
 
 
 def clockwise(rng: np.random.Generator, corners: int, reach: float = 0.4) -> Polygon:
@@ -103,7 +105,9 @@ def placed(shape: Shape, pose: np.ndarray) -> tuple[shapely.Geometry, np.ndarray
     if isinstance(shape, Circle):
         rim = shapely.Point(pose[:2]).buffer(shape.radius, quad_segs=64).exterior
         return rim, np.zeros((0, 2))
-    points = np.array(getattr(shape, "points", shape.outline))  # in the user's own order
+    points = np.array(
+        getattr(shape, "points", shape.outline)
+    )  # in the user's own order
     corners = pose[:2] + geometry.rotate(points, pose[2])
     if isinstance(shape, Segment):
         return shapely.LineString(corners), corners
@@ -113,9 +117,14 @@ def placed(shape: Shape, pose: np.ndarray) -> tuple[shapely.Geometry, np.ndarray
 def by_plane_geometry(spec: LidarSpec, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Ranges (B,) by a library of plane geometry, and which of them are fit for comparison."""
     sensor = geometry.compose(scene.robot, spec.mount)
-    outlines = [placed(shape, pose) for shape, pose in zip(scene.shapes, scene.poses, strict=True)]
+    outlines = [
+        placed(shape, pose)
+        for shape, pose in zip(scene.shapes, scene.poses, strict=True)
+    ]
     walls = scene.walls.reshape(-1, 2, 2)
-    corners = np.concatenate([*(c for _, c in outlines), walls.reshape(-1, 2)]) - sensor[:2]
+    corners = (
+        np.concatenate([*(c for _, c in outlines), walls.reshape(-1, 2)]) - sensor[:2]
+    )
     moved = [
         shapely.transform(outline, lambda xy: xy - sensor[:2])
         for outline in (*(o for o, _ in outlines), *shapely.linestrings(walls))
@@ -147,7 +156,9 @@ def by_plane_geometry(spec: LidarSpec, scene: Scene) -> tuple[np.ndarray, np.nda
 def slice_poses(pose, twist, sweep_time: float, slices: int, skew: str) -> np.ndarray:
     """Poses (G, 3) of a robot during a sweep that ends at `pose`, with a body twist (3,)."""
     out = np.empty((slices, 3))
-    fault_kernels.slice_poses(out, np.asarray(pose), np.asarray(twist), sweep_time, SKEW[skew])
+    fault_kernels.slice_poses(
+        out, np.asarray(pose), np.asarray(twist), sweep_time, SKEW[skew]
+    )
     out[:, 2] = geometry.wrap_angle(out[:, 2])
     return out
 
@@ -156,4 +167,6 @@ def scan_skewed(render, poses: np.ndarray) -> np.ndarray:
     """A scan (B,) by `render` in G equal groups of beams, each from its pose (G, 3)."""
     scans = [render(pose) for pose in poses]
     edges = np.arange(len(poses) + 1) * len(scans[0]) // len(poses)
-    return np.concatenate([scans[g][edges[g] : edges[g + 1]] for g in range(len(poses))])
+    return np.concatenate(
+        [scans[g][edges[g] : edges[g + 1]] for g in range(len(poses))]
+    )

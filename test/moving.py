@@ -62,8 +62,12 @@ def scattered(radii, half, rng, walls=None, free=0.05):
             )
             for wall in () if walls is None else walls:
                 one, other = np.reshape(wall, (2, 2))
-                share = np.clip((at - one) @ (other - one) / np.sum((other - one) ** 2), 0.0, 1.0)
-                clear &= np.linalg.norm(at - one - share * (other - one)) > radius + free
+                share = np.clip(
+                    (at - one) @ (other - one) / np.sum((other - one) ** 2), 0.0, 1.0
+                )
+                clear &= (
+                    np.linalg.norm(at - one - share * (other - one)) > radius + free
+                )
             if clear:
                 found.append(at)
                 break
@@ -76,13 +80,26 @@ def state_of(bodies, marks, velocity, seeds):
     worlds, none = len(bodies), np.zeros((len(bodies), 0, 3))
     ints, empty = np.zeros((worlds, 0), np.int64), np.zeros((worlds, 0, 0, 0))
     return State(
-        pose=none, state=none, history=empty, bodies=bodies, odom=none, twist=none,
-        ranges=none.astype(np.float32), collided=ints.astype(np.uint8),
-        steps=np.zeros(worlds, np.int64), seeds=np.array(seeds, np.int64),
-        member=np.zeros(worlds, np.int64), faults=none,
-        coefficient=none, delay=ints, age=ints, noise=none, velocity=velocity, past=empty,
+        pose=none,
+        state=none,
+        history=empty,
+        bodies=bodies,
+        odom=none,
+        twist=none,
+        ranges=none.astype(np.float32),
+        collided=ints.astype(np.uint8),
+        steps=np.zeros(worlds, np.int64),
+        seeds=np.array(seeds, np.int64),
+        member=np.zeros(worlds, np.int64),
+        faults=none,
+        coefficient=none,
+        delay=ints,
+        age=ints,
+        noise=none,
+        velocity=velocity,
+        past=empty,
         marks=marks,
-    )  # fmt: skip
+    )
 
 
 def surroundings_of(motions, half, walls, grid=NO_FIELD):
@@ -94,9 +111,16 @@ def surroundings_of(motions, half, walls, grid=NO_FIELD):
 
 
 def watch(
-    motions, places, radii, half=(3.0, 3.0), steps=2000, seed=1, walls=None, grid=NO_FIELD,
+    motions,
+    places,
+    radii,
+    half=(3.0, 3.0),
+    steps=2000,
+    seed=1,
+    walls=None,
+    grid=NO_FIELD,
     robots=None,
-):  # fmt: skip
+):
     """Lets the first K of the bodies move, see `Watched`, and `robots` (T, M, 2) the others."""
     count = len(motions)
     poses = np.concatenate([places, np.zeros((len(places), 1))], axis=1)[None]

@@ -20,7 +20,16 @@ from nics_drl_bridge.lidar.baked_kernels import (
     silhouette,
     way_of,
 )
-from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
+from nics_drl_bridge.lidar.exact_kernels import (
+    COS,
+    HEADING,
+    RADIUS,
+    SHAPE,
+    SIN,
+    LidarPose,
+    X,
+    Y,
+)
 
 
 @kernel(allocates=True)
@@ -44,7 +53,9 @@ def look_up(out, x, y, heading, body, lidar):  # type: ignore[no-untyped-def]
     shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
     dx, dy = body[X] - x, body[Y] - y
     distance, bearing = polar(dx, dy)
-    cell, hull, blend = nearest_cell(distance, bearing, body[RADIUS], body[HEADING], shape, table)
+    cell, hull, blend = nearest_cell(
+        distance, bearing, body[RADIUS], body[HEADING], shape, table
+    )
     near, far = table.cells[np.uintp(cell)], table.cells[np.uintp(cell + 1)]
     seen = seen_at(dx, dy, body[COS], body[SIN])
     right = silhouette(near[2], hull, shape, table.hulls, seen, 1.0)
@@ -66,6 +77,14 @@ def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-un
     range_min, range_max = np.float32(lidar.range_min), np.float32(lidar.range_max)
     for j in range(hits):
         value = blended(
-            rows, one + j, two + j, other + j, other2 + j, share, blend, range_min, range_max
+            rows,
+            one + j,
+            two + j,
+            other + j,
+            other2 + j,
+            share,
+            blend,
+            range_min,
+            range_max,
         )
         out[begin + j] = min(out[begin + j], value)

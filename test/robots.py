@@ -24,9 +24,27 @@ DIRECT = RobotSpec.model_validate(
         "name": "direct",
         "footprint_radius": FOOTPRINT,
         "command": [
-            {"name": "forward", "unit": "m/s", "min": -2.0, "max": 2.0, "cmd_vel": "linear.x"},
-            {"name": "left", "unit": "m/s", "min": -2.0, "max": 2.0, "cmd_vel": "linear.y"},
-            {"name": "turn", "unit": "rad/s", "min": -2.0, "max": 2.0, "cmd_vel": "angular.z"},
+            {
+                "name": "forward",
+                "unit": "m/s",
+                "min": -2.0,
+                "max": 2.0,
+                "cmd_vel": "linear.x",
+            },
+            {
+                "name": "left",
+                "unit": "m/s",
+                "min": -2.0,
+                "max": 2.0,
+                "cmd_vel": "linear.y",
+            },
+            {
+                "name": "turn",
+                "unit": "rad/s",
+                "min": -2.0,
+                "max": 2.0,
+                "cmd_vel": "angular.z",
+            },
         ],
     }
 )

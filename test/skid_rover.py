@@ -18,9 +18,17 @@ from nics_drl_bridge.sim.world import World
 
 FOOTPRINT = [[0.45, 0.34], [-0.45, 0.34], [-0.45, -0.34], [0.45, -0.34]]
 PILLARS = (
-    (2.5, 1.5, 0.3), (-2.0, 2.8, 0.2), (3.6, -2.2, 0.35), (-3.4, -2.6, 0.3), (0.6, 4.0, 0.25),
-    (-4.2, 1.0, 0.2), (0.4, -3.6, 0.35), (4.2, 3.9, 0.2), (-1.4, -1.3, 0.2), (2.0, -4.6, 0.2),
-)  # fmt: skip
+    (2.5, 1.5, 0.3),
+    (-2.0, 2.8, 0.2),
+    (3.6, -2.2, 0.35),
+    (-3.4, -2.6, 0.3),
+    (0.6, 4.0, 0.25),
+    (-4.2, 1.0, 0.2),
+    (0.4, -3.6, 0.35),
+    (4.2, 3.9, 0.2),
+    (-1.4, -1.3, 0.2),
+    (2.0, -4.6, 0.2),
+)
 """Their x, y and radius [m]."""
 LIMITS = """
 robot: skid_rover
@@ -34,20 +42,32 @@ def rover() -> RobotSpec:
     """The robot as its YAML file tells it."""
     return robot_from(
         {
-            "name": "skid_rover", "kind": "free", "footprint": FOOTPRINT,
+            "name": "skid_rover",
+            "kind": "free",
+            "footprint": FOOTPRINT,
             "lidar_mount": [0.25, 0.0, 0.0],
             "command": [
-                {"name": "forward_command", "unit": "m/s", "min": -0.8, "max": 0.8,
-                 "cmd_vel": "linear.x"},
-                {"name": "turn_command", "unit": "rad/s", "min": -1.2, "max": 1.2,
-                 "cmd_vel": "angular.z"},
+                {
+                    "name": "forward_command",
+                    "unit": "m/s",
+                    "min": -0.8,
+                    "max": 0.8,
+                    "cmd_vel": "linear.x",
+                },
+                {
+                    "name": "turn_command",
+                    "unit": "rad/s",
+                    "min": -1.2,
+                    "max": 1.2,
+                    "cmd_vel": "angular.z",
+                },
             ],
             "state": [
                 {"name": "vx", "unit": "m/s", "min": -1.6, "max": 1.6, "twist": "vx"},
                 {"name": "wz", "unit": "rad/s", "min": -2.4, "max": 2.4, "twist": "wz"},
             ],
         }
-    )  # fmt: skip
+    )
 
 
 def kinematics(unsure: bool = True) -> TaylorModel:
@@ -64,20 +84,31 @@ def kinematics(unsure: bool = True) -> TaylorModel:
         errors[4, [1, 3]] = [0.84, 0.66]
     high = np.array([1.6, 2.4, 0.8, 1.2])
     return TaylorModel(
-        robot.variable_names, robot.dof_names, robot.dof_units, np.eye(4, dtype=np.int64),
-        coefficients, 0.02, -high, high, std_errors=errors,
+        robot.variable_names,
+        robot.dof_names,
+        robot.dof_units,
+        np.eye(4, dtype=np.int64),
+        coefficients,
+        0.02,
+        -high,
+        high,
+        std_errors=errors,
         limits=np.array([[-2.17, 2.11], [-np.inf, np.inf]]),
-    )  # fmt: skip
+    )
 
 
 def rover_model() -> SimulatorModel:
     """The robot with its lidar, which looks over 270 degrees, for pillars of all its radii."""
     lidar = LidarSpec.model_validate(
         {
-            "beams": 271, "angle_min": -0.75 * np.pi, "angle_max": 0.75 * np.pi,
-            "range_min": 0.1, "range_max": 10.0, "rate": 10.0,
+            "beams": 271,
+            "angle_min": -0.75 * np.pi,
+            "angle_max": 0.75 * np.pi,
+            "range_min": 0.1,
+            "range_max": 10.0,
+            "rate": 10.0,
         }
-    )  # fmt: skip
+    )
     radii = sorted({radius for _, _, radius in PILLARS})
     table = bake(lidar, tuple(Circle(radius=radius) for radius in radii))
     return SimulatorModel(rover(), kinematics(), Calibration(), lidar, table, Noise())
@@ -90,9 +121,14 @@ def pillars() -> World:
         for x, y, radius in PILLARS
     ]
     return World.model_validate(
-        {"name": "pillars", "size": [12.0, 12.0], "obstacles": groups, "clearance": 0.1,
-         "goal_distance": [2.0, 5.0]}
-    )  # fmt: skip
+        {
+            "name": "pillars",
+            "size": [12.0, 12.0],
+            "obstacles": groups,
+            "clearance": 0.1,
+            "goal_distance": [2.0, 5.0],
+        }
+    )
 
 
 def limits_in(folder: Path) -> str:

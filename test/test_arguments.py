@@ -11,7 +11,9 @@ from nics_drl_bridge.errors import BridgeError, ConfigError
 
 
 @checked_arguments("drive")
-def drive(model: str = "ackermann", metres: float = 1.0, turns: int | None = None) -> Any:
+def drive(
+    model: str = "ackermann", metres: float = 1.0, turns: int | None = None
+) -> Any:
     """Returns its arguments."""
     return model, metres, turns
 
@@ -29,12 +31,16 @@ def test_both_words_may_name_the_same_robot() -> None:
 @pytest.mark.parametrize("first", [{"model": "ackermann"}, {}])
 def test_two_words_for_two_robots_are_refused(first: dict[str, Any]) -> None:
     given = () if first else ("ackermann",)
-    with pytest.raises(ConfigError, match=r"model='ackermann' and robot='jackal'.*give one"):
+    with pytest.raises(
+        ConfigError, match=r"model='ackermann' and robot='jackal'.*give one"
+    ):
         drive(*given, robot="jackal", **first)  # type: ignore[call-arg]
 
 
 def test_an_unknown_keyword_is_told_with_the_nearest_one() -> None:
-    with pytest.raises(ConfigError, match="drive: unknown argument 'metre'; did you mean 'metres'"):
+    with pytest.raises(
+        ConfigError, match="drive: unknown argument 'metre'; did you mean 'metres'"
+    ):
         drive(metre=2.0)  # type: ignore[call-arg]
 
 
@@ -46,7 +52,9 @@ def test_a_value_that_is_no_number_is_refused(value: Any) -> None:
 
 def test_a_value_that_may_be_none_is_accepted_as_none() -> None:
     assert drive(turns=None)[2] is None
-    with pytest.raises(ConfigError, match=r"turns=1\.5: must be a whole number, or None"):
+    with pytest.raises(
+        ConfigError, match=r"turns=1\.5: must be a whole number, or None"
+    ):
         drive(turns=1.5)  # type: ignore[arg-type]
 
 
@@ -70,11 +78,19 @@ def test_a_large_object_is_quoted_by_its_type() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "load_model", "load_policy", "load_recording", "load_robot", "load_world", "load_worlds",
-        "open_model", "read_recording",
+        "load_model",
+        "load_policy",
+        "load_recording",
+        "load_robot",
+        "load_world",
+        "load_worlds",
+        "open_model",
+        "read_recording",
     ],
-)  # fmt: skip
-def test_what_is_no_path_is_refused_by_all_that_opens_one(name: str, value: Any) -> None:
+)
+def test_what_is_no_path_is_refused_by_all_that_opens_one(
+    name: str, value: Any
+) -> None:
     with pytest.raises(BridgeError) as caught:
         getattr(nics_drl_bridge, name)(value)
     assert "\n" not in str(caught.value)

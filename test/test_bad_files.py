@@ -27,7 +27,9 @@ CONFIGS = {
     "robots/ackermann.yaml": load_robot,
     "lidars/rplidar_a1.yaml": load_lidar,
     "worlds/doorway.yaml": load_world,
-    "limits/differential.yaml": lambda name: load_limits(name, load_robot("differential")),
+    "limits/differential.yaml": lambda name: load_limits(
+        name, load_robot("differential")
+    ),
     "randomisation/strong.yaml": load_randomisation,
     "training/navigation_differential.yaml": load_training,
     "maps/room.yaml": load_map,
@@ -59,7 +61,9 @@ def copy(tmp_path):
     return make
 
 
-@pytest.mark.parametrize("what", [*FILES, *(text for text in TEXTS if "long" not in text)])
+@pytest.mark.parametrize(
+    "what", [*FILES, *(text for text in TEXTS if "long" not in text)]
+)
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_damaged_configuration_is_refused_by_name(copy, name, what):
     path = copy(name)
@@ -81,7 +85,9 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, name, what):
 def test_any_value_in_the_place_of_a_number_is_a_number_or_refused(copy, key, value):
     path = copy("lidars/rplidar_a1.yaml")
     lines = path.read_text().splitlines()
-    changed = [f"{key}: {value}" if line.startswith(f"{key}:") else line for line in lines]
+    changed = [
+        f"{key}: {value}" if line.startswith(f"{key}:") else line for line in lines
+    ]
     assert changed != lines
     path.write_text("\n".join(changed))
     try:
@@ -94,7 +100,9 @@ def test_any_value_in_the_place_of_a_number_is_a_number_or_refused(copy, key, va
         assert found == float(value.strip("'"))
 
 
-def test_a_huge_configuration_or_an_endless_device_is_refused_without_reading_it(tmp_path):
+def test_a_huge_configuration_or_an_endless_device_is_refused_without_reading_it(
+    tmp_path,
+):
     path = tmp_path / "huge.yaml"
     with path.open("wb") as huge:
         huge.truncate(MAX_BYTES + 1)

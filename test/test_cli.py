@@ -63,13 +63,24 @@ def csv_folder(path: Path, bad_row: str = "") -> Path:
 
 
 COMMANDS = {
-    "generate", "record", "explain", "doctor", "urdf", "train", "evaluate", "demo", "policy", "bag",
+    "generate",
+    "record",
+    "explain",
+    "doctor",
+    "urdf",
+    "train",
+    "evaluate",
+    "demo",
+    "policy",
+    "bag",
     "world",
-}  # fmt: skip
+}
 
 
 @pytest.mark.process
-def test_it_tells_its_version_and_its_commands_and_refuses_others_in_one_sentence(tmp_path):
+def test_it_tells_its_version_and_its_commands_and_refuses_others_in_one_sentence(
+    tmp_path,
+):
     assert started("--version", cwd=tmp_path).stdout == f"{__version__}\n"
     told = started("--help", cwd=tmp_path)
     assert told.returncode == 0
@@ -79,9 +90,20 @@ def test_it_tells_its_version_and_its_commands_and_refuses_others_in_one_sentenc
 
 @pytest.mark.process
 def test_the_help_loads_nothing_that_only_commands_need(tmp_path):
-    heavy = {"numba", "scipy", "matplotlib", "gymnasium", "torch", "rclpy", "onnx", "numpy"}
+    heavy = {
+        "numba",
+        "scipy",
+        "matplotlib",
+        "gymnasium",
+        "torch",
+        "rclpy",
+        "onnx",
+        "numpy",
+    }
     code = "import sys, nics_drl_bridge.commands.cli; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert heavy.isdisjoint(done.stdout.split())
 
 
@@ -112,10 +134,16 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.0100036, 0.0083, 1.0 / 60.0])
-def test_a_recording_of_any_rate_gives_a_model_whose_step_divides_the_period(tmp_path, dt):
+def test_a_recording_of_any_rate_gives_a_model_whose_step_divides_the_period(
+    tmp_path, dt
+):
     spec = load_robot("differential")
-    save_recording(textbook.record(spec, np.random.default_rng(0), 40.0, dt), tmp_path / "d.npz")
-    done = nics("generate", "d.npz", "--robot", "differential", "--out", "car", cwd=tmp_path)
+    save_recording(
+        textbook.record(spec, np.random.default_rng(0), 40.0, dt), tmp_path / "d.npz"
+    )
+    done = nics(
+        "generate", "d.npz", "--robot", "differential", "--out", "car", cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     model = load_model(tmp_path / "car")
     steps = model.control_period / model.kinematics.dt
@@ -199,7 +227,9 @@ def test_a_damaged_npz_is_one_sentence(drive, tmp_path):
     ],
 )
 def test_an_unknown_name_comes_with_the_nearest(drive, tmp_path, option, name, hint):
-    sentence = refused(nics("generate", drive, "--out", "car", option, name, cwd=tmp_path))
+    sentence = refused(
+        nics("generate", drive, "--out", "car", option, name, cwd=tmp_path)
+    )
     assert name in sentence
     assert hint in sentence
     assert names(tmp_path) == set()
@@ -224,7 +254,9 @@ def test_a_recording_of_another_robot_is_refused(drive, tmp_path):
 
 def test_ctrl_c_in_a_compiled_function_is_an_interruption_and_another_fault_is_not():
     with pytest.raises(typer.Exit) as caught, console.one_sentence():
-        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+        raise SystemError(
+            "returned a result with an exception set"
+        ) from KeyboardInterrupt()
     assert caught.value.exit_code == 130
     with pytest.raises(SystemError, match="of another kind"), console.one_sentence():
         raise SystemError("of another kind")

@@ -89,7 +89,9 @@ def model_with_a_sensor(trap, place):
     folder = trap.folder / "model"
     save_model(direct_model(), folder)
     model = folder / "model.yaml"
-    model.write_text(f"{model.read_text()}\nsensors:\n- {{kind: '{place}', name: rear}}\n")
+    model.write_text(
+        f"{model.read_text()}\nsensors:\n- {{kind: '{place}', name: rear}}\n"
+    )
     (folder / SUMS).unlink()
     write_sums(folder)
     return folder
@@ -134,8 +136,13 @@ def run_of_a_task(trap, place):
 
 
 def foreign_mapping(trap, key, place):
-    data = {"kind": "foreign policy", "network": "n.onnx", "robot": "differential"} | {key: place}
-    data |= {"inputs": {"x": {"parts": [{"of": "scan"}]}}, "outputs": {"forward": {"of": "y"}}}
+    data = {"kind": "foreign policy", "network": "n.onnx", "robot": "differential"} | {
+        key: place
+    }
+    data |= {
+        "inputs": {"x": {"parts": [{"of": "scan"}]}},
+        "outputs": {"forward": {"of": "y"}},
+    }
     return write(trap.folder, "foreign.yaml", json.dumps(data))
 
 
@@ -154,32 +161,56 @@ def resume_a_run(trap, place):
 
 
 WAYS = {
-    "a sensor of a model": lambda t, p: load_model(model_with_a_sensor(t, p("TrapSensor"))),
-    "a model by name": lambda t, p: open_model(str(model_with_a_sensor(t, p("TrapSensor")))),
+    "a sensor of a model": lambda t, p: load_model(
+        model_with_a_sensor(t, p("TrapSensor"))
+    ),
+    "a model by name": lambda t, p: open_model(
+        str(model_with_a_sensor(t, p("TrapSensor")))
+    ),
     "a sensor's own file": lambda t, p: load_sensor(
         write(t.folder, "rear.yaml", f"{{kind: '{p('TrapSensor')}', name: rear}}")
     ),
-    "a sensor of a policy": lambda t, p: load_policy(policy_with_a_sensor(t, p("TrapSensor"))),
+    "a sensor of a policy": lambda t, p: load_policy(
+        policy_with_a_sensor(t, p("TrapSensor"))
+    ),
     "the task of a policy": lambda t, p: open_policy(
         str(policy_with_a_task(t, p("Trap"))), direct_model()
     ),
-    "the robot of a mapping": lambda t, p: load_any(foreign_mapping(t, "robot", p("Trap"))),
-    "the network of a mapping": lambda t, p: load_any(foreign_mapping(t, "network", p("Trap"))),
-    "the scan of a mapping": lambda t, p: load_any(foreign_mapping(t, "scan", p("Trap"))),
+    "the robot of a mapping": lambda t, p: load_any(
+        foreign_mapping(t, "robot", p("Trap"))
+    ),
+    "the network of a mapping": lambda t, p: load_any(
+        foreign_mapping(t, "network", p("Trap"))
+    ),
+    "the scan of a mapping": lambda t, p: load_any(
+        foreign_mapping(t, "scan", p("Trap"))
+    ),
     "a network of a bundle": lambda t, p: import_policy(leapp_bundle(t, p("Trap"))),
-    "the textbook of a robot": lambda t, p: load_robot(robot_with(t, "textbook", p("KIND"))),
-    "the lidar of a robot": lambda t, p: open_model(str(robot_with(t, "lidar", p("Trap")))),
+    "the textbook of a robot": lambda t, p: load_robot(
+        robot_with(t, "textbook", p("KIND"))
+    ),
+    "the lidar of a robot": lambda t, p: open_model(
+        str(robot_with(t, "lidar", p("Trap")))
+    ),
     "the task of settings": lambda t, p: open_named_task(
         load_training(write(t.folder, "settings.yaml", f"task: '{p('Trap')}'\n"))
     ),
-    "the task of a run": lambda t, p: open_named_task(settings_of(run_of_a_task(t, p("Trap")))),
+    "the task of a run": lambda t, p: open_named_task(
+        settings_of(run_of_a_task(t, p("Trap")))
+    ),
     "a resumed run": lambda t, p: resume_a_run(t, p("Trap")),
-    "a backend": lambda t, p: make_backend(p("Trap"), direct_model(), load_world("arena")),
+    "a backend": lambda t, p: make_backend(
+        p("Trap"), direct_model(), load_world("arena")
+    ),
     "limits": lambda t, p: load_limits(
         write(t.folder, "l.yaml", f"based_on: '{p('Trap')}'\n"), direct_model().robot
     ),
-    "a world": lambda t, p: load_world(write(t.folder, "w.yaml", f"kind: '{p('Trap')}'\n")),
-    "a mapping": lambda t, p: load_mapping(write(t.folder, "m.yaml", f"kind: '{p('Trap')}'\n")),
+    "a world": lambda t, p: load_world(
+        write(t.folder, "w.yaml", f"kind: '{p('Trap')}'\n")
+    ),
+    "a mapping": lambda t, p: load_mapping(
+        write(t.folder, "m.yaml", f"kind: '{p('Trap')}'\n")
+    ),
 }
 
 
@@ -278,7 +309,10 @@ def test_the_name_of_a_type_in_a_bag_is_no_program(tmp_path, name):
     given = SimpleNamespace(msgdef=(definition_format(), "int32 a\n"))
     given.msgtype = name.format(canary=str(canary))
     with_types([given])
-    given.msgdef = (definition_format(), f"string A=x'+open('{canary}','w')+'\nint32 b\n")
+    given.msgdef = (
+        definition_format(),
+        f"string A=x'+open('{canary}','w')+'\nint32 b\n",
+    )
     given.msgtype = "pkg/msg/Fine"
     with_types([given])
     assert not canary.exists()
@@ -296,7 +330,10 @@ def definition_format():
 def test_a_sensor_of_ones_own_is_given_by_the_caller_and_named_by_files(trap):
     kind = add_sensor_kind(f"{trap.file}:TrapSensor")
     assert trap.canary.exists()
-    rear = {"name": "rear", "lidar": {**direct_model().lidar.model_dump(), "frame": "back"}}
+    rear = {
+        "name": "rear",
+        "lidar": {**direct_model().lidar.model_dump(), "frame": "back"},
+    }
     sensor = sensor_of({"kind": "TrapSensor", **rear})
     assert type(sensor) is kind
     by_path = sensor_of({"kind": f"{trap.file}:TrapSensor", **rear})
@@ -304,7 +341,9 @@ def test_a_sensor_of_ones_own_is_given_by_the_caller_and_named_by_files(trap):
 
 
 def test_the_command_line_imports_a_kind_of_sensor(trap):
-    done = nics("--sensor-kind", f"{trap.file}:TrapSensor", "list", "robots", cwd=trap.folder)
+    done = nics(
+        "--sensor-kind", f"{trap.file}:TrapSensor", "list", "robots", cwd=trap.folder
+    )
     assert done.returncode == 0, done.stderr
     assert trap.canary.exists()
     done = nics("--sensor-kind", f"{trap.file}:Trap", "list", "robots", cwd=trap.folder)
@@ -315,7 +354,9 @@ def test_the_command_line_imports_a_kind_of_sensor(trap):
 def test_a_task_of_ones_own_is_opened_where_the_caller_names_it(trap):
     path = policy_with_a_task(trap, "Trap")
     model = direct_model()
-    with pytest.raises(BridgeError, match=r"say --task path/to/file\.py:Trap, or task= in Python"):
+    with pytest.raises(
+        BridgeError, match=r"say --task path/to/file\.py:Trap, or task= in Python"
+    ):
         open_policy(str(path), model)
     assert not trap.canary.exists()
     _, task = open_policy(str(path), model, kind=f"{trap.file}:Trap")
@@ -325,7 +366,9 @@ def test_a_task_of_ones_own_is_opened_where_the_caller_names_it(trap):
 def test_settings_of_a_task_of_ones_own_are_read_where_the_caller_names_it(trap):
     place = f"{trap.file}:Trap"
     file = write(trap.folder, "settings.yaml", f"task: '{place}'\nsteps: 77\n")
-    with pytest.raises(ConfigError, match=r"name it yourself: --task path/to/file\.py:ClassName"):
+    with pytest.raises(
+        ConfigError, match=r"name it yourself: --task path/to/file\.py:ClassName"
+    ):
         load_training(file)
     settings = load_training(file, task=place)
     assert (settings.task, settings.steps) == (place, 77)
@@ -336,6 +379,9 @@ def test_a_run_of_a_task_of_ones_own_is_resumed_where_the_caller_names_it(trap):
     place = f"{trap.file}:Trap"
     run_of_a_task(trap, place)
     done = nics("train", "--resume", "--out", "run", cwd=trap.folder)
-    assert "is a program, which a file of data may not start; name it yourself" in done.stderr
+    assert (
+        "is a program, which a file of data may not start; name it yourself"
+        in done.stderr
+    )
     done = nics("train", "--resume", "--out", "run", "--task", place, cwd=trap.folder)
     assert "run: holds no checkpoint of these seeds" in done.stderr

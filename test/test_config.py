@@ -68,20 +68,39 @@ def test_what_looks_like_a_decimal_number_is_that_number(text, value):
 
 
 @pytest.mark.parametrize(
-    "text", ["no", "yes", "on", "off", "Y", "0x10", "0b1", "0o7", "1_000", "12:30:45", "2024-01-31"]
+    "text",
+    [
+        "no",
+        "yes",
+        "on",
+        "off",
+        "Y",
+        "0x10",
+        "0b1",
+        "0o7",
+        "1_000",
+        "12:30:45",
+        "2024-01-31",
+    ],
 )
 def test_what_is_a_surprise_in_yaml_1_1_stays_text(text):
     assert value_of(text) == text
 
 
-@pytest.mark.parametrize(("text", "value"), [("true", True), ("False", False), ("~", None)])
+@pytest.mark.parametrize(
+    ("text", "value"), [("true", True), ("False", False), ("~", None)]
+)
 def test_truth_and_nothing_are_read(text, value):
     assert value_of(text) is value
 
 
-@pytest.mark.parametrize("text", ["a: 1\na: 2", "b: {a: 1, a: 1}", "b: [{c: 1, d: 2, c: 3}]"])
+@pytest.mark.parametrize(
+    "text", ["a: 1\na: 2", "b: {a: 1, a: 1}", "b: [{c: 1, d: 2, c: 3}]"]
+)
 def test_a_key_that_stands_twice_is_refused(text):
-    with pytest.raises(ConfigError, match=r"file.yaml, line \d: the key '[ac]' stands twice"):
+    with pytest.raises(
+        ConfigError, match=r"file.yaml, line \d: the key '[ac]' stands twice"
+    ):
         parse_yaml(text, "file.yaml")
 
 
@@ -92,14 +111,18 @@ def test_a_merged_key_may_be_overridden():
 
 @pytest.mark.parametrize("opening", ["[", "{a: "])
 def test_deep_nesting_is_refused_before_it_is_built(opening):
-    with pytest.raises(ConfigError, match="nested more than 32 levels deep; flatten it"):
+    with pytest.raises(
+        ConfigError, match="nested more than 32 levels deep; flatten it"
+    ):
         parse_yaml("key: " + opening * 100_000, "a.yaml")
 
 
 @pytest.mark.parametrize("key", ["spare", "extras"])
 def test_a_value_in_place_of_keys_is_told_without_the_words_of_a_library(key):
     sentence = refusal(f"name: a\n{key}: [1, 2]\n")
-    assert sentence == f"cart.yaml: key '{key}': must hold `key: value` pairs, not [1, 2]."
+    assert (
+        sentence == f"cart.yaml: key '{key}': must hold `key: value` pairs, not [1, 2]."
+    )
 
 
 @pytest.mark.parametrize(
@@ -167,7 +190,15 @@ def test_a_missing_key_is_named():
 
 
 @pytest.mark.parametrize(
-    "text", ["mass: heavy", "mass: .inf", "mass: -.inf", "mass: .nan", "mass: 1e999", "seats: 1.5"]
+    "text",
+    [
+        "mass: heavy",
+        "mass: .inf",
+        "mass: -.inf",
+        "mass: .nan",
+        "mass: 1e999",
+        "seats: 1.5",
+    ],
 )
 def test_a_wrong_value_is_shown_with_its_key(text):
     key, _, _ = text.partition(":")
@@ -201,12 +232,30 @@ def test_configurations_are_frozen_and_share_no_defaults():
 def test_written_yaml_reads_back_to_the_same_bits():
     rng = np.random.default_rng(0)
     numbers = (rng.normal(size=500) * 10.0 ** rng.uniform(-300, 300, 500)).tolist()
-    data = {"numbers": [*numbers, 0.0, 5e-324, 1e-3, 1e16, 3.0], "whole": [0, -7, 10**20]}
+    data = {
+        "numbers": [*numbers, 0.0, 5e-324, 1e-3, 1e16, 3.0],
+        "whole": [0, -7, 10**20],
+    }
     assert parse_yaml(dump_yaml(data), "a.yaml") == data
 
 
 @pytest.mark.parametrize(
-    "text", ["1e-3", "010", "09", "no", "null", "~", "true", "1.5", "5.", "- a", "", " a", "größe"]
+    "text",
+    [
+        "1e-3",
+        "010",
+        "09",
+        "no",
+        "null",
+        "~",
+        "true",
+        "1.5",
+        "5.",
+        "- a",
+        "",
+        " a",
+        "größe",
+    ],
 )
 def test_written_text_reads_back_as_text(text):
     assert parse_yaml(dump_yaml({"key": text}), "a.yaml") == {"key": text}
@@ -232,7 +281,10 @@ def test_files_that_cant_be_read_are_one_sentence(tmp_path):
 
 
 def test_a_shipped_file_is_found_by_name_and_any_by_path(tmp_path):
-    assert find_config("arena", "worlds") == share_folder() / "config" / "worlds" / "arena.yaml"
+    assert (
+        find_config("arena", "worlds")
+        == share_folder() / "config" / "worlds" / "arena.yaml"
+    )
     assert find_config("some/where.yaml", "worlds").as_posix() == "some/where.yaml"
 
 
@@ -245,8 +297,22 @@ def test_an_unknown_name_gives_the_nearest():
 
 
 SOON_S = 2.0
-TAGS = ("!!python/name:os.system", "!!int", "!!float", "!!bool", "!!timestamp", "!!binary", "!!set",
-        "!!omap", "!!pairs", "!!str", "!!map", "!!seq", "!own", "!")  # fmt: skip
+TAGS = (
+    "!!python/name:os.system",
+    "!!int",
+    "!!float",
+    "!!bool",
+    "!!timestamp",
+    "!!binary",
+    "!!set",
+    "!!omap",
+    "!!pairs",
+    "!!str",
+    "!!map",
+    "!!seq",
+    "!own",
+    "!",
+)
 VALUES = ('"abc"', '""', "[1]", "{a: 1}", '"%%%"')
 
 
@@ -277,7 +343,9 @@ def test_merge_keys_that_stay_small_are_read(levels, times):
     assert parse_yaml(merges(levels, times), "a.yaml")[f"m{levels - 1}"] == {"x": 1}
 
 
-@pytest.mark.parametrize("text", ["a: &a {<<: *a}", "a: &a [1, *a]", "a: &a {b: {c: *a}}"])
+@pytest.mark.parametrize(
+    "text", ["a: &a {<<: *a}", "a: &a [1, *a]", "a: &a {b: {c: *a}}"]
+)
 def test_an_alias_of_itself_is_refused(text):
     assert "line 1: the alias 'a' stands within itself" in refused_soon(text)
 
@@ -288,7 +356,9 @@ def test_a_tag_is_one_sentence_with_its_line(tag, value):
     assert "a.yaml, line 2: the tag" in refused_soon(f"x: 1\na: {tag} {value}")
 
 
-@pytest.mark.parametrize("text", ["!!int abc: 1", "? !!set {a}\n: 1", "%TAG ! !!\n---\na: !int 1"])
+@pytest.mark.parametrize(
+    "text", ["!!int abc: 1", "? !!set {a}\n: 1", "%TAG ! !!\n---\na: !int 1"]
+)
 def test_a_tag_of_a_key_or_of_another_name_is_found(text):
     assert "the tag" in refused_soon(text)
 
@@ -302,7 +372,9 @@ def test_a_text_that_is_too_large_is_refused_unread():
     assert "larger than 1 MB" in refused_soon(f"a: {'x' * MAX_BYTES}")
 
 
-@pytest.mark.parametrize("text", ["a: " + "9" * 10_000, "a: {b: -" + "1" * 500_000 + "}"])
+@pytest.mark.parametrize(
+    "text", ["a: " + "9" * 10_000, "a: {b: -" + "1" * 500_000 + "}"]
+)
 def test_a_number_of_very_many_digits_is_refused_with_its_line(text):
     assert "line 1: a number of" in refused_soon(text)
 

@@ -23,7 +23,10 @@ NAMES = ("robot", "model")
 def commands_of(group, path=""):
     """Yields name and function of each command of an app and its groups."""
     for command in group.registered_commands:
-        yield f"{path} {command.name or command.callback.__name__}".strip(), command.callback
+        yield (
+            f"{path} {command.name or command.callback.__name__}".strip(),
+            command.callback,
+        )
     for each in group.registered_groups:
         yield from commands_of(each.typer_instance, f"{path} {each.name}".strip())
 
@@ -54,9 +57,13 @@ def named_literally(tree):
         elif isinstance(node, ast.BoolOp):
             held = node.values
         elif isinstance(node, ast.Assign | ast.AnnAssign):
-            parts = node.value.elts if isinstance(node.value, ast.Tuple) else [node.value]
+            parts = (
+                node.value.elts if isinstance(node.value, ast.Tuple) else [node.value]
+            )
             held = parts
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("Row", ".get")):
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
+            ("Row", ".get")
+        ):
             held = node.args[1:2]
         for each in held:
             if isinstance(each, ast.Constant) and each.value in robots:
@@ -65,7 +72,8 @@ def named_literally(tree):
 
 def test_every_command_env_and_node_that_has_a_default_robot_has_the_same():
     functions = dict(commands_of(app)) | {
-        each.__name__: each.__init__ for each in (BridgeEnv, BridgeVectorEnv, BridgeParallelEnv)
+        each.__name__: each.__init__
+        for each in (BridgeEnv, BridgeVectorEnv, BridgeParallelEnv)
     }
     found = {
         (where, name): default
@@ -79,7 +87,14 @@ def test_every_command_env_and_node_that_has_a_default_robot_has_the_same():
     for env in (BridgeEnv(), BridgeVectorEnv(), BridgeParallelEnv().env):
         found[repr(env), "model"] = env.model.robot.name
         env.close()
-    told = {"record", "drive", "world draw", "bag replay", "record_node", "simulator_node"}
+    told = {
+        "record",
+        "drive",
+        "world draw",
+        "bag replay",
+        "record_node",
+        "simulator_node",
+    }
     assert told <= {where for where, _ in found}
     assert {key: value for key, value in found.items() if value != DEFAULT_ROBOT} == {}
 

@@ -28,7 +28,9 @@ DEVIATION = r"<td>([0-9.e+-]+)</td></tr>"
 def needs_ros(test):
     """Marks a test that drives over ROS 2, and skips it where there is none."""
     reason = "needs ROS 2: rclpy is not installed"
-    return pytest.mark.ros(pytest.mark.skipif(find_spec("rclpy") is None, reason=reason)(test))
+    return pytest.mark.ros(
+        pytest.mark.skipif(find_spec("rclpy") is None, reason=reason)(test)
+    )
 
 
 class Running:
@@ -58,7 +60,13 @@ class Running:
 def demo(*words: object, cwd: Path) -> Iterator[Running]:
     with claimed_domain() as domain_id:
         process = subprocess.Popen(
-            [sys.executable, "-m", "nics_drl_bridge.commands.cli", "demo", *map(str, words)],
+            [
+                sys.executable,
+                "-m",
+                "nics_drl_bridge.commands.cli",
+                "demo",
+                *map(str, words),
+            ],
             cwd=cwd,
             env=os.environ | {"ROS_DOMAIN_ID": str(domain_id), "PYTHONUNBUFFERED": "1"},
             stdout=subprocess.PIPE,
@@ -97,7 +105,9 @@ class Sources(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        self.loads += [value for name, value in attrs if name in ("src", "href", "data")]
+        self.loads += [
+            value for name, value in attrs if name in ("src", "href", "data")
+        ]
 
 
 def section(text: str, heading: str) -> str:
@@ -123,15 +133,25 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
     assert successes == ("2", "2")
     assert (tmp_path / "out" / "paths.png").is_file()
     assert any("the deployed nodes reached the goal" in line for line in running.lines)
-    perturbed = [line for line in running.lines if re.match("  (as it is|lidar): success", line)]
+    perturbed = [
+        line for line in running.lines if re.match("  (as it is|lidar): success", line)
+    ]
     assert len(perturbed) == 2
     page = Sources()
     page.feed(text)
-    assert page.tags.count("img") >= 8  # episodes, predictions, yardsticks, and what is folded
+    assert (
+        page.tags.count("img") >= 8
+    )  # episodes, predictions, yardsticks, and what is folded
     assert page.loads  # all of it is inside
     assert all(source.startswith("data:image/png;base64,") for source in page.loads)
     assert "script" not in page.tags
-    for words in ("Verdict", "Fit report", "2 of 2 episodes", "The robot reached its goal", "mild"):
+    for words in (
+        "Verdict",
+        "Fit report",
+        "2 of 2 episodes",
+        "The robot reached its goal",
+        "mild",
+    ):
         assert words in text
     # Commands go through a quaternion and back at most: the two drives are the same drive.
     episodes = section(text, "Paths in the world")
@@ -147,16 +167,23 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
 @needs_ros
 @pytest.mark.process
 @pytest.mark.campaign
-@pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="needs the extra train")
+@pytest.mark.skipif(
+    find_spec("stable_baselines3") is None, reason="needs the extra train"
+)
 @pytest.mark.timeout(400)
 def test_it_deploys_the_policy_file_that_it_trained(tmp_path):
     running, (here, there), text = whole_road("--train-steps", 9000, cwd=tmp_path)
     assert here == there  # learned little, but drives the same
-    told = [line for line in running.lines if re.match("  [0-9,]+ steps: success ", line)]
+    told = [
+        line for line in running.lines if re.match("  [0-9,]+ steps: success ", line)
+    ]
     assert told[-1].startswith("  16,384 steps: ")  # rollouts of 8192 steps
     assert "img" in section(text, "The policy")
     assert "500 unseen episodes" in section(text, "The policy")
-    assert max(map(float, re.findall(DEVIATION, section(text, "Paths in the world")))) < 1e-6
+    assert (
+        max(map(float, re.findall(DEVIATION, section(text, "Paths in the world"))))
+        < 1e-6
+    )
     assert (tmp_path / "out" / "policy.onnx").is_file()
     deployed = (tmp_path / "out" / "logs" / "realtime" / "policy_node.yaml").read_text()
     assert "policy: out/policy.onnx" in deployed
@@ -169,13 +196,17 @@ def test_it_deploys_the_policy_file_that_it_trained(tmp_path):
     [
         pytest.param("training", "^  .* steps: success", 1, (), marks=campaign),
         pytest.param("in process", "^  seed 0: ", 1000, READY_MADE, marks=campaign),
-        pytest.param("over DDS", "^driving the same .* over DDS", 50, READY_MADE, marks=campaign),
+        pytest.param(
+            "over DDS", "^driving the same .* over DDS", 50, READY_MADE, marks=campaign
+        ),
         ("in real time", "^deploying ", 1, READY_MADE),
     ],
 )
 @pytest.mark.process
 @pytest.mark.slow
-def test_ctrl_c_ends_it_and_all_that_it_started(tmp_path, phase, pattern, episodes, policy):
+def test_ctrl_c_ends_it_and_all_that_it_started(
+    tmp_path, phase, pattern, episodes, policy
+):
     if phase == "training":
         pytest.importorskip("stable_baselines3")
     words = ("--episodes", episodes, "--world", "empty", "--out", "out", *policy)
@@ -202,11 +233,13 @@ def wait_for(condition, what):
 @pytest.mark.parametrize(
     "words",
     [
-        ("--recording", "drive"), ("--robot", "ackerman"), ("--world", "areena"),
+        ("--recording", "drive"),
+        ("--robot", "ackerman"),
+        ("--world", "areena"),
         pytest.param(("--out", "file"), marks=pytest.mark.slow),
         pytest.param(("--policy", "dynamic_widow"), marks=pytest.mark.slow),
     ],
-)  # fmt: skip
+)
 def test_bad_input_ends_it_with_code_2_and_one_sentence(tmp_path, words):
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "cmd.csv").write_text("0.5,nan,0.0\n", encoding="utf-8")

@@ -37,7 +37,8 @@ def test_a_topic_that_never_spoke_is_told_from_a_late_one():
 
 
 @pytest.mark.parametrize(
-    "error", [StaleDataError("scan", 1.0, 0.5), errors.ConfigError("a: wrong; mend it.")]
+    "error",
+    [StaleDataError("scan", 1.0, 0.5), errors.ConfigError("a: wrong; mend it.")],
 )
 def test_errors_travel_between_processes(error):
     copy = pickle.loads(pickle.dumps(error))

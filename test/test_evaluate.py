@@ -42,10 +42,19 @@ def started(*words, cwd, domain_id):
 @needs_nodes
 def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     with claimed_domain() as domain_id:
-        words = ("evaluate", "dynamic_window", "--model", "differential", "--episodes", 2)
+        words = (
+            "evaluate",
+            "dynamic_window",
+            "--model",
+            "differential",
+            "--episodes",
+            2,
+        )
         done = started(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    told = json.loads(
+        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
+    )
     places = told["policies"]["dynamic_window"]
     assert list(places) == ["fast", "dds", "mujoco_dds"]
     for figures in places.values():
@@ -55,14 +64,25 @@ def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     assert dds["same"] == 1.0
     assert dds["greatest_deviation"] < 1e-6  # the same numbers, by way of messages
     assert 0.001 < mujoco["greatest_deviation"] < 1.0  # another machine, the same road
-    assert [one["goal"] for one in fast["each"]] == [one["goal"] for one in mujoco["each"]]
+    assert [one["goal"] for one in fast["each"]] == [
+        one["goal"] for one in mujoco["each"]
+    ]
     picture = tmp_path / "out" / "trajectories_dynamic_window.png"
     assert picture.read_bytes().startswith(PNG)
     assert "dynamic_window: success in process " in done.stdout.splitlines()[-2]
 
 
 def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_path):
-    words = ("evaluate", "straight", "--in", "fast", "--episodes", "1", "--world", "empty")
+    words = (
+        "evaluate",
+        "straight",
+        "--in",
+        "fast",
+        "--episodes",
+        "1",
+        "--world",
+        "empty",
+    )
     first, second = (nics(*words, "--out", "out", cwd=tmp_path) for _ in range(2))
     assert (first.returncode, second.returncode) == (0, 0)
     assert "replaced" not in first.stderr
@@ -75,17 +95,38 @@ def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_pat
 @needs_nodes
 def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(tmp_path):
     with claimed_domain() as domain_id:
-        words = ("evaluate", "dynamic_window", "--model", "differential", "--episodes", 2)
-        under = ("--lidar", "rplidar_a2", "--randomisation", "mild", "--gate", "differential")
+        words = (
+            "evaluate",
+            "dynamic_window",
+            "--model",
+            "differential",
+            "--episodes",
+            2,
+        )
+        under = (
+            "--lidar",
+            "rplidar_a2",
+            "--randomisation",
+            "mild",
+            "--gate",
+            "differential",
+        )
         words = (*words, *under, "--fallback", "mppi", "--in", "fast", "--in", "dds")
         words = (*words, "--out", "out")
         done = started(*words, cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    told = json.loads(
+        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
+    )
     assert told["conditions"] == {
-        "lidar": "rplidar_a2", "randomisation": "mild", "gate": "differential",
-        "fallback": "mppi", "steps": 300, "task": {}, "kind": None,
-    }  # fmt: skip
+        "lidar": "rplidar_a2",
+        "randomisation": "mild",
+        "gate": "differential",
+        "fallback": "mppi",
+        "steps": 300,
+        "task": {},
+        "kind": None,
+    }
     fast, dds = told["policies"]["dynamic_window"].values()
     assert dds["greatest_deviation"] < 1e-6
     for name in ("result", "fallback_actions"):
@@ -107,13 +148,24 @@ def test_a_policy_of_a_task_of_ones_own_is_driven_by_the_file_of_the_task(tmp_pa
     task = make_task(kind, model, {"scan": 24})
     size = task.observation_space.shape[0]
     export_policy(network(size, 2), task, model, tmp_path / "patrol.onnx", None, {})
-    words = ("evaluate", "patrol.onnx", "--in", "fast", "--world", "empty", "--episodes", 1)
+    words = (
+        "evaluate",
+        "patrol.onnx",
+        "--in",
+        "fast",
+        "--world",
+        "empty",
+        "--episodes",
+        1,
+    )
     done = nics(*words, cwd=tmp_path)
     assert done.returncode == 2
     assert "say --task path/to/file.py:Patrol" in done.stderr
     done = nics(*words, "--task", kind, "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    told = json.loads(
+        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
+    )
     assert told["conditions"]["kind"] == kind
     assert len(told["policies"]["patrol.onnx"]["fast"]["each"]) == 1
     done = nics("evaluate", "straight", "--task", kind, "--in", "fast", cwd=tmp_path)
@@ -122,25 +174,52 @@ def test_a_policy_of_a_task_of_ones_own_is_driven_by_the_file_of_the_task(tmp_pa
 
 @pytest.mark.slow
 def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
-    words = ("evaluate", "dynamic_window", "random", "--in", "fast", "--episodes", 3, "--seed", 7)
+    words = (
+        "evaluate",
+        "dynamic_window",
+        "random",
+        "--in",
+        "fast",
+        "--episodes",
+        3,
+        "--seed",
+        7,
+    )
     done = nics(*words, "--model", "ackermann", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    told = json.loads(
+        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
+    )
     one, other = (policy["fast"]["each"] for policy in told["policies"].values())
     assert [each["goal"] for each in one] == [each["goal"] for each in other]
     assert [each["path"][0] for each in one] == [each["path"][0] for each in other]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "evaluation.json", "trajectories_dynamic_window.png", "trajectories_random.png",
-    }  # fmt: skip
+        "evaluation.json",
+        "trajectories_dynamic_window.png",
+        "trajectories_random.png",
+    }
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("differential" not in shipped_policies(), reason="no policy is shipped")
+@pytest.mark.skipif(
+    "differential" not in shipped_policies(), reason="no policy is shipped"
+)
 def test_a_shipped_policy_brings_its_own_robot(tmp_path):
-    words = ("evaluate", "differential", "--in", "fast", "--episodes", 2, "--out", "out")
+    words = (
+        "evaluate",
+        "differential",
+        "--in",
+        "fast",
+        "--episodes",
+        2,
+        "--out",
+        "out",
+    )
     done = nics(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    told = json.loads(
+        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
+    )
     assert told["robot"] == "differential"
 
 
@@ -156,13 +235,28 @@ def test_a_shipped_policy_brings_its_own_robot(tmp_path):
         (("dynamic_window", "--shadow", "x", "--goal", "there"), "--goal 'there'"),
         (("dynamic_window", "--gate", "diferential", "--in", "fast"), "differential"),
         (("dynamic_window", "--lidar", "rplidar_a9", "--in", "fast"), "rplidar_a"),
-        (("dynamic_window", "--shadow", "nothing", "--lidar", "rplidar_a2"), "leave out --lidar"),
+        (
+            ("dynamic_window", "--shadow", "nothing", "--lidar", "rplidar_a2"),
+            "leave out --lidar",
+        ),
         (("dynamic_window", "--shadow", "nothing"), "nothing"),
-        (("random", "--fallback", "mpi"), "fallback 'mpi': no such planner; did you mean 'mppi'"),
-        (("random", "mppi", "--fallback", "mppi"), "fallback 'mppi' is the policy itself"),
-        (("random", "--shadow", "nothing", "--fallback", "mppi"), "leave out --fallback"),
+        (
+            ("random", "--fallback", "mpi"),
+            "fallback 'mpi': no such planner; did you mean 'mppi'",
+        ),
+        (
+            ("random", "mppi", "--fallback", "mppi"),
+            "fallback 'mppi' is the policy itself",
+        ),
+        (
+            ("random", "--shadow", "nothing", "--fallback", "mppi"),
+            "leave out --fallback",
+        ),
         (("dynamic_window", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
-        (("dynamic_window", "random", "--backend", "dds", "--hardware"), "one policy at a time"),
+        (
+            ("dynamic_window", "random", "--backend", "dds", "--hardware"),
+            "one policy at a time",
+        ),
     ],
 )
 def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
@@ -188,14 +282,18 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
         for one in load_robot("differential").command
     }
     file = tmp_path / "limits.yaml"
-    file.write_text(dump_yaml({"robot": "differential", "commands": limits}), encoding="utf-8")
+    file.write_text(
+        dump_yaml({"robot": "differential", "commands": limits}), encoding="utf-8"
+    )
     model, logs, said = {"model": "differential"}, tmp_path / "logs", []
     gate = model | {"limits": str(file), "black_box": str(tmp_path / "black_box")}
     gate |= {"use_sim_time": True, "e_stop_required": False}
     # What a busy machine does to rates and ages would be a finding; that is tested elsewhere.
     monkeypatch.setattr(vehicle, "examine", lambda facts, expected: [])
     out = tmp_path / "out"
-    order = vehicle.EvaluationOrder(["dynamic_window"], out, "differential", "empty", 1, 0)
+    order = vehicle.EvaluationOrder(
+        ["dynamic_window"], out, "differential", "empty", 1, 0
+    )
     options = {"start": "present", "stale_after_s": DEADLINE_S}
     with claimed_domain() as domain_id:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
@@ -208,14 +306,18 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
         ):
             with Witness(domain_id) as witness:  # it may be compiling
                 assert witness.sees(DEADLINE_S)
-            made = vehicle.drive_vehicle(order, None, True, said.append, said.append, **options)
+            made = vehicle.drive_vehicle(
+                order, None, True, said.append, said.append, **options
+            )
     assert "  command_gate is armed" in said
     assert any("it will drive to" in line for line in said)
     (driven,), (beside,) = made.runs.values()
     assert driven.length > 0.3  # the gate let commands pass
     assert list(driven.path[0]) == list(beside.path[0])
     assert list(driven.goal) == list(beside.goal)
-    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    told = json.loads(
+        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
+    )
     assert list(told["policies"]["dynamic_window"]) == ["vehicle", "fast"]
 
 
@@ -226,17 +328,27 @@ def far_from_the_origin(tmp_path, monkeypatch):
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness
 
     world = tmp_path / "wide.yaml"
-    world.write_text("name: wide\nbounds: [-40, -40, 40, 40]\ngoal_distance: [2.0, 4.0]\n")
-    given = {"model": "differential", "world": str(world), "enable_stamped_cmd_vel": True}
+    world.write_text(
+        "name: wide\nbounds: [-40, -40, 40, 40]\ngoal_distance: [2.0, 4.0]\n"
+    )
+    given = {
+        "model": "differential",
+        "world": str(world),
+        "enable_stamped_cmd_vel": True,
+    }
     given |= {"episode_start": [18.0, 5.0, 2.0], "mode": "realtime"}
-    monkeypatch.setattr(vehicle, "examine", lambda facts, expected: [])  # of a busy machine
+    monkeypatch.setattr(
+        vehicle, "examine", lambda facts, expected: []
+    )  # of a busy machine
     monkeypatch.setattr(vehicle, "LISTEN_S", 0.1)
     with claimed_domain() as domain_id:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         raw = {"cmd_vel": "cmd_vel_raw"}
         with (
-            NodeProcess("simulator_node", tmp_path / "logs", given, domain_id, remap=raw),
+            NodeProcess(
+                "simulator_node", tmp_path / "logs", given, domain_id, remap=raw
+            ),
             Witness(domain_id) as witness,
         ):
             assert witness.sees(DEADLINE_S)
@@ -246,7 +358,9 @@ def far_from_the_origin(tmp_path, monkeypatch):
 def vehicle_order(folder):
     from nics_drl_bridge.commands import episodes as vehicle
 
-    return vehicle.EvaluationOrder(["dynamic_window"], folder, "differential", "circles", 1, 0)
+    return vehicle.EvaluationOrder(
+        ["dynamic_window"], folder, "differential", "circles", 1, 0
+    )
 
 
 @pytest.mark.ros
@@ -260,9 +374,13 @@ def test_a_goal_from_where_the_vehicle_stands_lies_there_wherever_odometry_began
     said = []
     options = {"start": "present", "stale_after_s": DEADLINE_S, "stamped": True}
     order = vehicle_order(tmp_path / "out")
-    made = vehicle.drive_vehicle(order, (1.0, 0.5), False, said.append, said.append, **options)
+    made = vehicle.drive_vehicle(
+        order, (1.0, 0.5), False, said.append, said.append, **options
+    )
     driven = made.runs["vehicle"][0]
-    assert any("it will drive to 1.00 m ahead and 0.50 m to the left" in line for line in said)
+    assert any(
+        "it will drive to 1.00 m ahead and 0.50 m to the left" in line for line in said
+    )
     assert driven.result == "success", said
     assert driven.goal == pytest.approx([1.0, 0.5])
     assert driven.path[0] == pytest.approx(np.zeros(3), abs=0.1)
@@ -285,12 +403,24 @@ def test_a_goal_in_map_far_from_where_the_vehicle_stands_is_refused_unconfirmed(
     order = vehicle_order(tmp_path / "out")
     far = r"\(2.00 m, 0.50 m\) in map, 16.\d+ m from where it stands, farther than 5 m.*say --yes"
     with pytest.raises(ConfigError, match=far):
-        vehicle.drive_vehicle(order, (2.0, 0.5), False, str, str, stamped=True, **options)
+        vehicle.drive_vehicle(
+            order, (2.0, 0.5), False, str, str, stamped=True, **options
+        )
     assert np.ptp(far_from_the_origin.path[:, :2], axis=0).max() < 0.01
 
 
-def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be_asked(tmp_path):
-    words = ("evaluate", "dynamic_window", "--backend", "dds", "--hardware", "--start", "present")
+def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be_asked(
+    tmp_path,
+):
+    words = (
+        "evaluate",
+        "dynamic_window",
+        "--backend",
+        "dds",
+        "--hardware",
+        "--start",
+        "present",
+    )
     done = nics(*words, "--goal", "20,0", "--model", "differential", cwd=tmp_path)
     assert done.returncode == 2
     sentence = done.stderr.splitlines()[-1]
@@ -304,7 +434,14 @@ def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be
 @needs_nodes
 def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
     with claimed_domain() as domain_id:  # nobody is there
-        words = ("evaluate", "dynamic_window", "--backend", "dds", "--hardware", "--yes")
+        words = (
+            "evaluate",
+            "dynamic_window",
+            "--backend",
+            "dds",
+            "--hardware",
+            "--yes",
+        )
         done = started(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 2
     assert "the vehicle is not driven: " in done.stderr.splitlines()[-1]

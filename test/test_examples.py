@@ -32,7 +32,11 @@ def test_every_example_runs_in_a_process_of_its_own(example, tmp_path):
     if example.stem == NEEDS_ROS and find_spec("rclpy") is None:
         pytest.skip("needs ROS 2")
     done = subprocess.run(
-        [sys.executable, str(example)], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, str(example)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert re.search(SAYS.get(example.stem, r"\w"), done.stdout), done.stdout
@@ -40,7 +44,9 @@ def test_every_example_runs_in_a_process_of_its_own(example, tmp_path):
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_every_example_is_short_has_a_main_and_stands_in_the_docs_with_its_picture(example):
+def test_every_example_is_short_has_a_main_and_stands_in_the_docs_with_its_picture(
+    example,
+):
     text = example.read_text(encoding="utf-8")
     assert len(text.splitlines()) < MOST_LINES
     assert "\ndef main()" in text
@@ -73,5 +79,7 @@ def test_there_are_twelve_on_the_road():
 @pytest.mark.process
 def test_gymnasium_knows_the_environments(imports):
     code = f"{imports}\nprint('NicsBridge/Navigation-v0' in gymnasium.registry)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "True"

@@ -72,7 +72,9 @@ def test_text_is_written_as_utf_8(tmp_path):
 
 
 @pytest.mark.parametrize("moment", ["fsync", "replace"])
-def test_a_crash_while_writing_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, moment):
+def test_a_crash_while_writing_leaves_the_old_file_and_no_other(
+    tmp_path, monkeypatch, moment
+):
     path = tmp_path / "file"
     write_bytes(path, b"old")
 
@@ -103,7 +105,9 @@ def test_what_can_not_be_written_is_told_by_the_name_that_was_asked_for(
     tmp_path, monkeypatch, write, fails
 ):
     def refuse(*_, **__):
-        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".out.9m2ta3id"))
+        raise PermissionError(
+            errno.EACCES, "Permission denied", str(tmp_path / ".out.9m2ta3id")
+        )
 
     monkeypatch.setattr(*fails, refuse)
     with pytest.raises(PermissionError) as caught:
@@ -123,7 +127,9 @@ def test_a_killed_writer_leaves_one_whole_version(tmp_path):
         "    print(i, flush=True)\n"
     )
     for _ in range(3):
-        writer = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE)
+        writer = subprocess.Popen(
+            [sys.executable, "-c", code, path], stdout=subprocess.PIPE
+        )
         assert writer.stdout is not None
         for _ in range(3):
             writer.stdout.readline()
@@ -232,7 +238,9 @@ while True:
 
 @pytest.mark.process
 def test_a_folder_is_whole_at_every_moment_while_two_write_it_and_are_killed(old):
-    writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(old)]) for _ in range(2)]
+    writers = [
+        subprocess.Popen([sys.executable, "-c", WRITER, str(old)]) for _ in range(2)
+    ]
     try:
         seen = set()
         deadline = time.monotonic() + 60.0
@@ -279,7 +287,9 @@ def test_a_file_is_not_taken_for_a_folder(tmp_path):
 def test_a_place_is_checked_without_making_anything(tmp_path, monkeypatch):
     assert check_folder(tmp_path / "a" / "b", "model.yaml") == tmp_path / "a" / "b"
     (tmp_path / "file").write_text("mine", encoding="utf-8")
-    with pytest.raises(ConfigError, match="is a file, not a folder; choose another place"):
+    with pytest.raises(
+        ConfigError, match="is a file, not a folder; choose another place"
+    ):
         check_folder(tmp_path / "file" / "b", "model.yaml")
     monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
     with pytest.raises(ConfigError, match=f"{tmp_path} can't be written to"):
@@ -330,9 +340,13 @@ else:
 
 @pytest.mark.process
 @pytest.mark.parametrize("kind", ["file", "file of a library", "folder"])
-def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_not(tmp_path, kind):
+def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_not(
+    tmp_path, kind
+):
     def hidden():
-        return sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("."))
+        return sorted(
+            path.name for path in tmp_path.iterdir() if path.name.startswith(".")
+        )
 
     command = [sys.executable, "-c", LEAVING, kind]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -363,7 +377,13 @@ def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_no
 
 
 def test_what_somebody_else_hid_is_no_leftover(tmp_path):
-    others = (".git", ".out.a1b2c3d4", ".out.8charact", ".x.unfinished", ".out.a1b2c3d4.replaced")
+    others = (
+        ".git",
+        ".out.a1b2c3d4",
+        ".out.8charact",
+        ".x.unfinished",
+        ".out.a1b2c3d4.replaced",
+    )
     for name in others:
         (tmp_path / name).mkdir()
     (tmp_path / ".out.0123abcd.unfinished").symlink_to(tmp_path / ".git")
@@ -379,7 +399,9 @@ def test_what_the_user_put_into_a_folder_stays_there(old):
     (old / "empty").mkdir()
     (old / "script.sh").write_text("echo")
     (old / "script.sh").chmod(0o750)
-    with whole_folder(old, MARKER, {MARKER, "extra", "sub/deep"}.__contains__) as temporary:
+    with whole_folder(
+        old, MARKER, {MARKER, "extra", "sub/deep"}.__contains__
+    ) as temporary:
         fill(temporary)
     assert tree(old) == {
         MARKER: b"new",
@@ -430,7 +452,9 @@ except OSError as error:
 def test_a_disk_that_takes_no_more_leaves_the_old_file_and_no_other(tmp_path):
     path = tmp_path / "file"
     write_bytes(path, b"old")
-    run = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True)
+    run = subprocess.run(
+        [sys.executable, "-c", FULL, str(path)], capture_output=True, text=True
+    )
     assert run.stdout == "File too large\n", run.stderr
     assert tree(tmp_path) == {"file": b"old"}
 
@@ -471,7 +495,9 @@ def unlisted(folder, name):
 
 def test_a_manifest_is_that_of_sha256sum(listed):
     check_sums(listed, NAMES)
-    by_tool = subprocess.run(["sha256sum", *NAMES], cwd=listed, capture_output=True, check=True)
+    by_tool = subprocess.run(
+        ["sha256sum", *NAMES], cwd=listed, capture_output=True, check=True
+    )
     assert (listed / SUMS).read_bytes() == by_tool.stdout
     (listed / "notes").write_text("mine")
     check_sums(listed, NAMES)
@@ -490,11 +516,15 @@ def test_any_flipped_bit_of_a_manifest_is_noticed(listed):
 
 def test_a_changed_file_is_named_and_an_editable_one_may_lose_its_line(listed):
     (listed / "sub" / "deep").write_text("deeP")
-    with pytest.raises(ModelError, match=r"sub/deep: does not match its checksum in SHA256SUMS; g"):
+    with pytest.raises(
+        ModelError, match=r"sub/deep: does not match its checksum in SHA256SUMS; g"
+    ):
         check_sums(listed, NAMES, editable="model.yaml")
     (listed / "sub" / "deep").write_text("deep")
     (listed / "model.yaml").write_text("a: 2\n")
-    with pytest.raises(ModelError, match=r"if you changed it yourself, remove its line from SHA"):
+    with pytest.raises(
+        ModelError, match=r"if you changed it yourself, remove its line from SHA"
+    ):
         check_sums(listed, NAMES, editable="model.yaml")
     unlisted(listed, "model.yaml")
     check_sums(listed, NAMES, editable="model.yaml")
@@ -506,7 +536,9 @@ def test_a_changed_file_is_named_and_an_editable_one_may_lose_its_line(listed):
 
 
 @pytest.mark.parametrize("name", ["../../../dev/zero", "/etc/passwd", "other"])
-def test_a_manifest_that_lists_other_files_is_refused_without_reading_them(listed, name):
+def test_a_manifest_that_lists_other_files_is_refused_without_reading_them(
+    listed, name
+):
     with (listed / SUMS).open("a") as manifest:
         manifest.write(f"{sha256(b'')}  {name}\n")
     with pytest.raises(ModelError, match="is of no file of a model; remove it"):
@@ -523,10 +555,14 @@ def test_what_is_no_file_to_read_is_one_sentence(listed, name, what):
     if what == "large":
         with path.open("wb") as file:
             file.truncate(MOST_BYTES + 1)
-    with pytest.raises(ModelError, match=f"{name}: is (missing, or no file|larger than 256 MB);"):
+    with pytest.raises(
+        ModelError, match=f"{name}: is (missing, or no file|larger than 256 MB);"
+    ):
         check_sums(listed, NAMES)
 
 
 def test_json_has_null_for_numbers_that_are_not_finite():
-    text = files.json_of({"nan": float("nan"), "ends": (-float("inf"), 1.5), "at": Path("a")})
+    text = files.json_of(
+        {"nan": float("nan"), "ends": (-float("inf"), 1.5), "at": Path("a")}
+    )
     assert text == '{"nan": null, "ends": [null, 1.5], "at": "a"}'

@@ -55,7 +55,11 @@ def assert_alike(one: SimulatorModel, other: SimulatorModel, spec: RobotSpec) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "robot", ["ackermann", *(pytest.param(r, marks=CAMPAIGN) for r in ("differential", "mecanum"))]
+    "robot",
+    [
+        "ackermann",
+        *(pytest.param(r, marks=CAMPAIGN) for r in ("differential", "mecanum")),
+    ],
 )
 def test_a_bag_gives_the_model_of_the_same_drive(tmp_path, robot):
     spec = load_robot(robot)
@@ -123,11 +127,15 @@ def test_a_mapping_leads_to_the_same_model(tmp_path, storage):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("storage", ["mcap", pytest.param("sqlite3", marks=CAMPAIGN)])
-def test_a_real_drive_with_two_clocks_gives_the_same_model(shared_recordings, tmp_path, storage):
+def test_a_real_drive_with_two_clocks_gives_the_same_model(
+    shared_recordings, tmp_path, storage
+):
     spec = load_robot("ackermann")
     drive = read_recording(shared_recordings / "xtark_ackermann" / "random_drive_45s")
     write_bag(drive, tmp_path / "bag", spec, storage)
-    one, other = (identify(d, spec) for d in (drive, read_recording(tmp_path / "bag", spec)))
+    one, other = (
+        identify(d, spec) for d in (drive, read_recording(tmp_path / "bag", spec))
+    )
     assert np.allclose(other.model.coefficients, one.model.coefficients, atol=1e-5)
     latency = one.calibration.command_latency_s
     assert other.calibration.command_latency_s == pytest.approx(latency, abs=1e-5)
@@ -144,8 +152,12 @@ def test_without_a_mapping_the_topics_are_listed_and_nothing_is_made(tmp_path):
 
 def test_a_wrong_mapping_is_one_sentence(tmp_path):
     bag = bags.write(tmp_path / "bag", bags.drive())
-    assert "must be ROLE=TOPIC" in refused(bag, "--out", tmp_path / "a", "--topic", "odom")
-    assert "no such file" in refused(bag, "--out", tmp_path / "a", "--topics", tmp_path / "t.yaml")
+    assert "must be ROLE=TOPIC" in refused(
+        bag, "--out", tmp_path / "a", "--topic", "odom"
+    )
+    assert "no such file" in refused(
+        bag, "--out", tmp_path / "a", "--topics", tmp_path / "t.yaml"
+    )
     assert "has no topic '/x' (odom)" in refused(
         bag, "--out", tmp_path / "a", "--topic", "odom=/x", "--topic", "pose=none"
     )

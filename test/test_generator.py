@@ -53,7 +53,9 @@ def change(folder, edit):
     edit(data)
     path.write_text(dump_yaml(data))
     lines = manifest.read_text().splitlines(keepends=True)
-    manifest.write_text("".join(line for line in lines if not line.endswith(f"  {MODEL_FILE}\n")))
+    manifest.write_text(
+        "".join(line for line in lines if not line.endswith(f"  {MODEL_FILE}\n"))
+    )
 
 
 def contents(folder):
@@ -70,10 +72,15 @@ def test_a_saved_model_is_the_same_to_the_bit(robot, tmp_path):
     assert back.fingerprint == model.fingerprint
     assert back.report == model.report
     assert back.timing == model.timing
-    assert (back.table.shapes, back.table.density) == (model.table.shapes, model.table.density)
+    assert (back.table.shapes, back.table.density) == (
+        model.table.shapes,
+        model.table.density,
+    )
     for name in ("grid", "start", "cell", "rows"):
         assert np.array_equal(getattr(back.table, name), getattr(model.table, name))
-    commands = np.random.default_rng(0).uniform(-0.3, 0.5, (20, 1, 1, len(model.robot.command)))
+    commands = np.random.default_rng(0).uniform(
+        -0.3, 0.5, (20, 1, 1, len(model.robot.command))
+    )
     ends = []
     for one in (model, back):
         simulator = FastSimulator(one, field(obstacles=one_radius(one)))
@@ -89,7 +96,9 @@ def one_radius(model):
     return [circles(2, (model.table.shapes[0].radius,))]
 
 
-def test_a_measured_latency_is_kept_and_one_that_nothing_showed_leaves_no_trace(tmp_path):
+def test_a_measured_latency_is_kept_and_one_that_nothing_showed_leaves_no_trace(
+    tmp_path,
+):
     model = builtin_model("ackermann")
     late = replace(model, latency=Latency(scan=Delay(least=0.012, jitter=0.01)))
     save_model(late, tmp_path / "model")
@@ -106,19 +115,30 @@ def test_saving_twice_gives_the_same_bytes(saved, tmp_path):
     assert len(contents(saved)) == len(MODEL_FILES) + 1
 
 
-def test_a_model_over_an_older_one_keeps_what_the_user_put_there_and_nothing_else(tmp_path):
+def test_a_model_over_an_older_one_keeps_what_the_user_put_there_and_nothing_else(
+    tmp_path,
+):
     folder, model = tmp_path / "model", direct_model()
     save_model(model, folder)
     own = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     (folder / "pictures").mkdir()
     drawn = ("report.html", "pictures/accuracy.png")  # of the older one's fit
-    users = ("notes.md", "pictures/robot.jpg", "lidar_table/why.txt", "drives/monday.npz")
+    users = (
+        "notes.md",
+        "pictures/robot.jpg",
+        "lidar_table/why.txt",
+        "drives/monday.npz",
+    )
     (folder / "drives").mkdir()
     for name in (*drawn, *users):
         (folder / name).write_text(name)
     save_model(replace(model, report="another"), folder)
     assert load_model(folder).report == "another"
-    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    found = {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
     assert found == {name for name in own if (folder / name).is_file()} | set(users)
     for name in users:
         assert (folder / name).read_text() == name
@@ -184,8 +204,12 @@ def test_the_table_of_another_model_is_refused(saved, tmp_path):
 
 def test_an_edited_model_is_read_once_its_line_is_removed(saved):
     path = saved / MODEL_FILE
-    path.write_text(path.read_text().replace("control_period: 0.1", "control_period: 0.2"))
-    with pytest.raises(ModelError, match=r"model\.yaml: .* if you changed it yourself, remove its"):
+    path.write_text(
+        path.read_text().replace("control_period: 0.1", "control_period: 0.2")
+    )
+    with pytest.raises(
+        ModelError, match=r"model\.yaml: .* if you changed it yourself, remove its"
+    ):
         load_model(saved)
     change(saved, lambda data: None)
     assert load_model(saved).control_period == 0.2
@@ -198,7 +222,9 @@ def test_a_model_that_is_replaced_while_it_is_read_is_refused(saved, monkeypatch
 
     check_sums = generator.files.check_sums
     monkeypatch.setattr(generator.files, "check_sums", meanwhile)
-    with pytest.raises(ModelError, match="was replaced while it was read; open it again"):
+    with pytest.raises(
+        ModelError, match="was replaced while it was read; open it again"
+    ):
         load_model(saved)
 
 
@@ -223,12 +249,18 @@ def test_a_missing_key_is_one_sentence_with_file_and_key(saved, key):
     ("part", "key"),
     [
         *(("kinematics", key) for key in ("dt", "units", "terms", "valid", "assumed")),
-        *(("calibration", key.name) for key in fields(Calibration) if key.name not in MOTORS),
+        *(
+            ("calibration", key.name)
+            for key in fields(Calibration)
+            if key.name not in MOTORS
+        ),
     ],
 )
 def test_a_missing_key_of_a_part_is_one_sentence(saved, part, key):
     change(saved, lambda data: data[part].pop(key))
-    with pytest.raises(ConfigError, match=f"the key '{part}.{key}' is missing; add") as caught:
+    with pytest.raises(
+        ConfigError, match=f"the key '{part}.{key}' is missing; add"
+    ) as caught:
         load_model(saved)
     assert "\n" not in str(caught.value)
 
@@ -243,7 +275,11 @@ def test_a_missing_key_of_a_part_is_one_sentence(saved, part, key):
         ("calibration.lever_arm_m", [0.0], "lever_arm_m"),
         ("calibration.notes", 3, "must be a list, as"),
         ("calibration.colour", 3, "unknown key 'calibration.colour'"),
-        ("calibration.responses", [{"state": "speed"}], "the key 'calibration.responses.0."),
+        (
+            "calibration.responses",
+            [{"state": "speed"}],
+            "the key 'calibration.responses.0.",
+        ),
         ("calibration", 3, "key 'calibration'"),
         ("kinematics.dt", 0.0, "should be greater than 0"),
         ("kinematics.colour", 3, "unknown key 'kinematics.colour'; valid are"),
@@ -270,19 +306,27 @@ def test_a_wrong_value_is_one_sentence_with_file_and_key(saved, place, value, se
 def test_a_calibration_and_figures_of_merit_that_are_inf_are_kept(saved, tmp_path):
     model = load_model(saved)
     calibration = Calibration(
-        clock_offset_s=0.1, lever_arm_m=(0.1, -0.2), responses=(Response("speed", "speed_c", 0.2),),
-        wheels_swapped=True, wheel_scale=0.1 / 3.0, uncertainty={"clock_offset_s": float("inf")},
+        clock_offset_s=0.1,
+        lever_arm_m=(0.1, -0.2),
+        responses=(Response("speed", "speed_c", 0.2),),
+        wheels_swapped=True,
+        wheel_scale=0.1 / 3.0,
+        uncertainty={"clock_offset_s": float("inf")},
         notes=("one", "two"),
-    )  # fmt: skip
+    )
     quality = replace(model.kinematics.quality, condition={"vx": float("inf")})
     kinematics = replace(model.kinematics, quality=quality)
-    save_model(replace(model, calibration=calibration, kinematics=kinematics), tmp_path / "new")
+    save_model(
+        replace(model, calibration=calibration, kinematics=kinematics), tmp_path / "new"
+    )
     back = load_model(tmp_path / "new")
     assert back.calibration == calibration
     assert back.kinematics.quality == quality
 
 
-@pytest.mark.parametrize("value", ["other/1", "nics_drl_bridge/simulator_model/3", None, 7])
+@pytest.mark.parametrize(
+    "value", ["other/1", "nics_drl_bridge/simulator_model/3", None, 7]
+)
 def test_another_format_is_refused(saved, value):
     change(saved, lambda data: data.update(format=value))
     with pytest.raises(ModelError, match="key 'format' is"):
@@ -350,7 +394,9 @@ def test_a_shipped_robot_goes_before_a_folder_of_its_name_which_is_told(
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("'differential' is shipped; the folder is ./differential")
     assert open_model("./differential").robot.name == "ackermann"
-    assert open_model(Path("./differential")).robot.name == "ackermann"  # which drops the "./"
+    assert (
+        open_model(Path("./differential")).robot.name == "ackermann"
+    )  # which drops the "./"
     assert capsys.readouterr().err == ""
 
 

@@ -26,7 +26,9 @@ def random_poses(count, seed=0):
     rng = np.random.default_rng(seed)
     poses = rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-3.0, 2.0, (count, 1))
     poses[:, 2] = rng.uniform(-np.pi, np.pi, count)
-    seam = [edge for edge in EDGES if abs(edge) < 10.0]  # beyond, rounding hides the direction
+    seam = [
+        edge for edge in EDGES if abs(edge) < 10.0
+    ]  # beyond, rounding hides the direction
     poses[: len(seam), 2] = seam
     return poses
 
@@ -86,7 +88,10 @@ def test_exp_is_the_matrix_exponential(turn):
     for x, y in rng.normal(size=(20, 2)):
         twist = np.array([x, y, turn])
         assert np.allclose(
-            matrix(geometry.exp(twist)), expm(generator_matrix(twist)), rtol=0.0, atol=1e-11
+            matrix(geometry.exp(twist)),
+            expm(generator_matrix(twist)),
+            rtol=0.0,
+            atol=1e-11,
         )
 
 

@@ -22,4 +22,6 @@ def test_the_versions_of_python_are_those_of_setup(name):
 def test_the_page_on_installing_has_every_extra_that_users_need():
     extras = set(re.findall(r'^    "(\w+)": \[', SETUP, re.MULTILINE)) - {"test"}
     page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
-    assert extras | {"all", "dev"} == set(re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE))
+    assert extras | {"all", "dev"} == set(
+        re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE)
+    )

@@ -54,9 +54,12 @@ def package(tmp_path):
     folder.mkdir()
     shutil.copy(kernels.__file__, folder)
     for name, text in {
-        "__init__.py": "", "constants.py": "STEP = 1.0\n", "low_kernels.py": LOW,
-        "high_kernels.py": HIGH, "other_kernels.py": OTHER,
-    }.items():  # fmt: skip
+        "__init__.py": "",
+        "constants.py": "STEP = 1.0\n",
+        "low_kernels.py": LOW,
+        "high_kernels.py": HIGH,
+        "other_kernels.py": OTHER,
+    }.items():
         (folder / name).write_text(text)
     return folder
 
@@ -65,12 +68,18 @@ def ask(package: Path) -> tuple[list[float], list[int]]:
     """What the kernels give in a fresh process, and how many were compiled there."""
     # Not kept as bytecode, which an edit within the same second would leave as it was.
     done = subprocess.run(
-        [sys.executable, "-B", "-c", ASK], cwd=package.parent, capture_output=True, text=True,
-        check=False, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
-    )  # fmt: skip
+        [sys.executable, "-B", "-c", ASK],
+        cwd=package.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+    )
     assert done.returncode == 0, done.stderr
     values, compiled = done.stdout.splitlines()
-    return [float(word) for word in values.split()], [int(word) for word in compiled.split()]
+    return [float(word) for word in values.split()], [
+        int(word) for word in compiled.split()
+    ]
 
 
 @pytest.mark.slow
@@ -139,7 +148,9 @@ def index(folder, version="1"):
     return made
 
 
-def test_of_two_processes_that_save_at_once_neither_gets_the_others_code(tmp_path, monkeypatch):
+def test_of_two_processes_that_save_at_once_neither_gets_the_others_code(
+    tmp_path, monkeypatch
+):
     one, other = index(tmp_path), index(tmp_path)
     write, unaware = one._save_data, dict
 
@@ -173,10 +184,17 @@ def test_imports_are_read_in_every_spelling(tmp_path):
         "from nics_drl_bridge.robot import (\n    kernels,\n    spec as config,\n)\n"
         "def f():\n    from nics_drl_bridge.errors import BridgeError\n"
     )
-    found = {each.relative_to(kernels.PACKAGE).as_posix() for each in kernels.imports_of(path)}
+    found = {
+        each.relative_to(kernels.PACKAGE).as_posix()
+        for each in kernels.imports_of(path)
+    }
     assert found == {
-        "geometry.py", "random_kernels.py", "robot/kernels.py", "robot/spec.py", "errors.py",
-    }  # fmt: skip
+        "geometry.py",
+        "random_kernels.py",
+        "robot/kernels.py",
+        "robot/spec.py",
+        "errors.py",
+    }
 
 
 def test_a_kernel_of_ones_own_is_made_of_the_files_beside_it(tmp_path):
@@ -185,9 +203,11 @@ def test_a_kernel_of_ones_own_is_made_of_the_files_beside_it(tmp_path):
     for name, text in {
         "__init__.py": "",
         "main_kernels.py": "from .helpers import half\nimport consts, numpy as np\n",
-        "helpers.py": "from nics_drl_bridge import geometry\nfrom . import more\n", "more.py": "",
-        "../consts.py": "import mine.deep as deep\n", "deep.py": "",
-    }.items():  # fmt: skip
+        "helpers.py": "from nics_drl_bridge import geometry\nfrom . import more\n",
+        "more.py": "",
+        "../consts.py": "import mine.deep as deep\n",
+        "deep.py": "",
+    }.items():
         (folder / name).write_text(text)
     found, left = set(), [folder / "main_kernels.py"]
     while left:

@@ -85,7 +85,9 @@ def imports_of(path: Path, package: Path) -> set[str]:
             above = ".".join(here[: len(here) - node.level + 1]) if node.level else ""
             module = ".".join(part for part in (above, node.module) if part)
             found |= {f"{module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
+            "import_module"
+        ):
             found |= {a.value for a in node.args if isinstance(a, ast.Constant)}
     return found
 
@@ -120,7 +122,9 @@ def strangers(package: Path) -> list[str]:
     wrong = []
     for path in sorted(package.rglob("*.py")):
         place = path.relative_to(package).as_posix()
-        for library in sorted({module.partition(".")[0] for module in imports_of(path, package)}):
+        for library in sorted(
+            {module.partition(".")[0] for module in imports_of(path, package)}
+        ):
             for name, homes in HOMES.items():
                 away = not any(fnmatch(place, home) for home in homes)
                 if fnmatch(library, name) and away:
@@ -176,9 +180,18 @@ def test_a_package_without_a_fault_passes(package):
         ("robot/taylor.py", "from nics_drl_bridge.lidar import spec"),
         ("robot/taylor.py", "from ..env import navigation"),
         ("robot/taylor.py", "from .. import commands"),
-        ("sim/world.py", "def f():\n    from nics_drl_bridge.middleware.middleware import M"),
-        ("sim/world.py", "import importlib\nimportlib.import_module('nics_drl_bridge.nodes.gate')"),
-        ("sim/world.py", "if TYPE_CHECKING:\n    from nics_drl_bridge.report import pictures"),
+        (
+            "sim/world.py",
+            "def f():\n    from nics_drl_bridge.middleware.middleware import M",
+        ),
+        (
+            "sim/world.py",
+            "import importlib\nimportlib.import_module('nics_drl_bridge.nodes.gate')",
+        ),
+        (
+            "sim/world.py",
+            "if TYPE_CHECKING:\n    from nics_drl_bridge.report import pictures",
+        ),
         ("policy/act.py", "from nics_drl_bridge.gate.gate import decide"),
         ("nowhere/new.py", ""),
     ],
@@ -201,7 +214,10 @@ def test_an_import_that_runs_up_or_sideways_is_found(package, file, line):
         ("lidar/table.py", "import numba as nb"),
         ("generator.py", "import matplotlib.pyplot as plt"),
         ("sim/world.py", "import gymnasium"),
-        ("sim/world.py", "from importlib import import_module\nimport_module('std_srvs.srv')"),
+        (
+            "sim/world.py",
+            "from importlib import import_module\nimport_module('std_srvs.srv')",
+        ),
     ],
 )
 def test_a_library_away_from_home_is_found(package, file, line):
@@ -214,20 +230,31 @@ def test_a_library_away_from_home_is_found(package, file, line):
 def modules_after(code: str) -> set[str]:
     """The top-level modules that are loaded in a fresh process after some code."""
     ask = f"import sys\n{code}\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
-    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", ask], capture_output=True, text=True, check=True
+    )
     return set(done.stdout.split())
 
 
 LIGHT = {
-    "config.py", "errors.py", "geometry.py", "interface.py", "robot/curve.py", "robot/taylor.py",
-    "sim/state.py", "status.py", "strict_yaml.py",
-}  # fmt: skip
+    "config.py",
+    "errors.py",
+    "geometry.py",
+    "interface.py",
+    "robot/curve.py",
+    "robot/taylor.py",
+    "sim/state.py",
+    "status.py",
+    "strict_yaml.py",
+}
 
 
 def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
     heavy = {}
     for path in (ROOT / PACKAGE).rglob("*.py"):
-        if "@kernel" not in path.read_text(encoding="utf-8") or path == Path(kernels.__file__):
+        if "@kernel" not in path.read_text(encoding="utf-8") or path == Path(
+            kernels.__file__
+        ):
             continue
         assert path.name.endswith("kernels.py"), path
         files, left = set(), [path]
@@ -236,7 +263,9 @@ def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
             if file not in files:
                 files.add(file)
                 left += kernels.imports_of(file)
-        others = {file.relative_to(kernels.PACKAGE).as_posix() for file in files} - LIGHT
+        others = {
+            file.relative_to(kernels.PACKAGE).as_posix() for file in files
+        } - LIGHT
         heavy[str(path)] = {name for name in others if not name.endswith("kernels.py")}
     assert {name: found for name, found in heavy.items() if found} == {}
 
@@ -245,7 +274,16 @@ def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
 def test_importing_the_package_imports_nothing_heavy():
     loaded = modules_after(f"import {PACKAGE}")
     assert PACKAGE in loaded
-    heavy = {"numpy", "numba", "scipy", "gymnasium", "matplotlib", "pydantic", "filterpy", "torch"}
+    heavy = {
+        "numpy",
+        "numba",
+        "scipy",
+        "gymnasium",
+        "matplotlib",
+        "pydantic",
+        "filterpy",
+        "torch",
+    }
     assert not loaded & (heavy | {"rclpy"})
 
 
@@ -261,4 +299,11 @@ def test_an_env_in_process_imports_neither_ros_nor_pictures():
         "env.close()"
     )
     assert {PACKAGE, "gymnasium", "numba"} <= loaded
-    assert not loaded & {"rclpy", "sensor_msgs", "geometry_msgs", "matplotlib", "typer", "mujoco"}
+    assert not loaded & {
+        "rclpy",
+        "sensor_msgs",
+        "geometry_msgs",
+        "matplotlib",
+        "typer",
+        "mujoco",
+    }

@@ -32,7 +32,12 @@ def python(code, *words, path=None):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([*before, *sys.path[1:]])}
     command = [sys.executable, "-c", code, *words]
     return subprocess.run(
-        command, env=environment, capture_output=True, text=True, timeout=240, check=False
+        command,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
     )
 
 
@@ -65,7 +70,9 @@ def test_all_that_is_missing_or_old_is_told_at_once(monkeypatch):
 
 def test_a_version_is_told_that_is_too_new(monkeypatch):
     pretend(monkeypatch, gymnasium="1.10.0")
-    assert "(1.10.0)" in extensions.unmet(ModuleNotFoundError("no module", name="gymnasium.x"))
+    assert "(1.10.0)" in extensions.unmet(
+        ModuleNotFoundError("no module", name="gymnasium.x")
+    )
 
 
 def test_what_is_only_needed_for_some_things_is_told_by_its_name():
@@ -88,7 +95,9 @@ def test_a_name_that_needs_more_says_what(monkeypatch):
         raise ModuleNotFoundError("No module named 'gymnasium'", name="gymnasium")
 
     monkeypatch.setattr(nics_drl_bridge, "import_module", fails)
-    with pytest.raises(ModuleNotFoundError, match=r"^nics_drl_bridge\.make needs gymnasium"):
+    with pytest.raises(
+        ModuleNotFoundError, match=r"^nics_drl_bridge\.make needs gymnasium"
+    ):
         nics_drl_bridge.make  # noqa: B018
 
 
@@ -102,18 +111,24 @@ def test_the_core_does_without_what_no_system_brings():
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("words", [("--help",), ("generate", "--help"), ("urdf", "{out}")])
+@pytest.mark.parametrize(
+    "words", [("--help",), ("generate", "--help"), ("urdf", "{out}")]
+)
 def test_nics_does_without_what_no_system_brings(words, tmp_path):
     given = [word.replace("{out}", "ackermann") for word in words]
     given += ["--out", str(tmp_path / "car.urdf")] if words[0] == "urdf" else []
-    done = python(f"{WITHOUT}\nfrom nics_drl_bridge.commands.start import main\nmain()", *given)
+    done = python(
+        f"{WITHOUT}\nfrom nics_drl_bridge.commands.start import main\nmain()", *given
+    )
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.process
 def test_nics_says_in_one_sentence_what_a_command_needs(tmp_path):
     code = f"{WITHOUT}\nfrom nics_drl_bridge.commands.start import main\nmain()"
-    done = python(code, "evaluate", "straight", "--episodes", "1", "--out", str(tmp_path / "out"))
+    done = python(
+        code, "evaluate", "straight", "--episodes", "1", "--out", str(tmp_path / "out")
+    )
     assert done.returncode == 2
     (sentence,) = done.stderr.splitlines()
     assert sentence == "nics: needs the module 'gymnasium'; install it."
@@ -144,7 +159,9 @@ def test_an_old_library_is_one_sentence(tmp_path, start):
     (tmp_path / "pydantic" / "__init__.py").touch()
     facts = tmp_path / "pydantic-1.10.4.dist-info"
     facts.mkdir()
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: pydantic\nVersion: 1.10.4\n")
+    (facts / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: pydantic\nVersion: 1.10.4\n"
+    )
     command = start == "commands.start"
     call = "main()" if command else "command_gate()"
     code = f"from nics_drl_bridge.{start} import *\n{call}"

@@ -31,29 +31,51 @@ from nics_drl_bridge.sim.simulator import CommandBox, FastSimulator
 
 CAR = robot_from(
     {
-        "kind": "ackermann_throttle", "footprint_radius": 0.2,
-        "parameters": {"wheelbase": 0.26}, "state": [{"name": "vx"}, {"name": "wz"}],
+        "kind": "ackermann_throttle",
+        "footprint_radius": 0.2,
+        "parameters": {"wheelbase": 0.26},
+        "state": [{"name": "vx"}, {"name": "wz"}],
     },
     {"throttle": (-1.0, 1.0), "steering": (-1.0, 1.0)},
-)  # fmt: skip
+)
 DEAD, PERIODS, SUBSTEPS = 0.12, 60, 10
 
 
 def motors() -> TaylorModel:
     """vx' = 5 throttle - 0.8 vx, wz' = 8 vx steering - 5 wz, behind motors that bend all of it."""
     powers = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 1]])
-    rows = [[1.0, 0, 0, 0], [0.0] * 4, [0, 1.0, 0, 0], [-0.8, 0, 5.0, 0], [0, -5.0, 0, 8.0]]
+    rows = [
+        [1.0, 0, 0, 0],
+        [0.0] * 4,
+        [0, 1.0, 0, 0],
+        [-0.8, 0, 5.0, 0],
+        [0, -5.0, 0, 8.0],
+    ]
     return TaylorModel(
-        CAR.variable_names, CAR.dof_names, CAR.dof_units, powers, np.array(rows), 0.01,
-        np.array([-1.0, -1.0, -0.6, -1.0]), np.array([2.0, 1.0, 0.7, 1.0]),
+        CAR.variable_names,
+        CAR.dof_names,
+        CAR.dof_units,
+        powers,
+        np.array(rows),
+        0.01,
+        np.array([-1.0, -1.0, -0.6, -1.0]),
+        np.array([2.0, 1.0, 0.7, 1.0]),
         inputs=(
-            InputCurve(command="throttle", dead=DEAD, least=-0.5, most=0.8, back=0.6, delay=0.02),
+            InputCurve(
+                command="throttle",
+                dead=DEAD,
+                least=-0.5,
+                most=0.8,
+                back=0.6,
+                delay=0.02,
+            ),
             InputCurve(command="steering", dead=0.02, delay=0.13),
         ),
-        friction=np.array([0.2, 0.0]), drag=np.array([0.4, 0.0]),
+        friction=np.array([0.2, 0.0]),
+        drag=np.array([0.4, 0.0]),
         limits=np.array([[-2.5, 1.5], [-np.inf, 6.0]]),
         back_emf=np.array([[1.1, 0.0], [0.0, 0.7]]),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +122,14 @@ def test_the_drive_shows_every_stage(commands, path):
     assert (speed == 0.0).sum() > 5
     assert (np.abs(commands[:, 0]) < DEAD).any()
     assert (np.abs(commands[:, 0]) > 0.8).any()
-    raw = replace(car, inputs=()), *(replace(car, **{k: np.zeros(2)}) for k in ("friction", "drag"))
+    raw = (
+        replace(car, inputs=()),
+        *(replace(car, **{k: np.zeros(2)}) for k in ("friction", "drag")),
+    )
     free = replace(car, limits=np.tile([-np.inf, np.inf], (2, 1)))
-    swift = replace(car, inputs=tuple(c.model_copy(update={"delay": 0.0}) for c in car.inputs))
+    swift = replace(
+        car, inputs=tuple(c.model_copy(update={"delay": 0.0}) for c in car.inputs)
+    )
     for other in (*raw, free, swift, replace(car, back_emf=np.zeros((2, 2)))):
         ends = rolled(other, commands)[0]
         assert np.hypot(*(ends[-1] - path[0][-1])[:2]) > 0.02
@@ -153,7 +180,9 @@ def test_robots_that_might_touch_follow_the_model_too(model):
     start = np.array([[0.0, 0.0, 0.0], [0.0, 0.41, 0.0]])
     simulator.reset([0], starts=start[None])
     pose, state = start, np.zeros((2, 2))
-    commands = np.array([[throttle, 0.0] for throttle in (0.7, 0.7, 0.7, 0.2, -0.9, -0.9)])
+    commands = np.array(
+        [[throttle, 0.0] for throttle in (0.7, 0.7, 0.7, 0.2, -0.9, -0.9)]
+    )
     for command in commands:
         simulator.step(np.tile(command, (1, 2, 1)))
     for command in late(model.kinematics, commands):
@@ -175,11 +204,16 @@ def test_the_estimator_predicts_the_path_of_the_model(model, commands, path):
 
 
 @pytest.mark.parametrize("throttle", [0.0, -0.3])
-def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(throttle):
+def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(
+    throttle,
+):
     motion = MotionModel(term_arrays(motors()), SERIES, 0, 0)
 
     def ahead(speed: float) -> tuple[float, float]:
-        mean, transition = np.array([0.0, 0.0, 0.0, speed, 0.0]), kernels.unmoved(5, 0.0)
+        mean, transition = (
+            np.array([0.0, 0.0, 0.0, speed, 0.0]),
+            kernels.unmoved(5, 0.0),
+        )
         kernels.predict(mean, transition, np.array([throttle, 0.0]), 0.01, 10, motion)
         return mean[3], transition[3, 3]
 
@@ -198,7 +232,9 @@ def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
     estimator.command(0, np.array([0.3, 0.0]))
     for time, speed in ((0.01, 0.0), (0.02, 0.0), (0.021, 0.3 - DEAD)):
         twist = estimator.at(round(time * NS_PER_S))[1]
-        assert twist == pytest.approx([speed, 0.0, 0.0]), f"the throttle acts after 0.02 s: {time}"
+        assert twist == pytest.approx([speed, 0.0, 0.0]), (
+            f"the throttle acts after 0.02 s: {time}"
+        )
 
 
 def test_a_batch_of_robots_moves_as_each_alone(commands, path):
@@ -223,9 +259,13 @@ def test_predictions_over_seconds_have_the_derivatives_that_differences_show(com
 
     def ends(terms):
         shot = Shot(
-            state, first, every, np.full((len(first), 1), steps),
-            np.zeros((len(first), 1, 3)), np.zeros((len(first), 1, 3, len(free))),
-        )  # fmt: skip
+            state,
+            first,
+            every,
+            np.full((len(first), 1), steps),
+            np.zeros((len(first), 1, 3)),
+            np.zeros((len(first), 1, 3, len(free))),
+        )
         shoot(shot, terms, free, car.dt, tangent(2, 2, len(free), len(free)))
         return shot.end[:, 0], shot.slope[:, 0]
 
@@ -248,17 +288,25 @@ def test_a_model_that_is_written_steps_as_it_did(model, tmp_path, commands):
     read = load_model(tmp_path / "car")
     assert read.fingerprint == model.fingerprint
     pose = [np.zeros((PERIODS, 3)), np.full((PERIODS, 2), 0.3), commands]
-    for one, other in zip(model.kinematics.step(*pose), read.kinematics.step(*pose), strict=True):
+    for one, other in zip(
+        model.kinematics.step(*pose), read.kinematics.step(*pose), strict=True
+    ):
         assert np.array_equal(one, other)
     assert "dead: 0.12" in model.text
-    assert "less 0.4*vx*|vx|, less dry friction of 0.2" in model.kinematics.restraint("d_vx")
+    assert "less 0.4*vx*|vx|, less dry friction of 0.2" in model.kinematics.restraint(
+        "d_vx"
+    )
     assert "inputs" not in replace(model, kinematics=replace(motors(), inputs=())).text
 
 
 def test_a_written_car_stands_still_at_a_throttle_in_its_dead_zone(model, tmp_path):
     save_model(model, tmp_path / "car")
     simulator = FastSimulator(load_model(tmp_path / "car"), field(20.0))
-    for throttle, moves in ((0.9 * DEAD, False), (-0.9 * DEAD, False), (3.0 * DEAD, True)):
+    for throttle, moves in (
+        (0.9 * DEAD, False),
+        (-0.9 * DEAD, False),
+        (3.0 * DEAD, True),
+    ):
         simulator.reset([0], starts=np.zeros((1, 1, 3)))
         for _ in range(30):
             simulator.step([[[throttle, 0.5]]])
@@ -280,7 +328,10 @@ def test_a_warning_is_of_the_command_that_was_sent(model):
     ("change", "says"),
     [
         ({"inputs": ({"command": "gas"},)}, "key 'inputs' has 'gas', not one of"),
-        ({"inputs": ({"command": "throttle"},) * 2}, "key 'inputs' has a command twice"),
+        (
+            {"inputs": ({"command": "throttle"},) * 2},
+            "key 'inputs' has a command twice",
+        ),
         ({"friction": {"speed": 0.1}}, "key 'friction' has 'speed'"),
         ({"drag": {"speed": 0.1}}, "key 'drag' has 'speed'"),
         ({"back_emf": {"speed": {}}}, "key 'back_emf' has 'speed'"),

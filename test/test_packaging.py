@@ -20,14 +20,21 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "nics_drl_bridge"
 EXECUTABLES = {
-    "nics", "simulator_node", "mujoco_node", "middleware_node", "policy_node", "command_gate",
+    "nics",
+    "simulator_node",
+    "mujoco_node",
+    "middleware_node",
+    "policy_node",
+    "command_gate",
     "record_node",
-}  # fmt: skip
+}
 # As rosdistro's rosdep/python.yaml has them, for Debian and Ubuntu; others are python3-NAME.
 ROSDEP_KEYS = {
-    "filterpy": "python3-filterpy-pip", "gymnasium": "python3-gymnasium-pip",
-    "pillow": "python3-pil", "pyyaml": "python3-yaml",
-}  # fmt: skip
+    "filterpy": "python3-filterpy-pip",
+    "gymnasium": "python3-gymnasium-pip",
+    "pillow": "python3-pil",
+    "pyyaml": "python3-yaml",
+}
 WITHOUT_KEY = {"threadpoolctl"}
 VERSION = "9.8.7"  # written into the package.xml of the copy, and nowhere else
 
@@ -72,27 +79,44 @@ def run(*command: str | Path, cwd: Path, **env: str) -> str:
         text=True,
         timeout=100,
     )
-    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}"
+    assert done.returncode == 0, (
+        f"{command} ended with {done.returncode}:\n{done.stdout}"
+    )
     return done.stdout
 
 
 def files_below(root: Path, *tops: str) -> set[str]:
     """The files below some folders, relative to the root."""
     paths = (path for top in tops for path in (root / top).rglob("*") if path.is_file())
-    return {path.relative_to(root).as_posix() for path in paths if "__pycache__" not in path.parts}
+    return {
+        path.relative_to(root).as_posix()
+        for path in paths
+        if "__pycache__" not in path.parts
+    }
 
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of this checkout with the probes and another version."""
     copy = tmp_path_factory.mktemp("workspace") / "src" / PACKAGE
-    left_behind = ("build", "install", "log", "dist", "runs", "*.egg-info", "__pycache__", ".?*")
+    left_behind = (
+        "build",
+        "install",
+        "log",
+        "dist",
+        "runs",
+        "*.egg-info",
+        "__pycache__",
+        ".?*",
+    )
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*left_behind))
     for name, text in PROBES.items():
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         (copy / name).write_text(text, encoding="utf-8")
     manifest = (copy / "package.xml").read_text(encoding="utf-8")
-    manifest = re.sub("<version>.*</version>", f"<version>{VERSION}</version>", manifest)
+    manifest = re.sub(
+        "<version>.*</version>", f"<version>{VERSION}</version>", manifest
+    )
     (copy / "package.xml").write_text(manifest, encoding="utf-8")
     return copy
 
@@ -101,7 +125,16 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from the source archive as an index would hold it."""
     dist = tmp_path_factory.mktemp("dist")
-    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", dist, checkout, cwd=dist)
+    run(
+        sys.executable,
+        "-m",
+        "build",
+        "--no-isolation",
+        "--outdir",
+        dist,
+        checkout,
+        cwd=dist,
+    )
     return next(dist.glob("*.whl"))
 
 
@@ -124,7 +157,9 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fresh virtual environment with the wheel; libraries are those of this one."""
     venv = tmp_path_factory.mktemp("environment") / "venv"
     run(sys.executable, "-m", "venv", "--without-pip", venv, cwd=venv.parent)
-    libraries = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
+    libraries = [
+        path for path in sys.path if path.endswith(("site-packages", "dist-packages"))
+    ]
     site_packages = next(venv.glob("lib/python3.*/site-packages"))
     (site_packages / "libraries.pth").write_text("\n".join(libraries), encoding="utf-8")
     pip = (sys.executable, "-m", "pip", "--python", venv / "bin" / "python")
@@ -143,7 +178,14 @@ def install_space(checkout: Path) -> Path:
         pytest.skip("colcon is not installed; `make setup` installs it")
     workspace = checkout.parents[1]
     prefix = os.environ.get("AMENT_PREFIX_PATH", sys.prefix)
-    run(colcon, "build", "--packages-select", PACKAGE, cwd=workspace, AMENT_PREFIX_PATH=prefix)
+    run(
+        colcon,
+        "build",
+        "--packages-select",
+        PACKAGE,
+        cwd=workspace,
+        AMENT_PREFIX_PATH=prefix,
+    )
     return workspace / "install"
 
 
@@ -151,7 +193,9 @@ def test_the_wheel_holds_every_module(checkout: Path, names_in_wheel: set[str]) 
     written = files_below(checkout, PACKAGE)
     assert f"{PACKAGE}/probe/inner/leaf.py" in written
     assert f"{PACKAGE}/py.typed" in written
-    assert {name for name in names_in_wheel if name.startswith(f"{PACKAGE}/")} == written
+    assert {
+        name for name in names_in_wheel if name.startswith(f"{PACKAGE}/")
+    } == written
 
 
 def test_the_wheel_holds_every_config_launch_and_urdf_file(
@@ -159,10 +203,14 @@ def test_the_wheel_holds_every_config_launch_and_urdf_file(
 ) -> None:
     written = files_below(checkout, "config", "launch", "urdf")
     assert {
-        "config/probe/inner/leaf.yaml", "launch/probe/leaf.launch.py", "urdf/probe/leaf.urdf"
-    } <= written  # fmt: skip
+        "config/probe/inner/leaf.yaml",
+        "launch/probe/leaf.launch.py",
+        "urdf/probe/leaf.urdf",
+    } <= written
     share = f"share/{PACKAGE}/"
-    shared = {name.removeprefix(share) for name in names_in_wheel if name.startswith(share)}
+    shared = {
+        name.removeprefix(share) for name in names_in_wheel if name.startswith(share)
+    }
     assert shared == written | {"package.xml"}
 
 
@@ -184,7 +232,9 @@ def test_a_pip_install_puts_the_executables_into_bin(environment: Path) -> None:
 
 
 def test_every_entry_point_leads_to_code(environment: Path) -> None:
-    loaded = run(environment / "bin" / "python", "-c", LOAD_ENTRY_POINTS, cwd=environment)
+    loaded = run(
+        environment / "bin" / "python", "-c", LOAD_ENTRY_POINTS, cwd=environment
+    )
     assert {"nics", "sim"} <= set(loaded.split())
 
 
@@ -204,8 +254,12 @@ def test_colcon_shares_config_launch_files_urdf_and_the_ament_marker(
     assert (share / "ament_index" / "resource_index" / "packages" / PACKAGE).is_file()
 
 
-def test_a_sourced_colcon_install_takes_version_and_config_from_itself(install_space: Path) -> None:
-    sourced = f"source {install_space}/setup.bash && exec {sys.executable} -c '{WHERE_AM_I}'"
+def test_a_sourced_colcon_install_takes_version_and_config_from_itself(
+    install_space: Path,
+) -> None:
+    sourced = (
+        f"source {install_space}/setup.bash && exec {sys.executable} -c '{WHERE_AM_I}'"
+    )
     answer = run("bash", "-c", sourced, cwd=install_space)
     version, module, share = answer.splitlines()
     assert version == VERSION
@@ -229,10 +283,16 @@ def test_a_sourced_colcon_install_has_nics_on_the_path(install_space: Path) -> N
 def requirements(metadata: Message, extra: str = "") -> list[Requirement]:
     """What the wheel requires on this machine, with an extra or without."""
     every = [Requirement(text) for text in metadata.get_all("Requires-Dist", [])]
-    return [one for one in every if one.marker is None or one.marker.evaluate({"extra": extra})]
+    return [
+        one
+        for one in every
+        if one.marker is None or one.marker.evaluate({"extra": extra})
+    ]
 
 
-def test_package_xml_has_the_rosdep_key_of_every_python_library(metadata: Message) -> None:
+def test_package_xml_has_the_rosdep_key_of_every_python_library(
+    metadata: Message,
+) -> None:
     libraries = {one.name for one in requirements(metadata)}
     assert "numpy" in libraries
     keys = {each.name for each in package_xml().exec_depends}
@@ -250,7 +310,12 @@ def test_package_xml_is_as_its_format_wants_it() -> None:
     "file",
     [
         str(file.relative_to(ROOT))
-        for pattern in ("package.xml", "launch/**/*.xml", "config/**/*.xml", f"{PACKAGE}/**/*.xml")
+        for pattern in (
+            "package.xml",
+            "launch/**/*.xml",
+            "config/**/*.xml",
+            f"{PACKAGE}/**/*.xml",
+        )
         for file in sorted(ROOT.glob(pattern))
     ],
 )
@@ -268,7 +333,9 @@ def package_xml() -> Package:
     return package
 
 
-def test_every_requirement_is_pinned_to_a_version_that_it_allows(metadata: Message) -> None:
+def test_every_requirement_is_pinned_to_a_version_that_it_allows(
+    metadata: Message,
+) -> None:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     every = [Requirement(line) for line in lines if line and not line.startswith("#")]
     pins = {
@@ -284,10 +351,21 @@ def test_every_requirement_is_pinned_to_a_version_that_it_allows(metadata: Messa
 
 def test_the_linter_of_ros_2_finds_nothing_in_the_package() -> None:
     pytest.importorskip("flake8", reason="needs flake8 of the extra `test`")
-    run(sys.executable, "-m", "flake8", "--config", "setup.cfg", PACKAGE, "launch", cwd=ROOT)
+    run(
+        sys.executable,
+        "-m",
+        "flake8",
+        "--config",
+        "setup.cfg",
+        PACKAGE,
+        "launch",
+        cwd=ROOT,
+    )
 
 
-def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(metadata: Message) -> None:
+def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(
+    metadata: Message,
+) -> None:
     core, everything, without_ros, ros = (
         {one.name for one in requirements(metadata, extra)}
         for extra in ("", "dev", "dev-without-ros", "ros")

@@ -44,7 +44,11 @@ def test_a_model_is_saved_and_opened_at_either(tmp_path, kind):
     place, model = kind(tmp_path / "model"), builtin_model("ackermann")
     check_place(place)
     save_model(model, place)
-    assert load_model(place).fingerprint == open_model(place).fingerprint == model.fingerprint
+    assert (
+        load_model(place).fingerprint
+        == open_model(place).fingerprint
+        == model.fingerprint
+    )
     table = LidarTable.load(kind(tmp_path / "model" / TABLE_FOLDER))
     assert table.fingerprint == model.table.fingerprint
     table.save(kind(tmp_path / "table"))
@@ -57,7 +61,10 @@ def test_a_model_is_saved_and_opened_at_either(tmp_path, kind):
 def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
     if not name.endswith(".npz"):
         pytest.importorskip("rosbags")
-    place, drive = kind(tmp_path / name), record(CAR, np.random.default_rng(0), duration=20.0)
+    place, drive = (
+        kind(tmp_path / name),
+        record(CAR, np.random.default_rng(0), duration=20.0),
+    )
     assert check_out(place) == tmp_path / name
     write_drive(drive, place, CAR)
     assert len(read_recording(place, CAR).pose.t) == len(drive.pose.t)
@@ -65,7 +72,10 @@ def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
 
 @KINDS
 def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
-    place, drive = kind(tmp_path / "drive.npz"), record(CAR, np.random.default_rng(0), duration=5.0)
+    place, drive = (
+        kind(tmp_path / "drive.npz"),
+        record(CAR, np.random.default_rng(0), duration=5.0),
+    )
     save_recording(drive, place)
     assert np.array_equal(load_recording(place).pose.values, drive.pose.values)
 

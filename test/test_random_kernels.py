@@ -46,8 +46,12 @@ def test_neighbours_in_seed_stream_and_counter_are_not_correlated():
 def test_a_draw_depends_on_its_three_numbers_alone():
     seeds, streams, counters = np.arange(5), np.arange(3), np.arange(7)
     all_of_them = draws(random.normal, seeds, streams, counters)
-    assert np.array_equal(draws(random.normal, seeds[::-1], streams, counters)[::-1], all_of_them)
-    assert np.array_equal(draws(random.normal, seeds[3:4], streams, counters)[0], all_of_them[3])
+    assert np.array_equal(
+        draws(random.normal, seeds[::-1], streams, counters)[::-1], all_of_them
+    )
+    assert np.array_equal(
+        draws(random.normal, seeds[3:4], streams, counters)[0], all_of_them[3]
+    )
     swapped = draws(random.normal, np.array([1]), np.array([2]), np.array([3]))
     assert swapped != draws(random.normal, np.array([2]), np.array([1]), np.array([3]))
 
@@ -75,7 +79,9 @@ def test_normals_by_the_thousand_are_standard_normal_far_out_too():
     sample = normals(30, 60, 1080).ravel().astype(np.float64)
     assert stats.kstest(sample, "norm").pvalue > 1e-3
     assert sample.std() == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * sample.size))
-    assert stats.kurtosis(sample) == pytest.approx(0.0, abs=4.0 * np.sqrt(24.0 / sample.size))
+    assert stats.kurtosis(sample) == pytest.approx(
+        0.0, abs=4.0 * np.sqrt(24.0 / sample.size)
+    )
     for share in (1e-3, 1e-4):
         far = stats.norm.isf(share)
         expected = share * sample.size

@@ -13,7 +13,12 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-OF_OTHERS = ("PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
+OF_OTHERS = (
+    "PYTHONPATH",
+    "VIRTUAL_ENV",
+    "LD_LIBRARY_PATH",
+    "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+)
 INSTRUCTIONS = {"FROM", "WORKDIR", "COPY", "RUN", "ENTRYPOINT", "CMD"}
 
 
@@ -25,10 +30,17 @@ def run(*command: str | Path, cwd: Path) -> str:
     """Runs a command away from this repository; what it printed is returned, or shown."""
     clean = {key: value for key, value in os.environ.items() if key not in OF_OTHERS}
     done = subprocess.run(
-        [str(word) for word in command], cwd=cwd, env=clean, text=True, timeout=1700,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}"
+        [str(word) for word in command],
+        cwd=cwd,
+        env=clean,
+        text=True,
+        timeout=1700,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    assert done.returncode == 0, (
+        f"{command} ended with {done.returncode}:\n{done.stdout}"
+    )
     return done.stdout
 
 
@@ -36,7 +48,16 @@ def run(*command: str | Path, cwd: Path) -> str:
 def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the source archive, and the wheel that is made of it."""
     folder = tmp_path_factory.mktemp("dist")
-    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    run(
+        sys.executable,
+        "-m",
+        "build",
+        "--no-isolation",
+        "--outdir",
+        folder,
+        ROOT,
+        cwd=folder,
+    )
     return folder
 
 
@@ -46,11 +67,24 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("kind", ["*.whl", "*.tar.gz"])
 def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path):
     archive = next(dist.glob(kind))
-    uv, python = Path(sys.executable).with_name("uv"), tmp_path / "venv" / "bin" / "python"
+    uv, python = (
+        Path(sys.executable).with_name("uv"),
+        tmp_path / "venv" / "bin" / "python",
+    )
     run(uv, "venv", "--python", sys.executable, tmp_path / "venv", cwd=tmp_path)
-    install = (uv, "pip", "install", "--python", python, "--constraints", ROOT / "constraints.txt")
+    install = (
+        uv,
+        "pip",
+        "install",
+        "--python",
+        python,
+        "--constraints",
+        ROOT / "constraints.txt",
+    )
     run(*install, f"{archive}[ros,deploy]", cwd=tmp_path)
-    where = run(python, "-c", "import nics_drl_bridge as n; print(n.__file__)", cwd=tmp_path)
+    where = run(
+        python, "-c", "import nics_drl_bridge as n; print(n.__file__)", cwd=tmp_path
+    )
     assert str(tmp_path) in where
     words = ["demo", "--policy", "differential", "--episodes", "2", "--out", "demo"]
     told = run(python.with_name("nics"), *words, cwd=tmp_path)
@@ -60,10 +94,16 @@ def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path)
 
 
 def test_the_container_file_copies_what_there_is_and_runs_what_is_installed():
-    parser = pytest.importorskip("dockerfile_parse", reason="needs dockerfile-parse of `test`")
+    parser = pytest.importorskip(
+        "dockerfile_parse", reason="needs dockerfile-parse of `test`"
+    )
     file = io.BytesIO((ROOT / "Containerfile").read_bytes())
     every = parser.DockerfileParser(fileobj=file).structure
-    lines = [(one["instruction"], one["value"]) for one in every if one["instruction"] != "COMMENT"]
+    lines = [
+        (one["instruction"], one["value"])
+        for one in every
+        if one["instruction"] != "COMMENT"
+    ]
     assert lines[0][0] == "FROM"
     assert {name for name, _ in lines} == INSTRUCTIONS
     for name, words in lines:

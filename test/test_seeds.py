@@ -13,7 +13,19 @@ from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
-BAD = (2**63, 2**64, -1, -(2**63), 10**30, 10**5000, 1.5, "word", None, True, float("nan"))
+BAD = (
+    2**63,
+    2**64,
+    -1,
+    -(2**63),
+    10**30,
+    10**5000,
+    1.5,
+    "word",
+    None,
+    True,
+    float("nan"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +43,13 @@ TAKERS = {
 
 
 @pytest.mark.parametrize("taker", TAKERS)
-@pytest.mark.parametrize("seed", BAD, ids=lambda seed: "huge" if seed == 10**5000 else str(seed))
+@pytest.mark.parametrize(
+    "seed", BAD, ids=lambda seed: "huge" if seed == 10**5000 else str(seed)
+)
 def test_what_is_no_seed_is_one_sentence(simulator, taker, seed):
-    with pytest.raises(ConfigError, match="must be a whole number from 0 to 9223372036854775807"):
+    with pytest.raises(
+        ConfigError, match="must be a whole number from 0 to 9223372036854775807"
+    ):
         TAKERS[taker](seed, simulator)
 
 

@@ -63,11 +63,16 @@ def test_the_estimate_ends_with_the_last_kernel_and_never_says_zero() -> None:
     assert kernels.estimate(0, 400, 1.0).endswith("the last kernels")
 
 
-def test_a_terminal_is_told_again_and_again_and_its_line_is_removed_at_the_end() -> None:
+def test_a_terminal_is_told_again_and_again_and_its_line_is_removed_at_the_end() -> (
+    None
+):
     terminal = Terminal()
     told = kernels._Compiling()
     told.patience_s = 0.0
-    with mock.patch("sys.stderr", terminal), mock.patch.object(kernels, "KERNELS", [mock.Mock()]):
+    with (
+        mock.patch("sys.stderr", terminal),
+        mock.patch.object(kernels, "KERNELS", [mock.Mock()]),
+    ):
         clock = map(float, range(1000))
         kernels.KERNELS[0].is_warm = False
         with mock.patch.object(kernels.time, "monotonic", side_effect=clock):

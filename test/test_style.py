@@ -31,7 +31,8 @@ def test_measured_model_and_goal_differ_in_grey_too():
     weights = 0.2126, 0.7152, 0.0722
     colours = (style.MEASURED, style.MODEL, style.GOAL)
     grey = sorted(
-        sum(w * c for w, c in zip(weights, to_rgb(each), strict=True)) for each in colours
+        sum(w * c for w, c in zip(weights, to_rgb(each), strict=True))
+        for each in colours
     )
     assert min(b - a for a, b in pairwise(grey)) > 0.05
 
@@ -48,7 +49,9 @@ def test_no_title_is_cut(columns):
     figure, grid = style.panels(1, columns, (3.0 * columns, 2.5))
     for axes in grid:
         axes.plot([0.0, 1.0], [0.0, 1.0], label="line")
-        axes.set_title("clock offset -3.001 +- 0.010 s, which is known from the wheels alone")
+        axes.set_title(
+            "clock offset -3.001 +- 0.010 s, which is known from the wheels alone"
+        )
     image = Image.open(io.BytesIO(style.png(figure, grid[0])))
     assert image.width == 330 * columns
     for n, axes in enumerate(grid):

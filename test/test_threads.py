@@ -14,7 +14,9 @@ from nics_drl_bridge.threads import one_blas_thread, run_parts
 def blas_threads() -> set[int]:
     """Of each BLAS that is loaded."""
     np.ones((2, 2)) @ np.ones((2, 2))
-    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+    return {
+        pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"
+    }
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +61,9 @@ def test_whatever_solves_many_small_systems_is_limited(function):
 @pytest.mark.parametrize("parts", [1, 2, 7])
 def test_parts_give_their_results_in_order(parts):
     for _ in range(3):
-        assert run_parts(lambda part: part * part, range(parts)) == [n * n for n in range(parts)]
+        assert run_parts(lambda part: part * part, range(parts)) == [
+            n * n for n in range(parts)
+        ]
 
 
 @pytest.mark.parametrize("broken", [0, 1])

@@ -38,15 +38,25 @@ class Without:
 sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
 """
 NICS = "from nics_drl_bridge.commands.cli import main\nmain()"
-SETTINGS = "{worlds: {empty: 32}, steps: 2048, hidden: [16], ppo: {rollout: 16, batch: 256}}"
+SETTINGS = (
+    "{worlds: {empty: 32}, steps: 2048, hidden: [16], ppo: {rollout: 16, batch: 256}}"
+)
 
 
 def without_ros(code: str, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """A process in which no part of ROS 2 can be imported."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]])}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]])
+    }
     command = [sys.executable, "-c", f"{WITHOUT_ROS}\n{code}", *words]
     return subprocess.run(
-        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=800, check=False
+        command,
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=800,
+        check=False,
     )
 
 
@@ -59,14 +69,26 @@ def test_ros_can_not_be_imported_in_these_tests(tmp_path):
 @pytest.mark.timeout(900)  # a cold start compiles
 def test_a_policy_is_trained_and_evaluated(tmp_path):
     (tmp_path / "short.yaml").write_text(SETTINGS, encoding="utf-8")
-    words = ["train", "--settings", "short.yaml", "--seeds", "0", "--episodes", "8", "--out", "run"]
+    words = [
+        "train",
+        "--settings",
+        "short.yaml",
+        "--seeds",
+        "0",
+        "--episodes",
+        "8",
+        "--out",
+        "run",
+    ]
     done = without_ros(NICS, *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     policy = "run/seed_0/policy.onnx"
     words = f"evaluate {policy} --in fast --world empty --episodes 2 --out seen".split()
     done = without_ros(NICS, *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "seen" / "evaluation.json").read_text(encoding="utf-8"))
+    assert json.loads(
+        (tmp_path / "seen" / "evaluation.json").read_text(encoding="utf-8")
+    )
 
 
 def test_a_world_over_dds_is_refused_in_one_sentence(tmp_path):

@@ -60,7 +60,9 @@ class Watcher:
         self.said: list[tuple[float, bool]] = []
         self.speed = 0.0
         self._context = open_context(domain_id=domain_id)
-        self._node = Node("watcher", context=self._context, start_parameter_services=False)
+        self._node = Node(
+            "watcher", context=self._context, start_parameter_services=False
+        )
         self._node.create_subscription(Twist, "cmd_vel", self._hear, qos.EVERY_COMMAND)
         self._node.create_subscription(Odometry, "ground_truth", self._see, qos.SENSOR)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -70,7 +72,9 @@ class Watcher:
 
     def _hear(self, message: Twist) -> None:
         told = message.linear.x, message.linear.y, message.angular.z
-        self.said.append((time.monotonic(), told != (0.0, 0.0, 0.0)))  # NaN is a motion too
+        self.said.append(
+            (time.monotonic(), told != (0.0, 0.0, 0.0))
+        )  # NaN is a motion too
 
     def _see(self, message: Odometry) -> None:
         self.speed = abs(message.twist.twist.linear.x)
@@ -125,17 +129,37 @@ def bad_action(env: BridgeEnv, rng: Rng) -> None:
     spoilt = AHEAD.copy()
     spoilt[rng.integers(2)] = rng.choice([np.nan, np.inf, -np.inf])
     choices: list[Any] = [
-        spoilt, spoilt, np.ones(int(rng.integers(3, 9)), np.float32), np.float32(1.0), None,
-        "ahead", [[AHEAD]], [AHEAD, 1.0], {"speed": 1.0}, AHEAD * 1j * np.nan, object(),
-        np.ones((0, 2)), np.array(["a", "b"]),
-    ]  # fmt: skip
+        spoilt,
+        spoilt,
+        np.ones(int(rng.integers(3, 9)), np.float32),
+        np.float32(1.0),
+        None,
+        "ahead",
+        [[AHEAD]],
+        [AHEAD, 1.0],
+        {"speed": 1.0},
+        AHEAD * 1j * np.nan,
+        object(),
+        np.ones((0, 2)),
+        np.array(["a", "b"]),
+    ]
     env.step(choices[rng.integers(len(choices))])
 
 
 def bad_seed(env: BridgeEnv, rng: Rng) -> None:
     """Begins an episode by a seed that is none."""
     great = 2 ** int(rng.integers(63, 5000))
-    choices: list[Any] = [-1, -great, great, 2**63, 1.5, float("nan"), "three", [1], np.ones(3)]
+    choices: list[Any] = [
+        -1,
+        -great,
+        great,
+        2**63,
+        1.5,
+        float("nan"),
+        "three",
+        [1],
+        np.ones(3),
+    ]
     env.reset(seed=choices[rng.integers(len(choices))])
 
 
@@ -143,10 +167,19 @@ def bad_options(env: BridgeEnv, rng: Rng) -> None:
     """Begins an episode with options that are none."""
     size = int(rng.integers(4, 9))
     choices: list[Any] = [
-        {"start": "there"}, {"start": (1.0,)}, {"goal": np.nan}, {"goal": np.ones(size)},
-        {"goal": object()}, {"strat": (0.0, 0.0, 0.0)}, {3: 4}, [1], "start", 7, {"start": None},
+        {"start": "there"},
+        {"start": (1.0,)},
+        {"goal": np.nan},
+        {"goal": np.ones(size)},
+        {"goal": object()},
+        {"strat": (0.0, 0.0, 0.0)},
+        {3: 4},
+        [1],
+        "start",
+        7,
+        {"start": None},
         {"start": (np.inf, 0.0, 0.0)},
-    ]  # fmt: skip
+    ]
     env.reset(seed=int(rng.integers(100)), options=choices[rng.integers(len(choices))])
 
 
@@ -162,9 +195,13 @@ def raising_task(env: BridgeEnv, rng: Rng) -> None:
 def senseless_task(env: BridgeEnv, rng: Rng) -> None:
     """Lets the task command what no robot can be told."""
     nonsense: list[Callable[[Any], Any]] = [
-        lambda right: right * np.nan, lambda right: right / 0.0, lambda right: right[..., :1],
-        lambda right: None, lambda right: "ahead", lambda right: right * -np.inf,
-    ]  # fmt: skip
+        lambda right: right * np.nan,
+        lambda right: right / 0.0,
+        lambda right: right[..., :1],
+        lambda right: None,
+        lambda right: "ahead",
+        lambda right: right * -np.inf,
+    ]
     planned(nonsense=nonsense[rng.integers(len(nonsense))])
     with np.errstate(all="ignore"):
         env.step(AHEAD)
@@ -204,27 +241,40 @@ def interrupted(env: BridgeEnv, rng: Rng) -> None:
 def bad_call(env: BridgeEnv, rng: Rng) -> None:
     """Calls a method with arguments that it does not have."""
     calls: list[Callable[[], Any]] = [
-        lambda: env.step(), lambda: env.reset(3), lambda: env.reset(sed=1),  # type: ignore[call-arg,misc]
-        lambda: env.render("human"), lambda: env.close(1),  # type: ignore[call-arg]
-    ]  # fmt: skip
+        lambda: env.step(),
+        lambda: env.reset(3),
+        lambda: env.reset(sed=1),  # type: ignore[call-arg,misc]
+        lambda: env.render("human"),
+        lambda: env.close(1),  # type: ignore[call-arg]
+    ]
     calls[rng.integers(len(calls))]()
 
 
 OF_THE_USER = (bad_action, bad_seed, bad_options)
 """What has to be answered by one sentence."""
 PLACES: tuple[Throw, ...] = (
-    *OF_THE_USER, raising_task, senseless_task, raising_picture, raising_backend, interrupted,
+    *OF_THE_USER,
+    raising_task,
+    senseless_task,
+    raising_picture,
+    raising_backend,
+    interrupted,
     bad_call,
-)  # fmt: skip
+)
 
 
 def make_env(domain_id: int) -> BridgeEnv:
     """An env in real time whose task and picture can be made to throw."""
     options = {"mode": "realtime", "domain_id": domain_id, "stale_after_s": 60.0}
     made = gymnasium.make(
-        "NicsBridge/Task-v0", backend="dds", model=ROBOT, world="empty", task=Thrower,
-        render_mode="rgb_array", backend_options=options,
-    )  # fmt: skip
+        "NicsBridge/Task-v0",
+        backend="dds",
+        model=ROBOT,
+        world="empty",
+        task=Thrower,
+        render_mode="rgb_array",
+        backend_options=options,
+    )
     env = made.unwrapped
     assert isinstance(env, BridgeEnv)
     return env
@@ -260,7 +310,9 @@ def judge(
     """Counts what an env must not answer."""
     if error is None:
         score.count("accepted", line)
-    elif place in OF_THE_USER and not isinstance(error, BridgeError | gymnasium.error.Error):
+    elif place in OF_THE_USER and not isinstance(
+        error, BridgeError | gymnasium.error.Error
+    ):
         score.count("tracebacks", f"{line}: {type(error).__name__}: {error}")
     if took_s > HANGS_S:
         score.count("hangs", f"{line}: {took_s:.1f} s")
@@ -272,7 +324,9 @@ def abuse(score: Score, env: BridgeEnv, watcher: Watcher, rng: Rng, line: str) -
         if drives(env, watcher, int(rng.integers(1000))):
             break
     else:
-        raise RuntimeError(f"{line}: the robot does not move, so that nothing can be measured")
+        raise RuntimeError(
+            f"{line}: the robot does not move, so that nothing can be measured"
+        )
     place = PLACES[rng.integers(len(PLACES))]
     began = time.monotonic()
     error = thrown(env, place, rng)
@@ -316,7 +370,9 @@ def campaign(seed: int, rounds: int, control: str | None = None) -> Score:
             "command_timeout": 3600.0,
         }
         parameters["enable_stamped_cmd_vel"] = False
-        node = stack.enter_context(NodeProcess("simulator_node", folder, parameters, domain_id))
+        node = stack.enter_context(
+            NodeProcess("simulator_node", folder, parameters, domain_id)
+        )
         watcher = Watcher(domain_id)
         stack.callback(watcher.close)
         stack.enter_context(weakened(control))

@@ -16,9 +16,11 @@ from measuring.attempt import MOST_MEMORY, Attempt, Outcome, made
 
 Source = Callable[[np.random.Generator, Path], Iterator[Attempt]]
 SOURCES: tuple[Source, ...] = (
-    hostile_policies.attempts, hostile_configs.attempts, hostile_data.attempts,
+    hostile_policies.attempts,
+    hostile_configs.attempts,
+    hostile_data.attempts,
     hostile_commands.attempts,
-)  # fmt: skip
+)
 
 
 @dataclass
@@ -84,9 +86,12 @@ def _take_checks_out() -> None:
 
     vars(config).update(_Loader=yaml.SafeLoader, MAX_BYTES=10**9)
     vars(onnx_graph).update(
-        check_wire=_believe, check_graph=_believe, check_seal=_believe,
-        rows_at_once=lambda *_: 10**9, CONTRACT_LIMIT=10**9,
-    )  # fmt: skip
+        check_wire=_believe,
+        check_graph=_believe,
+        check_seal=_believe,
+        rows_at_once=lambda *_: 10**9,
+        CONTRACT_LIMIT=10**9,
+    )
 
 
 def _believe(*_: object) -> None:

@@ -67,7 +67,9 @@ class Adversary:
         rng: draws the commands.
     """
 
-    def __init__(self, kind: str, model: SimulatorModel, rng: np.random.Generator) -> None:
+    def __init__(
+        self, kind: str, model: SimulatorModel, rng: np.random.Generator
+    ) -> None:
         self._kind, self._robot, self._rng = kind, model.robot, rng
         self._held, self._left = np.zeros(len(model.robot.command)), 0
 
@@ -79,8 +81,12 @@ class Adversary:
         if self._kind == "jerk":
             return self._hold(ends[0])
         sign = 1.0
-        if self._kind == "late":  # away from everything for a while, then into the nearest
-            self._left = self._left - 1 if self._left > 0 else int(self._rng.integers(2, 15))
+        if (
+            self._kind == "late"
+        ):  # away from everything for a while, then into the nearest
+            self._left = (
+                self._left - 1 if self._left > 0 else int(self._rng.integers(2, 15))
+            )
             sign = -1.0 if self._left > 2 else 1.0
         least = self._nearest(truth, tries)
         if self._kind == "graze":
@@ -98,11 +104,15 @@ class Adversary:
         twist = steady_twist(self._robot, commands)
         moved = geometry.exp(np.multiply.outer(np.array(HORIZON_S), twist))
         places = geometry.compose(truth.pose, moved)[..., :2]
-        away = np.array([[wall_distance(x, y, truth.walls) for x, y in row] for row in places])
+        away = np.array(
+            [[wall_distance(x, y, truth.walls) for x, y in row] for row in places]
+        )
         ahead = np.multiply.outer(np.array(HORIZON_S), truth.velocities)
         for k, (x, y, radius) in enumerate(truth.circles):
             there = ahead[:, None, k] + (x, y)
-            away = np.minimum(away, np.hypot(*np.moveaxis(places - there, -1, 0)) - radius)
+            away = np.minimum(
+                away, np.hypot(*np.moveaxis(places - there, -1, 0)) - radius
+            )
         return np.asarray(away.min(axis=0) - self._robot.footprint_radius)
 
 

@@ -82,7 +82,9 @@ def _recording() -> Artefact:
     drives = [textbook.record(robot, np.random.default_rng(seed)) for seed in (0, 1)]
 
     def version(path: Path) -> int:
-        return _which(load_recording(path).pose.values, [drive.pose.values for drive in drives])
+        return _which(
+            load_recording(path).pose.values, [drive.pose.values for drive in drives]
+        )
 
     def write(path: Path, n: int) -> None:
         save_recording(drives[n], path)
@@ -128,7 +130,9 @@ def _policy(folder: Path) -> Artefact:
     task = make_task("navigation", model, {"scan": 36})
     contents = []
     for n in (0, 1):
-        actor = torch.nn.Linear(task.observation_space.shape[0], len(model.robot.command))
+        actor = torch.nn.Linear(
+            task.observation_space.shape[0], len(model.robot.command)
+        )
         file = folder / f"{n}.onnx"
         export_policy(actor, task, model, file, provenance={"seed": n})
         contents.append(file.read_bytes())
@@ -136,7 +140,9 @@ def _policy(folder: Path) -> Artefact:
     def version(path: Path) -> int:
         return int(load_policy(path).contract.provenance["seed"])
 
-    return Artefact("policy.onnx", lambda path, n: write_bytes(path, contents[n]), version)
+    return Artefact(
+        "policy.onnx", lambda path, n: write_bytes(path, contents[n]), version
+    )
 
 
 def _checkpoint(folder: Path) -> Artefact:
@@ -164,7 +170,9 @@ def _which(found: NDArray[Any], versions: list[NDArray[Any]]) -> int:
     return [np.array_equal(found, version) for version in versions].index(True)
 
 
-def torn(artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path) -> dict[str, int]:
+def torn(
+    artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path
+) -> dict[str, int]:
     """How often something was left that is neither the old nor the new version, whole.
 
     Each time a process that writes both in turn is killed with SIGKILL at a random moment after it
@@ -259,15 +267,20 @@ def unchecked() -> Any:
     """Takes every checksum out while it is entered: they fit whatever they are held against."""
     fits = contextlib.ExitStack()
     for place in (
-        "recording.recording._check_seal", "generator.check_sums", "lidar.table.check_sums",
-        "policy.onnx_graph.check_seal", "policy.contract._check_unchanged",
+        "recording.recording._check_seal",
+        "generator.check_sums",
+        "lidar.table.check_sums",
+        "policy.onnx_graph.check_seal",
+        "policy.contract._check_unchanged",
         "policy.train_checkpoint.check_sealed",
-    ):  # fmt: skip
+    ):
         fits.enter_context(mock.patch(f"nics_drl_bridge.{place}", return_value=True))
     return fits
 
 
-def accepted(artefact: Artefact, flips: int, rng: np.random.Generator, folder: Path) -> int:
+def accepted(
+    artefact: Artefact, flips: int, rng: np.random.Generator, folder: Path
+) -> int:
     """How often a file with one flipped bit was read as if nothing were wrong."""
     path, good = folder / artefact.name, 0
     artefact.write(path, 0)
@@ -279,7 +292,9 @@ def accepted(artefact: Artefact, flips: int, rng: np.random.Generator, folder: P
         damaged[int(rng.integers(len(whole)))] ^= 1 << int(rng.integers(8))
         file.write_bytes(damaged)
         try:
-            with contextlib.suppress(ValueError):  # read, but as no version that was written
+            with contextlib.suppress(
+                ValueError
+            ):  # read, but as no version that was written
                 artefact.version(path)
             good += 1
         except BridgeError:
@@ -289,7 +304,9 @@ def accepted(artefact: Artefact, flips: int, rng: np.random.Generator, folder: P
     return good
 
 
-def measure(kills: int, flips: int, seed: int, control: str | None = None) -> dict[str, Any]:
+def measure(
+    kills: int, flips: int, seed: int, control: str | None = None
+) -> dict[str, Any]:
     """All figures over all artefacts, and by artefact.
 
     Args:

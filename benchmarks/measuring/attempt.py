@@ -27,7 +27,9 @@ ROOM = 4 * 2**30
 """Address space that a process may take besides what it has, so that the machine survives."""
 EXIT_BAD_INPUT = 2
 
-PROGRESS = re.compile(r"^[a-z][\w ]* \(\d+ s\)\n", re.MULTILINE)  # where a step takes long
+PROGRESS = re.compile(
+    r"^[a-z][\w ]* \(\d+ s\)\n", re.MULTILINE
+)  # where a step takes long
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,9 @@ def made(attempt: Attempt) -> Outcome:
     if not data:
         waited = time.monotonic() - begin
         end = "hang" if waited >= LONGEST_S else "traceback"
-        return Outcome(end, f"no answer after {waited:.1f} s, status {status}", own_s, 0)
+        return Outcome(
+            end, f"no answer after {waited:.1f} s, status {status}", own_s, 0
+        )
     end, words, memory, compiling_s = pickle.loads(data)
     own_s -= compiling_s  # which is once on a machine, whatever the input
     return Outcome("hang" if own_s > OWN_TIME_S else end, words, own_s, memory)
@@ -101,7 +105,10 @@ def _answer(attempt: Attempt, writing: int) -> None:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         size = pages * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
-        before, compiled_s = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, COMPILING.cpu_s
+        before, compiled_s = (
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+            COMPILING.cpu_s,
+        )
         end, words = _end_of(attempt.act)
         after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         told = end, words[:3000], (after - before) * 1024, COMPILING.cpu_s - compiled_s
@@ -124,7 +131,10 @@ def _end_of(act: Callable[[], object]) -> tuple[str, str]:
 
 def _judged(sentence: str) -> tuple[str, str]:
     if "\n" in sentence or not 0 < len(sentence) <= LONGEST_SENTENCE:
-        return "traceback", f"no sentence, but {len(sentence)} characters: {sentence[:300]!r}"
+        return (
+            "traceback",
+            f"no sentence, but {len(sentence)} characters: {sentence[:300]!r}",
+        )
     return "refused", sentence
 
 
@@ -150,7 +160,11 @@ def nics(*words: object) -> Callable[[], None]:
             text = said.read()
         if code == EXIT_BAD_INPUT:
             told = PROGRESS.sub("", text)
-            raise BridgeError(told.rstrip("\n")) if _is_sentence(told) else ValueError(text[:2000])
+            raise (
+                BridgeError(told.rstrip("\n"))
+                if _is_sentence(told)
+                else ValueError(text[:2000])
+            )
         if code not in (0, None, 1):
             raise ValueError(f"exit code {code}: {text[:2000]}")
 
@@ -158,4 +172,8 @@ def nics(*words: object) -> Callable[[], None]:
 
 
 def _is_sentence(text: str) -> bool:
-    return text.startswith("nics: ") and text.count("\n") == 1 and len(text) <= LONGEST_SENTENCE
+    return (
+        text.startswith("nics: ")
+        and text.count("\n") == 1
+        and len(text) <= LONGEST_SENTENCE
+    )

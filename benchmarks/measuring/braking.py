@@ -38,9 +38,16 @@ def braking_used(robot: str, given: Mapping[str, float] | None) -> float:
         arm = 1.0 if limits.linear[index] else reach * limits.turn[index]
         if arm == 0.0:
             continue
-        for speed in (share * end for end in (low, high) if end != 0.0 for share in SHARES):
-            kept = abs(speed) * shield.latency_s + arm * speed**2 / (2.0 * shield.deceleration)
-            away = _stopping_distance(sim, index, speed) + abs(speed) * model.control_period
+        for speed in (
+            share * end for end in (low, high) if end != 0.0 for share in SHARES
+        ):
+            kept = abs(speed) * shield.latency_s + arm * speed**2 / (
+                2.0 * shield.deceleration
+            )
+            away = (
+                _stopping_distance(sim, index, speed)
+                + abs(speed) * model.control_period
+            )
             most = max(most, away / kept)
     return most
 

@@ -40,7 +40,11 @@ class Jumped:
 
 
 def drive(
-    model: SimulatorModel, simulator: FastSimulator, made: Middleware, seed: int, moving: bool
+    model: SimulatorModel,
+    simulator: FastSimulator,
+    made: Middleware,
+    seed: int,
+    moving: bool,
 ) -> Jumped:
     """Drives with data that are late, and lost at times, and sets the clock once.
 
@@ -55,8 +59,15 @@ def drive(
     start = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     simulator.reset([seed], starts=start[None, None])
     made.reset(0, start)
-    when, shift = int(rng.integers(30, 100)), round(JUMPS_S[seed % len(JUMPS_S)] * SECOND)
-    truth, underway, found = [start], deque[tuple[int, Any]](), list[tuple[int, float, float]]()
+    when, shift = (
+        int(rng.integers(30, 100)),
+        round(JUMPS_S[seed % len(JUMPS_S)] * SECOND),
+    )
+    truth, underway, found = (
+        [start],
+        deque[tuple[int, Any]](),
+        list[tuple[int, float, float]](),
+    )
     command = _command(model, rng, moving)
     for k in range(1, PERIODS):
         if k % 8 == 0:
@@ -113,7 +124,10 @@ def campaign(
 
 def summary(drives: list[Jumped]) -> dict[str, Any]:
     """What the drives show together."""
-    error, nees = np.array([d.error for d in drives]), np.array([d.nees for d in drives])
+    error, nees = (
+        np.array([d.error for d in drives]),
+        np.array([d.nees for d in drives]),
+    )
     return {
         "drives": len(drives),
         "driven_unseen_m": float(np.mean([d.driven for d in drives])),

@@ -40,12 +40,16 @@ class Client:
 
     def __init__(self, domain_id: int | None = None, prefix: str = "") -> None:
         self.context = open_context(domain_id=domain_id)
-        self.node = Node("conformance", context=self.context, start_parameter_services=False)
+        self.node = Node(
+            "conformance", context=self.context, start_parameter_services=False
+        )
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._clients: dict[str, Any] = {}
         self._prefix = f"{prefix}/" if prefix else ""
-        self._action = ActionClient(self.node, SimulateSteps, f"{self._prefix}simulate_steps")
+        self._action = ActionClient(
+            self.node, SimulateSteps, f"{self._prefix}simulate_steps"
+        )
         self.clock: list[Any] = []
         self.node.create_subscription(Clock, "/clock", self.clock.append, 10)
 
@@ -73,7 +77,9 @@ class Client:
             self._clients[name] = self.node.create_client(kind, topic)
         client = self._clients[name]
         self.until(client.service_is_ready, f"the service of {name}")
-        return self.wait(client.call_async(kind.Request(**fields)), f"an answer of {name}")
+        return self.wait(
+            client.call_async(kind.Request(**fields)), f"an answer of {name}"
+        )
 
     def code(self, name: str, /, **fields: Any) -> int:
         """Returns the result of a service."""
@@ -109,7 +115,10 @@ class Client:
     def spawn(self, name: str, x: float = 0.0, /, **fields: Any) -> Any:
         """Spawns a disc; returns the response."""
         request = spawn_request(name, x, **fields)
-        given = {field: getattr(request, field) for field in request.get_fields_and_field_types()}
+        given = {
+            field: getattr(request, field)
+            for field in request.get_fields_and_field_types()
+        }
         return self("SpawnEntity", **given)
 
     def start(self) -> None:
@@ -139,9 +148,13 @@ def spawn_request(name: str, x: float = 0.0, /, **fields: Any) -> Any:
     return request
 
 
-def box(x1: float, y1: float, x2: float, y2: float, kind: int = msg.Bounds.TYPE_BOX) -> Any:
+def box(
+    x1: float, y1: float, x2: float, y2: float, kind: int = msg.Bounds.TYPE_BOX
+) -> Any:
     """Returns bounds by two corners."""
-    return msg.Bounds(type=kind, points=[Vector3(x=x2, y=y2, z=1.0), Vector3(x=x1, y=y1, z=-1.0)])
+    return msg.Bounds(
+        type=kind, points=[Vector3(x=x2, y=y2, z=1.0), Vector3(x=x1, y=y1, z=-1.0)]
+    )
 
 
 def sphere(x: float, y: float, radius: float) -> Any:
@@ -153,14 +166,20 @@ def sphere(x: float, y: float, radius: float) -> Any:
 def _spawns_and_deletes(c: Client) -> bool:
     spawned = c.spawn("disc", 1.0)
     there = "disc" in c.names() and spawned.entity_name == "disc"
-    return there and c.code("DeleteEntity", entity="disc") == OK and "disc" not in c.names()
+    return (
+        there
+        and c.code("DeleteEntity", entity="disc") == OK
+        and "disc" not in c.names()
+    )
 
 
 def _names_collide(c: Client) -> bool:
     first, second = c.spawn("twin", 1.0), c.spawn("twin", 1.5)
     other = c.spawn("twin", 1.5, allow_renaming=True)
     codes = srv.SpawnEntity.Response
-    refused = second.result.result == codes.NAME_NOT_UNIQUE and second.result.error_message
+    refused = (
+        second.result.result == codes.NAME_NOT_UNIQUE and second.result.error_message
+    )
     renamed = other.result.result == OK and other.entity_name not in ("", "twin")
     return first.result.result == OK and bool(refused) and renamed
 
@@ -181,20 +200,36 @@ def _text_is_spawned(c: Client) -> bool:
         "<box><size>0.4 0.4 0.4</size></box></geometry></collision></link></model></sdf>"
     )
     named = c.spawn("", 1.0, entity_resource=msg.Resource(resource_string=sdf))
-    wrong = c.spawn("w", 1.0, entity_resource=msg.Resource(resource_string="kind: sphere"))
+    wrong = c.spawn(
+        "w", 1.0, entity_resource=msg.Resource(resource_string="kind: sphere")
+    )
     empty = c.spawn("e", 1.0, entity_resource=msg.Resource())
-    urdf = c.spawn("u", 1.0, entity_resource=msg.Resource(resource_string="<robot name='r'/>"))
+    urdf = c.spawn(
+        "u", 1.0, entity_resource=msg.Resource(resource_string="<robot name='r'/>")
+    )
     told = [each.result.result for each in (named, wrong, empty, urdf)]
-    wanted = [OK, codes.RESOURCE_PARSE_ERROR, codes.NO_RESOURCE, codes.UNSUPPORTED_FORMAT]
+    wanted = [
+        OK,
+        codes.RESOURCE_PARSE_ERROR,
+        codes.NO_RESOURCE,
+        codes.UNSUPPORTED_FORMAT,
+    ]
     return told == wanted and named.entity_name == "crate"
 
 
 def _state_is_got(c: Client) -> bool:
     c.spawn("disc", 1.25)
-    one, none = c("GetEntityState", entity="disc"), c("GetEntityState", entity="nothing")
+    one, none = (
+        c("GetEntityState", entity="disc"),
+        c("GetEntityState", entity="nothing"),
+    )
     every = c("GetEntitiesStates", filters=msg.EntityFilters(filter="^disc$"))
     x = [one.state.pose.position.x, every.states[0].pose.position.x]
-    return x == [1.25, 1.25] and none.result.result == NOT_FOUND and bool(none.result.error_message)
+    return (
+        x == [1.25, 1.25]
+        and none.result.result == NOT_FOUND
+        and bool(none.result.error_message)
+    )
 
 
 def _state_is_set(c: Client) -> bool:
@@ -223,7 +258,9 @@ def _info_is_got(c: Client) -> bool:
 
 def _info_is_set(c: Client) -> bool:
     c.spawn("disc", 1.0)
-    info = msg.EntityInfo(category=category("HUMAN"), description="a person", tags=["walks"])
+    info = msg.EntityInfo(
+        category=category("HUMAN"), description="a person", tags=["walks"]
+    )
     done = c.code("SetEntityInfo", entity="disc", info=info) == OK
     return done and c("GetEntityInfo", entity="disc").info == info
 
@@ -249,9 +286,15 @@ def _bounds(c: Client) -> bool:
     c.spawn("disc", 1.0)
     bounds = c("GetEntityBounds", entity="disc").bounds
     (high, low), near = bounds.points, 0.01
-    right = bounds.type == msg.Bounds.TYPE_BOX and abs(high.x - 0.15) < near > abs(low.x + 0.15)
+    right = bounds.type == msg.Bounds.TYPE_BOX and abs(high.x - 0.15) < near > abs(
+        low.x + 0.15
+    )
     inside, outside = sphere(1.0, 0.0, 0.05), sphere(-1.9, -1.9, 0.01)
-    return right and "disc" in c.names(bounds=inside) and "disc" not in c.names(bounds=outside)
+    return (
+        right
+        and "disc" in c.names(bounds=inside)
+        and "disc" not in c.names(bounds=outside)
+    )
 
 
 def _bounds_box(c: Client) -> bool:
@@ -268,7 +311,9 @@ def _bounds_convex(c: Client) -> bool:
         points = [Vector3(x=a, y=b) for a, b in corners]
         return msg.Bounds(type=msg.Bounds.TYPE_CONVEX_HULL, points=points)
 
-    return "disc" in c.names(bounds=corner(0.9)) and "disc" not in c.names(bounds=corner(1.3))
+    return "disc" in c.names(bounds=corner(0.9)) and "disc" not in c.names(
+        bounds=corner(1.3)
+    )
 
 
 def _spawnables(c: Client) -> bool:
@@ -308,11 +353,17 @@ def _state_of_simulation(c: Client) -> bool:
 def _sets_state(c: Client) -> bool:
     codes = srv.SetSimulationState.Response
     asked = (
-        STATES.STATE_PLAYING, STATES.STATE_PLAYING, STATES.STATE_STOPPED, STATES.STATE_NO_WORLD,
-    )  # fmt: skip
+        STATES.STATE_PLAYING,
+        STATES.STATE_PLAYING,
+        STATES.STATE_STOPPED,
+        STATES.STATE_NO_WORLD,
+    )
     wanted = [OK, codes.ALREADY_IN_TARGET_STATE, OK, codes.INCORRECT_TRANSITION]
     found = [c.set_state(each) for each in asked]
-    return found == wanted and int(c("GetSimulationState").state.state) == STATES.STATE_STOPPED
+    return (
+        found == wanted
+        and int(c("GetSimulationState").state.state) == STATES.STATE_STOPPED
+    )
 
 
 def _pauses(c: Client) -> bool:
@@ -356,7 +407,9 @@ def _loads(c: Client) -> bool:
 
 def _loads_text(c: Client) -> bool:
     loaded = c("LoadWorld", world_resource=msg.Resource(resource_string=WORLD))
-    wrong = c.code("LoadWorld", world_resource=msg.Resource(resource_string="name: [\n"))
+    wrong = c.code(
+        "LoadWorld", world_resource=msg.Resource(resource_string="name: [\n")
+    )
     right = loaded.result.result == OK and loaded.world.name == "text"
     return right and wrong == srv.LoadWorld.Response.RESOURCE_PARSE_ERROR
 
@@ -365,7 +418,10 @@ def _unloads(c: Client) -> bool:
     unloaded = c.code("UnloadWorld") == OK
     state = int(c("GetSimulationState").state.state)
     again, spawned = c.code("UnloadWorld"), c.spawn("disc").result.result
-    wanted = [srv.UnloadWorld.Response.NO_WORLD_LOADED, msg.Result.RESULT_INCORRECT_STATE]
+    wanted = [
+        srv.UnloadWorld.Response.NO_WORLD_LOADED,
+        msg.Result.RESULT_INCORRECT_STATE,
+    ]
     return unloaded and state == STATES.STATE_NO_WORLD and [again, spawned] == wanted
 
 
@@ -380,7 +436,9 @@ def _lists_worlds(c: Client) -> bool:
     listed = c("GetAvailableWorlds")
     right = listed.result.result == OK and len(listed.worlds) > 1
     failed = c("GetAvailableWorlds", additional_sources=["/nowhere"])
-    on = c("GetAvailableWorlds", additional_sources=["/nowhere"], continue_on_error=True)
+    on = c(
+        "GetAvailableWorlds", additional_sources=["/nowhere"], continue_on_error=True
+    )
     return right and failed.result.result != OK and on.result.result == OK
 
 
@@ -394,36 +452,59 @@ def _filters_worlds(c: Client) -> bool:
 
 SCOPES = srv.ResetSimulation.Request
 CHECKS: dict[str, Callable[[Client], bool]] = {
-    "SPAWNING": _names_collide, "DELETING": _spawns_and_deletes, "ENTITY_TAGS": _tags,
-    "ENTITY_BOUNDS": _bounds, "ENTITY_BOUNDS_BOX": _bounds_box,
-    "ENTITY_BOUNDS_CONVEX": _bounds_convex, "ENTITY_CATEGORIES": _categories,
-    "SPAWNING_RESOURCE_STRING": _text_is_spawned, "ENTITY_STATE_GETTING": _state_is_got,
-    "ENTITY_STATE_SETTING": _state_is_set, "ENTITY_INFO_GETTING": _info_is_got,
-    "ENTITY_INFO_SETTING": _info_is_set, "SPAWNABLES": _spawnables,
+    "SPAWNING": _names_collide,
+    "DELETING": _spawns_and_deletes,
+    "ENTITY_TAGS": _tags,
+    "ENTITY_BOUNDS": _bounds,
+    "ENTITY_BOUNDS_BOX": _bounds_box,
+    "ENTITY_BOUNDS_CONVEX": _bounds_convex,
+    "ENTITY_CATEGORIES": _categories,
+    "SPAWNING_RESOURCE_STRING": _text_is_spawned,
+    "ENTITY_STATE_GETTING": _state_is_got,
+    "ENTITY_STATE_SETTING": _state_is_set,
+    "ENTITY_INFO_GETTING": _info_is_got,
+    "ENTITY_INFO_SETTING": _info_is_set,
+    "SPAWNABLES": _spawnables,
     "SIMULATION_RESET": _resets(SCOPES.SCOPE_ALL),
     "SIMULATION_RESET_TIME": _resets(SCOPES.SCOPE_TIME),
     "SIMULATION_RESET_STATE": _resets(SCOPES.SCOPE_STATE),
     "SIMULATION_RESET_SPAWNED": _resets(SCOPES.SCOPE_SPAWNED),
-    "SIMULATION_STATE_GETTING": _state_of_simulation, "SIMULATION_STATE_SETTING": _sets_state,
-    "SIMULATION_STATE_PAUSE": _pauses, "STEP_SIMULATION_SINGLE": _steps(1),
-    "STEP_SIMULATION_MULTIPLE": _steps(7), "STEP_SIMULATION_ACTION": _acts,
-    "WORLD_LOADING": _loads, "WORLD_RESOURCE_STRING": _loads_text, "WORLD_TAGS": _filters_worlds,
-    "WORLD_UNLOADING": _unloads, "WORLD_INFO_GETTING": _tells_world,
-    "AVAILABLE_WORLDS": _lists_worlds, "SPAWNING_ENTITIES": _spawns_several,
-}  # fmt: skip
+    "SIMULATION_STATE_GETTING": _state_of_simulation,
+    "SIMULATION_STATE_SETTING": _sets_state,
+    "SIMULATION_STATE_PAUSE": _pauses,
+    "STEP_SIMULATION_SINGLE": _steps(1),
+    "STEP_SIMULATION_MULTIPLE": _steps(7),
+    "STEP_SIMULATION_ACTION": _acts,
+    "WORLD_LOADING": _loads,
+    "WORLD_RESOURCE_STRING": _loads_text,
+    "WORLD_TAGS": _filters_worlds,
+    "WORLD_UNLOADING": _unloads,
+    "WORLD_INFO_GETTING": _tells_world,
+    "AVAILABLE_WORLDS": _lists_worlds,
+    "SPAWNING_ENTITIES": _spawns_several,
+}
 # Features of which the service itself is answered as unsupported where they are not announced.
 SERVICES = {
-    "SPAWNING": "SpawnEntity", "DELETING": "DeleteEntity", "NAMED_POSES": "GetNamedPoses",
-    "POSE_BOUNDS": "GetNamedPoseBounds", "ENTITY_BOUNDS": "GetEntityBounds",
-    "ENTITY_STATE_GETTING": "GetEntityState", "ENTITY_STATE_SETTING": "SetEntityState",
-    "ENTITY_INFO_GETTING": "GetEntityInfo", "ENTITY_INFO_SETTING": "SetEntityInfo",
-    "SPAWNABLES": "GetSpawnables", "SIMULATION_RESET": "ResetSimulation",
+    "SPAWNING": "SpawnEntity",
+    "DELETING": "DeleteEntity",
+    "NAMED_POSES": "GetNamedPoses",
+    "POSE_BOUNDS": "GetNamedPoseBounds",
+    "ENTITY_BOUNDS": "GetEntityBounds",
+    "ENTITY_STATE_GETTING": "GetEntityState",
+    "ENTITY_STATE_SETTING": "SetEntityState",
+    "ENTITY_INFO_GETTING": "GetEntityInfo",
+    "ENTITY_INFO_SETTING": "SetEntityInfo",
+    "SPAWNABLES": "GetSpawnables",
+    "SIMULATION_RESET": "ResetSimulation",
     "SIMULATION_STATE_GETTING": "GetSimulationState",
-    "SIMULATION_STATE_SETTING": "SetSimulationState", "STEP_SIMULATION_SINGLE": "StepSimulation",
-    "WORLD_LOADING": "LoadWorld", "WORLD_UNLOADING": "UnloadWorld",
-    "WORLD_INFO_GETTING": "GetCurrentWorld", "AVAILABLE_WORLDS": "GetAvailableWorlds",
+    "SIMULATION_STATE_SETTING": "SetSimulationState",
+    "STEP_SIMULATION_SINGLE": "StepSimulation",
+    "WORLD_LOADING": "LoadWorld",
+    "WORLD_UNLOADING": "UnloadWorld",
+    "WORLD_INFO_GETTING": "GetCurrentWorld",
+    "AVAILABLE_WORLDS": "GetAvailableWorlds",
     "SPAWNING_ENTITIES": "SpawnEntities",
-}  # fmt: skip
+}
 
 
 def features() -> dict[str, int]:
@@ -455,12 +536,22 @@ def failures(client: Client, world: str, told: set[str] | None = None) -> list[s
             client.start()
             try:
                 right = CHECKS[name](client)
-            except (AttributeError, LookupError, StopIteration, TimeoutError, ValueError):
+            except (
+                AttributeError,
+                LookupError,
+                StopIteration,
+                TimeoutError,
+                ValueError,
+            ):
                 right = False  # an answer without what was asked for
             if not right:
-                failed.append(f"{name} is announced, but does not do what the standard says")
+                failed.append(
+                    f"{name} is announced, but does not do what the standard says"
+                )
         elif name in told:
             failed.append(f"{name} is announced, but nothing checks it")
         elif name in SERVICES and client.code(SERVICES[name]) != UNSUPPORTED:
-            failed.append(f"{name} is not announced, but {SERVICES[name]} does not say so")
+            failed.append(
+                f"{name} is not announced, but {SERVICES[name]} does not say so"
+            )
     return failed

@@ -73,18 +73,29 @@ def samples(folder: Path) -> list[Sample]:
     _foreign(ours, folder / "foreign_mcap", "none")
     _foreign(ours, folder / "foreign_packed", "storage")
     names = ("ours_mcap", "ours_sqlite3", "foreign_mcap", "foreign_packed")
-    return [Sample(folder / name, name == "ours_mcap", _held(folder / name)) for name in names]
+    return [
+        Sample(folder / name, name == "ours_mcap", _held(folder / name))
+        for name in names
+    ]
 
 
 def _foreign(source: Path, path: Path, compression: str) -> None:
     """A copy by rosbags alone, without checksums."""
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+    from rosbags.rosbag2 import (
+        CompressionFormat,
+        CompressionMode,
+        Reader,
+        StoragePlugin,
+        Writer,
+    )
 
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     with Reader(source) as reader, writer:
         connections = {
-            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
+            c.id: writer.add_connection(
+                c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest
+            )
             for c in reader.connections
         }
         for connection, ns, data in reader.messages():
@@ -101,7 +112,9 @@ def _held(path: Path) -> Held:
         return told
 
 
-def truncations(sample: Sample, count: int, rng: np.random.Generator) -> Iterator[dict[str, bytes]]:
+def truncations(
+    sample: Sample, count: int, rng: np.random.Generator
+) -> Iterator[dict[str, bytes]]:
     """Files of a bag, one of them cut off anywhere."""
     for _ in range(count):
         files = _files(sample.path)
@@ -109,7 +122,9 @@ def truncations(sample: Sample, count: int, rng: np.random.Generator) -> Iterato
         yield files | {name: files[name][: int(rng.integers(len(files[name])))]}
 
 
-def corruptions(sample: Sample, count: int, rng: np.random.Generator) -> Iterator[dict[str, bytes]]:
+def corruptions(
+    sample: Sample, count: int, rng: np.random.Generator
+) -> Iterator[dict[str, bytes]]:
     """Files of a bag, with some bits flipped or bytes replaced in one of them."""
     for _ in range(count):
         files = _files(sample.path)
@@ -157,7 +172,9 @@ def judge(sample: Sample, files: dict[str, bytes], folder: Path, score: Score) -
 def _same(bag: Path, sample: Sample) -> str:
     """What was given without a word has to be what was written."""
     held = _held(bag)
-    if {t: v[:2] for t, v in held.items()} != {t: v[:2] for t, v in sample.held.items()}:
+    if {t: v[:2] for t, v in held.items()} != {
+        t: v[:2] for t, v in sample.held.items()
+    }:
         return "topics, types, counts or times differ"
     if sample.sealed and held != sample.held:
         return "messages differ"
@@ -166,7 +183,11 @@ def _same(bag: Path, sample: Sample) -> str:
 
 def _informed(bag: Path, sample: Sample) -> str:
     told = {topic.topic: topic.count for topic in bag_info(bag).topics}
-    return "" if told == {t: len(v[1]) for t, v in sample.held.items()} else "counts differ"
+    return (
+        ""
+        if told == {t: len(v[1]) for t, v in sample.held.items()}
+        else "counts differ"
+    )
 
 
 def _read(bag: Path, sample: Sample) -> str:
@@ -186,7 +207,9 @@ def _salvaged(bag: Path, sample: Sample, score: Score) -> None:
         score.told.append(f"salvage: {type(error).__name__}: {error}")
         return
     known = {topic: set(digests) for topic, (_, _, digests) in sample.held.items()}
-    if sample.sealed and any(set(d) - known.get(t, set()) for t, (_, _, d) in kept.items()):
+    if sample.sealed and any(
+        set(d) - known.get(t, set()) for t, (_, _, d) in kept.items()
+    ):
         score.silent_partial += 1
         score.told.append("salvage: kept what was never written")
 

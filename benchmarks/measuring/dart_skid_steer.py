@@ -41,7 +41,9 @@ FRICTION = 0.6
 MOTOR_TORQUE = 80.0  # [N m]
 WHEEL_ACCELERATION = 12.0  # [rad/s^2]
 BODY = (0.9, 0.4, 0.2)  # [m]
-BELIEVED_TRACK = 1.35 * TRACK  # by which the driver converts wheel speeds and turn rates
+BELIEVED_TRACK = (
+    1.35 * TRACK
+)  # by which the driver converts wheel speeds and turn rates
 COMMAND_TIMEOUT_S = 0.5
 
 
@@ -92,7 +94,9 @@ class Lidar:
             _range_of_walls(place, pose, rays), _range_of_pillars(place, pose, rays)
         )
         ranges *= 1.0 + rng.normal(0.0, self.noise, self.beams)
-        return np.where((ranges > self.range_min) & (ranges < self.range_max), ranges, np.inf)
+        return np.where(
+            (ranges > self.range_min) & (ranges < self.range_max), ranges, np.inf
+        )
 
 
 def _range_of_walls(place: Place, pose: Array, rays: Array) -> Array:
@@ -247,8 +251,14 @@ class Engine:
         """Whether the robot touches something other than the ground."""
         for contact in self.world.getLastCollisionResult().getContacts():
             names = {
-                contact.collisionObject1.getShapeFrame().asShapeNode().getSkeleton().getName(),
-                contact.collisionObject2.getShapeFrame().asShapeNode().getSkeleton().getName(),
+                contact.collisionObject1.getShapeFrame()
+                .asShapeNode()
+                .getSkeleton()
+                .getName(),
+                contact.collisionObject2.getShapeFrame()
+                .asShapeNode()
+                .getSkeleton()
+                .getName(),
             }
             if "skid_steer" in names and "ground" not in names and len(names) == 2:
                 return True
@@ -282,10 +292,14 @@ class Driver(Node):
         self._touched = False
         self._started_ns = self.get_clock().now().nanoseconds
         self.create_subscription(TwistStamped, "cmd_vel", self._on_command, 1)
-        self.create_subscription(Bool, "hold", lambda message: self.engine.hold(message.data), 10)
+        self.create_subscription(
+            Bool, "hold", lambda message: self.engine.hold(message.data), 10
+        )
         self._odom = self.create_publisher(Odometry, "odom", 10)
         self._scan = self.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
-        self._imu = self.create_publisher(Imu, "imu", qos_profile_sensor_data) if imu else None
+        self._imu = (
+            self.create_publisher(Imu, "imu", qos_profile_sensor_data) if imu else None
+        )
         self._true_pose = self.create_publisher(PoseStamped, "true_pose", 10)
         self._touch = self.create_publisher(Bool, "touched", 10)
         self.create_timer(0.01, self._run)
@@ -320,7 +334,9 @@ class Driver(Node):
         right = (forward + 0.5 * BELIEVED_TRACK * turn) / WHEEL_RADIUS
         wanted = np.array([left, right, left, right])
         change = WHEEL_ACCELERATION * STEP_S
-        self.engine.wheel_speeds += np.clip(wanted - self.engine.wheel_speeds, -change, change)
+        self.engine.wheel_speeds += np.clip(
+            wanted - self.engine.wheel_speeds, -change, change
+        )
 
     def _odometry_twist(self) -> tuple[float, float]:
         speeds = WHEEL_RADIUS * self.engine.measured_wheel_speeds
@@ -331,7 +347,9 @@ class Driver(Node):
     def _integrate_odometry(self) -> None:
         forward, turn = self._odometry_twist()
         heading = self._odometry[2] + 0.5 * turn * STEP_S
-        step = np.array([math.cos(heading) * forward, math.sin(heading) * forward, turn])
+        step = np.array(
+            [math.cos(heading) * forward, math.sin(heading) * forward, turn]
+        )
         self._odometry += STEP_S * step
 
     def _stamp_ns(self) -> int:
@@ -416,7 +434,10 @@ def main() -> None:
     options = parser.parse_args()
     rclpy.init()
     driver = Driver(
-        Place.read(options.place), np.array(options.pose), options.seed, not options.no_imu
+        Place.read(options.place),
+        np.array(options.pose),
+        options.seed,
+        not options.no_imu,
     )
     try:
         rclpy.spin(driver)

@@ -34,7 +34,9 @@ def lie() -> None:
 
     def lying(self: Middleware, now_ns: int) -> RobotView:
         seen = view(self, now_ns)
-        return replace(seen, pose=np.array([*goals[0], seen.pose[2]])) if goals else seen
+        return (
+            replace(seen, pose=np.array([*goals[0], seen.pose[2]])) if goals else seen
+        )
 
     BridgeEnv.reset, Middleware.view = remembering, lying  # type: ignore[method-assign]
 

@@ -47,7 +47,9 @@ def drive(name: str, policy: str, folder: Path) -> int:
             process.check()
             now = time.time_ns()
             frames, variance = ("odom", "base_link"), (1e-3, 1e-3, 1e-3, 1e-3)
-            odometry.publish(conversions.odometry_to_ros(still, still, now, frames, variance))
+            odometry.publish(
+                conversions.odometry_to_ros(still, still, now, frames, variance)
+            )
             scans.publish(conversions.scan_to_ros(lidar, ranges, now, "laser"))
             executor.spin_once(timeout_sec=0.05)
     node.destroy_node()

@@ -37,22 +37,32 @@ class RealDrive:
 
 
 # The calibrations that were published with the four drives of that robot: from least to greatest.
-WHEELS = {"left_m": (0.1632, 0.1734), "right_m": (0.1624, 0.1732), "base_m": (0.5625, 0.5949)}
+WHEELS = {
+    "left_m": (0.1632, 0.1734),
+    "right_m": (0.1624, 0.1732),
+    "base_m": (0.5625, 0.5949),
+}
 
 
 def camera(number: str) -> RealDrive:
     """Returns a drive of the robot with ticks."""
     source = f"differential_ticks/Camera_Odo_Data_{number}.txt"
     bars = Bars(share=0.05, of_yardstick=None)
-    return RealDrive(source, EXAMPLES / "differential_ticks.yaml", bars, Truth(wheels=WHEELS))
+    return RealDrive(
+        source, EXAMPLES / "differential_ticks.yaml", bars, Truth(wheels=WHEELS)
+    )
 
 
 DRIVES = {
     "xtark_random_drive_45s": RealDrive(
-        "xtark_ackermann/random_drive_45s", SHIPPED / "xtark_folder.yaml", Bars(error_m=0.0215)
+        "xtark_ackermann/random_drive_45s",
+        SHIPPED / "xtark_folder.yaml",
+        Bars(error_m=0.0215),
     ),
     "jetracer_free_driving_104s": RealDrive(
-        "jetracer_dart/free_driving_104s.csv", EXAMPLES / "jetracer_csv.yaml", Bars(0.14, 0.8)
+        "jetracer_dart/free_driving_104s.csv",
+        EXAMPLES / "jetracer_csv.yaml",
+        Bars(0.14, 0.8),
     ),
     "jetracer_random_driving_slow_63s": RealDrive(
         "jetracer_dart/random_driving_slow_63s.bag",

@@ -9,9 +9,16 @@ import sys
 import venv
 from pathlib import Path
 
-CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nics_drl_bridge"
+CACHE = (
+    Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nics_drl_bridge"
+)
 INSTALL_S = 600.0
-OF_OUR_OWN = ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH", "PYTHONHOME")
+OF_OUR_OWN = (
+    "LD_LIBRARY_PATH",
+    "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+    "PYTHONPATH",
+    "PYTHONHOME",
+)
 """Variables that would load our libraries into the other environment."""
 
 
@@ -22,7 +29,12 @@ class NotInstalledError(Exception):
 def clean() -> dict[str, str]:
     """The environment variables for a program of another environment."""
     kept = {name: value for name, value in os.environ.items() if name not in OF_OUR_OWN}
-    return {**kept, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    return {
+        **kept,
+        "MPLBACKEND": "Agg",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
 
 
 def python_with(name: str, requirements: tuple[str, ...]) -> Path:
@@ -45,8 +57,12 @@ def python_with(name: str, requirements: tuple[str, ...]) -> Path:
         venv.create(folder, with_pip=True)
         subprocess.run(
             [*command, *requirements],
-            env=clean(), check=True, capture_output=True, text=True, timeout=INSTALL_S,
-        )  # fmt: skip
+            env=clean(),
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=INSTALL_S,
+        )
     except (OSError, subprocess.SubprocessError) as error:
         shutil.rmtree(folder, ignore_errors=True)
         said = getattr(error, "stderr", None) or str(error)
@@ -61,8 +77,12 @@ def run(python: Path, script: Path, *arguments: str, timeout: float = 600.0) -> 
     try:
         done = subprocess.run(
             [str(python), str(script), *arguments],
-            env=clean(), check=True, capture_output=True, text=True, timeout=timeout,
-        )  # fmt: skip
+            env=clean(),
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+        )
     except (OSError, subprocess.SubprocessError) as error:
         said = getattr(error, "stderr", None) or str(error)
         last = str(said).strip().splitlines()[-1:] or ["no message"]

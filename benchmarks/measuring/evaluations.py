@@ -37,7 +37,8 @@ class Run:
 
 
 def evaluations(
-    runs: Mapping[str, Run], tell: Callable[[str, dict[str, Any]], None] = lambda *_: None
+    runs: Mapping[str, Run],
+    tell: Callable[[str, dict[str, Any]], None] = lambda *_: None,
 ) -> dict[str, dict[str, Any]]:
     """What `evaluation.json` says of each run's policy: place -> figures; `tell` hears it at once.
 
@@ -55,21 +56,38 @@ def evaluations(
 
 def _evaluate(run: Run) -> dict[str, Any]:
     words: Sequence[object] = (
-        "evaluate", run.policy, "--model", run.robot, "--world", run.world, "--episodes",
-        run.episodes, "--seed", run.seed, "--out", run.out,
+        "evaluate",
+        run.policy,
+        "--model",
+        run.robot,
+        "--world",
+        run.world,
+        "--episodes",
+        run.episodes,
+        "--seed",
+        run.seed,
+        "--out",
+        run.out,
         *(word for place in run.places for word in ("--in", place)),
         *(
-            word for name in ("lidar", "randomisation", "gate")
+            word
+            for name in ("lidar", "randomisation", "gate")
             for word in (f"--{name}", getattr(run.conditions, name))
             if getattr(run.conditions, name) is not None
         ),
-    )  # fmt: skip
-    program = (
-        ["measuring.deceived", run.control] if run.control else ["nics_drl_bridge.commands.cli"]
     )
-    paths = os.pathsep.join([str(BENCHMARKS), *filter(None, [os.environ.get("PYTHONPATH")])])
+    program = (
+        ["measuring.deceived", run.control]
+        if run.control
+        else ["nics_drl_bridge.commands.cli"]
+    )
+    paths = os.pathsep.join(
+        [str(BENCHMARKS), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
     # Without a domain, the command takes one that nobody uses when it needs it.
-    kept = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
+    kept = {
+        name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"
+    }
     command = [sys.executable, "-m", *program, *map(str, words)]
     env = kept | {"PYTHONPATH": paths}
     done = subprocess.run(command, env=env, capture_output=True, text=True)

@@ -74,7 +74,9 @@ def _stamp(topic: str, off_s: float, growing: bool = False) -> Injection:
         def change(message: Any) -> Any:
             sent[0] += 1
             off = off_s * (sent[0] if growing else 1)
-            stamp = conversions.stamp_from_ros(message.header.stamp) + round(off * NS_PER_S)
+            stamp = conversions.stamp_from_ros(message.header.stamp) + round(
+                off * NS_PER_S
+            )
             message.header.stamp = conversions.stamp_to_ros(stamp)
             return message
 
@@ -180,13 +182,19 @@ def _freeze_gate(around: Around) -> None:
 FAULTS: dict[str, Fault] = {
     "policy_killed": Fault(LATE_S, _signal(signal.SIGKILL), policy=True),
     "policy_frozen": Fault(LATE_S, _signal(signal.SIGSTOP), policy=True),
-    "policy_hung": Fault(LATE_S, _signal(signal.SIGSTOP, republished=True), policy=True),
+    "policy_hung": Fault(
+        LATE_S, _signal(signal.SIGSTOP, republished=True), policy=True
+    ),
     "scan_silent": Fault(LATE_S, _silence("scan"), "scan"),
     "odom_silent": Fault(LATE_S, _silence("odom"), "odom"),
     "nan_scan": Fault(LATE_S, _nan_scan, "scan"),
     "clock_jump": Fault(LATE_S, (_jump(10), _jump(-10), _jump(1), _jump(-1)), "scan"),
     "e_stop": Fault(
-        SOON_S, (lambda around: around.robot.press(), lambda around: around.robot.call("e_stop"))
+        SOON_S,
+        (
+            lambda around: around.robot.press(),
+            lambda around: around.robot.call("e_stop"),
+        ),
     ),
     "e_stop_silent": Fault(LATE_S, _silence("e_stop"), "e_stop"),
     "all_silent": Fault(LATE_S, _silence(*ALL), "scan"),
@@ -195,15 +203,21 @@ FAULTS: dict[str, Fault] = {
     "command_nan": Fault(LATE_S, _twist(float("nan"), 0.0), "cmd_vel_raw"),
     "command_inf": Fault(LATE_S, _twist(float("inf"), 0.0), "cmd_vel_raw"),
     "command_absurd": Fault(LATE_S, _twist(1e9, 0.0), "cmd_vel_raw"),
-    "command_from_the_future": Fault(LATE_S, _stamp("cmd_vel_raw", 3600.0), "cmd_vel_raw"),
+    "command_from_the_future": Fault(
+        LATE_S, _stamp("cmd_vel_raw", 3600.0), "cmd_vel_raw"
+    ),
     "scan_of_another_lidar": Fault(LATE_S, _few_beams, "scan"),
     "scan_stamps_frozen": Fault(LATE_S, _freeze("scan"), "scan"),
     "scan_from_the_future": Fault(LATE_S, _stamp("scan", 3600.0), "scan"),
     "stamps_run_ahead": Fault(
-        LATE_S, (_stamp("scan", 0.35, growing=True), _stamp("odom", 0.35, growing=True)), "scan"
+        LATE_S,
+        (_stamp("scan", 0.35, growing=True), _stamp("odom", 0.35, growing=True)),
+        "scan",
     ),
     "stamps_creep": Fault(1.20, _stamp("scan", 0.02, growing=True), "scan"),
-    "odom_teleports": Fault(LATE_S, (_teleport(3.0, 0.0), _teleport(0.0, -1.0)), "odom"),
+    "odom_teleports": Fault(
+        LATE_S, (_teleport(3.0, 0.0), _teleport(0.0, -1.0)), "odom"
+    ),
     "scan_frozen": Fault(1.50, _freeze("scan", stamped=True), "scan"),
     "scan_alternates": Fault(1.50, _alternate, "scan"),
     "scan_frozen_but_one_beam": Fault(1.50, _freeze_but_one, "scan"),

@@ -83,21 +83,30 @@ class Robot:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         kinds = {
-            "odom": Odometry, "scan": LaserScan, "e_stop": Bool, "cmd_vel_raw": TwistStamped,
+            "odom": Odometry,
+            "scan": LaserScan,
+            "e_stop": Bool,
+            "cmd_vel_raw": TwistStamped,
             "odometry/filtered": Odometry,
-        }  # fmt: skip
+        }
         self._topics = {
             name: self.node.create_publisher(kind, name, qos.COMMAND)
             for name, kind in kinds.items()
         }
         self.heard: list[tuple[float, np.ndarray]] = []
         self._policy, self._speed, self._relayed = policy, speed, relayed
-        self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND) if relayed else None
+        self._past = (
+            self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+            if relayed
+            else None
+        )
         spawning = multiprocessing.get_context("spawn")
         self._ear, out = spawning.Pipe(duplex=False)
         self._base = spawning.Process(target=hear, args=(domain_id, out), daemon=True)
         self._base.start()
-        self.node.create_subscription(TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND)
+        self.node.create_subscription(
+            TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND
+        )
         self._clients = {
             service: self.node.create_client(Trigger, f"command_gate/{service}")
             for service in ("arm", "reset", "e_stop")
@@ -128,9 +137,15 @@ class Robot:
         self._x += speed * min(self._now_ns - before, NS_PER_S) / NS_PER_S
         stamp = self._now_ns + self.jump_ns
         odometry = conversions.odometry_to_ros(
-            [self._x, 0.0, 0.0], [speed, 0.0, 0.0], stamp, ("odom", "base_link"), (1e-4,) * 4
+            [self._x, 0.0, 0.0],
+            [speed, 0.0, 0.0],
+            stamp,
+            ("odom", "base_link"),
+            (1e-4,) * 4,
         )
-        ranges = np.full(self._lidar.beams, 2.0 + 0.1 * np.sin(self._now_ns * 1e-9), np.float32)
+        ranges = np.full(
+            self._lidar.beams, 2.0 + 0.1 * np.sin(self._now_ns * 1e-9), np.float32
+        )
         self._say("odom", odometry)
         self._say("odometry/filtered", odometry)
         self._say("scan", conversions.scan_to_ros(self._lidar, ranges, stamp, "laser"))
@@ -161,7 +176,9 @@ class Robot:
         """Presses the emergency stop, by its topic."""
         self._topics["e_stop"].publish(Bool(data=True))
 
-    def until(self, condition: Callable[[], object], seconds: float, what: str = "") -> None:
+    def until(
+        self, condition: Callable[[], object], seconds: float, what: str = ""
+    ) -> None:
         """Lives on until something is the case; raises after the time, if it is to be named."""
         end = time.monotonic() + seconds
         self._listen()
@@ -205,7 +222,9 @@ class Robot:
             self.until(lambda: self.moves, min(MOTION_S, patience_s))
         self.until(lambda: False, 0.5 + random.uniform(0.0, PERIOD_S))
         if not self.moves or time.monotonic() - self.heard[-1][0] > RECENT_S:
-            raise NoMotionError("the robot was not being told to move when it was to be broken")
+            raise NoMotionError(
+                "the robot was not being told to move when it was to be broken"
+            )
 
     def _arm(self) -> None:
         self.call("reset")

@@ -20,9 +20,22 @@ def told(*rows: tuple[str, str, str]) -> Table:
     )
 
 
-ROBOTS = {"ackermann": "Ackermann", "differential": "differential", "mecanum": "mecanum"}
+ROBOTS = {
+    "ackermann": "Ackermann",
+    "differential": "differential",
+    "mecanum": "mecanum",
+}
 POLICIES = {**ROBOTS, "jackal": "Jackal"}
-WORLDS = ("empty", "arena", "circles", "doorway", "clutter", "corridor", "crowd", "room")
+WORLDS = (
+    "empty",
+    "arena",
+    "circles",
+    "doorway",
+    "clutter",
+    "corridor",
+    "crowd",
+    "room",
+)
 PERTURBATIONS = ("noise", "drop-out", "latency", "response", "drift", "footprint")
 README = told(
     (
@@ -173,12 +186,19 @@ README = told(
             "; ".join(
                 f"{title} {{training_{robot}{lidar}:success_rate|.1%}} in "
                 f"{{training_{robot}{lidar}:wall_s|.0f}} s"
-                for robot, title in (("differential", "differential"), ("mecanum", "mecanum"),
-                                     ("ackermann", "car"))
-            ) + " with the evaluation",
+                for robot, title in (
+                    ("differential", "differential"),
+                    ("mecanum", "mecanum"),
+                    ("ackermann", "car"),
+                )
+            )
+            + " with the evaluation",
         )
         for lidar, told_of in (
-            ("", "navigation learnt from nothing, 500 unseen episodes, the worst of three seeds"),
+            (
+                "",
+                "navigation learnt from nothing, 500 unseen episodes, the worst of three seeds",
+            ),
             ("_rplidar", "the same with an RPLIDAR A2: 800 beams up to 12 m, noise"),
         )
     ),
@@ -190,7 +210,7 @@ README = told(
         "{seconds.robot|.0f} s, success {success.robot|.1%}; report {seconds.recording|.0f} s; "
         "own task {seconds.task|.0f} s, success {success.task|.1%}",
     ),
-)  # fmt: skip
+)
 SAFETY = told(
     (
         "gate_faults",
@@ -215,135 +235,248 @@ SAFETY = told(
         "{contacts} contacts in {episodes|,} and {path_m x0.001|.1f} km; without the shield "
         "{contacts_without} in {tried_without}",
     ),
-    ("gate_rules", "the gate's rules, each taken out in turn", "a test misses each of {rules}"),
+    (
+        "gate_rules",
+        "the gate's rules, each taken out in turn",
+        "a test misses each of {rules}",
+    ),
 )
 THROUGHPUT = Table(
     ("", "ir-sim 2.12.0", "irsim-x 1.1.4"),
     tuple(
-        ("env_throughput", title, *(f"{{{path.format(name)}}}" for name in ("ir_sim", "irsim_x")))
+        (
+            "env_throughput",
+            title,
+            *(f"{{{path.format(name)}}}" for name in ("ir_sim", "irsim_x")),
+        )
         for title, path in (
-            ("one thread is as fast, at equal work: one scan per control period",
-             "times_as_fast_at_equal_work.{}|,.0f"),
-            ("one thread is as fast, with ten of their own steps per control period",
-             "times_as_fast_with_ten_scans.{}|,.0f"),
+            (
+                "one thread is as fast, at equal work: one scan per control period",
+                "times_as_fast_at_equal_work.{}|,.0f",
+            ),
+            (
+                "one thread is as fast, with ten of their own steps per control period",
+                "times_as_fast_with_ten_scans.{}|,.0f",
+            ),
             ("a scan alone [ms]", "peer_readings.{}.scan_s x1000|.3g"),
-            ("a scan within their step [ms]", "peer_readings.{}.scan_within_step_s x1000|.3g"),
-            ("their step, a motion and a scan [ms]", "peer_readings.{}.step_s x1000|.3g"),
-            ("control period with one scan [ms]",
-             "peer_readings.{}.period_with_one_scan_s x1000|.3g"),
-            ("control period with ten scans [ms]",
-             "peer_readings.{}.period_with_ten_scans_s x1000|.3g"),
+            (
+                "a scan within their step [ms]",
+                "peer_readings.{}.scan_within_step_s x1000|.3g",
+            ),
+            (
+                "their step, a motion and a scan [ms]",
+                "peer_readings.{}.step_s x1000|.3g",
+            ),
+            (
+                "control period with one scan [ms]",
+                "peer_readings.{}.period_with_one_scan_s x1000|.3g",
+            ),
+            (
+                "control period with ten scans [ms]",
+                "peer_readings.{}.period_with_ten_scans_s x1000|.3g",
+            ),
         )
     ),
-)  # fmt: skip
+)
 REAL_LIDARS = Table(
-    ("lidar", "env steps per second, one thread", "of the usual env's",
-     "step time, of a copy without faults"),
+    (
+        "lidar",
+        "env steps per second, one thread",
+        "of the usual env's",
+        "step time, of a copy without faults",
+    ),
     tuple(
-        (f"env_throughput_{run}", title, "{single_thread_env_steps_per_s|.1e}",
-         "{share_of_usual|.0%}", "{times_as_long_as_clean|.2f}")
+        (
+            f"env_throughput_{run}",
+            title,
+            "{single_thread_env_steps_per_s|.1e}",
+            "{share_of_usual|.0%}",
+            "{times_as_long_as_clean|.2f}",
+        )
         for run, title in (
-            ("lidar", "Hokuyo UST-10LX"), ("rplidar", "RPLIDAR A2"), ("sick", "SICK TiM571"),
+            ("lidar", "Hokuyo UST-10LX"),
+            ("rplidar", "RPLIDAR A2"),
+            ("sick", "SICK TiM571"),
         )
     ),
-)  # fmt: skip
+)
 SCALING = Table(
     ("",) * 6,
     tuple(
-        ("env_scaling", title, *(f"{{{key}.{k}{how}}}" if k >= 0 else "" for k in indices))
+        (
+            "env_scaling",
+            title,
+            *(f"{{{key}.{k}{how}}}" if k >= 0 else "" for k in indices),
+        )
         for sizes, name, key, indices in (
             ("worlds", "µs per env step", "worlds_us", (0, 2, 4, 5, 7)),
-            ("robots in each world", "µs per robot and step", "robots_us_per_robot",
-             (0, 2, 4, 5, 6)),
+            (
+                "robots in each world",
+                "µs per robot and step",
+                "robots_us_per_robot",
+                (0, 2, 4, 5, 6),
+            ),
             ("obstacles", "µs per env step", "obstacles_us", (0, 1, 2, 3, 4)),
             ("beams", "µs per env step", "beams_us", (0, 2, 4, 5, 6)),
             ("members of the set", "µs per env step", "members_us", (0, 1, 2, 3, -1)),
         )
         for title, key, how in ((sizes, sizes.split()[0], ""), (name, key, "|.1f"))
     ),
-)  # fmt: skip
+)
 ESTIMATOR = Table(
     ("robot", "odometry, RMSE [m]", "estimate, RMSE [m]", "mean NEES", "95 % band"),
     tuple(
-        ("estimator", title, f"{{{path}raw_rmse_m|.3f}}", f"{{{path}ekf_rmse_m|.3f}}",
-         f"{{{path}nees_mean|.2f}}",
-         f"{{{path}nees_95_band.0|.2f}} to {{{path}nees_95_band.1|.2f}}")
-        for title, path in (*((each, f"robots.{each}.") for each in ROBOTS), ("all", ""))
+        (
+            "estimator",
+            title,
+            f"{{{path}raw_rmse_m|.3f}}",
+            f"{{{path}ekf_rmse_m|.3f}}",
+            f"{{{path}nees_mean|.2f}}",
+            f"{{{path}nees_95_band.0|.2f}} to {{{path}nees_95_band.1|.2f}}",
+        )
+        for title, path in (
+            *((each, f"robots.{each}.") for each in ROBOTS),
+            ("all", ""),
+        )
     ),
-)  # fmt: skip
+)
 TRANSFER = Table(
     ("success [%], collision, believed", "in process", "over DDS", "MuJoCo"),
     tuple(
-        (f"transfer_{robot}", f"{title}, `{world}`", *(
-            f"{{success.{at} x100|.0f}}, {{collision.{at} x100|.0f}}, {{believed.{at} x100|.0f}}"
-            for at in (f"{robot}.{world}.{place}" for place in ("fast", "dds", "mujoco_dds"))
-        ))
+        (
+            f"transfer_{robot}",
+            f"{title}, `{world}`",
+            *(
+                f"{{success.{at} x100|.0f}}, {{collision.{at} x100|.0f}}, {{believed.{at} x100|.0f}}"
+                for at in (
+                    f"{robot}.{world}.{place}"
+                    for place in ("fast", "dds", "mujoco_dds")
+                )
+            ),
+        )
         for robot, title in POLICIES.items()
         for world in WORLDS
     ),
-)  # fmt: skip
+)
 ROBUSTNESS = Table(
-    ("success [%] at 0, 1/2, 1, 2 times the range", "declared range", *POLICIES.values()),
+    (
+        "success [%] at 0, 1/2, 1, 2 times the range",
+        "declared range",
+        *POLICIES.values(),
+    ),
     tuple(
-        ("robustness_differential", each, f"{{declared.differential.{each}}}", *(
-            ", ".join(
-                f"{{robustness_{robot}:success.{robot}.{each}.{k} x100|.0f}}" for k in range(4)
-            )
-            for robot in POLICIES
-        ))
+        (
+            "robustness_differential",
+            each,
+            f"{{declared.differential.{each}}}",
+            *(
+                ", ".join(
+                    f"{{robustness_{robot}:success.{robot}.{each}.{k} x100|.0f}}"
+                    for k in range(4)
+                )
+                for robot in POLICIES
+            ),
+        )
         for each in PERTURBATIONS
     ),
-)  # fmt: skip
+)
 BASELINES = Table(
     ("`circles`, success", "differential", "ackermann", "mecanum"),
     tuple(
-        ("baselines", f"`{policy}`", *(
-            f"{{{at}.success.value|.1%}} ({{{at}.success.low x100|.1f}} to "
-            f"{{{at}.success.high x100|.1f}}), collision {{{at}.collision.value|.1%}}"
-            for at in (f"circles/{robot}/{policy}"
-                       for robot in ("differential", "ackermann", "mecanum"))
-        ))
+        (
+            "baselines",
+            f"`{policy}`",
+            *(
+                f"{{{at}.success.value|.1%}} ({{{at}.success.low x100|.1f}} to "
+                f"{{{at}.success.high x100|.1f}}), collision {{{at}.collision.value|.1%}}"
+                for at in (
+                    f"circles/{robot}/{policy}"
+                    for robot in ("differential", "ackermann", "mecanum")
+                )
+            ),
+        )
         for policy in ("dynamic_window", "mppi", "straight", "random")
     ),
-)  # fmt: skip
+)
 BARN = Table(
     ("in the 250 worlds", "success", "collision", "time-out", "time", "score"),
     tuple(
-        (run, who, *(f"{{{at}{key}|.1%}}" for key in ("success", "collision", "time_out")),
-         f"{{{at}time_s|.1f}} s", f"{{{at}score|.3f}}")
+        (
+            run,
+            who,
+            *(f"{{{at}{key}|.1%}}" for key in ("success", "collision", "time_out")),
+            f"{{{at}time_s|.1f}} s",
+            f"{{{at}score|.3f}}",
+        )
         for run, at, who in (
             ("barn", "", "the Jackal's policy, which was learnt from them"),
             ("barn_five_fold", "", "learnt from four fifths, in the rest"),
-            ("barn_mujoco", "", "the Jackal's policy in MuJoCo over DDS, every tenth world"),
+            (
+                "barn_mujoco",
+                "",
+                "the Jackal's policy in MuJoCo over DDS, every tenth world",
+            ),
             ("barn", "policies.mppi.", "`mppi`"),
             ("barn", "policies.dynamic_window.", "`dynamic_window`"),
             ("barn", "policies.straight.", "`straight`"),
         )
     ),
-)  # fmt: skip
+)
 TRAINING = Table(
-    ("robot", "lidar", "success", "collision", "environment steps", "time", "steps per second"),
+    (
+        "robot",
+        "lidar",
+        "success",
+        "collision",
+        "environment steps",
+        "time",
+        "steps per second",
+    ),
     tuple(
-        (f"training_{robot}{run}", robot, lidar,
-         "{success_rate|.1%} ({success_95ci.0 x100|.1f} to {success_95ci.1 x100|.1f})",
-         "{collision_rate|.1%}", "{env_steps|,}", "{wall_s|.0f} s", "{steps_per_s|,.0f}")
+        (
+            f"training_{robot}{run}",
+            robot,
+            lidar,
+            "{success_rate|.1%} ({success_95ci.0 x100|.1f} to {success_95ci.1 x100|.1f})",
+            "{collision_rate|.1%}",
+            "{env_steps|,}",
+            "{wall_s|.0f} s",
+            "{steps_per_s|,.0f}",
+        )
         for run, lidar in (("", "the paper's"), ("_rplidar", "RPLIDAR A2"))
         for robot in ("differential", "mecanum", "ackermann")
     ),
-)  # fmt: skip
+)
 MUJOCO = Table(
     ("robot", "error / path, mean", "worst unseen drive", "speed-up, batched", "alone"),
     tuple(
-        ("generate_from_mujoco", title, f"{{robots.{robot}.position_error_over_path|.3f}}",
-         f"{{robots.{robot}.worst_drive_error_over_path|.3f}}",
-         f"{{robots.{robot}.speed_up_batched|.1e}}", f"{{robots.{robot}.speed_up_single|.1e}}")
+        (
+            "generate_from_mujoco",
+            title,
+            f"{{robots.{robot}.position_error_over_path|.3f}}",
+            f"{{robots.{robot}.worst_drive_error_over_path|.3f}}",
+            f"{{robots.{robot}.speed_up_batched|.1e}}",
+            f"{{robots.{robot}.speed_up_single|.1e}}",
+        )
         for robot, title in (*ROBOTS.items(), ("jackal", "Jackal, skid-steer"))
     ),
-)  # fmt: skip
-ERRORS = ("{%s.error_m|.3f} m", "{%s.share_of_path|.1%%}", "{%s.yardstick_share|.1%%}",
-          "{%s.constant_twist_share|.1%%}", "{%s.coverage_95|.0%%}")  # fmt: skip
+)
+ERRORS = (
+    "{%s.error_m|.3f} m",
+    "{%s.share_of_path|.1%%}",
+    "{%s.yardstick_share|.1%%}",
+    "{%s.constant_twist_share|.1%%}",
+    "{%s.coverage_95|.0%%}",
+)
 REAL_DRIVES = Table(
-    ("drive", "error", "of the path", "fitted textbook", "constant twist", "95 % band holds"),
+    (
+        "drive",
+        "error",
+        "of the path",
+        "fitted textbook",
+        "constant twist",
+        "95 % band holds",
+    ),
     tuple(
         ("real_drives", title, *(each % place for each in ERRORS))
         for title, place in (
@@ -363,28 +496,43 @@ REAL_DRIVES = Table(
             ("simulated differential, ticks", "own_robots.ticks"),
         )
     ),
-)  # fmt: skip
+)
 PAPER_STEPS = {
     "ackermann": ("3.1e-9", "9.7e-6", "9.9e-5", "", "9.0e4", ""),
     "differential": ("2.6e-7", "5.1e-9", "1.6e-16", "", "5.7e4", ""),
     "mecanum": ("1.2e-17", "9.4e-18", "3.8e-17", "", "4.7e4", ""),
 }
 TABLE1 = Table(
-    ("robot", "", "x [m]", "y [m]", "heading [rad]", "terms", "steps/s, one robot",
-     "steps/s, batched"),
+    (
+        "robot",
+        "",
+        "x [m]",
+        "y [m]",
+        "heading [rad]",
+        "terms",
+        "steps/s, one robot",
+        "steps/s, batched",
+    ),
     tuple(
         row
         for robot, title in ROBOTS.items()
         for row in (
-            ("table1_kinematics", title, "here",
-             *(f"{{robots.{robot}.rmse_{each}|.1e}}" for each in ("x_m", "y_m", "heading_rad")),
-             f"{{robots.{robot}.terms_kept}} of {{robots.{robot}.terms_total}}",
-             f"{{robots.{robot}.steps_per_s_single|.1e}}",
-             f"{{robots.{robot}.steps_per_s_batched|.1e}}"),
+            (
+                "table1_kinematics",
+                title,
+                "here",
+                *(
+                    f"{{robots.{robot}.rmse_{each}|.1e}}"
+                    for each in ("x_m", "y_m", "heading_rad")
+                ),
+                f"{{robots.{robot}.terms_kept}} of {{robots.{robot}.terms_total}}",
+                f"{{robots.{robot}.steps_per_s_single|.1e}}",
+                f"{{robots.{robot}.steps_per_s_batched|.1e}}",
+            ),
             ("table1_kinematics", "", "paper", *PAPER_STEPS[robot]),
         )
     ),
-)  # fmt: skip
+)
 TABLES: Mapping[str, Table] = {
     "figures": README,
     "safety": SAFETY,

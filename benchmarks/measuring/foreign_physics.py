@@ -35,7 +35,9 @@ def _skid_steer(s, u, p, out):  # type: ignore[no-untyped-def]
         y = half_track if side == 0 else -half_track
         for x in (front, -rear):
             load = mass * GRAVITY * 0.5 * (rear if x > 0.0 else front) / (front + rear)
-            fx, fy = _grip(vx - turn * y - s[6 + side], vy + turn * x, friction, load, softness)
+            fx, fy = _grip(
+                vx - turn * y - s[6 + side], vy + turn * x, friction, load, softness
+            )
             force_x, force_y = force_x + fx, force_y + fy
             torque += x * fy - y * fx
     out[3], out[4] = force_x / mass + turn * vy, force_y / mass - turn * vx
@@ -48,11 +50,28 @@ def _skid_steer(s, u, p, out):  # type: ignore[no-untyped-def]
 @kernel
 def _throttle_car(s, u, p, out):  # type: ignore[no-untyped-def]
     """A motor whose pull falls with the speed, a dead zone, drag; a servo, understeer, slip."""
-    dead, pull, top, rolling, drag, wheelbase, greatest, servo, understeer, slip, yaw_lag = p[:11]
+    (
+        dead,
+        pull,
+        top,
+        rolling,
+        drag,
+        wheelbase,
+        greatest,
+        servo,
+        understeer,
+        slip,
+        yaw_lag,
+    ) = p[:11]
     v, angle, turn = s[3], s[4], s[5]
     beyond = max(abs(u[0]) - dead, 0.0) / (1.0 - dead)
     push = math.copysign(beyond, u[0]) * pull
-    out[3] = push - pull * beyond * v / top - rolling * math.tanh(v / 0.002) - drag * v * abs(v)
+    out[3] = (
+        push
+        - pull * beyond * v / top
+        - rolling * math.tanh(v / 0.002)
+        - drag * v * abs(v)
+    )
     out[4] = (greatest * min(max(u[1], -1.0), 1.0) - angle) / servo
     out[5] = (v * math.tan(angle) / (wheelbase + understeer * v * v) - turn) / yaw_lag
     return v, -slip * v * v * turn, turn
@@ -76,7 +95,9 @@ def _omni(s, u, p, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         at = math.pi / 3.0 + i * 2.0 * math.pi / 3.0
         along_x, along_y = -math.sin(at), math.cos(at)
-        out[3 + i] = (along_x * u[0] + along_y * u[1] + arm * u[2] - s[3 + i]) / p[1 + i]
+        out[3 + i] = (along_x * u[0] + along_y * u[1] + arm * u[2] - s[3 + i]) / p[
+            1 + i
+        ]
         speed = p[4 + i] * s[3 + i]
         vx, vy = vx + speed * along_x * 2.0 / 3.0, vy + speed * along_y * 2.0 / 3.0
         turn += speed / (3.0 * arm)
@@ -111,7 +132,12 @@ def _rates(kind, s, u, p, out):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def integrate(states, command, kind, p, dt):  # type: ignore[no-untyped-def]
     """Fills states (T + 1, 8) of which the first is given, under commands (T, C) of `dt` [s]."""
-    k1, k2, k3, k4 = np.zeros(STATES), np.zeros(STATES), np.zeros(STATES), np.zeros(STATES)
+    k1, k2, k3, k4 = (
+        np.zeros(STATES),
+        np.zeros(STATES),
+        np.zeros(STATES),
+        np.zeros(STATES),
+    )
     for t in range(len(command)):
         s, u = states[t], command[t]
         _rates(kind, s, u, p, k1)

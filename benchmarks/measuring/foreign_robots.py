@@ -35,14 +35,20 @@ class ForeignRobot:
 
     physics: int  # its equations of motion, see `foreign_physics`
     values: tuple[float, ...]  # their parameters
-    commands: dict[str, tuple[float, float]]  # least and greatest, by name in the mapping
+    commands: dict[
+        str, tuple[float, float]
+    ]  # least and greatest, by name in the mapping
     robot: dict[str, Any]  # what a user would say of it in a mapping
     latency_s: float = 0.06  # from a command's stamp to its effect
     delays_s: tuple[float, ...] = ()  # of the commands after that; none if empty
-    slew: tuple[float, ...] = ()  # greatest rates of the commands, by the robot's own driver
+    slew: tuple[
+        float, ...
+    ] = ()  # greatest rates of the commands, by the robot's own driver
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)  # pose of the tracked body
     pose_s: float = 0.01  # between poses
-    arm_known: bool = True  # the tracked point's x is defined, as no other point moves alike
+    arm_known: bool = (
+        True  # the tracked point's x is defined, as no other point moves alike
+    )
     dead_zone: float | None = None  # greatest throttle at which it stands
     wheels: dict[str, float] = field(default_factory=dict)  # radii and base [m]
     ticks_per_turn: int = 0  # of encoders that are recorded in place of commands
@@ -54,9 +60,10 @@ class ForeignRobot:
         mounting = {"rotation_rad": -heading, "lever_arm_y_m": y}
         return Truth(
             None if self.ticks_per_turn or self.slew else self.latency_s,
-            mounting | ({"lever_arm_x_m": x} if self.arm_known else {}), self.dead_zone,
+            mounting | ({"lever_arm_x_m": x} if self.arm_known else {}),
+            self.dead_zone,
             {name: (size, size) for name, size in self.wheels.items()},
-        )  # fmt: skip
+        )
 
 
 def throttle_car() -> ForeignRobot:
@@ -64,41 +71,66 @@ def throttle_car() -> ForeignRobot:
     dead, pull, rolling = 0.1, 8.0, 0.25
     values = (dead, pull, 7.0, rolling, 0.12, 0.26, 0.4, 0.06, 0.035, 0.015, 0.03)
     return ForeignRobot(
-        physics.THROTTLE_CAR, values, {"throttle": (-0.2, 0.5), "steering": (-1.0, 1.0)},
-        {"kind": "ackermann_throttle", "footprint_radius": 0.25, "parameters": {"wheelbase": 0.26}},
-        latency_s=0.04, mounting=(0.08, 0.0, 0.1), dead_zone=dead + (1.0 - dead) * rolling / pull,
-    )  # fmt: skip
+        physics.THROTTLE_CAR,
+        values,
+        {"throttle": (-0.2, 0.5), "steering": (-1.0, 1.0)},
+        {
+            "kind": "ackermann_throttle",
+            "footprint_radius": 0.25,
+            "parameters": {"wheelbase": 0.26},
+        },
+        latency_s=0.04,
+        mounting=(0.08, 0.0, 0.1),
+        dead_zone=dead + (1.0 - dead) * rolling / pull,
+    )
 
 
 ROBOTS: dict[str, ForeignRobot] = {
     "skid_steer": ForeignRobot(
-        physics.SKID_STEER, (30.0, 2.2, 0.25, 0.18, 0.24, 0.6, 0.15, 0.08),
+        physics.SKID_STEER,
+        (30.0, 2.2, 0.25, 0.18, 0.24, 0.6, 0.15, 0.08),
         {"forward_command": (-1.0, 1.0), "turn_command": (-1.5, 1.5)},
         {"kind": "skid_steer", "footprint_radius": 0.4, "parameters": {"track": 0.48}},
-        mounting=(0.15, 0.0, 0.3), arm_known=False,
+        mounting=(0.15, 0.0, 0.3),
+        arm_known=False,
     ),
     "throttle_car": throttle_car(),
     "tricycle": ForeignRobot(
-        physics.TRICYCLE, (0.9, 0.15, 180.0, 22.0),
+        physics.TRICYCLE,
+        (0.9, 0.15, 180.0, 22.0),
         {"speed_command": (-0.5, 1.2), "steering_command": (-1.1, 1.1)},
-        {"kind": "tricycle", "footprint_radius": 0.6, "angular_is": "steering",
-         "parameters": {"wheelbase": 0.9}},
-        mounting=(0.25, 0.12, 0.5), latency_s=0.1, delays_s=(0.0, 0.15),
+        {
+            "kind": "tricycle",
+            "footprint_radius": 0.6,
+            "angular_is": "steering",
+            "parameters": {"wheelbase": 0.9},
+        },
+        mounting=(0.25, 0.12, 0.5),
+        latency_s=0.1,
+        delays_s=(0.0, 0.15),
     ),
     "omni": ForeignRobot(
-        physics.OMNI, (0.2, 0.07, 0.08, 0.09, 1.0, 0.99, 1.015),
+        physics.OMNI,
+        (0.2, 0.07, 0.08, 0.09, 1.0, 0.99, 1.015),
         {"vx": (-0.8, 0.8), "vy": (-0.8, 0.8), "wz": (-2.0, 2.0)},
         {"kind": "omnidirectional", "footprint_radius": 0.25},
-        mounting=(0.05, -0.03, -0.2), latency_s=0.05, delays_s=(0.0, 0.0, 0.1), pose_s=0.02,
+        mounting=(0.05, -0.03, -0.2),
+        latency_s=0.05,
+        delays_s=(0.0, 0.0, 0.1),
+        pose_s=0.02,
     ),
     "ticks": ForeignRobot(
-        physics.TICKS, (0.0975, 0.0985, 0.34, 0.1),
+        physics.TICKS,
+        (0.0975, 0.0985, 0.34, 0.1),
         {"left_wheel": (-4.0, 8.0), "right_wheel": (-4.0, 8.0)},
-        {"kind": "differential_wheels", "footprint_radius": 0.25}, latency_s=0.0,
-        mounting=(-0.1, 0.0, 0.0), pose_s=0.02, ticks_per_turn=2048,
+        {"kind": "differential_wheels", "footprint_radius": 0.25},
+        latency_s=0.0,
+        mounting=(-0.1, 0.0, 0.0),
+        pose_s=0.02,
+        ticks_per_turn=2048,
         wheels={"left_m": 0.0975, "right_m": 0.0985, "base_m": 0.34},
     ),
-}  # fmt: skip
+}
 ROBOTS["slewed_tricycle"] = replace(ROBOTS["tricycle"], slew=(0.6, 1.0), delays_s=())
 
 
@@ -123,18 +155,27 @@ class ForeignDrive:
         folder.mkdir(parents=True, exist_ok=True)
         values = self.command.values
         counts = self.robot.ticks_per_turn
-        _write_csv(folder / "poses.csv", ("x", "y", "yaw"), self.pose.t, self.pose.values)
         _write_csv(
-            folder / "commands.csv", tuple(self.robot.commands), self.command.t,
+            folder / "poses.csv", ("x", "y", "yaw"), self.pose.t, self.pose.values
+        )
+        _write_csv(
+            folder / "commands.csv",
+            tuple(self.robot.commands),
+            self.command.t,
             np.mod(values, COUNTER).astype(int) if counts else values,
-        )  # fmt: skip
-        extra = {"unit": "ticks", "ticks_per_turn": counts, "wrap": COUNTER} if counts else {}
+        )
+        extra = (
+            {"unit": "ticks", "ticks_per_turn": counts, "wrap": COUNTER}
+            if counts
+            else {}
+        )
         mapping = {
             "robot": self.robot.robot,
             "time": "stamp",
             "pose": {"in": "poses.csv", "x": "x", "y": "y", "heading": "yaw"},
             "command": {
-                name: {"from": f"commands.csv:{name}", **extra} for name in self.robot.commands
+                name: {"from": f"commands.csv:{name}", **extra}
+                for name in self.robot.commands
             },
         }
         place = folder.parent / f"{folder.name}.yaml"
@@ -142,7 +183,9 @@ class ForeignDrive:
         return place
 
 
-def foreign_drive(robot: ForeignRobot, seed: int, duration_s: float = 90.0) -> ForeignDrive:
+def foreign_drive(
+    robot: ForeignRobot, seed: int, duration_s: float = 90.0
+) -> ForeignDrive:
     """Drives a robot by commands of many levels, holds, ramps and rests."""
     rng = np.random.default_rng(seed)
     fine, stride = round(duration_s / STEP_S), round(robot.pose_s / STEP_S)
@@ -153,7 +196,9 @@ def foreign_drive(robot: ForeignRobot, seed: int, duration_s: float = 90.0) -> F
     sent = np.arange(fine)[:, None] * STEP_S - delays + 1e-9
     acting = np.searchsorted(stamp, sent, "right") - 1
     states = np.zeros((fine + 1, physics.STATES))
-    command = np.where(acting < 0, 0.0, np.take_along_axis(values, np.maximum(acting, 0), axis=0))
+    command = np.where(
+        acting < 0, 0.0, np.take_along_axis(values, np.maximum(acting, 0), axis=0)
+    )
     if robot.slew:
         command = _slewed(command, np.array(robot.slew) * STEP_S)
     parameters = np.append(robot.values, np.zeros(12 - len(robot.values)))
@@ -182,7 +227,9 @@ def _varied(rng: np.random.Generator, t: Array, low: float, high: float) -> Arra
     values, k, before = np.zeros(len(t)), round(1.0 / COMMAND_S), 0.0
     while k < len(t):
         count, draw = round(rng.uniform(*SEGMENT_S) / COMMAND_S), rng.random()
-        level = rng.choice(np.linspace(low, high, LEVELS)) if draw > REST + RAMP else 0.0
+        level = (
+            rng.choice(np.linspace(low, high, LEVELS)) if draw > REST + RAMP else 0.0
+        )
         if REST < draw <= REST + RAMP:
             ramp = np.linspace(before, rng.uniform(low, high), count)
             values[k : k + count] = ramp[: len(t) - k]
@@ -197,4 +244,6 @@ def _write_csv(path: Path, names: tuple[str, ...], t: Array, values: Array) -> N
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(("stamp", *names))
-        rows.writerows((f"{a:.4f}", *row) for a, row in zip(t, values.tolist(), strict=True))
+        rows.writerows(
+            (f"{a:.4f}", *row) for a, row in zip(t, values.tolist(), strict=True)
+        )

@@ -64,9 +64,13 @@ class Ended:
         if self.stops < 2:
             missed.append(f"{END}: {self.stops} stops: nothing was measured")
         if not self.exit_s <= LIMIT_S:
-            missed.append(f"{END}: ended {self.exit_s} s after SIGINT, limit {LIMIT_S} s")
+            missed.append(
+                f"{END}: ended {self.exit_s} s after SIGINT, limit {LIMIT_S} s"
+            )
         if not self.first_kept:
-            missed.append(f"{END}: the first stop is not among the {self.files} files kept")
+            missed.append(
+                f"{END}: the first stop is not among the {self.files} files kept"
+            )
         return missed
 
 

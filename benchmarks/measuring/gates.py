@@ -25,7 +25,10 @@ SETTLE_PERIODS = 12
 def gate_config(robot: RobotSpec, lidar: LidarSpec, **changes: object) -> GateConfig:
     """The gate of a shipped robot, without emergency stop and middleware around it."""
     given = GateConfig(
-        fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
+        fields=tuple(
+            int(i)
+            for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))
+        ),
         limits=load_limits(robot.name, robot),
         beam_angles=lidar.angles,
         mount=lidar.mount,

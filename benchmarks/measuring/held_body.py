@@ -135,7 +135,9 @@ class RuleAlone(Watched):
         elif isinstance(event, Scan):
             motion = scan_motion.watch_scan(self.config, self.state, event)
             self.state = replace(self.state, scan_motion=motion)
-            if (cause := scan_motion.body_held(self.config, self.state, self.now)) is not None:
+            if (
+                cause := scan_motion.body_held(self.config, self.state, self.now)
+            ) is not None:
                 self.state = replace(self.state, latched=cause)
                 self.stopped = RULE
         return np.zeros(3)
@@ -145,16 +147,25 @@ class Drive:
     """Worlds with a robot each, its own odometry, and a gate that watches."""
 
     def __init__(
-        self, case: Case, worlds: int, seed: int, change: Callable[[GateConfig], GateConfig],
+        self,
+        case: Case,
+        worlds: int,
+        seed: int,
+        change: Callable[[GateConfig], GateConfig],
         kind: type[Watched] = Watched,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.case = case
         model = open_model(case.robot, case.lidar or None)
         lidar = model.lidar
         period, every = 0.1, round(10.0 / case.rate)
-        if every < 2 or abs(10.0 / case.rate - every) > 0.05:  # a whole number of the model's steps
+        if (
+            every < 2 or abs(10.0 / case.rate - every) > 0.05
+        ):  # a whole number of the model's steps
             every = 2 if case.rate < 8.0 else 1
-            period = round(1.0 / case.rate / every / model.kinematics.dt) * model.kinematics.dt
+            period = (
+                round(1.0 / case.rate / every / model.kinematics.dt)
+                * model.kinematics.dt
+            )
         faults = lidar.faults.model_copy(update={"dropout": case.dropout})
         lidar = lidar.model_copy(
             update={
@@ -175,11 +186,17 @@ class Drive:
         task: object = "navigation"
         if case.driver != "random":
             self.policy, task = open_policy(case.driver, model)
-        self.env = BridgeVectorEnv(worlds, model, case.world, task, None, EPISODE_STEPS, "SameStep")
+        self.env = BridgeVectorEnv(
+            worlds, model, case.world, task, None, EPISODE_STEPS, "SameStep"
+        )
         config = gate_config(
-            model, load_limits(case.robot, model.robot), None, e_stop_required=False,
-            estimate_required=False, odom_rate=1.0 / period,
-        )  # fmt: skip
+            model,
+            load_limits(case.robot, model.robot),
+            None,
+            e_stop_required=False,
+            estimate_required=False,
+            odom_rate=1.0 / period,
+        )
         told = tuple(case.noise_told * std for std in config.range_noise)
         self.config = change(replace(config, range_noise=told))
         self.gates = [kind(self.config) for _ in range(worlds)]
@@ -213,17 +230,23 @@ class Drive:
         """Steps all worlds and their gates; returns which worlds began another episode."""
         action = self._actions()
         robot, data = self.model.robot, self.env.simulator.data
-        commands = np.asarray(self.env.task.command(action)).reshape(len(self.gates), -1)
+        commands = np.asarray(self.env.task.command(action)).reshape(
+            len(self.gates), -1
+        )
         self.observation, _, ended, cut, _ = self.env.step(action)
         self.steps += 1
         began = ended | cut
         pose = data.pose[:, 0]
         moved = between(self.before, pose)
-        scale = np.array([self.case.path_scale, self.case.path_scale, self.case.turn_scale])
+        scale = np.array(
+            [self.case.path_scale, self.case.path_scale, self.case.turn_scale]
+        )
         for i in range(len(self.gates)):
             if self.held[i]:
                 told = steady_twist(robot, commands[i : i + 1])[0]
-                self.wheel[i] += (told - self.wheel[i]) * min(1.0, self.period / WHEEL_LAG_S)
+                self.wheel[i] += (told - self.wheel[i]) * min(
+                    1.0, self.period / WHEEL_LAG_S
+                )
                 moved[i] = exp(self.wheel[i] * self.period)
             else:
                 self.wheel[i] = moved[i] / self.period
@@ -257,9 +280,12 @@ class Drive:
 
 
 def drive_freely(
-    case: Case, worlds: int, seconds: float, seed: int,
+    case: Case,
+    worlds: int,
+    seconds: float,
+    seed: int,
     change: Callable[[GateConfig], GateConfig] = lambda config: config,
-) -> Tally:  # fmt: skip
+) -> Tally:
     """Drives robots freely, and counts by what their gates were stopped."""
     drive, tally = Drive(case, worlds, seed, change, RuleAlone), Tally()
     for _ in range(round(seconds / drive.period)):
@@ -332,19 +358,27 @@ class Hold:
     def _count(self, stopped: str, tally: Tally) -> None:
         if not self._ordinary:
             return
-        if stopped not in (RULE, ""):  # as of a lidar without noise, whose scans are frozen
+        if stopped not in (
+            RULE,
+            "",
+        ):  # as of a lidar without noise, whose scans are frozen
             tally.other_stops[stopped] += 1
         delay = self._since_s if stopped else math.inf
         tally.delays_s.append(delay)
         if delay > WATCHED_S + 1e-6:
             spun = (self._spun / WATCHED_S).round(2).tolist()
-            tally.missed.append(f"{self._drive.case} at {spun} m/s, rad/s: {delay:.2f} s")
+            tally.missed.append(
+                f"{self._drive.case} at {spun} m/s, rad/s: {delay:.2f} s"
+            )
 
 
 def hold_bodies(
-    case: Case, worlds: int, holds: int, seed: int,
+    case: Case,
+    worlds: int,
+    holds: int,
+    seed: int,
     change: Callable[[GateConfig], GateConfig] = lambda config: config,
-) -> Tally:  # fmt: skip
+) -> Tally:
     """Holds bodies while they drive, and counts how long each was not stopped."""
     drive, tally = Drive(case, worlds, seed, change), Tally()
     bodies = [Hold(drive, index) for index in range(worlds)]

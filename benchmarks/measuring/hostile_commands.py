@@ -22,7 +22,9 @@ Rng = np.random.Generator
 
 def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
     """Without end."""
-    simulator = FastSimulator(builtin_model("differential"), load_world("arena"), worlds=1)
+    simulator = FastSimulator(
+        builtin_model("differential"), load_world("arena"), worlds=1
+    )
     while True:
         draw = rng.random()
         if draw < 0.1:
@@ -38,7 +40,18 @@ def _reset(simulator: FastSimulator, seed: int) -> Callable[[], object]:
 
 
 def _seed(rng: Rng, folder: Path, simulator: FastSimulator) -> Attempt:
-    values = (2**63, 2**64, -1, -(2**63), 10**30, 10**4200, 1.5, "word", 2**63 + 7, 1e308)
+    values = (
+        2**63,
+        2**64,
+        -1,
+        -(2**63),
+        10**30,
+        10**4200,
+        1.5,
+        "word",
+        2**63 + 7,
+        1e308,
+    )
     seed = values[int(rng.integers(len(values)))]
     settings = folder / "settings.yaml"
     settings.write_text(dump_yaml(SHORT_TRAINING), encoding="utf-8")
@@ -48,9 +61,13 @@ def _seed(rng: Rng, folder: Path, simulator: FastSimulator) -> Attempt:
     acts: dict[str, Callable[[], object]] = {
         "reset": lambda: simulator.reset([seed]),
         "scene": lambda: sample_scene(load_world("arena"), 0.2, seed),  # type: ignore[arg-type]
-        "evaluate": nics("evaluate", "straight", *robot, "--in", "fast", f"--seed={seed}", *short),
+        "evaluate": nics(
+            "evaluate", "straight", *robot, "--in", "fast", f"--seed={seed}", *short
+        ),
         "train": nics("train", "--settings", settings, f"--seeds={seed}", "--out", out),
-        "record": nics("record", "--preview", *robot, f"--seed={seed}", "--out", folder / "d.npz"),
+        "record": nics(
+            "record", "--preview", *robot, f"--seed={seed}", "--out", folder / "d.npz"
+        ),
     }
     name = str(rng.choice(list(acts)))
     return Attempt("seed", f"{name} {str(seed)[:30]}", acts[name])
@@ -59,25 +76,46 @@ def _seed(rng: Rng, folder: Path, simulator: FastSimulator) -> Attempt:
 def _path(rng: Rng, folder: Path) -> Attempt:
     """What is no file, in the place of one."""
     commands: tuple[tuple[str, ...], ...] = (
-        ("policy", "info"), ("explain",), ("bag", "info"), ("bake", "--world"),
-        ("bake", "--shapes"), ("bake", "--lidar"), ("bake", "--robot"),
+        ("policy", "info"),
+        ("explain",),
+        ("bag", "info"),
+        ("bake", "--world"),
+        ("bake", "--shapes"),
+        ("bake", "--lidar"),
+        ("bake", "--robot"),
         ("generate", "--out", "model", "--robot"),
-        ("generate", "--robot", "ackermann", "--out", "model"), ("train", "--settings"),
+        ("generate", "--robot", "ackermann", "--out", "model"),
+        ("train", "--settings"),
         ("doctor", "--model", "ackermann"),
-        ("evaluate", "--in", "fast", "--out", "evaluated"), ("urdf",),
+        ("evaluate", "--in", "fast", "--out", "evaluated"),
+        ("urdf",),
         (
-            "evaluate", "straight", "--robot", "ackermann", "--in", "fast", "--out", "evaluated",
+            "evaluate",
+            "straight",
+            "--robot",
+            "ackermann",
+            "--in",
+            "fast",
+            "--out",
+            "evaluated",
             "--world",
         ),
-        ("doctor", "--policy"), ("bag", "replay", "x", "--estimate", "--model"),
-    )  # fmt: skip
-    command = commands[int(rng.integers(len(commands)))]
-    suffix = {"info": ".onnx", "replay": ".jsonl", "model": ".npz"}.get(command[-1], ".yaml")
-    path = folder / f"no_file{suffix}"
-    shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else (
-        path.unlink(missing_ok=True)
+        ("doctor", "--policy"),
+        ("bag", "replay", "x", "--estimate", "--model"),
     )
-    way = str(rng.choice(["pipe", "/dev/zero", "/dev/null", "loop", "folder", "missing", "large"]))
+    command = commands[int(rng.integers(len(commands)))]
+    suffix = {"info": ".onnx", "replay": ".jsonl", "model": ".npz"}.get(
+        command[-1], ".yaml"
+    )
+    path = folder / f"no_file{suffix}"
+    shutil.rmtree(
+        path, ignore_errors=True
+    ) if path.is_dir() and not path.is_symlink() else (path.unlink(missing_ok=True))
+    way = str(
+        rng.choice(
+            ["pipe", "/dev/zero", "/dev/null", "loop", "folder", "missing", "large"]
+        )
+    )
     if way == "pipe":
         os.mkfifo(path)
     elif way.startswith("/dev"):

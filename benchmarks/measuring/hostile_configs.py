@@ -81,9 +81,13 @@ def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
         elif draw < 0.6:
             told, bad = _WORLDS[int(rng.integers(len(_WORLDS)))](rng)
             path.write_text(bad, encoding="utf-8")
-            act = nics("train", "--world", path, "--steps", "1", "--out", folder / "run")
+            act = nics(
+                "train", "--world", path, "--steps", "1", "--out", folder / "run"
+            )
             use = _used(_world, path) if rng.random() < 0.7 else act
-            fits = told != "more than fit" or use is not act  # which nobody finds by baking
+            fits = (
+                told != "more than fit" or use is not act
+            )  # which nobody finds by baking
             yield Attempt("world", told, use, "bad" if fits else "any")
         elif draw < 0.7:
             yield _picture(rng, folder)
@@ -105,11 +109,31 @@ def _text_of(kind: str) -> str:
 def _syntax(rng: Rng, text: str) -> tuple[str, str]:
     """YAML that is never read, put behind a true file."""
     n, times = int(rng.integers(4, 30)), int(rng.integers(2, 12))
-    base, value = "k0: &k0 {x: 1, y: 2}\n", str(rng.choice(["[1]", '"%%"', "abc", "{a: 1}", '""']))
-    merged = "".join(f"k{i}: &k{i} {{<<: [{_again(i, times)}]}}\n" for i in range(1, 3 * n))
+    base, value = (
+        "k0: &k0 {x: 1, y: 2}\n",
+        str(rng.choice(["[1]", '"%%"', "abc", "{a: 1}", '""'])),
+    )
+    merged = "".join(
+        f"k{i}: &k{i} {{<<: [{_again(i, times)}]}}\n" for i in range(1, 3 * n)
+    )
     listed = "".join(f"k{i}: &k{i} [{_again(i, times)}]\n" for i in range(1, 3 * n))
-    tag = rng.choice(["int", "float", "bool", "timestamp", "set", "omap", "pairs", "binary", "map",
-                      "python/object/apply:os.system", "python/tuple", "value", "str"])  # fmt: skip
+    tag = rng.choice(
+        [
+            "int",
+            "float",
+            "bool",
+            "timestamp",
+            "set",
+            "omap",
+            "pairs",
+            "binary",
+            "map",
+            "python/object/apply:os.system",
+            "python/tuple",
+            "value",
+            "str",
+        ]
+    )
     endless = "9" * int(rng.integers(5_000, 300_000))
     choices = {
         "merge keys": base + merged,
@@ -129,9 +153,10 @@ def _syntax(rng: Rng, text: str) -> tuple[str, str]:
         "bytes": "\x00\x01",
     }
     told = str(rng.choice(list(choices)))
-    return f"{told} {n} {times} {tag if 'tag' in told else ''}", text.rstrip() + "\n" + choices[
-        told
-    ]
+    return (
+        f"{told} {n} {times} {tag if 'tag' in told else ''}",
+        text.rstrip() + "\n" + choices[told],
+    )
 
 
 def _again(i: int, times: int) -> str:
@@ -152,28 +177,72 @@ def _big(rng: Rng) -> float:
 
 
 _WORLDS: tuple[Callable[[Rng], tuple[str, str]], ...] = (
-    lambda rng: ("copies", _with(obstacles=_group(count=int(10 ** rng.uniform(5, 18))))),
-    lambda rng: ("copies, a range", _with(
-        obstacles=_group(count=[0, int(10 ** rng.uniform(5, 18))]))),
-    lambda rng: ("many groups", _with(obstacles=_group(count=9000) * int(rng.integers(2, 40)))),
+    lambda rng: (
+        "copies",
+        _with(obstacles=_group(count=int(10 ** rng.uniform(5, 18)))),
+    ),
+    lambda rng: (
+        "copies, a range",
+        _with(obstacles=_group(count=[0, int(10 ** rng.uniform(5, 18))])),
+    ),
+    lambda rng: (
+        "many groups",
+        _with(obstacles=_group(count=9000) * int(rng.integers(2, 40))),
+    ),
     lambda rng: ("a huge field", _with(size=[_big(rng), _big(rng)])),
     lambda rng: ("a long field", _with(size=[_big(rng), 1e-3])),
     lambda rng: ("a tiny field", _with(size=[10.0 ** rng.uniform(-320, -5)] * 2)),
-    lambda rng: ("a huge shape", _with(obstacles=[
-        {"shapes": [{"kind": "circle", "radius": _big(rng)}], "count": 3}])),
-    lambda rng: ("a tiny shape", _with(obstacles=[
-        {"shapes": [{"kind": "rectangle", "size": [10.0 ** rng.uniform(-322, -100)] * 2}],
-         "count": 3}])),
+    lambda rng: (
+        "a huge shape",
+        _with(
+            obstacles=[
+                {"shapes": [{"kind": "circle", "radius": _big(rng)}], "count": 3}
+            ]
+        ),
+    ),
+    lambda rng: (
+        "a tiny shape",
+        _with(
+            obstacles=[
+                {
+                    "shapes": [
+                        {
+                            "kind": "rectangle",
+                            "size": [10.0 ** rng.uniform(-322, -100)] * 2,
+                        }
+                    ],
+                    "count": 3,
+                }
+            ]
+        ),
+    ),
     lambda rng: ("many walls", _with(walls=[[0, 0, 1, k] for k in range(30_000)])),
-    lambda rng: ("a wall to the stars", _with(walls=[[0.0, 0.0, _big(rng), _big(rng)]])),
-    lambda rng: ("a polygon", _with(obstacles=[{"count": 1, "shapes": [{
-        "kind": "polygon", "points": rng.normal(size=(20_000, 2)).round(2).tolist()}]}])),
+    lambda rng: (
+        "a wall to the stars",
+        _with(walls=[[0.0, 0.0, _big(rng), _big(rng)]]),
+    ),
+    lambda rng: (
+        "a polygon",
+        _with(
+            obstacles=[
+                {
+                    "count": 1,
+                    "shapes": [
+                        {
+                            "kind": "polygon",
+                            "points": rng.normal(size=(20_000, 2)).round(2).tolist(),
+                        }
+                    ],
+                }
+            ]
+        ),
+    ),
     lambda rng: ("a gap", _with(obstacles=_group(count=5, gap=_big(rng)))),
     lambda rng: ("a far goal", _with(goal_distance=[1.0, -_big(rng)])),
     lambda rng: ("a clearance", _with(clearance=_big(rng))),
     lambda rng: ("more than fit", _with(obstacles=_group(count=9999, gap=0.5))),
     lambda rng: ("places beyond", _with(starts={"regions": [[_big(rng)] * 4]})),
-)  # fmt: skip
+)
 
 
 def _picture(rng: Rng, folder: Path) -> Attempt:
@@ -181,7 +250,11 @@ def _picture(rng: Rng, folder: Path) -> Attempt:
     image = folder / "image.pgm"
     image.unlink(missing_ok=True)
     big = int(rng.integers(9_000, 2**31))
-    way = str(rng.choice(["a pipe", "/dev/zero", "a loop", "pixels", "a folder", "PNG", "noise"]))
+    way = str(
+        rng.choice(
+            ["a pipe", "/dev/zero", "a loop", "pixels", "a folder", "PNG", "noise"]
+        )
+    )
     if way == "a pipe":
         os.mkfifo(image)
     elif way == "/dev/zero":
@@ -194,7 +267,9 @@ def _picture(rng: Rng, folder: Path) -> Attempt:
         image.write_bytes(b"P5\n%d %d\n255\n" % (big, big) + bytes(1000))
     elif way == "PNG":
         size = big.to_bytes(4, "big") * 2
-        image.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + size + b"\x08\0\0\0\0" + bytes(50))
+        image.write_bytes(
+            b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + size + b"\x08\0\0\0\0" + bytes(50)
+        )
     else:
         image.write_bytes(rng.integers(256, size=5000, dtype=np.uint8).tobytes())
     text = (folder / "room.yaml").read_text(encoding="utf-8")
@@ -204,10 +279,30 @@ def _picture(rng: Rng, folder: Path) -> Attempt:
 
 
 _VALUES: tuple[Any, ...] = (
-    "word", -1, 0, 1e308, 1e-320, 10**18, 2**63, 10**30, -(2**63), float("nan"), float("inf"), None,
-    True, [], {}, [[[1]]], "x" * 5000, [1.0] * 5000, "a\nb\x1b[2J", 1e9, 1e12, 10**9,
+    "word",
+    -1,
+    0,
+    1e308,
+    1e-320,
+    10**18,
+    2**63,
+    10**30,
+    -(2**63),
+    float("nan"),
+    float("inf"),
+    None,
+    True,
+    [],
+    {},
+    [[[1]]],
+    "x" * 5000,
+    [1.0] * 5000,
+    "a\nb\x1b[2J",
+    1e9,
+    1e12,
+    10**9,
     {"a": {"b": 1}},
-)  # fmt: skip
+)
 
 
 def _replaced(rng: Rng, text: str) -> tuple[str, str]:
@@ -220,7 +315,11 @@ def _replaced(rng: Rng, text: str) -> tuple[str, str]:
             keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
             key = keys[int(rng.integers(len(keys)))]
             place.append(str(key))
-            if not isinstance(inner[key], dict | list) or not inner[key] or rng.random() < 0.2:
+            if (
+                not isinstance(inner[key], dict | list)
+                or not inner[key]
+                or rng.random() < 0.2
+            ):
                 break
             inner = inner[key]
         which = int(rng.integers(len(_VALUES)))

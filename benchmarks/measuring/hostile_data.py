@@ -72,18 +72,24 @@ def _whole(folder: Path) -> Whole:
     save_model(builtin_model(ROBOT), folder / "whole_model")
     (folder / "bags").mkdir()
     bags = tuple(sample.path for sample in samples(folder / "bags"))
-    return Whole(folder / "whole.npz", folder / "whole.jsonl", folder / "whole_model", bags)
+    return Whole(
+        folder / "whole.npz", folder / "whole.jsonl", folder / "whole_model", bags
+    )
 
 
 def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
     """Without end."""
     whole = _whole(folder)
     makers: tuple[Callable[[], Attempt], ...] = (
-        lambda: _recording(rng, folder, whole), lambda: _csv(rng, folder),
-        lambda: _bag(rng, folder, whole), lambda: _bag(rng, folder, whole),
-        lambda: _box(rng, folder, whole), lambda: _model(rng, folder, whole),
-        lambda: _checkpoint(rng, folder), lambda: _good(rng, whole),
-    )  # fmt: skip
+        lambda: _recording(rng, folder, whole),
+        lambda: _csv(rng, folder),
+        lambda: _bag(rng, folder, whole),
+        lambda: _bag(rng, folder, whole),
+        lambda: _box(rng, folder, whole),
+        lambda: _model(rng, folder, whole),
+        lambda: _checkpoint(rng, folder),
+        lambda: _good(rng, whole),
+    )
     while True:
         yield makers[int(rng.integers(len(makers)))]()
 
@@ -122,14 +128,19 @@ def _recording(rng: Rng, folder: Path, whole: Whole) -> Attempt:
         arrays = dict(held)
     way, rows = int(rng.integers(8)), int(10 ** rng.uniform(8, 18))
     name = str(rng.choice([key for key in arrays if key != "meta"]))
-    parts = {key: _npy(repr(a.dtype.str), str(a.shape), a.tobytes()) for key, a in arrays.items()}
+    parts = {
+        key: _npy(repr(a.dtype.str), str(a.shape), a.tobytes())
+        for key, a in arrays.items()
+    }
     path, told, verdict = folder / "drive.npz", f"way {way}, {name}, {rows}", "bad"
     if way == 0:
         parts[name] = _npy("'<f8'", f"({rows},)", b"")
     elif way == 1:
         parts[name] = _npy("'|O'", "(3,)", b"cos\nsystem\n(S'true'\ntR.")
     elif way == 2:
-        parts[name] = _npy("'<f8'", f"({120_000_000 + rows % 99},)", bytes(8 * 120_000_000))
+        parts[name] = _npy(
+            "'<f8'", f"({120_000_000 + rows % 99},)", bytes(8 * 120_000_000)
+        )
     elif way == 3:
         parts[name] = _npy("'<f8'", "(" + "(" * 3000 + ")" * 3000 + ",)", b"")
     elif way == 4:
@@ -199,8 +210,20 @@ def _bag(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     about = data["rosbag2_bagfile_information"]
     topics = about["topics_with_message_count"]
     k = int(rng.integers(len(topics)))
-    ways = ("no name", "other name", "no topic", "more", "fewer, elsewhere", "empty name", "type",
-            "twice", "bomb", "tag", "files", "all to one")  # fmt: skip
+    ways = (
+        "no name",
+        "other name",
+        "no topic",
+        "more",
+        "fewer, elsewhere",
+        "empty name",
+        "type",
+        "twice",
+        "bomb",
+        "tag",
+        "files",
+        "all to one",
+    )
     way = str(rng.choice(ways))
     one, text = topics[k], ""
     if way == "no name":
@@ -224,7 +247,8 @@ def _bag(rng: Rng, folder: Path, whole: Whole) -> Attempt:
         about["relative_file_paths"] = ["../../../../dev/zero"]
     elif way == "bomb":
         text = "k0: &k0 {x: 1}\n" + "".join(
-            f"k{i}: &k{i} {{<<: [{', '.join([f'*k{i - 1}'] * 9)}]}}\n" for i in range(1, 30)
+            f"k{i}: &k{i} {{<<: [{', '.join([f'*k{i - 1}'] * 9)}]}}\n"
+            for i in range(1, 30)
         )
     else:
         text = "tagged: !!python/object/apply:os.system ['true']\n"
@@ -246,7 +270,9 @@ def _box(rng: Rng, folder: Path, whole: Whole) -> Attempt:
         record["now"] = [None, "x", 1e308, [], -1e308][int(rng.integers(5))]
     elif way == 3:
         key = str(rng.choice(list(lines[0]["config"])))
-        lines[0]["config"][key] = [None, 1e308, "x" * 5000, [], size][int(rng.integers(5))]
+        lines[0]["config"][key] = [None, 1e308, "x" * 5000, [], size][
+            int(rng.integers(5))
+        ]
     elif way == 4:
         record["given"] = _nested(int(rng.integers(1200, 20_000)))
     else:
@@ -255,7 +281,9 @@ def _box(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     path = folder / "stop.jsonl"
     path.write_text(text + json.dumps({"sha256": sha256(text.encode())}) + "\n")
     verdict = "any" if way in (2, 3, 5) else "bad"
-    act = nics("explain", path) if rng.random() < 0.3 else lambda: black_box.replay(path)
+    act = (
+        nics("explain", path) if rng.random() < 0.3 else lambda: black_box.replay(path)
+    )
     return Attempt("black box", f"way {way}, {size}", act, verdict)
 
 
@@ -266,7 +294,10 @@ def _nested(depth: int) -> str:
 def _line(record: Any) -> str:
     given = record.get("given")
     if isinstance(given, str):  # brackets, too deep for the writer
-        return json.dumps(record | {"given": 0}).replace('"given": 0', f'"given": {given}') + "\n"
+        return (
+            json.dumps(record | {"given": 0}).replace('"given": 0', f'"given": {given}')
+            + "\n"
+        )
     return json.dumps(record) + "\n"
 
 
@@ -295,20 +326,30 @@ def _model(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     which = int(rng.integers(len(values)))
     inner[key] = values[which]
     (place / MODEL_FILE).write_text(dump_yaml(data), encoding="utf-8")
-    return Attempt("model", f"{'.'.join(told)} is {which}", lambda: load_model(place), "any")
+    return Attempt(
+        "model", f"{'.'.join(told)} is {which}", lambda: load_model(place), "any"
+    )
 
 
 def _table(rng: Rng, place: Path) -> Attempt:
     """A table with one array of a false header, whose checksums are right."""
-    name, way, size = str(rng.choice(ARRAYS)), int(rng.integers(5)), int(10 ** rng.uniform(8, 30))
+    name, way, size = (
+        str(rng.choice(ARRAYS)),
+        int(rng.integers(5)),
+        int(10 ** rng.uniform(8, 30)),
+    )
     ways = (
-        _npy("'<f4'", f"({size},)", b""), _npy("'<f4'", f"({2**32}, {2**32})", b""),
-        _npy("'|O'", "(3,)", b"cos\nsystem\n(S'true'\ntR."), _npy("'<f4'", "(" * 3000, b""),
+        _npy("'<f4'", f"({size},)", b""),
+        _npy("'<f4'", f"({2**32}, {2**32})", b""),
+        _npy("'|O'", "(3,)", b"cos\nsystem\n(S'true'\ntR."),
+        _npy("'<f4'", "(" * 3000, b""),
         _zip({"rows": bytes(size % 10**7)}),
-    )  # fmt: skip
+    )
     (place / f"{name}.npy").write_bytes(ways[way])
     write_sums(place)
-    return Attempt("model", f"table, way {way}, {name}, {size}", lambda: LidarTable.load(place))
+    return Attempt(
+        "model", f"table, way {way}, {name}, {size}", lambda: LidarTable.load(place)
+    )
 
 
 def _checkpoint(rng: Rng, folder: Path) -> Attempt:

@@ -28,7 +28,10 @@ def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
         name = names[int(rng.integers(len(names)))]
         if rng.random() < 0.08:
             yield Attempt(
-                "policy", f"{name} as shipped", _loaded(shipped() / f"{name}.onnx"), "good"
+                "policy",
+                f"{name} as shipped",
+                _loaded(shipped() / f"{name}.onnx"),
+                "good",
             )
             continue
         told, data, verdict = makers[int(rng.integers(len(makers)))](rng, name)
@@ -67,7 +70,9 @@ def _grown(rng: Rng, name: str) -> tuple[str, bytes, str]:
     kind = str(rng.choice(list(_GROWN)))
     amount = int(rng.integers(1, 9))
     nodes, arrays = _GROWN[kind](amount, width)
-    proto.graph.initializer.extend(from_array(value, f"x_{key}") for key, value in arrays.items())
+    proto.graph.initializer.extend(
+        from_array(value, f"x_{key}") for key, value in arrays.items()
+    )
     own = list(proto.graph.node)
     del proto.graph.node[:]
     proto.graph.node.extend([*nodes, *own])
@@ -102,7 +107,10 @@ def _gather(amount: int, width: int) -> Grown:
 
 def _wide(amount: int, width: int) -> Grown:
     thin = np.zeros((8000 * amount, 1), np.float32)
-    return [node("Mul", ["x_thin", "x_turned"], ["x_0"])], {"thin": thin, "turned": thin.T}
+    return [node("Mul", ["x_thin", "x_turned"], ["x_0"])], {
+        "thin": thin,
+        "turned": thin.T,
+    }
 
 
 def _products(amount: int, width: int) -> Grown:
@@ -141,27 +149,58 @@ def _kernel(amount: int, width: int) -> Grown:
 def _by_value(amount: int, width: int) -> Grown:
     cast = node("Cast", ["observation"], ["x_i"], to=onnx.TensorProto.INT64)
     flat = node("Reshape", ["x_i", "x_flat"], ["x_j"])
-    return [cast, flat, node("Reshape", ["observation", "x_j"], ["x_0"])], {"flat": np.array([-1])}
+    return [cast, flat, node("Reshape", ["observation", "x_j"], ["x_0"])], {
+        "flat": np.array([-1])
+    }
 
 
 _GROWN: dict[str, Callable[[int, int], Grown]] = {
-    "Concat": _concat, "Concat of rows": _concat_of_rows, "operators": _many, "Gather": _gather,
-    "a wide product": _wide, "products": _products, "a square": _outer, "mismatch": _mismatch,
-    "kernel": _kernel, "by value": _by_value, "ConstantOfShape": _operator("ConstantOfShape"),
+    "Concat": _concat,
+    "Concat of rows": _concat_of_rows,
+    "operators": _many,
+    "Gather": _gather,
+    "a wide product": _wide,
+    "products": _products,
+    "a square": _outer,
+    "mismatch": _mismatch,
+    "kernel": _kernel,
+    "by value": _by_value,
+    "ConstantOfShape": _operator("ConstantOfShape"),
     "RandomNormal": _operator("RandomNormal", shape=[10**5, 10**5]),
-    "Loop": _operator("Loop"), "Expand": _operator("Expand"), "Range": _operator("Range"),
-}  # fmt: skip
+    "Loop": _operator("Loop"),
+    "Expand": _operator("Expand"),
+    "Range": _operator("Range"),
+}
 _VALUES: tuple[Any, ...] = (
-    "x" * 3_000_000, -1, 0, 1e308, 10**400, [], {}, None, True, [[[]]], "\n" * 50, "\x1b[2J", 2**63,
-    [0.0] * 30_000, {"a" * 1000: 1}, 1e-320, float(2**70), "../../etc/passwd", ["x"] * 20_000,
-)  # fmt: skip
+    "x" * 3_000_000,
+    -1,
+    0,
+    1e308,
+    10**400,
+    [],
+    {},
+    None,
+    True,
+    [[[]]],
+    "\n" * 50,
+    "\x1b[2J",
+    2**63,
+    [0.0] * 30_000,
+    {"a" * 1000: 1},
+    1e-320,
+    float(2**70),
+    "../../etc/passwd",
+    ["x"] * 20_000,
+)
 
 
 def _false(rng: Rng, name: str) -> tuple[str, bytes, str]:
     """A contract with something else in the place of an entry, or with one more."""
     proto = _proto(name)
     data = json.loads(onnx_graph.metadata(proto, "file"))
-    places = [path for path, _ in contract.leaves(data) if not path.startswith("checksums")]
+    places = [
+        path for path, _ in contract.leaves(data) if not path.startswith("checksums")
+    ]
     place = str(rng.choice(places)).split(".")
     inner: Any = data
     depth = int(rng.integers(len(place)))
@@ -205,10 +244,15 @@ def _raw(rng: Rng, name: str) -> tuple[str, bytes, str]:
             nested = _field(1, _field(5, _field(6, nested)))
         return f"{300 * amount} graphs in graphs", _field(7, nested), "bad"
     text = (
-        "[" * (500_000 * amount), '{"a":' * (300_000 * amount),
+        "[" * (500_000 * amount),
+        '{"a":' * (300_000 * amount),
         '"' + "z" * (4_000_000 * amount) + '"',
-    )[which - 5]  # fmt: skip
-    return f"contract {text[:5]} of {len(text)}", _with_contract(_proto(name), text), "bad"
+    )[which - 5]
+    return (
+        f"contract {text[:5]} of {len(text)}",
+        _with_contract(_proto(name), text),
+        "bad",
+    )
 
 
 def _mutated(rng: Rng, name: str) -> tuple[str, bytes, str]:
@@ -219,7 +263,9 @@ def _mutated(rng: Rng, name: str) -> tuple[str, bytes, str]:
         data = data[: int(rng.integers(len(data)))]
     elif way == 1:
         place = int(rng.integers(len(data)))
-        data[place:place] = bytes(rng.integers(256, size=int(rng.integers(1, 60)), dtype=np.uint8))
+        data[place:place] = bytes(
+            rng.integers(256, size=int(rng.integers(1, 60)), dtype=np.uint8)
+        )
     else:
         for place in rng.integers(len(data), size=int(rng.integers(1, 9))):
             data[place] ^= 1 << int(rng.integers(8))

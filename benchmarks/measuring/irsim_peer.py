@@ -47,7 +47,10 @@ def content_of(scene: dict, about: dict) -> dict:
     ]
     x, y = about["half"]
     corners = [[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]]
-    room = {"shape": {"name": "linestring", "vertices": corners}, "state": [0.0, 0.0, 0.0]}
+    room = {
+        "shape": {"name": "linestring", "vertices": corners},
+        "state": [0.0, 0.0, 0.0],
+    }
     obstacles.append(room)
     side = 4.0 * about["range_max"]
     field = {
@@ -125,7 +128,9 @@ class Simulator:
 class Task:
     """Control periods of the task by random commands, one episode after the other."""
 
-    def __init__(self, simulator: Simulator, scenes: list, about: dict, one_scan: bool) -> None:
+    def __init__(
+        self, simulator: Simulator, scenes: list, about: dict, one_scan: bool
+    ) -> None:
         self.simulator, self.scenes, self.about = simulator, scenes, about
         self.one_scan, self.rng = one_scan, np.random.default_rng(0)
         self.at, self.periods, self.ended, self.moved, self.changed = -1, 0, 0, 0.0, 0
@@ -205,7 +210,9 @@ class Readings:
         self.alone = getattr(self.simulator, given["alone"])
         self.rng = np.random.default_rng(1)
         self.tasks = {
-            name: Task(Simulator(self.scenes[0], about), self.scenes, about, "one" in name)
+            name: Task(
+                Simulator(self.scenes[0], about), self.scenes, about, "one" in name
+            )
             for name in CHUNKS
         }
 
@@ -215,24 +222,34 @@ class Readings:
         for scene in self.scenes:
             self.simulator.begin(scene)
             self.alone()
-            found.append([float(value) for value in self.simulator.env.robot.lidar.range_data])
+            found.append(
+                [float(value) for value in self.simulator.env.robot.lidar.range_data]
+            )
         return found
 
     def steps(self) -> dict[str, list[float]]:
         """A scan, and a step with and without it, in turn and at the same places [s]."""
-        times: dict[str, list[float]] = {"scan": [], "step": [], "step_without_scan": []}
+        times: dict[str, list[float]] = {
+            "scan": [],
+            "step": [],
+            "step_without_scan": [],
+        }
         until = time.perf_counter() + STEPS_S
         while time.perf_counter() < until:
             self.simulator.begin(self.scenes[self.at % len(self.scenes)])
             self.at += 1
             for k in range(1 + STEP_SAMPLES):
-                action = np.array([[self.rng.uniform(0.0, 1.0)], [self.rng.uniform(-2.0, 2.0)]])
+                action = np.array(
+                    [[self.rng.uniform(0.0, 1.0)], [self.rng.uniform(-2.0, 2.0)]]
+                )
                 calls = {
                     "scan": (self.alone,),
                     "step": (self.simulator.step, action),
                     "step_without_scan": (self.simulator.step_without_scan, action),
                 }
-                for name in self.rng.permutation(list(calls)):  # each after each of the others
+                for name in self.rng.permutation(
+                    list(calls)
+                ):  # each after each of the others
                     seconds = timed(*calls[name])
                     times[name] += [seconds] if k else []  # the first fills caches
         return times

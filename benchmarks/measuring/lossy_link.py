@@ -42,7 +42,16 @@ class Link:
         """Loses so many of a hundred packets from now on, in both directions."""
         for end, device in zip(self.ends, self.devices, strict=True):
             rules = RULES.format(device=device, percent=percent) if percent else ""
-            _run("ip", "netns", "exec", end, "nft", "-f", "-", text=f"flush ruleset\n{rules}")
+            _run(
+                "ip",
+                "netns",
+                "exec",
+                end,
+                "nft",
+                "-f",
+                "-",
+                text=f"flush ruleset\n{rules}",
+            )
 
     def command(self, end: int, words: list[str]) -> list[str]:
         """A command line that runs in one of the namespaces."""
@@ -67,10 +76,24 @@ def link() -> Iterator[Link]:
     try:
         for end in ends:
             _run("ip", "netns", "add", end)
-        _run("ip", "-n", ends[0], "link", "add", "robot", "type", "veth", "peer", "stack", "netns",
-             ends[1])  # fmt: skip
+        _run(
+            "ip",
+            "-n",
+            ends[0],
+            "link",
+            "add",
+            "robot",
+            "type",
+            "veth",
+            "peer",
+            "stack",
+            "netns",
+            ends[1],
+        )
         for number, (end, device) in enumerate(zip(ends, made.devices, strict=True), 1):
-            _run("ip", "-n", end, "address", "add", f"10.77.0.{number}/24", "dev", device)
+            _run(
+                "ip", "-n", end, "address", "add", f"10.77.0.{number}/24", "dev", device
+            )
             for name in ("lo", device):
                 _run("ip", "-n", end, "link", "set", name, "up")
         for end, device in zip(ends, made.devices, strict=True):
@@ -78,7 +101,9 @@ def link() -> Iterator[Link]:
         yield made
     finally:
         for end in ends:
-            subprocess.run(["ip", "netns", "delete", end], check=False, capture_output=True)
+            subprocess.run(
+                ["ip", "netns", "delete", end], check=False, capture_output=True
+            )
 
 
 def _await_carrier(end: str, device: str) -> None:
@@ -91,7 +116,9 @@ def _await_carrier(end: str, device: str) -> None:
 
 
 def _run(*words: str, text: str = "") -> str:
-    done = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, input=text, capture_output=True, text=True, check=False
+    )
     if done.returncode != 0:
         raise NoNamespacesError(f"{' '.join(words)}: {done.stderr.strip()}")
     return done.stdout

@@ -10,9 +10,17 @@ from pathlib import Path
 from typing import Any
 
 LIBRARIES = (
-    "numpy", "numba", "scipy", "gymnasium", "torch", "stable_baselines3", "onnxruntime", "mujoco",
-    "ros-humble-rclpy", "ros-jazzy-rclpy",
-)  # fmt: skip
+    "numpy",
+    "numba",
+    "scipy",
+    "gymnasium",
+    "torch",
+    "stable_baselines3",
+    "onnxruntime",
+    "mujoco",
+    "ros-humble-rclpy",
+    "ros-jazzy-rclpy",
+)
 
 
 def field(file: str, key: str) -> str:
@@ -29,7 +37,9 @@ def describe() -> dict[str, Any]:
     """The machine, and the versions of what is measured with."""
     memory = field("/proc/meminfo", "MemTotal").split()
     return {
-        "cpu": field("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
+        "cpu": field("/proc/cpuinfo", "model name")
+        or platform.processor()
+        or platform.machine(),
         "architecture": platform.machine(),
         "cores": os.cpu_count(),
         "memory_gb": round(int(memory[0]) / 1e6, 1) if memory else None,
@@ -57,15 +67,25 @@ def commit_of(folder: Path) -> dict[str, Any]:
     told = said(folder, "rev-parse", "HEAD")
     if told is None:
         return {"commit": None, "dirty": None}
-    changes = said(folder, "status", "--porcelain", "--untracked-files=no", "--", ".",
-                   ":(exclude)benchmarks/results.json", ":(exclude)*.md")  # fmt: skip
+    changes = said(
+        folder,
+        "status",
+        "--porcelain",
+        "--untracked-files=no",
+        "--",
+        ".",
+        ":(exclude)benchmarks/results.json",
+        ":(exclude)*.md",
+    )
     return {"commit": told[:12], "dirty": bool(changes)}
 
 
 def said(folder: Path, *words: str) -> str | None:
     """What git answers, `None` where it can't."""
     try:
-        done = subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True)
+        done = subprocess.run(
+            ["git", "-C", str(folder), *words], capture_output=True, text=True
+        )
     except OSError:
         return None
     return done.stdout.strip() if done.returncode == 0 else None

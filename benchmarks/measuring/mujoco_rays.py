@@ -24,7 +24,10 @@ def geoms(shape: Shape, pose: Array, number: int) -> tuple[str, str]:
         return "", f'<geom type="cylinder" size="{shape.radius} {HEIGHT / 2}" {at}/>'
     if isinstance(shape, Rectangle):
         length, width = shape.size
-        return "", f'<geom type="box" size="{length / 2} {width / 2} {HEIGHT / 2}" {at}/>'
+        return (
+            "",
+            f'<geom type="box" size="{length / 2} {width / 2} {HEIGHT / 2}" {at}/>',
+        )
     if isinstance(shape, Polygon):
         mesh = f'<mesh name="polygon{number}" {prism(shape)}/>'
         return mesh, f'<geom type="mesh" mesh="polygon{number}" {at}/>'
@@ -65,7 +68,8 @@ def scan(
     """
     mujoco = load_mujoco()
     placed = [
-        geoms(shape, pose, k) for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True))
+        geoms(shape, pose, k)
+        for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True))
     ]
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><compiler angle="radian"/><asset>'

@@ -9,14 +9,31 @@ from typing import Any
 import yaml
 from rclpy.duration import Infinite
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    qos_check_compatible,
+)
 
 # What nodes of Nav2 say to each other, and the frame of a lidar that its own simulator plays.
 OWN = {
-    "cmd_vel_smoothed", "cmd_vel_raw", "cmd_vel_nav", "cmd_vel_teleop", "collision_monitor_state",
-    "base_scan", "speed_filter_mask", "keepout_filter_mask",
-}  # fmt: skip
-OWN_ENDS = ("costmap_raw", "published_footprint", "filter_info", "/voxel_grid", "costmap_updates")
+    "cmd_vel_smoothed",
+    "cmd_vel_raw",
+    "cmd_vel_nav",
+    "cmd_vel_teleop",
+    "collision_monitor_state",
+    "base_scan",
+    "speed_filter_mask",
+    "keepout_filter_mask",
+}
+OWN_ENDS = (
+    "costmap_raw",
+    "published_footprint",
+    "filter_info",
+    "/voxel_grid",
+    "costmap_updates",
+)
 FRAME_KEYS = ("frame", "frame_id")
 TYPES = {
     "scan": "sensor_msgs/msg/LaserScan",
@@ -51,7 +68,12 @@ def wanted(file: Path) -> tuple[set[str], set[str]]:
     topics, frames = set(ALWAYS), set[str]()
     for key, value in named:
         name = value.strip("/")
-        if not name or name in OWN or name.endswith(OWN_ENDS) or key == "polygon_pub_topic":
+        if (
+            not name
+            or name in OWN
+            or name.endswith(OWN_ENDS)
+            or key == "polygon_pub_topic"
+        ):
             continue
         if key.endswith(FRAME_KEYS):
             frames.add(name)
@@ -60,7 +82,12 @@ def wanted(file: Path) -> tuple[set[str], set[str]]:
     return topics, frames
 
 
-HEARD = ("cmd_vel", "initialpose", "goal_pose", "speed_limit")  # the others are published
+HEARD = (
+    "cmd_vel",
+    "initialpose",
+    "goal_pose",
+    "speed_limit",
+)  # the others are published
 # The other end, as Nav2 opens it: reliable, and for some with what was sent before.
 ENDLESS = {"depth": 1, "deadline": Infinite, "liveliness_lease_duration": Infinite}
 USUAL = QoSProfile(**ENDLESS)

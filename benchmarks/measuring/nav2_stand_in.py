@@ -22,14 +22,18 @@ from nics_drl_bridge.policy.route import route
 
 Array = NDArray[np.float64]
 DEADLINE_S = 300.0
-STUCK_S = 2.0  # silence after which the simulator, which waits for commands, is told a zero
+STUCK_S = (
+    2.0  # silence after which the simulator, which waits for commands, is told a zero
+)
 REPLAN = 40  # feedbacks after which the path is planned anew
 
 
 class StandIn:
     """Speaks to a simulator in lock-step and to a policy; relays the commands of the latter."""
 
-    def __init__(self, domain_id: int, kind: Any, controller: str = "FollowPath") -> None:
+    def __init__(
+        self, domain_id: int, kind: Any, controller: str = "FollowPath"
+    ) -> None:
         self.context = open_context(domain_id=domain_id)
         self.node = node = Node("behaviour_tree", context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
@@ -37,12 +41,16 @@ class StandIn:
         self.kind, self.client = kind, ActionClient(node, kind, "follow_path")
         self.maps, self.truths, self.feedback = list[Any](), list[Any](), list[Any]()
         self._commands = node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self.poses = node.create_publisher(PoseWithCovarianceStamped, "initialpose", qos.COMMAND)
+        self.poses = node.create_publisher(
+            PoseWithCovarianceStamped, "initialpose", qos.COMMAND
+        )
         self._moved_s = time.monotonic()
         self._controller = controller
         node.create_subscription(TwistStamped, "cmd_vel_raw", self._relay, qos.COMMAND)
         node.create_subscription(OccupancyGrid, "map", self.maps.append, qos.LATCHED)
-        node.create_subscription(Odometry, "ground_truth", self.truths.append, qos.SENSOR)
+        node.create_subscription(
+            Odometry, "ground_truth", self.truths.append, qos.SENSOR
+        )
 
     def _relay(self, message: TwistStamped) -> None:
         self._moved_s = time.monotonic()
@@ -84,7 +92,10 @@ class StandIn:
 
     def place(self, pose: Array) -> None:
         """Says where the robot is to simulator and policy."""
-        message, placed = PoseWithCovarianceStamped(), conversions.pose_to_ros(pose, 0, "map")
+        message, placed = (
+            PoseWithCovarianceStamped(),
+            conversions.pose_to_ros(pose, 0, "map"),
+        )
         message.header, message.pose.pose = placed.header, placed.pose
         self.poses.publish(message)
 
@@ -99,7 +110,9 @@ class StandIn:
         for field, name in names.items():
             if hasattr(goal, field):
                 setattr(goal, field, name)
-        future = self.client.send_goal_async(goal, feedback_callback=self.feedback.append)
+        future = self.client.send_goal_async(
+            goal, feedback_callback=self.feedback.append
+        )
         self.until(future.done, "an answer to a goal", kick=True)
         return future.result()
 
@@ -112,12 +125,15 @@ class StandIn:
                 lambda result=result, known=known: (
                     result.done() or len(self.feedback) >= known + REPLAN
                 ),
-                "a result", kick=True,
-            )  # fmt: skip
+                "a result",
+                kick=True,
+            )
             if result.done():
                 return result.result()
             if math.dist(self.pose[:2], goal) > 1.0:
-                handle = self.send(self.plan(goal, radius), controller_id=self._controller)
+                handle = self.send(
+                    self.plan(goal, radius), controller_id=self._controller
+                )
 
     def touched(self) -> bool:
         """True if the robot has touched something."""

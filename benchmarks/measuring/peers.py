@@ -39,7 +39,13 @@ from nics_drl_bridge.sim.world import World
 WITH = ("numpy==2.4.6", "shapely==2.2.0", "matplotlib==3.11.2")
 PEERS = {"ir_sim": ("ir-sim==2.12.0", *WITH), "irsim_x": ("irsim-x==1.1.4", *WITH)}
 SCRIPT = Path(__file__).resolve().parent / "irsim_peer.py"
-READINGS = ("scan", "step", "step_without_scan", "period_with_one_scan", "period_with_ten_scans")
+READINGS = (
+    "scan",
+    "step",
+    "step_without_scan",
+    "period_with_one_scan",
+    "period_with_ten_scans",
+)
 MODEL = open_model("differential")
 RADIUS, CIRCLES = 0.15, 10
 WORLD = World.model_validate(
@@ -47,7 +53,11 @@ WORLD = World.model_validate(
         "name": "ten circles",
         "size": [6.0, 6.0],
         "obstacles": [
-            {"shapes": [{"kind": "circle", "radius": RADIUS}], "count": CIRCLES, "gap": 0.3}
+            {
+                "shapes": [{"kind": "circle", "radius": RADIUS}],
+                "count": CIRCLES,
+                "gap": 0.3,
+            }
         ],
         "clearance": 0.3,
         "goal_distance": [2.0, 4.0],
@@ -80,7 +90,9 @@ class Peer:
     process: subprocess.Popen[str]
     log: IO[str]
     ranges: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.float32))
-    times: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in READINGS})
+    times: dict[str, list[float]] = field(
+        default_factory=lambda: {name: [] for name in READINGS}
+    )
     drove: dict[str, float] = field(default_factory=dict)
 
     def answer(self) -> dict[str, Any]:
@@ -112,7 +124,9 @@ class Peer:
 
     def readings(self) -> dict[str, float]:
         """The median of each reading [s], and what is made of them."""
-        found = {f"{name}_s": float(np.median(each)) for name, each in self.times.items()}
+        found = {
+            f"{name}_s": float(np.median(each)) for name, each in self.times.items()
+        }
         within = np.subtract(self.times["step"], self.times["step_without_scan"])
         found["scan_within_step_s"] = float(np.median(within))
         found["agreement"] = found["scan_within_step_s"] / found["scan_s"]
@@ -173,8 +187,12 @@ def started(name: str, task: Mapping[str, Any]) -> Peer:
         asked.write_text(json.dumps(task))
         process = subprocess.Popen(
             [str(python), str(SCRIPT), str(asked)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=clean(),
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            env=clean(),
+        )
         peer = Peer(name, process, log)
         try:
             peer.ranges = np.array(peer.answer()["ranges"], dtype=np.float32)
@@ -239,7 +257,11 @@ def measure(
         for name, each in times.items():
             found.seconds[name], found.wall[name] = np.median(each, axis=0).tolist()
         found.peers.update(
-            {name: one.readings() for name, one in peers.items() if name not in found.failed}
+            {
+                name: one.readings()
+                for name, one in peers.items()
+                if name not in found.failed
+            }
         )
     finally:
         for peer in peers.values():

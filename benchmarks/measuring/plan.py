@@ -29,7 +29,9 @@ class Run:
     timeout_s: float = TIMEOUT_S
 
 
-def row(script: str, full: str = "", quick: str = "", timeout_s: float = TIMEOUT_S) -> Run:
+def row(
+    script: str, full: str = "", quick: str = "", timeout_s: float = TIMEOUT_S
+) -> Run:
     """Arguments as one would type them."""
     return Run(f"{script}.py", tuple(full.split()), tuple(quick.split()), timeout_s)
 
@@ -39,13 +41,17 @@ SHIPPED = ("ackermann", "differential", "mecanum", "jackal")
 RUNS: dict[str, Run] = {
     "barn": row("barn", "", "--policy straight", HOUR),
     "barn_five_fold": row("barn", "--five-fold", "--policy straight", 3 * HOUR),
-    "barn_mujoco": row("barn", "--in mujoco_dds --policy jackal", "--policy straight", HOUR),
+    "barn_mujoco": row(
+        "barn", "--in mujoco_dds --policy jackal", "--policy straight", HOUR
+    ),
     "baselines": row("baselines", "--episodes 200", "--episodes 20"),
     "env_scaling": row("env_scaling", "", "--ends-only --repeats 5"),
     "env_throughput": row("env_throughput", "", "--worlds 256 --repeats 2"),
     **{
         f"env_throughput_{name}": row(
-            "env_throughput", f"--lidar {lidar}", f"--lidar {lidar} --worlds 256 --repeats 2"
+            "env_throughput",
+            f"--lidar {lidar}",
+            f"--lidar {lidar} --worlds 256 --repeats 2",
         )
         for name, lidar in (
             ("lidar", "hokuyo_ust_10lx"),
@@ -63,14 +69,22 @@ RUNS: dict[str, Run] = {
     "unknown_robot": row("unknown_robot", "--minutes 120", "--goals 3", 4 * HOUR),
     "gate_held": row("gate_held", "", "--hours 0.1 --holds 13", 2 * HOUR),
     "gate_envelope": row("gate_envelope", "--steps 1000000", "--steps 5000"),
-    "gate_faults": row("gate_faults", "--load 2 --repeats 100", "--repeats 1", 4 * HOUR),
+    "gate_faults": row(
+        "gate_faults", "--load 2 --repeats 100", "--repeats 1", 4 * HOUR
+    ),
     "gate_rules": row("gate_rules", timeout_s=2 * HOUR),
-    "generate_from_mujoco": row("generate_from_mujoco", "", "--drives 1 --train 30", HOUR),
+    "generate_from_mujoco": row(
+        "generate_from_mujoco", "", "--drives 1 --train 30", HOUR
+    ),
     "lidar_complexity": row("lidar_complexity", "", "--most 16 --scans 64 --repeats 5"),
     "lidar_peers": row("lidar_peers", "", "--scans 128 --scenes 5 --repeats 2"),
     "lidar_sensor_models": row("lidar_sensor_models", "", "--scans 128 --repeats 10"),
-    "node_endings": row("node_endings", "", "--times 1 --phases starting running", HOUR),
-    "node_first_lines": row("node_endings", "--loops 0 --phases starting", "--loops 0 --times 1"),
+    "node_endings": row(
+        "node_endings", "", "--times 1 --phases starting running", HOUR
+    ),
+    "node_first_lines": row(
+        "node_endings", "--loops 0 --phases starting", "--loops 0 --times 1"
+    ),
     "packet_loss": row("packet_loss", "", "--seconds 5"),
     "paper_fig7": row("paper_fig7", "", "--episodes 1"),
     "parity": row("parity", "", "--steps 50"),
@@ -82,7 +96,9 @@ RUNS: dict[str, Run] = {
     "soak_env": row("soak_env", "", "--steps 200000"),
     "standards": row("standards", "", "--parts leapp", HOUR),
     **{
-        f"table2_{name}": row("table2_lidar", lidar, f"{lidar} --scans 512 --repeats 5".strip())
+        f"table2_{name}": row(
+            "table2_lidar", lidar, f"{lidar} --scans 512 --repeats 5".strip()
+        )
         for name, lidar in (("lidar", ""), ("hokuyo", "--lidar hokuyo_ust_10lx"))
     },
     "table3_density": row("table3_density", "", "--scans 256"),

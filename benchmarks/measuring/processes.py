@@ -26,7 +26,9 @@ def use_of(pid: int | None = None) -> Use:
     """Of a process, or of this one."""
     home = Path("/proc") / str(pid or os.getpid())
     rows = dict(
-        line.split(":", 1) for line in (home / "status").read_text().splitlines() if ":" in line
+        line.split(":", 1)
+        for line in (home / "status").read_text().splitlines()
+        if ":" in line
     )
     return Use(
         rss_mb=int(rows["VmRSS"].split()[0]) * 1024 / 1e6,

@@ -85,7 +85,9 @@ def object_in(printed: str) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def judged(code: int | None, result: dict[str, Any] | None, last: str) -> dict[str, Any]:
+def judged(
+    code: int | None, result: dict[str, Any] | None, last: str
+) -> dict[str, Any]:
     """State, failures, result and error of a run that ended with a code, `None` if it was ended."""
     told = (result or {}).pop("failures", None)
     failures = [str(each) for each in told] if isinstance(told, list) else []
@@ -93,7 +95,11 @@ def judged(code: int | None, result: dict[str, Any] | None, last: str) -> dict[s
     if code is None:
         error = "was ended, since it took too long"
     elif code not in (0, 1):
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        how = (
+            f"was killed by signal {-code}"
+            if code < 0
+            else f"ended with exit code {code}"
+        )
         error = f"{how}: {last}"
     elif result is None:
         error = f"ended with exit code {code} and printed no JSON object: {last}"
@@ -104,21 +110,31 @@ def judged(code: int | None, result: dict[str, Any] | None, last: str) -> dict[s
     else:
         state = MISSED if code or failures else MET
     return {
-        "exit_code": code, "state": state, "failures": failures, "error": error,
+        "exit_code": code,
+        "state": state,
+        "failures": failures,
+        "error": error,
         "result": finite(result),
-    }  # fmt: skip
+    }
 
 
 def run_one(script: Path, arguments: Sequence[str], timeout_s: float) -> dict[str, Any]:
     """Runs a script to its end, or ends it; no process of it stays."""
     mark = uuid.uuid4().hex
     before, began, started = load(), time.monotonic(), datetime.now(timezone.utc)
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:  # no pipe can clog
+    with (
+        tempfile.TemporaryFile() as out,
+        tempfile.TemporaryFile() as err,
+    ):  # no pipe can clog
         process = subprocess.Popen(
             [sys.executable, str(script), "--json", *arguments],
-            stdin=subprocess.DEVNULL, stdout=out, stderr=err, cwd=script.parents[1],
-            env={**os.environ, MARK: mark}, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
+            cwd=script.parents[1],
+            env={**os.environ, MARK: mark},
+            start_new_session=True,
+        )
         code = None
         try:
             code = process.wait(timeout_s)
@@ -182,10 +198,15 @@ def line_of(name: str, entry: Mapping[str, Any]) -> str:
     wrong = entry["error"] or "; ".join(entry["failures"][:1])
     wrong = " ".join(wrong.split())
     wrong = wrong if len(wrong) <= 160 else f"{wrong[:160]} ..."
-    return f"{name:<26}{entry['state']:<8}{entry['seconds']:>8.1f} s  {wrong}".rstrip() + "\n"
+    return (
+        f"{name:<26}{entry['state']:<8}{entry['seconds']:>8.1f} s  {wrong}".rstrip()
+        + "\n"
+    )
 
 
-def run_all(runs: Mapping[str, Run], given: argparse.Namespace) -> dict[str, dict[str, Any]]:
+def run_all(
+    runs: Mapping[str, Run], given: argparse.Namespace
+) -> dict[str, dict[str, Any]]:
     """Runs all, one after the other, and writes the file after each."""
     commit, machine = commit_of(given.scripts.parent), describe()
     every = runs_of(given.scripts)
@@ -196,7 +217,12 @@ def run_all(runs: Mapping[str, Run], given: argparse.Namespace) -> dict[str, dic
         words = " ".join([run.script, *arguments])
         sys.stderr.write(f"[{k}/{len(runs)}] {name}: {words}\n")
         timeout_s = given.timeout or run.timeout_s
-        about = {"script": run.script, "quick": given.quick, "machine": machine, **commit}
+        about = {
+            "script": run.script,
+            "quick": given.quick,
+            "machine": machine,
+            **commit,
+        }
         entry = {**about, **run_one(given.scripts / run.script, arguments, timeout_s)}
         done[name] = entries[name] = entry
         write({"runs": dict(sorted(entries.items()))}, given.out)
@@ -207,24 +233,38 @@ def run_all(runs: Mapping[str, Run], given: argparse.Namespace) -> dict[str, dic
 def ask(arguments: Sequence[str] | None) -> argparse.Namespace:
     """What is asked for; `runs` are those that it names."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="*", metavar="NAME", help="these; other results are kept")
-    parser.add_argument("--quick", action="store_true", help="short versions, recorded as such")
-    parser.add_argument("--list", action="store_true", help="print the names of the runs")
+    parser.add_argument(
+        "--only", nargs="*", metavar="NAME", help="these; other results are kept"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="short versions, recorded as such"
+    )
+    parser.add_argument(
+        "--list", action="store_true", help="print the names of the runs"
+    )
     parser.add_argument("--out", type=Path, help="file of the results")
-    parser.add_argument("--timeout", type=float, help="seconds for each, instead of its own")
-    parser.add_argument("--scripts", type=Path, default=SCRIPTS, help="folder of the benchmarks")
+    parser.add_argument(
+        "--timeout", type=float, help="seconds for each, instead of its own"
+    )
+    parser.add_argument(
+        "--scripts", type=Path, default=SCRIPTS, help="folder of the benchmarks"
+    )
     given = parser.parse_args(arguments)
     given.out = given.out or (QUICK_RESULTS if given.quick else RESULTS)
     given.scripts, every = given.scripts.resolve(), runs_of(given.scripts.resolve())
     named = {name for name in given.only or () if name not in every}
     # A script that is run several times may be named itself.
     of = {
-        name: [each for each, run in every.items() if run.script == f"{name}.py"] for name in named
+        name: [each for each, run in every.items() if run.script == f"{name}.py"]
+        for name in named
     }
     unknown = [name for name, found in of.items() if not found]
     if unknown:
         parser.error(f"{unknown[0]!r} is no benchmark; there are {', '.join(every)}.")
-    wanted = {*(given.only or every), *(each for found in of.values() for each in found)}
+    wanted = {
+        *(given.only or every),
+        *(each for found in of.values() for each in found),
+    }
     given.runs = {name: run for name, run in every.items() if name in wanted}
     return given
 
@@ -244,7 +284,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, entry in done.items():
         sys.stdout.write(line_of(name, entry))
     wrong = [name for name, entry in done.items() if entry["state"] != MET]
-    sys.stdout.write(f"{len(done) - len(wrong)} of {len(done)} met their bars: {given.out}\n")
+    sys.stdout.write(
+        f"{len(done) - len(wrong)} of {len(done)} met their bars: {given.out}\n"
+    )
     raise SystemExit(1 if wrong else 0)
 
 

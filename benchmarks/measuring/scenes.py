@@ -89,7 +89,9 @@ def gap(shape: Shape, poses: Array) -> Array:
     return np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
 
 
-def scan(table: LidarTable, renderer: Renderer, batch: Batch, spec: LidarSpec = SPEC) -> Ranges:
+def scan(
+    table: LidarTable, renderer: Renderer, batch: Batch, spec: LidarSpec = SPEC
+) -> Ranges:
     """(N, B) ranges of a batch."""
     scanner = Scanner(spec, table, renderer)
     return scanner.scan(batch.lidar, batch.bodies(scanner))
@@ -109,11 +111,15 @@ def nearest_row(batch: Batch, table: LidarTable, spec: LidarSpec = SPEC) -> Batc
         grid = np.linspace(shape.radius, table.grid[h, 0], table.density.distances)
         distance, bearing = np.hypot(x, y), np.arctan2(y, x)
         step, turn = grid[1] - grid[0], 2.0 * np.pi / table.density.rotations
-        row = np.clip(np.rint((distance - grid[0]) / step), 0, len(grid) - 1).astype(int)
+        row = np.clip(np.rint((distance - grid[0]) / step), 0, len(grid) - 1).astype(
+            int
+        )
         beam = np.rint((bearing - spec.angle_min) / spec.angle_increment)
         to = spec.angle_min + beam * spec.angle_increment
         rotation = np.rint((heading - bearing) / turn) * turn
-        far = np.maximum(grid[row], shape.radius * (1.0 + 1e-6))  # a lidar outside of it
+        far = np.maximum(
+            grid[row], shape.radius * (1.0 + 1e-6)
+        )  # a lidar outside of it
         moved = np.stack([far * np.cos(to), far * np.sin(to), to + rotation], axis=1)
         poses[:, k] = np.where((distance < shape.radius)[:, None], poses[:, k], moved)
     return Batch(batch.shapes, poses, batch.lidar)

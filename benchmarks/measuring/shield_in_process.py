@@ -56,7 +56,10 @@ def config_of(place: Place, shield: dict[str, float] | None) -> GateConfig:
 
 
 def drive(
-    place: Place, config: GateConfig, jobs: Sequence[Job], witness: Witness | None = None
+    place: Place,
+    config: GateConfig,
+    jobs: Sequence[Job],
+    witness: Witness | None = None,
 ) -> list[Outcome]:
     """Drives episodes one after the other, each with a gate of its own.
 
@@ -69,7 +72,9 @@ def drive(
     return [_episode(place, config, job, witness) for job in jobs]
 
 
-def _episode(place: Place, config: GateConfig, job: Job, witness: Witness | None) -> Outcome:
+def _episode(
+    place: Place, config: GateConfig, job: Job, witness: Witness | None
+) -> Outcome:
     place.begin(job)
     gate, lidar = Gate(config, place.model.lidar), place.model.lidar
     gate.witness = witness
@@ -85,9 +90,16 @@ def _episode(place: Place, config: GateConfig, job: Job, witness: Witness | None
     while not place.ended:
         gate.now = begun + step * STEP_S
         if step % SCAN_STEPS == 0:
-            truth, stamp, seen = place.truth, round(gate.now * NS_PER_S), to_gate.arrival(step)
+            truth, stamp, seen = (
+                place.truth,
+                round(gate.now * NS_PER_S),
+                to_gate.arrival(step),
+            )
             scan = Scan(stamp, truth.ranges, (lidar.angle_min, lidar.angle_increment))
-            coming += [(seen, Odometry(stamp, place.odom.copy(), truth.twist)), (seen, scan)]
+            coming += [
+                (seen, Odometry(stamp, place.odom.copy(), truth.twist)),
+                (seen, scan),
+            ]
             commands.append((behind.arrival(seen), Command(stamp, place.wish(truth))))
         for queue in (coming, commands):
             while queue and queue[0][0] <= step:

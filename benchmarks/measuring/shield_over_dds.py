@@ -81,17 +81,22 @@ class Lane:
         outcomes: of those that were driven.
     """
 
-    def __init__(self, node: Node, name: str, place: Place, jobs: Sequence[Job]) -> None:
+    def __init__(
+        self, node: Node, name: str, place: Place, jobs: Sequence[Job]
+    ) -> None:
         self.place, self.outcomes = place, list[Outcome]()
         self._jobs = deque(jobs)
         self._told, self._told_s, self._begun_s = np.zeros(3), -np.inf, np.inf
         self._scan, self._odom, self._estimate, self._e_stop, self._raw = (
             node.create_publisher(kind, f"{name}/{topic}", qos.COMMAND)
             for kind, topic in (
-                (LaserScan, "scan"), (Odometry, "odom"), (Odometry, "odometry/filtered"),
-                (Bool, "e_stop"), (TwistStamped, "cmd_vel_raw"),
+                (LaserScan, "scan"),
+                (Odometry, "odom"),
+                (Odometry, "odometry/filtered"),
+                (Bool, "e_stop"),
+                (TwistStamped, "cmd_vel_raw"),
             )
-        )  # fmt: skip
+        )
         node.create_subscription(Twist, f"{name}/cmd_vel", self._hear, qos.COMMAND)
         self._clients = {
             service: node.create_client(Trigger, f"{name}/{GATE}/{service}")
@@ -111,7 +116,9 @@ class Lane:
     def _hear(self, message: Twist) -> None:
         now, outcome = time.monotonic(), self.place.outcome
         if self._driving:
-            outcome.silence = max(outcome.silence, now - max(self._told_s, self._begun_s))
+            outcome.silence = max(
+                outcome.silence, now - max(self._told_s, self._begun_s)
+            )
         self._told, self._told_s = conversions.twist_from_ros(message), now
 
     def step(self, stamp_ns: int, speaks: bool) -> None:
@@ -136,7 +143,9 @@ class Lane:
         )
         self._odom.publish(odometry)
         self._estimate.publish(odometry)
-        self._scan.publish(conversions.scan_to_ros(model.lidar, truth.ranges, stamp_ns, "laser"))
+        self._scan.publish(
+            conversions.scan_to_ros(model.lidar, truth.ranges, stamp_ns, "laser")
+        )
         self._e_stop.publish(Bool(data=False))
         wish = self.place.wish(truth) if self._driving else np.zeros(3)
         command = TwistStamped(twist=conversions.twist_to_ros(wish))
@@ -226,10 +235,19 @@ def drive(
         lanes, gates = [], []
         for index, (place, some) in enumerate(zip(places, jobs, strict=True)):
             name, logs = f"robot{index + 1}", folder / f"robot{index + 1}"
-            given = {"model": place.robot, "limits": place.robot, "e_stop_required": True}
-            given |= {"black_box": str(logs / "black_box"), "enable_stamped_cmd_vel": False}
+            given = {
+                "model": place.robot,
+                "limits": place.robot,
+                "e_stop_required": True,
+            }
+            given |= {
+                "black_box": str(logs / "black_box"),
+                "enable_stamped_cmd_vel": False,
+            }
             given |= parameters
-            gates.append(stack.enter_context(NodeProcess(GATE, logs, given, domain_id, name)))
+            gates.append(
+                stack.enter_context(NodeProcess(GATE, logs, given, domain_id, name))
+            )
             lanes.append(Lane(node, name, place, some))
         held_up = _run(lanes, gates, executor, tell)
         for lane in lanes:
@@ -254,7 +272,9 @@ def _run(
             continue
         if -ahead > BEHIND_S:
             began, epoch_ns = began - ahead, epoch_ns - round(ahead * NS_PER_S)
-            if voided := sum(lane.void() for lane in lanes):  # not while the gates start
+            if voided := sum(
+                lane.void() for lane in lanes
+            ):  # not while the gates start
                 held_up.add(HeldUp(1, -ahead, 0.0, voided))
         step_ns = epoch_ns + round(step * STEP_S * NS_PER_S)
         for index, lane in enumerate(lanes):

@@ -12,7 +12,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measuring.adversaries import ADVERSARIES, Adversary, Driver, GoalDriver, Standing, Truth
+from measuring.adversaries import (
+    ADVERSARIES,
+    Adversary,
+    Driver,
+    GoalDriver,
+    Standing,
+    Truth,
+)
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
@@ -96,7 +103,9 @@ class Place:
         model = builtin_model(robot)
         lidar = model.lidar.model_copy(update={"rate": 1.0 / (SCAN_STEPS * STEP_S)})
         self.model = replace(model, lidar=lidar)
-        self._sim = FastSimulator(replace(self.model, control_period=STEP_S), load_world(world))
+        self._sim = FastSimulator(
+            replace(self.model, control_period=STEP_S), load_world(world)
+        )
         self._walls = self._sim.world.all_walls()
         self._drivers: dict[str, Driver] = {}
         self.odom = np.zeros(3)
@@ -107,7 +116,9 @@ class Place:
         self.job, self._steps = job, 0
         self._sim.reset([job.seed])
         self._begun, self._anchor = self._sim.data.odom[0, 0].copy(), self.odom.copy()
-        self._lately = deque([self._sim.data.pose[0, 0, :2].copy()], maxlen=MOVING_STEPS + 1)
+        self._lately = deque(
+            [self._sim.data.pose[0, 0, :2].copy()], maxlen=MOVING_STEPS + 1
+        )
         self.outcome = Outcome(job.kind, where=(self.robot, self.world, job.seed))
         rng = np.random.default_rng([7, job.seed])
         self._phase = int(rng.integers(BASE_STEPS))
@@ -125,10 +136,14 @@ class Place:
         """All that there is to know now."""
         data, obstacles = self._sim.data, self._sim.obstacles[0]
         return Truth(
-            data.pose[0, 0].copy(), data.twist[0, 0].copy(), data.ranges[0, 0].copy(),
-            obstacles[:, [X, Y, RADIUS]], data.velocity[0, :, :2].copy(), self._walls,
+            data.pose[0, 0].copy(),
+            data.twist[0, 0].copy(),
+            data.ranges[0, 0].copy(),
+            obstacles[:, [X, Y, RADIUS]],
+            data.velocity[0, :, :2].copy(),
+            self._walls,
             self._sim.goals[0, 0],
-        )  # fmt: skip
+        )
 
     def wish(self, truth: Truth) -> Array:
         """What the driver wants (3,) for `cmd_vel_raw`."""
@@ -147,10 +162,14 @@ class Place:
         self._lately.append(data.pose[0, 0, :2].copy())
         outcome.seconds = self._steps * STEP_S
         if data.collided[0, 0] and not touched:
-            outcome.speed = max(before, self._speed())  # the touch itself may have stopped it
+            outcome.speed = max(
+                before, self._speed()
+            )  # the touch itself may have stopped it
             outcome.contact = outcome.speed > MOVING
             outcome.walked_into = not outcome.contact
-        self.odom = geometry.compose(self._anchor, geometry.between(self._begun, data.odom[0, 0]))
+        self.odom = geometry.compose(
+            self._anchor, geometry.between(self._begun, data.odom[0, 0])
+        )
 
     def _speed(self) -> float:
         """Over the last steps, by true places; what odometry says of it is noisy [m/s]."""
@@ -166,4 +185,6 @@ class Place:
             near = np.hypot(*(self._sim.data.pose[0, 0, :2] - self._sim.goals[0, 0]))
             outcome.reached = bool(near < GoalDriver.RADIUS)
         touched = outcome.contact or outcome.walked_into
-        return touched or outcome.reached or outcome.seconds >= self.job.longest_s - 1e-9
+        return (
+            touched or outcome.reached or outcome.seconds >= self.job.longest_s - 1e-9
+        )

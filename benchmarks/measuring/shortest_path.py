@@ -31,7 +31,9 @@ def shortest_path(cylinders: Array) -> Array:
         if found is not None:
             cells = np.array(found)[:, ::-1]
             return np.asarray(cells * barn.CELL + barn.CORNER)
-    raise ConfigError("a world of cylinders: no way from the start to the goal; leave it out.")
+    raise ConfigError(
+        "a world of cylinders: no way from the start to the goal; leave it out."
+    )
 
 
 def _grown(blocked: NDArray[np.bool_], wide: int) -> NDArray[np.bool_]:
@@ -41,7 +43,12 @@ def _grown(blocked: NDArray[np.bool_], wide: int) -> NDArray[np.bool_]:
         for j in range(-wide, wide + 1):
             if math.hypot(i, j) <= wide:
                 near, beside = rows + i, columns + j
-                fits = (near >= 0) & (near < out.shape[0]) & (beside >= 0) & (beside < out.shape[1])
+                fits = (
+                    (near >= 0)
+                    & (near < out.shape[0])
+                    & (beside >= 0)
+                    & (beside < out.shape[1])
+                )
                 out[near[fits], beside[fits]] = True
     return out
 
@@ -51,7 +58,9 @@ def _search(blocked: NDArray[np.bool_]) -> list[tuple[int, int]] | None:
     first = round((barn.PATH_CORNER[1] - barn.CORNER[1]) / barn.CELL)
     middle, last = blocked.shape[1] // 2, blocked.shape[0] - 1
     starts = [
-        (abs(j - middle), (first, j)) for j in range(blocked.shape[1]) if not blocked[first, j]
+        (abs(j - middle), (first, j))
+        for j in range(blocked.shape[1])
+        if not blocked[first, j]
     ]
     nowhere = -1, -1
     heap = [(float(away), cell, nowhere) for away, cell in starts]

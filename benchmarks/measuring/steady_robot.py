@@ -41,15 +41,20 @@ class SteadyRobot:
         self._executor.add_node(self.node)
         lidar = builtin_model(ROBOT).lidar
         self._ranges = np.full(lidar.beams, 2.0, np.float32)
-        self._scans = ScanWriter(conversions.scan_to_ros(lidar, self._ranges, 0, "laser"))
+        self._scans = ScanWriter(
+            conversions.scan_to_ros(lidar, self._ranges, 0, "laser")
+        )
         frames, variance = ("odom", "base_link"), (1e-4,) * 4
         self._odometries = OdometryWriter(
             conversions.odometry_to_ros(np.zeros(3), np.zeros(3), 0, frames, variance)
         )
         kinds = {
-            "scan": LaserScan, "odom": Odometry, "odometry/filtered": Odometry,
-            "cmd_vel_raw": TwistStamped, "e_stop": Bool,
-        }  # fmt: skip
+            "scan": LaserScan,
+            "odom": Odometry,
+            "odometry/filtered": Odometry,
+            "cmd_vel_raw": TwistStamped,
+            "e_stop": Bool,
+        }
         self._topics = {
             name: self.node.create_publisher(kind, name, qos.COMMAND)
             for name, kind in kinds.items()

@@ -63,7 +63,9 @@ def written(value: Any, how: str) -> str:
     text = format(value, how)
     if isinstance(value, str | bool):
         return text
-    text = re.sub(r"e([+-])0*(\d+)$", lambda m: "e" + m[1].replace("+", "") + m[2], text)
+    text = re.sub(
+        r"e([+-])0*(\d+)$", lambda m: "e" + m[1].replace("+", "") + m[2], text
+    )
     return re.sub(r"%$", " %", text)
 
 
@@ -91,7 +93,9 @@ class Page:
         """One placeholder. Raises UnknownFigureError."""
         result = self.runs.get(match["run"] or run, {}).get("result")
         values = list(found_at(result, match["path"].split(".")))
-        if not values or any(value is None or isinstance(value, dict | list) for value in values):
+        if not values or any(
+            value is None or isinstance(value, dict | list) for value in values
+        ):
             raise UnknownFigureError
         value = HOW[match["how"]](values) if match["how"] else values[0]
         if match["factor"]:
@@ -143,7 +147,9 @@ class Page:
                 wrong = shorten(wrong, 300, placeholder=" ...")  # between words
                 if more := len(told) - len(shown):
                     wrong += f"; and {more} more"
-                notes.append(f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong}")
+                notes.append(
+                    f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong}"
+                )
             if entry["quick"]:
                 notes.append(f"{OF_QUICK} `{entry['script']}`: a short run")
         away = sorted({name for name in runs & set(self.runs) if self.elsewhere(name)})
@@ -156,16 +162,26 @@ class Page:
         if not self.runs:
             return "Nothing is measured yet.\n"
         entries = [self.runs[name] for name in self.runs]
-        machine = next(e["machine"] for e in entries if machine_of(e) == self.machines[0])
-        others = "".join(f", or on {one} where marked {ELSEWHERE}" for one in self.machines[1:])
+        machine = next(
+            e["machine"] for e in entries if machine_of(e) == self.machines[0]
+        )
+        others = "".join(
+            f", or on {one} where marked {ELSEWHERE}" for one in self.machines[1:]
+        )
         commits = {e["commit"] for e in entries}
         changed = " and changes" if any(e["dirty"] for e in entries) else ""
-        told = f"{len(commits)} commits" if len(commits) > 1 else f"commit {entries[0]['commit']}"
+        told = (
+            f"{len(commits)} commits"
+            if len(commits) > 1
+            else f"commit {entries[0]['commit']}"
+        )
         days = sorted(e["started"][:10] for e in entries)
         loads = [e["load_before"][0] for e in entries]
         versions = [f"Python {machine['python']}"]
         libraries = machine.get("libraries", {})
-        versions += [f"{name} {libraries[name]}" for name in VERSIONS if name in libraries]
+        versions += [
+            f"{name} {libraries[name]}" for name in VERSIONS if name in libraries
+        ]
         return (
             f"On {self.machines[0]} with {machine['memory_gb']:.0f} GB{others}, "
             f"{', '.join(versions)}; load average before each run "
@@ -181,7 +197,10 @@ class Page:
 def rendered(text: str, page: Page) -> str:
     """A document with all its regions made anew."""
     return REGION.sub(
-        lambda match: f"<!-- results:{match[1]} -->\n{page.text(match[1])}<!-- /results -->", text
+        lambda match: (
+            f"<!-- results:{match[1]} -->\n{page.text(match[1])}<!-- /results -->"
+        ),
+        text,
     )
 
 
@@ -198,7 +217,9 @@ def open_page(file: Path = RESULTS) -> Page:
 def main() -> None:
     """Writes the tables, or says which are not as they should be."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="write nothing, end with 1 if unlike")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing, end with 1 if unlike"
+    )
     given = parser.parse_args()
     page, stale = open_page(), []
     for path in documents():
@@ -209,7 +230,11 @@ def main() -> None:
             if not given.check:
                 path.write_text(after, encoding="utf-8")
     for path in stale:
-        said = "is not what results.json gives; run `make tables`" if given.check else "written"
+        said = (
+            "is not what results.json gives; run `make tables`"
+            if given.check
+            else "written"
+        )
         sys.stdout.write(f"{path.relative_to(ROOT)}: {said}\n")
     raise SystemExit(1 if given.check and stale else 0)
 

@@ -23,7 +23,9 @@ class Truth:
     """What is known of a robot apart from its recording; None is not known or not defined."""
 
     latency_s: float | None = None  # from a command's stamp to its effect
-    mounting: dict[str, float] = field(default_factory=dict)  # by names of the uncertainties
+    mounting: dict[str, float] = field(
+        default_factory=dict
+    )  # by names of the uncertainties
     dead_zone: float | None = None  # greatest throttle at which it stands
     wheels: dict[str, tuple[float, float]] = field(default_factory=dict)  # ranges [m]
 
@@ -39,10 +41,21 @@ def compared(found: Identified, truth: Truth) -> dict[str, dict[str, Any]]:
     for name, true in truth.mounting.items():
         sigma = calibration.uncertainty.get(name, float("nan"))
         told = not np.isnan(sigma)
-        near = abs(values[name] - true) <= STANDARD_ERRORS * sigma if told else values[name] == 0.0
-        rows[name] = {"true": true, "found": values[name], "sigma": sigma, "near": bool(near)}
+        near = (
+            abs(values[name] - true) <= STANDARD_ERRORS * sigma
+            if told
+            else values[name] == 0.0
+        )
+        rows[name] = {
+            "true": true,
+            "found": values[name],
+            "sigma": sigma,
+            "near": bool(near),
+        }
     if truth.latency_s is not None and "command_latency_s" in calibration.uncertainty:
-        rows["latency_s"] = _row(truth.latency_s, calibration.command_latency_s, LATENCY_S)
+        rows["latency_s"] = _row(
+            truth.latency_s, calibration.command_latency_s, LATENCY_S
+        )
     if truth.dead_zone is not None:
         width = DEAD_ZONE * truth.dead_zone
         rows["dead_zone"] = _row(truth.dead_zone, dead_zone_of(found), width)

@@ -26,7 +26,8 @@ def parser_of(doc: str | None, controls: Mapping[str, str]) -> argparse.Argument
     """
     parser = argparse.ArgumentParser(
         description=(doc or "").splitlines()[0],
-        epilog="controls, which must fail: " + "; ".join(f"{k}: {v}" for k, v in controls.items()),
+        epilog="controls, which must fail: "
+        + "; ".join(f"{k}: {v}" for k, v in controls.items()),
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
@@ -39,7 +40,9 @@ def parser_of(doc: str | None, controls: Mapping[str, str]) -> argparse.Argument
     return parser
 
 
-def answer(result: Mapping[str, Any], missed: Sequence[str], table: str, as_json: bool) -> NoReturn:
+def answer(
+    result: Mapping[str, Any], missed: Sequence[str], table: str, as_json: bool
+) -> NoReturn:
     """Prints a result and the bars that were missed, and ends with 1 if there are any, else 0.
 
     Args:

@@ -27,10 +27,16 @@ def main() -> None:
         scan = np.where(np.isfinite(scan), scan, 2.0 * far)
         slam.process_scan(
             LocalizedRangeScan(
-                scan, float(angles[0]), float(angles[-1]), step, float(limits[0]), far, far,
+                scan,
+                float(angles[0]),
+                float(angles[-1]),
+                step,
+                float(limits[0]),
+                far,
+                far,
                 *map(float, pose),
             )
-        )  # fmt: skip
+        )
     slam.run_opt()
     corrected = [vertex.obj.corrected_pose for vertex in slam.graph.vertices]
     grid = slam.make_occupancy_grid(RESOLUTION, far)

@@ -17,7 +17,9 @@ AT_THE_TOP = ("CHANGELOG.md", "CONTRIBUTING.md")
 # The theme's for pages on disk would be loaded from elsewhere: ours takes its place.
 SHIM = re.compile(r"<script[^>]*unpkg\.com/iframe-worker[^>]*></script>")
 NAMED = re.compile(r"(?<!\[)`docs/(?P<page>[\w/]+\.md)`")
-FROM_DISK = f"<script>{Path(__file__).with_name('search_from_disk.js').read_text()}</script>"
+FROM_DISK = (
+    f"<script>{Path(__file__).with_name('search_from_disk.js').read_text()}</script>"
+)
 DISPLAYED_FORMULA = re.compile(r"^\$\$\n(?P<tex>.+?)\n\$\$$", re.MULTILINE | re.DOTALL)
 INLINE_FORMULA = re.compile(r"(?<![\w$`])\$(?P<tex>[^$`\n]+)\$(?![\w$`])")
 EQUATION_NUMBER = re.compile(r"\\tag\{(\d+)\}")
@@ -36,7 +38,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds what is no page of docs/ by itself."""
-    made: dict[str, str | bytes] = {f"api/{room}.md": api_page(room) for room in rooms()}
+    made: dict[str, str | bytes] = {
+        f"api/{room}.md": api_page(room) for room in rooms()
+    }
     made |= {name: (ROOT / name).read_text(encoding="utf-8") for name in AT_THE_TOP}
     for notebook in sorted(Path(config.docs_dir).glob("notebooks/*.ipynb")):
         made |= notebook_pages(notebook)
@@ -45,7 +49,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(
+    markdown: str, page: Any, config: MkDocsConfig, files: Files
+) -> str:
     """Makes links of the pages that a text names, and plain text of links that leave docs/."""
     here = str(PurePosixPath(page.file.src_uri).parent)
 
@@ -66,7 +72,9 @@ def with_formulas(markdown: str) -> str:
     markdown = DISPLAYED_FORMULA.sub(displayed_formula, markdown)
     parts = CODE.split(markdown)
     for index in range(0, len(parts), 2):  # every other part is code
-        parts[index] = INLINE_FORMULA.sub(lambda match: convert(match["tex"]), parts[index])
+        parts[index] = INLINE_FORMULA.sub(
+            lambda match: convert(match["tex"]), parts[index]
+        )
     return "".join(parts)
 
 
@@ -83,7 +91,9 @@ def on_post_page(output: str, page: Any, config: MkDocsConfig) -> str:
     return SHIM.sub(lambda _: FROM_DISK, output)
 
 
-def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
+def on_post_template(
+    output_content: str, template_name: str, config: MkDocsConfig
+) -> str:
     """Lets pages on disk be searched, too."""
     return SHIM.sub(lambda _: FROM_DISK, output_content)
 
@@ -97,7 +107,11 @@ def api_page(room: str) -> str:
     """The page of a room: all its modules but the kernels."""
     folder = PACKAGE if room == "top" else PACKAGE / room
     modules = sorted(folder.glob("*.py") if room == "top" else folder.rglob("*.py"))
-    kept = [m for m in modules if not m.stem.endswith("kernels") and not m.stem.startswith("_")]
+    kept = [
+        m
+        for m in modules
+        if not m.stem.endswith("kernels") and not m.stem.startswith("_")
+    ]
     names = [".".join(m.relative_to(ROOT).with_suffix("").parts) for m in kept]
     title = "nics_drl_bridge" if room == "top" else f"nics_drl_bridge.{room}"
     return "\n\n".join([f"# {title}", *(f"::: {name}" for name in names)]) + "\n"

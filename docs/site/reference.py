@@ -33,7 +33,12 @@ from nics_drl_bridge.sim.world_set import SetFile
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "reference"
 LARGE = 1e4  # a bound that only guards against nonsense is not told
-BOUNDS = (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
+BOUNDS = (
+    ("minimum", "≥"),
+    ("exclusiveMinimum", ">"),
+    ("maximum", "≤"),
+    ("exclusiveMaximum", "<"),
+)
 
 
 class Kind(NamedTuple):
@@ -53,33 +58,59 @@ SHORT = (
     f"Kinds are {', '.join(f'`{name}`' for name in kind_names())}."
 )
 KINDS = {
-    "robot": Kind("Robot file", RobotSpec, "config/robots/ackermann.yaml", "kinematics", SHORT),
+    "robot": Kind(
+        "Robot file", RobotSpec, "config/robots/ackermann.yaml", "kinematics", SHORT
+    ),
     "world": Kind("World file", World, "config/worlds/crowd.yaml", "worlds"),
-    "world_set": Kind("World set file", SetFile, "config/world_sets/cellular.yaml", "worlds"),
+    "world_set": Kind(
+        "World set file", SetFile, "config/world_sets/cellular.yaml", "worlds"
+    ),
     "map": Kind("Map file", MapFile, "config/maps/room.yaml", "worlds"),
     "lidar": Kind("Lidar file", LidarSpec, "config/lidars/rplidar_a2.yaml", "lidar"),
     "mapping": Kind(
-        "Mapping of a recording", Mapping, "examples/recordings/jetracer_csv.yaml", "recordings"
+        "Mapping of a recording",
+        Mapping,
+        "examples/recordings/jetracer_csv.yaml",
+        "recordings",
     ),
     "topics": Kind("Topic roles of a bag", TopicRoles, "", "kinematics"),
     "training": Kind(
-        "Settings of a training", TrainingSettings, "config/training/demo.yaml", "training"
+        "Settings of a training",
+        TrainingSettings,
+        "config/training/demo.yaml",
+        "training",
     ),
     "randomisation": Kind(
-        "Randomisation file", Randomisation, "config/randomisation/mild.yaml", "randomisation"
+        "Randomisation file",
+        Randomisation,
+        "config/randomisation/mild.yaml",
+        "randomisation",
     ),
-    "limits": Kind("Limits of the gate", LimitsFile, "config/limits/ackermann.yaml", "safety"),
-    "foreign_policy": Kind("Foreign policy file", ForeignPolicy, "", "foreign_policies"),
+    "limits": Kind(
+        "Limits of the gate", LimitsFile, "config/limits/ackermann.yaml", "safety"
+    ),
+    "foreign_policy": Kind(
+        "Foreign policy file", ForeignPolicy, "", "foreign_policies"
+    ),
 }
 
 
 @cache
 def comments_of(owner: type) -> dict[str, str]:
     """The comments at the fields of a class: above them, and at the end of their lines."""
-    lines = [line + "\n" for line in inspect.cleandoc("\n" + inspect.getsource(owner)).split("\n")]
+    lines = [
+        line + "\n"
+        for line in inspect.cleandoc("\n" + inspect.getsource(owner)).split("\n")
+    ]
     tokens = tokenize.generate_tokens(iter(lines).__next__)
-    at = {t.start[0]: t.string.lstrip("# ") for t in tokens if t.type == tokenize.COMMENT}
-    fields = [n for n in ast.parse("".join(lines)).body[0].body if isinstance(n, ast.AnnAssign)]  # type: ignore[attr-defined]
+    at = {
+        t.start[0]: t.string.lstrip("# ") for t in tokens if t.type == tokenize.COMMENT
+    }
+    fields = [
+        n
+        for n in ast.parse("".join(lines)).body[0].body
+        if isinstance(n, ast.AnnAssign)
+    ]  # type: ignore[attr-defined]
     found = {}
     for field in fields:
         first, last = field.lineno, field.end_lineno or field.lineno
@@ -92,7 +123,9 @@ def comments_of(owner: type) -> dict[str, str]:
 
 def meaning(schema: type[BaseModel], name: str) -> str:
     """The comment at a field, of the class or of one that it inherits from."""
-    owners = (one for one in schema.__mro__ if name in vars(one).get("__annotations__", {}))
+    owners = (
+        one for one in schema.__mro__ if name in vars(one).get("__annotations__", {})
+    )
     return comments_of(next(owners)).get(name, "")
 
 
@@ -118,7 +151,11 @@ def schemas_of(schema: type[BaseModel]) -> dict[str, type[BaseModel]]:
 
 def shown(value: Any) -> str:
     """A value as YAML writes it."""
-    text = yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
+    text = (
+        yaml.safe_dump(value, default_flow_style=True, width=1000)
+        .removesuffix("...\n")
+        .strip()
+    )
     return f"`{text}`"
 
 
@@ -137,16 +174,22 @@ def type_of(part: dict[str, Any]) -> str:
         return array_type(part)
     if part.get("type") == "object":
         inner = part.get("additionalProperties", {})
-        return f"map of {type_of(inner)}" if isinstance(inner, dict) and inner else "map"
-    return {"string": "text", "boolean": "true or false", "integer": "whole number"}.get(
-        part.get("type", "any"), part.get("type", "any")
-    )
+        return (
+            f"map of {type_of(inner)}" if isinstance(inner, dict) and inner else "map"
+        )
+    return {
+        "string": "text",
+        "boolean": "true or false",
+        "integer": "whole number",
+    }.get(part.get("type", "any"), part.get("type", "any"))
 
 
 def array_type(part: dict[str, Any]) -> str:
     """The type of a list: of so many, or of any number."""
     if "prefixItems" in part:
-        return f"[{', '.join(type_of(one) for one in part['prefixItems'])}]".replace("[[", "[ [")
+        return f"[{', '.join(type_of(one) for one in part['prefixItems'])}]".replace(
+            "[[", "[ ["
+        )
     return f"list of {type_of(part.get('items', {}))}"
 
 
@@ -163,15 +206,29 @@ def range_of(part: dict[str, Any]) -> str:
     return ""
 
 
-def rows(schema: type[BaseModel], properties: dict[str, Any], required: list[str]) -> Iterator[str]:
+def rows(
+    schema: type[BaseModel], properties: dict[str, Any], required: list[str]
+) -> Iterator[str]:
     """A line of a table for each key of a schema."""
     names = {field.alias or name: name for name, field in schema.model_fields.items()}
     for key, part in properties.items():
         default = "required" if key in required else ""
-        if "default" in part and "$ref" not in part:  # a schema's is that of its own keys
+        if (
+            "default" in part and "$ref" not in part
+        ):  # a schema's is that of its own keys
             default = shown(part["default"])
-        cells = (f"`{key}`", type_of(part), default, range_of(part), meaning(schema, names[key]))
-        yield "|" + "|".join(f" {re.sub(r'[|]', '&#124;', cell)} " for cell in cells) + "|"
+        cells = (
+            f"`{key}`",
+            type_of(part),
+            default,
+            range_of(part),
+            meaning(schema, names[key]),
+        )
+        yield (
+            "|"
+            + "|".join(f" {re.sub(r'[|]', '&#124;', cell)} " for cell in cells)
+            + "|"
+        )
 
 
 def section(schema: type[BaseModel], part: dict[str, Any], title: str) -> str:
@@ -180,7 +237,9 @@ def section(schema: type[BaseModel], part: dict[str, Any], title: str) -> str:
         line.rstrip() for line in inspect.cleandoc(schema.__doc__ or "").split("\n")
     ).split("\nAttributes:")[0]
     head = "| key | type | default | range | meaning |\n|---|---|---|---|---|"
-    table = "\n".join(rows(schema, part.get("properties", {}), part.get("required", [])))
+    table = "\n".join(
+        rows(schema, part.get("properties", {}), part.get("required", []))
+    )
     return f"{title}\n\n{text.strip()}\n\n{head}\n{table}\n"
 
 
@@ -217,14 +276,22 @@ def command_section(path: str, command: Any) -> str:
     for one in (each for each in command.params if not getattr(each, "hidden", False)):
         if one.name == "help":
             continue
-        names = [*one.opts, *one.secondary_opts] if one.param_type_name == "option" else [one.name]
+        names = (
+            [*one.opts, *one.secondary_opts]
+            if one.param_type_name == "option"
+            else [one.name]
+        )
         usual = "required" if one.required else ""
         if isinstance(one.default, bool):
             usual = f"`{names[not one.default]}`" if one.secondary_opts else ""
         elif isinstance(one.default, str | int | float | Path):
-            usual = shown(one.default if not isinstance(one.default, Path) else str(one.default))
+            usual = shown(
+                one.default if not isinstance(one.default, Path) else str(one.default)
+            )
         told = " ".join((getattr(one, "help", "") or "").split()).replace("|", "&#124;")
-        lines.append(f"| {', '.join(f'`{name}`' for name in names)} | {usual} | {told} |")
+        lines.append(
+            f"| {', '.join(f'`{name}`' for name in names)} | {usual} | {told} |"
+        )
     return "\n".join([*lines, ""])
 
 
@@ -263,7 +330,9 @@ def pages() -> dict[str, str]:
     every = [command_section(*one) for one in commands(get_command(app), "nics")]
     head = "# Commands\n\nEvery command of `nics`, as shown by `nics COMMAND --help`.\n"
     found["commands.md"] = "\n".join([head, *every])
-    head = "# Nodes\n\nEvery node, as shown by `ros2 run nics_drl_bridge NODE --help`.\n"
+    head = (
+        "# Nodes\n\nEvery node, as shown by `ros2 run nics_drl_bridge NODE --help`.\n"
+    )
     found["nodes.md"] = "\n".join([head, *map(node_section, NODES)])
     return found
 

@@ -16,7 +16,14 @@ from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
 from nics_drl_bridge.commands.examples import complete
 from nics_drl_bridge.commands.listing import list_
-from nics_drl_bridge.commands.model import drive, generate, import_, inspect, record, urdf
+from nics_drl_bridge.commands.model import (
+    drive,
+    generate,
+    import_,
+    inspect,
+    record,
+    urdf,
+)
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.start import EXIT_INTERRUPTED, was_interrupted
 from nics_drl_bridge.commands.train import train
@@ -34,7 +41,9 @@ class OneWordForARobot(TyperGroup):
         robots = [value for word in ROBOT_OPTIONS for value in values_of(word, args)]
         if len(set(robots)) > 1:
             told = " and ".join(map(repr, robots))
-            ctx.fail(f"--robot and --model are one option, and name {told}; give one of them")
+            ctx.fail(
+                f"--robot and --model are one option, and name {told}; give one of them"
+            )
         return super().parse_args(ctx, args)
 
 
@@ -62,7 +71,13 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool,
+        Option(
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Print the version.",
+        ),
     ] = False,
     sensor_kind: Annotated[
         list[str] | None,
@@ -82,9 +97,21 @@ def _options(
 
 
 for command in (
-    list_, drive, generate, inspect, import_, record, explain, doctor, urdf, train, evaluate, watch,
-    demo, warmup,
-):  # fmt: skip
+    list_,
+    drive,
+    generate,
+    inspect,
+    import_,
+    record,
+    explain,
+    doctor,
+    urdf,
+    train,
+    evaluate,
+    watch,
+    demo,
+    warmup,
+):
     app.command(command.__name__.rstrip("_"))(command)
 app.add_typer(policy, name="policy")
 app.add_typer(world, name="world")
@@ -104,13 +131,19 @@ def main() -> None:
         typer.echo("Aborted.", err=True)
         raise SystemExit(1) from None
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # stdout is flushed at exit
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # stdout is flushed at exit
         raise SystemExit(1) from None
     except Exception as error:
         if not hasattr(error, "format_message"):  # no option error of click or typer
             raise
-        if message := error.format_message().strip():  # otherwise its help has been shown
-            message = shortened(message.rstrip(".?").replace("Value error, ", ""), LONGEST)
+        if (
+            message := error.format_message().strip()
+        ):  # otherwise its help has been shown
+            message = shortened(
+                message.rstrip(".?").replace("Value error, ", ""), LONGEST
+            )
             typer.echo(f"nics: {message}; see `nics --help`.", err=True)
         raise SystemExit(EXIT_BAD_INPUT) from None
     raise SystemExit(code if isinstance(code, int) else 0)

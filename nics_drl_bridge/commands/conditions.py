@@ -14,17 +14,31 @@ class Conditions:
     """Conditions of an evaluation; None leaves the model's lidar, or randomisation and gate out."""
 
     lidar: str | None = None  # shipped lidar or file, instead of the model's
-    randomisation: str | None = None  # shipped one or file, which draws each episode's numbers
-    gate: str | None = None  # limits, shipped or a file, of a gate between policy and robot
+    randomisation: str | None = (
+        None  # shipped one or file, which draws each episode's numbers
+    )
+    gate: str | None = (
+        None  # limits, shipped or a file, of a gate between policy and robot
+    )
     fallback: str = ""  # planner behind the policy, none by default
-    steps: int | None = None  # time limit of an episode; None: that of policies, robot and world
-    task: Mapping[str, Any] = field(default_factory=dict)  # options, instead of the policy's own
-    kind: str | None = None  # path/to/file.py:ClassName of a policy's task, if it is not shipped
+    steps: int | None = (
+        None  # time limit of an episode; None: that of policies, robot and world
+    )
+    task: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # options, instead of the policy's own
+    kind: str | None = (
+        None  # path/to/file.py:ClassName of a policy's task, if it is not shipped
+    )
 
     @property
     def ranges(self) -> Randomisation | None:
         """The ranges that each episode draws from. Raises ConfigError."""
-        return None if self.randomisation is None else load_randomisation(self.randomisation)
+        return (
+            None
+            if self.randomisation is None
+            else load_randomisation(self.randomisation)
+        )
 
     def model(self, name: str, folder: Path) -> tuple[SimulatorModel, str]:
         """Opens a model and returns its name; with another lidar, it is saved below a folder."""

@@ -24,8 +24,13 @@ from nics_drl_bridge.status import STATUS
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 WIDEST = 10_000
-PATIENCE_S, REPEATED_S = 2.0, 10.0  # silence before the first line about work, and between lines
-Tell = Callable[[str, int, int], None]  # what is done, how much of it, of how much (0: unknown)
+PATIENCE_S, REPEATED_S = (
+    2.0,
+    10.0,
+)  # silence before the first line about work, and between lines
+Tell = Callable[
+    [str, int, int], None
+]  # what is done, how much of it, of how much (0: unknown)
 
 
 def say(as_json: bool, line: str, **facts: Any) -> None:
@@ -40,52 +45,120 @@ def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[st
         from nics_drl_bridge.config import shipped_names
 
         places = (Path(one) for one in sorted(glob(f"{incomplete}*")))
-        paths = [str(one) for one in places if one.is_dir() or one.suffix in (".yaml", ".onnx")]
+        paths = [
+            str(one)
+            for one in places
+            if one.is_dir() or one.suffix in (".yaml", ".onnx")
+        ]
         names = (*(name for kind in kinds for name in shipped_names(kind)), *also)
         return [name for name in names if name.startswith(incomplete)] + paths
 
     return complete
 
 
-ROBOTS, WORLDS = completing("robots"), completing("worlds", "world_sets", also=("barn",))
+ROBOTS, WORLDS = (
+    completing("robots"),
+    completing("worlds", "world_sets", also=("barn",)),
+)
 POLICIES = completing("policies", also=("dynamic_window", "mppi", "random", "straight"))
 ROBOT_OPTIONS = ("--robot", "--model")  # two words for one option, of every command
-RobotOption = Annotated[str, Option("--robot", "--model", autocompletion=ROBOTS,
-    help="A shipped robot (see nics list robots) or a YAML file.")]  # fmt: skip
-DrivenRobotOption = Annotated[str | None, Option("--robot", "--model", autocompletion=ROBOTS,
-    help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")]  # fmt: skip
-LidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
-    help="A shipped lidar or a YAML file; else the robot's own, or paper.")]  # fmt: skip
-WorldOption = Annotated[str, Option("--world", "--scene", autocompletion=WORLDS,
-    help="A shipped world (arena) or a YAML file.")]  # fmt: skip
+RobotOption = Annotated[
+    str,
+    Option(
+        "--robot",
+        "--model",
+        autocompletion=ROBOTS,
+        help="A shipped robot (see nics list robots) or a YAML file.",
+    ),
+]
+DrivenRobotOption = Annotated[
+    str | None,
+    Option(
+        "--robot",
+        "--model",
+        autocompletion=ROBOTS,
+        help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.",
+    ),
+]
+LidarOption = Annotated[
+    str | None,
+    Option(
+        autocompletion=completing("lidars"),
+        help="A shipped lidar or a YAML file; else the robot's own, or paper.",
+    ),
+]
+WorldOption = Annotated[
+    str,
+    Option(
+        "--world",
+        "--scene",
+        autocompletion=WORLDS,
+        help="A shipped world (arena) or a YAML file.",
+    ),
+]
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
-TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
+TopicsOption = Annotated[
+    Path | None, Option(help="YAML file: a bag's topic for each role.")
+]
 SalvageOption = Annotated[
-    bool, Option("--salvage", help="Use what is intact of a damaged bag; report the rest.")
+    bool,
+    Option("--salvage", help="Use what is intact of a damaged bag; report the rest."),
 ]
-OtherLidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
-    help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")]  # fmt: skip
-RandomisationOption = Annotated[str | None, Option(autocompletion=completing("randomisation"),
-    help="Drawn in each episode: a shipped one (mild) or a YAML file.")]  # fmt: skip
+OtherLidarOption = Annotated[
+    str | None,
+    Option(
+        autocompletion=completing("lidars"),
+        help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.",
+    ),
+]
+RandomisationOption = Annotated[
+    str | None,
+    Option(
+        autocompletion=completing("randomisation"),
+        help="Drawn in each episode: a shipped one (mild) or a YAML file.",
+    ),
+]
 TaskOption = Annotated[
-    str | None, Option(help="Your own task that the policy is for: path/to/file.py:ClassName.")
+    str | None,
+    Option(help="Your own task that the policy is for: path/to/file.py:ClassName."),
 ]
-GateOption = Annotated[str | None, Option(
-    metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped ones "
-    "(differential) or a YAML file.", autocompletion=completing("limits"))]  # fmt: skip
-TopicOption = Annotated[list[str] | None, Option(
-    metavar="ROLE=TOPIC", help="Topic of one role, as cmd_vel=/car/drive; may be given several "
-    "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")
-]  # fmt: skip
+GateOption = Annotated[
+    str | None,
+    Option(
+        metavar="LIMITS",
+        help="Drive through the gate and its shield, with these limits: shipped ones "
+        "(differential) or a YAML file.",
+        autocompletion=completing("limits"),
+    ),
+]
+TopicOption = Annotated[
+    list[str] | None,
+    Option(
+        metavar="ROLE=TOPIC",
+        help="Topic of one role, as cmd_vel=/car/drive; may be given several "
+        "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
+    ),
+]
 HARDWARE_OPTIONS = (
-    "start", "namespace", "pose_type", "imu", "yes", "arm", "goal_frame", "confirm_beyond",
-)  # fmt: skip
-NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
+    "start",
+    "namespace",
+    "pose_type",
+    "imu",
+    "yes",
+    "arm",
+    "goal_frame",
+    "confirm_beyond",
+)
+NEEDED: dict[
+    str, dict[str, tuple[str, ...]]
+] = {  # options that do nothing without another
     "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
 }
-APART: dict[str, dict[str, tuple[str, ...]]] = {  # options that leave others nothing to do
+APART: dict[
+    str, dict[str, tuple[str, ...]]
+] = {  # options that leave others nothing to do
     "evaluate": {
         "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
         "shadow": ("places", "fallback", "lidar", "randomisation", "gate", "task"),
@@ -106,12 +179,18 @@ def checked(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(command)
     def run(**given: Any) -> Any:
-        told = {one: value for one, value in given.items() if value and value != usual[one].default}
+        told = {
+            one: value
+            for one, value in given.items()
+            if value and value != usual[one].default
+        }
         with one_sentence():
             for name, value in told.items():
                 for each in value if isinstance(value, tuple | list) else (value,):
                     if isinstance(each, float) and not math.isfinite(each):
-                        raise ConfigError(f"{_option(name)} {each}: must be a finite number.")
+                        raise ConfigError(
+                            f"{_option(name)} {each}: must be a finite number."
+                        )
                 others = needed.get(name, ())
                 if others and not told.keys() & others:
                     fix = f"{' or '.join(map(_option, others))}; add that, or leave it out."
@@ -119,14 +198,18 @@ def checked(command: Callable[..., Any]) -> Callable[..., Any]:
                 for other in APART.get(command.__name__, {}).get(name, ()):
                     if other in told:
                         fix = f"does not go with {_option(name)}; leave out {_option(other)}"
-                        raise ConfigError(f"{_option(other)} {fix}, or {_option(name)}.")
+                        raise ConfigError(
+                            f"{_option(other)} {fix}, or {_option(name)}."
+                        )
             return command(**given)
 
     return run
 
 
 def _option(name: str) -> str:
-    return {"places": "--in", "policy": "a policy"}.get(name, f"--{name.replace('_', '-')}")
+    return {"places": "--in", "policy": "a policy"}.get(
+        name, f"--{name.replace('_', '-')}"
+    )
 
 
 def roles_of(options: Sequence[str]) -> dict[str, str]:
@@ -137,7 +220,9 @@ def roles_of(options: Sequence[str]) -> dict[str, str]:
     for option in options:
         role, _, name = option.partition("=")
         if role not in TYPES or not name:
-            raise ConfigError(f"--topic {option!r}: must be ROLE=TOPIC; {nearest(role, TYPES)}")
+            raise ConfigError(
+                f"--topic {option!r}: must be ROLE=TOPIC; {nearest(role, TYPES)}"
+            )
         roles[role] = name if name.startswith("/") else f"/{name}"
     return roles
 
@@ -151,14 +236,24 @@ def one_sentence() -> Iterator[None]:
         raise
     except BaseException as error:
         if was_interrupted(error):
-            typer.echo("nics: interrupted; everything that was started has ended.", err=True)
+            typer.echo(
+                "nics: interrupted; everything that was started has ended.", err=True
+            )
             raise typer.Exit(EXIT_INTERRUPTED) from None
         if not isinstance(error, Exception):
             raise
-        clause = str(error) if isinstance(error, BridgeError) else extensions.own_fault(error)
+        clause = (
+            str(error)
+            if isinstance(error, BridgeError)
+            else extensions.own_fault(error)
+        )
         if clause is None and isinstance(error, ImportError):
             clause = extensions.unmet(error)
-        elif not clause and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+        elif (
+            not clause
+            and isinstance(error, OSError)
+            and not isinstance(error, BrokenPipeError)
+        ):
             place = f"{error.filename}: " if error.filename else ""
             clause = f"{place}{error.strerror or error}; choose another place."
         if clause is None:
@@ -170,7 +265,9 @@ def one_sentence() -> Iterator[None]:
 def tell_replaced(file: Path) -> None:
     """Says so if a file that is there will be replaced."""
     if file.exists():
-        typer.echo(f"{file.parent}: the {file.name} that is there will be replaced", err=True)
+        typer.echo(
+            f"{file.parent}: the {file.name} that is there will be replaced", err=True
+        )
 
 
 @contextmanager
@@ -203,7 +300,9 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     from rich.table import Column, Table
     from rich.text import Text
 
-    made = Table(*(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False)  # no markup
+    made = Table(
+        *(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False
+    )  # no markup
     for row in rows:
         made.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()

@@ -11,16 +11,29 @@ from nics_drl_bridge.commands import console
 
 
 def demo(
-    recording: Annotated[Path | None, Option(help="A drive; by default a textbook one.")] = None,
-    out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
+    recording: Annotated[
+        Path | None, Option(help="A drive; by default a textbook one.")
+    ] = None,
+    out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path(
+        "runs/demo"
+    ),
     robot: console.DrivenRobotOption = None,
     world: console.WorldOption = "arena",
-    episodes: Annotated[int, Option(min=1, help="Episodes in process, and again over DDS.")] = 5,
-    policy: Annotated[str | None, Option(autocompletion=console.POLICIES,
-        help="Skip training: use a policy file, a shipped one or a baseline.")] = None,
-    train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
+    episodes: Annotated[
+        int, Option(min=1, help="Episodes in process, and again over DDS.")
+    ] = 5,
+    policy: Annotated[
+        str | None,
+        Option(
+            autocompletion=console.POLICIES,
+            help="Skip training: use a policy file, a shipped one or a baseline.",
+        ),
+    ] = None,
+    train_steps: Annotated[
+        int | None, Option(min=1, help="Environment steps to train.")
+    ] = None,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Runs the whole chain once, from a recording to a report."""
     from nics_drl_bridge.commands.demo_run import DemoPlan, run
 

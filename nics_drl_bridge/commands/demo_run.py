@@ -23,7 +23,13 @@ from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.report import opening
 from nics_drl_bridge.policy import evaluation
-from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, deviation, successes
+from nics_drl_bridge.policy.evaluation import (
+    FIRST_SEED,
+    Episode,
+    Summary,
+    deviation,
+    successes,
+)
 from nics_drl_bridge.policy.pace import Fitted, fitted, pace_of
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
 from nics_drl_bridge.policy.training_settings import load_training
@@ -32,7 +38,12 @@ from nics_drl_bridge.recording.readers import read_recording, robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.report import html, pictures
-from nics_drl_bridge.report.fit_page import fit_tile, model_blocks, path_blocks, verdict_blocks
+from nics_drl_bridge.report.fit_page import (
+    fit_tile,
+    model_blocks,
+    path_blocks,
+    verdict_blocks,
+)
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
@@ -44,7 +55,10 @@ MANY = 500  # episodes of the evaluation in the fast simulator
 BASELINE, AS_IT_IS, PERTURBED = "dynamic_window", "as it is", "mild"
 LINES = 10  # number of progress reports of a training
 ARRIVE_S = 90.0  # time that the robot may take [s]; its policy may have to be compiled
-FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05  # of the demo's gate, from zero to greatest command, rate
+FULL_COMMAND_S, FULL_RATE_S = (
+    0.3,
+    0.05,
+)  # of the demo's gate, from zero to greatest command, rate
 GOOD = 0.9  # share of successes below which the verdict doubts a policy
 PANELS = 9  # maximum number of episodes that are drawn
 R = TypeVar("R")
@@ -55,12 +69,20 @@ class DemoPlan:
     """Plan of a demo."""
 
     out: Path  # output folder
-    robot: str | None = None  # name or YAML file, as the world; None: as the recording tells
+    robot: str | None = (
+        None  # name or YAML file, as the world; None: as the recording tells
+    )
     world: str = "arena"
-    recording: Path | None = None  # of a drive; None makes one with the robot's textbook kinematics
+    recording: Path | None = (
+        None  # of a drive; None makes one with the robot's textbook kinematics
+    )
     episodes: int = 5  # number of episodes, in process and again over DDS
-    policy: str | None = None  # a policy file or a name, to drive with instead of training one
-    train_steps: int | None = None  # environment steps of the training; None: as in `demo.yaml`
+    policy: str | None = (
+        None  # a policy file or a name, to drive with instead of training one
+    )
+    train_steps: int | None = (
+        None  # environment steps of the training; None: as in `demo.yaml`
+    )
 
     @property
     def model(self) -> Path:
@@ -84,7 +106,9 @@ class DemoEpisodes:
     summaries: Mapping[str, Summary]  # of the world as it is, and perturbed
     here: Sequence[Episode]  # in process
     there: Sequence[Episode]  # over DDS
-    live: Episode | None  # deployed; None without ROS 2, with which `there` is empty, too
+    live: (
+        Episode | None
+    )  # deployed; None without ROS 2, with which `there` is empty, too
 
     @property
     def summary(self) -> Summary:
@@ -109,13 +133,27 @@ def run(plan: DemoPlan, say: Say) -> str:
     learned = timed("learning", learn, model)
     summaries = timed("evaluating", _evaluate, model, learned.policy)
     here = timed("driving in process", _drive, FAST, learned.policy)
-    world, radius, paths = load_world(plan.world), model.robot.footprint_radius, "paths.png"
-    write_bytes(plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius))
-    say(f"  the paths are drawn in {plan.out / paths}")  # while the report takes a while
+    world, radius, paths = (
+        load_world(plan.world),
+        model.robot.footprint_radius,
+        "paths.png",
+    )
+    write_bytes(
+        plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius)
+    )
+    say(
+        f"  the paths are drawn in {plan.out / paths}"
+    )  # while the report takes a while
     there = timed("driving over DDS", _drive, DDS, learned.policy) if topics else []
-    given = model, learned.policy, next((e.seed for e in there if e.result == "success"), 0)
+    given = (
+        model,
+        learned.policy,
+        next((e.seed for e in there if e.result == "success"), 0),
+    )
     live = timed("deploying", _deploy, *given) if topics else None
-    times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
+    times = [
+        (part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()
+    ]
     episodes = DemoEpisodes(summaries, here, there, live)
     sections = sections_of(plan, model, identified, learned, episodes)
     folded = html.details("Wall time", [html.table(("part", "wall time [s]"), times)])
@@ -124,7 +162,9 @@ def run(plan: DemoPlan, say: Say) -> str:
         f"Robot {model.robot.name!r} in the world {plan.world!r}, policy {learned.policy!r}, "
         f"simulator generated from {plan.recording or 'a textbook drive'}."
     )
-    write_text(file, html.page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])]))
+    write_text(
+        file, html.page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])])
+    )
     over = f"over DDS {successes(there)}/{plan.episodes}, " if topics else ""
     return f"demo: in process {successes(here)}/{plan.episodes}, {over}report {file}"
 
@@ -143,7 +183,9 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     world, (robot, recording) = load_world(plan.world), _recorded(plan, say)
     say(f"generating a simulator of the robot {robot.name!r} from {recording.source}")
     # The demo has to steer even if the drive never did; the report names the assumptions.
-    model, identified = generate(recording, robot, lidar_of(robot), world.shapes, assume=True)
+    model, identified = generate(
+        recording, robot, lidar_of(robot), world.shapes, assume=True
+    )
     save_model(model, plan.model)
     say(opening(model.report))
     return model, identified
@@ -153,12 +195,18 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     """Trains a policy, unless one is named or a module is missing. Raises BridgeError."""
     if plan.policy is not None:
         open_policy(plan.policy, model)
-        return Learned(plan.policy, f"The policy {plan.policy!r} was given; none was trained.")
+        return Learned(
+            plan.policy, f"The policy {plan.policy!r} was given; none was trained."
+        )
     missing = extensions.lacking(extensions.TRAINING)
     if missing is None:
         return _trained(plan, model, say)
     policy = BASELINE
-    if model.robot.name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
+    if (
+        model.robot.name in shipped_policies()
+        and find_spec("onnxruntime")
+        and find_spec("onnx")
+    ):
         with suppress(PolicyError):  # a shipped one may not fit
             open_policy(model.robot.name, model)
             policy = model.robot.name
@@ -166,7 +214,9 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         f"not training, which needs the module {missing!r} (pip install "
         f"'nics_drl_bridge[train,deploy]'); driving with the policy {policy!r} instead"
     )
-    return Learned(policy, f"None was trained, as {missing!r} is not installed: {policy!r} drives.")
+    return Learned(
+        policy, f"None was trained, as {missing!r} is not installed: {policy!r} drives."
+    )
 
 
 def settings_of(plan: DemoPlan, model: SimulatorModel) -> Fitted:
@@ -183,51 +233,87 @@ def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     (settings, told), curve = settings_of(plan, model), list[pictures.Point]()
     for line in told:
         say(line)
-    say(f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once")
+    say(
+        f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once"
+    )
 
     def tell(progress: Any) -> None:
         before = curve[-1].steps if curve else 0
-        curve.append(pictures.Point(progress.steps, progress.success, progress.collision))
+        curve.append(
+            pictures.Point(progress.steps, progress.success, progress.collision)
+        )
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
             say(f"  {progress.steps:,} steps: {progress.line}")
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
     result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"
-    export(settings, result, f"nics demo --robot {plan.robot or model.robot.name}", file)
-    steps = f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
+    export(
+        settings, result, f"nics demo --robot {plan.robot or model.robot.name}", file
+    )
+    steps = (
+        f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
+    )
     how = f"PPO learned it from nothing in the generated simulator: {steps} in the simulator."
     return Learned(str(file), how, curve)
 
 
-def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> dict[str, Summary]:
+def _evaluate(
+    plan: DemoPlan, model: SimulatorModel, name: str, say: Say
+) -> dict[str, Summary]:
     say(f"evaluating {name} in {MANY} unseen episodes, all at once, then perturbed")
     policy, task = open_policy(name, model)
     limit, found = pace_of(model, [load_world(plan.world)]).steps, {}
-    for what, drawn in {AS_IT_IS: None, **load_randomisation(PERTURBED).alone()}.items():
+    for what, drawn in {
+        AS_IT_IS: None,
+        **load_randomisation(PERTURBED).alone(),
+    }.items():
         options: dict[str, Any] = {"max_episode_steps": limit, "randomisation": drawn}
         env = BridgeVectorEnv(MANY, model, plan.world, task, **options)
-        outcomes = evaluation.drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
+        outcomes = evaluation.drive_worlds(
+            env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY)
+        )
         found[what] = summary = evaluation.summarise(outcomes, model.control_period)
-        rates = (f"{result} {100 * each.value:.1f} %" for result, each in summary.shares.items())
+        rates = (
+            f"{result} {100 * each.value:.1f} %"
+            for result, each in summary.shares.items()
+        )
         say(f"  {what.replace('_', ' ')}: {', '.join(rates)}")
     return found
 
 
 def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
     where = "in process" if place == FAST else "over DDS in lock-step"
-    say(f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}")
+    say(
+        f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}"
+    )
     seeds, logs = range(plan.episodes), plan.out / "logs" / place
     return drive_in(
-        place, policy, str(plan.model), plan.world, seeds, logs,
-        lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"), say,
-    )  # fmt: skip
+        place,
+        policy,
+        str(plan.model),
+        plan.world,
+        seeds,
+        logs,
+        lambda e: say(
+            f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"
+        ),
+        say,
+    )
 
 
-def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Episode:
+def _deploy(
+    plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say
+) -> Episode:
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
-    given, limits = {"model": str(plan.model)}, _write_limits(model.robot, plan.out / "limits.yaml")
-    boxes, gate = str(plan.out / "black_box"), {"use_sim_time": True, "e_stop_required": False}
+    given, limits = (
+        {"model": str(plan.model)},
+        _write_limits(model.robot, plan.out / "limits.yaml"),
+    )
+    boxes, gate = (
+        str(plan.out / "black_box"),
+        {"use_sim_time": True, "e_stop_required": False},
+    )
     nodes: dict[str, dict[str, Any]] = {
         "simulator_node": {**given, "world": plan.world, "episode_seed": seed},
         "middleware_node": given,
@@ -238,13 +324,19 @@ def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: 
     # The policy stops where it believes the goal is; its odometry drifts.
     near = Navigation(model.robot, model.lidar).goal_radius + 0.1
     arrived, path = _watched(nodes, plan.out / "logs" / "realtime", goal, near, say)
-    say(f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed {seed}")
+    say(
+        f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed {seed}"
+    )
     result = "success" if arrived else "time-out"
     return Episode(seed, result, path, path, scene.goals[0], scene.bodies, 0.0)
 
 
 def _watched(
-    nodes: dict[str, dict[str, Any]], logs: Path, goal: list[float], near: float, say: Say
+    nodes: dict[str, dict[str, Any]],
+    logs: Path,
+    goal: list[float],
+    near: float,
+    say: Say,
 ) -> tuple[bool, Any]:
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
@@ -253,11 +345,15 @@ def _watched(
         witness = stack.enter_context(Witness(domain_id))
         processes = []
         for node, parameters in nodes.items():
-            processes.append(stack.enter_context(NodeProcess(node, logs, parameters, domain_id)))
+            processes.append(
+                stack.enter_context(NodeProcess(node, logs, parameters, domain_id))
+            )
             if node == "simulator_node" and not witness.sees(START_S):
                 processes[0].check()
                 fix = f"look at its log, {processes[0].log}."
-                raise BackendError(f"{node} publishes nothing after {START_S:g} s; {fix}")
+                raise BackendError(
+                    f"{node} publishes nothing after {START_S:g} s; {fix}"
+                )
         refused = witness.arms("command_gate", START_S)
         for process in processes:
             process.check()
@@ -282,16 +378,20 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
 
 
 def sections_of(
-    plan: DemoPlan, model: SimulatorModel, identified: Identified, learned: Learned,
+    plan: DemoPlan,
+    model: SimulatorModel,
+    identified: Identified,
+    learned: Learned,
     of: DemoEpisodes,
-) -> list[tuple[str, Sequence[str]]]:  # fmt: skip
+) -> list[tuple[str, Sequence[str]]]:
     """Sections of the report, the verdict first, each a heading and HTML blocks."""
     return [
         ("Verdict", _verdict(plan, learned, identified, of)),
         ("Paths in the world", _episodes(plan, model, of)),
-        ("The policy", _policy(plan, learned, of)), ("Paths of the model", path_blocks(identified)),
+        ("The policy", _policy(plan, learned, of)),
+        ("Paths of the model", path_blocks(identified)),
         ("The model", model_blocks(model.robot, identified, model.report)),
-    ]  # fmt: skip
+    ]
 
 
 def _verdict(
@@ -322,11 +422,12 @@ def _verdict(
         next_step = more if share.value >= GOOD else "train longer, with --train-steps"
         conclusion = conclusion._replace(advice=f"Next: {next_step}.")
     return verdict_blocks(
-        tiles, conclusion,
+        tiles,
+        conclusion,
         f"nics watch {learned.policy} --model {plan.model} --world {plan.world}",
         f"nics evaluate {learned.policy} --model {plan.model} --world {plan.world}",
         "nics demo --recording DRIVE --robot ROBOT.yaml  # your own robot",
-    )  # fmt: skip
+    )
 
 
 def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
@@ -342,13 +443,19 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
     for name, share in summary.shares.items():
         rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
-        known = (f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount))
+        known = (
+            f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount)
+        )
         rows.append((name, *known))
     text = (
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, in parallel in the fast "
         "simulator, without exploration; path and time are means of the successful ones."
     )
-    return [*blocks, html.paragraph(text), html.table(("", "value", "95 % from", "to"), rows)]
+    return [
+        *blocks,
+        html.paragraph(text),
+        html.table(("", "value", "95 % from", "to"), rows),
+    ]
 
 
 def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[str]:
@@ -357,15 +464,24 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     world, radius = load_world(plan.world), model.robot.footprint_radius
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
-        shown = [(pictures.trajectories({both[0]: [a]}, world, radius), "") for a in here[:PANELS]]
+        shown = [
+            (pictures.trajectories({both[0]: [a]}, world, radius), "")
+            for a in here[:PANELS]
+        ]
         return [html.paragraph(text), html.gallery(shown)]
     rows = [
         (
-            f"{a.seed}", a.result, f"{a.steps}", f"{a.length:.2f}",
-            b.result, f"{b.steps}", f"{b.length:.2f}", f"{deviation(a, b):.1g}",
+            f"{a.seed}",
+            a.result,
+            f"{a.steps}",
+            f"{a.length:.2f}",
+            b.result,
+            f"{b.steps}",
+            f"{b.length:.2f}",
+            f"{deviation(a, b):.1g}",
         )
         for a, b in zip(here, there, strict=True)
-    ]  # fmt: skip
+    ]
     drawn = []
     for a, b in list(zip(here, there, strict=True))[:PANELS]:
         runs = {both[0]: [a], both[1]: [b]}
@@ -382,6 +498,7 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     about = "Deviation is the greatest distance between the two true paths at the same step."
     table = html.table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows)
     return [
-        html.paragraph(text), html.gallery(drawn),
+        html.paragraph(text),
+        html.gallery(drawn),
         html.details("Episode by episode", [html.paragraph(about), table]),
-    ]  # fmt: skip
+    ]

@@ -15,18 +15,37 @@ EXIT_FINDINGS = 1
 
 
 def doctor(
-    bag: Annotated[Path | None, Argument(help="A bag to check; else the live robot.")] = None,
-    model: Annotated[str | None, Option("--model", "--robot", autocompletion=console.ROBOTS,
-        help=f"Check against a model's folder, or a shipped robot ({DEFAULT_ROBOT}).")] = None,
-    policy: Annotated[str | None, Option(help="Check against a policy file instead.")] = None,
+    bag: Annotated[
+        Path | None, Argument(help="A bag to check; else the live robot.")
+    ] = None,
+    model: Annotated[
+        str | None,
+        Option(
+            "--model",
+            "--robot",
+            autocompletion=console.ROBOTS,
+            help=f"Check against a model's folder, or a shipped robot ({DEFAULT_ROBOT}).",
+        ),
+    ] = None,
+    policy: Annotated[
+        str | None, Option(help="Check against a policy file instead.")
+    ] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
-    duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
-    imu: Annotated[str, Option(metavar="TOPIC",
-        help="Topic of the gyro; auto: the one that is there; none.")] = "auto",
-    install: Annotated[bool, Option("--install",
-        help="Check this machine instead: what works here.")] = False,
+    duration: Annotated[
+        float, Option(min=1.0, help="How long to listen to a robot [s].")
+    ] = 5.0,
+    imu: Annotated[
+        str,
+        Option(
+            metavar="TOPIC",
+            help="Topic of the gyro; auto: the one that is there; none.",
+        ),
+    ] = "auto",
+    install: Annotated[
+        bool, Option("--install", help="Check this machine instead: what works here.")
+    ] = False,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Checks a robot or a bag against a model; sends nothing."""
     if install:
         _tell_installation(as_json)
@@ -39,7 +58,9 @@ def doctor(
     if policy is None:
         expected = expected_of(open_model(model or DEFAULT_ROBOT))
     elif model is not None:
-        raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
+        raise ConfigError(
+            "--model and --policy: give one of them, what the robot must fit."
+        )
     else:
         contract = load_any(policy).contract
         expected = expected_of(contract, contract.scan)
@@ -56,7 +77,9 @@ def doctor(
         heads = ("", "check", "where", "what does not fit", "what to do")
         rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
         told = console.table(heads, rows)
-    console.say(as_json, told, source=facts.source, findings=list(map(asdict, findings)))
+    console.say(
+        as_json, told, source=facts.source, findings=list(map(asdict, findings))
+    )
     if findings:
         raise typer.Exit(EXIT_FINDINGS)
 
@@ -66,14 +89,19 @@ def _tell_installation(as_json: bool) -> None:
 
     found = checks()
     heads = ("", "part", "what there is", "what to do")
-    rows = [("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix) for c in found]
-    console.say(as_json, console.table(heads, rows), checks=[each._asdict() for each in found])
+    rows = [
+        ("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix)
+        for c in found
+    ]
+    console.say(
+        as_json, console.table(heads, rows), checks=[each._asdict() for each in found]
+    )
 
 
 def explain(
     file: Annotated[Path, Argument(help="Black box written at a stop, *.jsonl.")],
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Explains why command_gate stopped a robot, from its black box."""
     from nics_drl_bridge.gate import black_box
 

@@ -43,25 +43,48 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
-LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS", VEHICLE: "on the vehicle"}
+LABELS = {
+    FAST: "in process",
+    DDS: "over DDS",
+    MUJOCO: "MuJoCo over DDS",
+    VEHICLE: "on the vehicle",
+}
 EVALUATION = "evaluation.json"
 GATE, RAW = "command_gate", "cmd_vel_raw"
 LISTEN_S, ARM_S = 5.0, 60.0
-START_S = 180.0  # time that a node may take to start [s]; its kernels may have to be compiled
+START_S = (
+    180.0  # time that a node may take to start [s]; its kernels may have to be compiled
+)
 PANELS = 6
 HEADS = (
-    "policy", "world", "success", "95 %", "believed", "collision", "time-out", "path [m]",
-    "time [s]", "as in the first", "deviation [m]", "greatest [m]",
-)  # fmt: skip
+    "policy",
+    "world",
+    "success",
+    "95 %",
+    "believed",
+    "collision",
+    "time-out",
+    "path [m]",
+    "time [s]",
+    "as in the first",
+    "deviation [m]",
+    "greatest [m]",
+)
 Say = Callable[[str], None]
 Tell = Callable[[str, int, int], None]
 
 
 def drive_in(
-    place: str, policy: str, name: str, world: str, seeds: Sequence[int], logs: Path,
-    on_episode: Callable[[Episode], None], say: Say = lambda _: None,
+    place: str,
+    policy: str,
+    name: str,
+    world: str,
+    seeds: Sequence[int],
+    logs: Path,
+    on_episode: Callable[[Episode], None],
+    say: Say = lambda _: None,
     conditions: Conditions = NO_CONDITIONS,
-) -> list[Episode]:  # fmt: skip
+) -> list[Episode]:
     """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
     model, drawn = open_model(name), conditions.ranges
     check_place(place, model.robot)
@@ -75,9 +98,17 @@ def drive_in(
     node, domain_id = NODES[place], free_domain_id()
     parameters = {"model": name, "world": world, "mode": "lockstep"}
     parameters["randomisation"] = conditions.randomisation or ""
-    options = {"domain_id": domain_id, "simulator": node, "timeout_s": START_S, "truth": True}
+    options = {
+        "domain_id": domain_id,
+        "simulator": node,
+        "timeout_s": START_S,
+        "truth": True,
+    }
     options["randomisation"] = drawn
-    with NodeProcess(node, logs, parameters, domain_id) as process, Witness(domain_id) as witness:
+    with (
+        NodeProcess(node, logs, parameters, domain_id) as process,
+        Witness(domain_id) as witness,
+    ):
         say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
         try:
             env, opened = env_of(policy, model, world, "dds", conditions, **options)
@@ -90,9 +121,13 @@ def drive_in(
 
 
 def env_of(
-    policy: str, model: SimulatorModel, world: str | AnyWorld, backend: str,
-    conditions: Conditions = NO_CONDITIONS, **options: Any,
-) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
+    policy: str,
+    model: SimulatorModel,
+    world: str | AnyWorld,
+    backend: str,
+    conditions: Conditions = NO_CONDITIONS,
+    **options: Any,
+) -> tuple[gymnasium.Env[Any, Any], Policy]:
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     field = load_worlds(world) if isinstance(world, str) else world
     given = {name: value for name, value in options.items() if value is not None}
@@ -103,13 +138,22 @@ def env_of(
 
 
 def env_with(
-    backend: Backend, policy: str, model: SimulatorModel, world: AnyWorld, conditions: Conditions
+    backend: Backend,
+    policy: str,
+    model: SimulatorModel,
+    world: AnyWorld,
+    conditions: Conditions,
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:
     """Makes the env of a policy's task on a backend; opens the policy."""
     register_envs()
     opened, task = open_policy(policy, model, conditions.fallback, conditions.kind)
     task = replace(task, **conditions.task)
-    given: dict[str, Any] = {"backend": backend, "model": model, "world": world, "task": task}
+    given: dict[str, Any] = {
+        "backend": backend,
+        "model": model,
+        "world": world,
+        "task": task,
+    }
     limit = conditions.steps or pace_of(model, [world]).steps
     return gymnasium.make(NAVIGATION, max_episode_steps=limit, **given), opened
 
@@ -117,7 +161,9 @@ def env_with(
 def check_place(place: str, robot: RobotSpec) -> None:
     """Raises ConfigError if there is no such place, or it lacks a module or can't have a robot."""
     if place not in PLACES:
-        raise ConfigError(f"--in {place!r}: there is no such simulator; {nearest(place, PLACES)}")
+        raise ConfigError(
+            f"--in {place!r}: there is no such simulator; {nearest(place, PLACES)}"
+        )
     if place == FAST:
         return
     robot.require_cmd_vel()
@@ -137,10 +183,14 @@ def robot_of(policy: str, contract: Contract) -> str:
         return name
     where = f"; its model was {place}, which is gone" if place else ""
     fix = "say where its model is with --model"
-    raise ConfigError(f"{policy}: is of the robot {name!r}, which is not shipped{where}; {fix}.")
+    raise ConfigError(
+        f"{policy}: is of the robot {name!r}, which is not shipped{where}; {fix}."
+    )
 
 
-def contracts_of(policies: Sequence[str], model: str | None = None) -> dict[str, Contract]:
+def contracts_of(
+    policies: Sequence[str], model: str | None = None
+) -> dict[str, Contract]:
     """The contracts of those policies that are files, by policy; baselines have none."""
     files = [policy for policy in policies if is_policy_file(policy)]
     if not files:
@@ -157,11 +207,15 @@ class EvaluationOrder:
 
     policies: Sequence[str]  # files, or names of shipped policies or of baselines
     out: Path  # output folder
-    model: str | None = None  # folder of a model or a shipped robot; None: the policies' own robot
+    model: str | None = (
+        None  # folder of a model or a shipped robot; None: the policies' own robot
+    )
     world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
     seed: int = evaluation.FIRST_SEED
-    places: Sequence[str] = ()  # some of `PLACES`, compared with the first; none: all that work
+    places: Sequence[
+        str
+    ] = ()  # some of `PLACES`, compared with the first; none: all that work
     conditions: Conditions = NO_CONDITIONS
 
     @property
@@ -203,18 +257,25 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
 
             given = place, policy, name, order.world, seeds, logs
             runs[place] = drive_in(*given, on_episode, say, under)
-        evaluated.append(judged(policy, runs, model, world, order.out, PANELS, order.policies))
+        evaluated.append(
+            judged(policy, runs, model, world, order.out, PANELS, order.policies)
+        )
         write_evaluation(replace(order, conditions=under), name, model, evaluated)
     return evaluated
 
 
 def limited(
-    conditions: Conditions, contracts: Mapping[str, Contract], model: SimulatorModel,
-    world: AnyWorld, say: Say,
-) -> Conditions:  # fmt: skip
+    conditions: Conditions,
+    contracts: Mapping[str, Contract],
+    model: SimulatorModel,
+    world: AnyWorld,
+    say: Say,
+) -> Conditions:
     """Conditions with a time limit, the policies' own or one for robot and world; tells it."""
     pace = pace_of(model, [world])
-    known = [one.max_episode_steps for one in contracts.values() if one.max_episode_steps]
+    known = [
+        one.max_episode_steps for one in contracts.values() if one.max_episode_steps
+    ]
     steps = conditions.steps or max(known, default=pace.steps)
     if (short := pace.shortfall(steps)) is not None:
         say(short)
@@ -224,7 +285,9 @@ def limited(
 def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
     """Returns the places of an order; without any those that work here, and why no more do."""
     found = list[str]()
-    for place in order.places or PLACES:  # whatever one of `PLACES` lacks, the next lacks, too
+    for place in (
+        order.places or PLACES
+    ):  # whatever one of `PLACES` lacks, the next lacks, too
         try:
             check_place(place, robot)
         except ConfigError as error:
@@ -237,9 +300,14 @@ def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]
 
 
 def judged(
-    policy: str, runs: Mapping[str, Sequence[Episode]], model: SimulatorModel, world: AnyWorld,
-    out: Path, panels: int | None = None, among: Sequence[str] = (),
-) -> Evaluated:  # fmt: skip
+    policy: str,
+    runs: Mapping[str, Sequence[Episode]],
+    model: SimulatorModel,
+    world: AnyWorld,
+    out: Path,
+    panels: int | None = None,
+    among: Sequence[str] = (),
+) -> Evaluated:
     """Judges the runs of a policy by place, and draws their first episodes into a folder."""
     shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
     picture = trajectories(shown, world, model.robot.footprint_radius)
@@ -256,7 +324,9 @@ def short_name(policy: str, among: Sequence[str]) -> str:
         [part.strip("/") for part in Path(re.sub(ENDS, "", one)).absolute().parts]
         for one in (policy, *({*among} - {policy}))
     )
-    alone = (k for k in range(1, len(own)) if all(one[-k:] != own[-k:] for one in others))
+    alone = (
+        k for k in range(1, len(own)) if all(one[-k:] != own[-k:] for one in others)
+    )
     return "_".join(own[-next(alone, 1) :])
 
 
@@ -264,12 +334,18 @@ def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
     """The model to drive: the given one, or that of all policy files; baselines drive any."""
     if model is not None:
         return model
-    robots = {policy: robot_of(policy, contract) for policy, contract in contracts.items()}
+    robots = {
+        policy: robot_of(policy, contract) for policy, contract in contracts.items()
+    }
     if not robots:
         return DEFAULT_ROBOT
     if len(set(robots.values())) > 1:
-        of_each = ", ".join(f"{policy!r} is of {robot!r}" for policy, robot in robots.items())
-        raise ConfigError(f"{of_each}: evaluate them one by one, or say which with --model.")
+        of_each = ", ".join(
+            f"{policy!r} is of {robot!r}" for policy, robot in robots.items()
+        )
+        raise ConfigError(
+            f"{of_each}: evaluate them one by one, or say which with --model."
+        )
     return next(iter(robots.values()))
 
 
@@ -279,16 +355,23 @@ def write_evaluation(
     """Writes `evaluation.json` of an order, driven with a model of a name."""
     policies = {
         one.policy: {
-            place: {**one.tallies[place].figures(), "each": [episode.plain() for episode in some]}
+            place: {
+                **one.tallies[place].figures(),
+                "each": [episode.plain() for episode in some],
+            }
             for place, some in one.runs.items()
         }
         for one in evaluated
     }
     data = {
-        "model": name, "model_fingerprint": model.fingerprint, "robot": model.robot.name,
-        "world": order.world, "seed": order.seed, "conditions": asdict(order.conditions),
+        "model": name,
+        "model_fingerprint": model.fingerprint,
+        "robot": model.robot.name,
+        "world": order.world,
+        "seed": order.seed,
+        "conditions": asdict(order.conditions),
         "policies": policies,
-    }  # fmt: skip
+    }
     write_text(order.out / EVALUATION, json_of(data) + "\n")
 
 
@@ -296,15 +379,25 @@ def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     """Rows of the table with the columns `HEADS`, as text."""
     return [
         (
-            one.policy, LABELS[place], _percent(tally.success.value),
+            one.policy,
+            LABELS[place],
+            _percent(tally.success.value),
             f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
-            *(_percent(rate.value) for rate in (tally.believed, tally.collision, tally.time_out)),
-            *("-" if isnan(of.value) else f"{of.value:.2f}" for of in (tally.length, tally.time)),
-            _percent(tally.same), f"{tally.deviation.value:.2g}", f"{tally.greatest_deviation:.2g}",
+            *(
+                _percent(rate.value)
+                for rate in (tally.believed, tally.collision, tally.time_out)
+            ),
+            *(
+                "-" if isnan(of.value) else f"{of.value:.2f}"
+                for of in (tally.length, tally.time)
+            ),
+            _percent(tally.same),
+            f"{tally.deviation.value:.2g}",
+            f"{tally.greatest_deviation:.2g}",
         )
         for one in evaluated
         for place, tally in one.tallies.items()
-    ]  # fmt: skip
+    ]
 
 
 def _percent(share: float) -> str:
@@ -322,14 +415,22 @@ def line_of(one: Evaluated) -> str:
         for place, tally in one.tallies.items()
         if not isnan(tally.fallback)
     )
-    return f"{one.policy}: success {each}" + (f"; fallback acted {planned}" if planned else "")
+    return f"{one.policy}: success {each}" + (
+        f"; fallback acted {planned}" if planned else ""
+    )
 
 
 def drive_vehicle(
-    order: EvaluationOrder, goal: tuple[float, float] | None, arm: bool, say: Say, ask: Say,
-    goal_frame: str | None = None, confirm: Say | None = None, confirm_beyond_m: float = FAR_M,
+    order: EvaluationOrder,
+    goal: tuple[float, float] | None,
+    arm: bool,
+    say: Say,
+    ask: Say,
+    goal_frame: str | None = None,
+    confirm: Say | None = None,
+    confirm_beyond_m: float = FAR_M,
     **options: Any,
-) -> Evaluated:  # fmt: skip
+) -> Evaluated:
     """Drives episodes on the vehicle by `cmd_vel_raw`, so through an armed gate, and compares.
 
     Then the fast simulator drives them from the actual starting poses. `ask` gets each start, and
@@ -347,7 +448,9 @@ def drive_vehicle(
     wanted = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
     radius = model.robot.footprint_radius
     if not wanted.needs_pose:  # refused before anybody waits for anything
-        planned = [wanted.episode(sample_scene(world, radius, seed)) for seed in order.seeds]
+        planned = [
+            wanted.episode(sample_scene(world, radius, seed)) for seed in order.seeds
+        ]
         max(planned, key=lambda one: one.distance).confirm(confirm)
     under = limited(order.conditions, contracts, model, world, say)
     # A misfit is an error before anything moves.
@@ -362,8 +465,16 @@ def drive_vehicle(
         say(f"  {finding.severity}: {sentence}")
         errors += [sentence] if finding.severity == "error" else []
     if errors:
-        raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
-    given = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say, **options}
+        raise BackendError(
+            f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest."
+        )
+    given = {
+        "mode": "realtime",
+        "vehicle": True,
+        "command_topic": RAW,
+        "say": say,
+        **options,
+    }
     given["lays_map"] = wanted.lays_map
     ground = wanted.ground(world)
     backend = make_backend("dds", model, ground, **given)
@@ -379,10 +490,14 @@ def drive_vehicle(
             ask(f"episode {count} of {order.episodes}: {episode.sentence()}{last}")
             if wanted.needs_pose:  # it may have been moved meanwhile
                 confirmed = episode.distance
-                episode = wanted.episode(sample_scene(world, radius, seed), backend.present_pose())
+                episode = wanted.episode(
+                    sample_scene(world, radius, seed), backend.present_pose()
+                )
                 if episode.distance > confirmed + NEAR_M:
                     episode.confirm(confirm)
-            driven = drive(env, driver, seed, episode.options, partial(_arm, arm, namespace, say))
+            driven = drive(
+                env, driver, seed, episode.options, partial(_arm, arm, namespace, say)
+            )
             # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {told_end(episodes[-1])}")

@@ -13,61 +13,142 @@ from nics_drl_bridge.files import check_above, json_of, write_bytes, write_text
 
 
 def evaluate(
-    policies: Annotated[list[str], Argument(
-        metavar="POLICY...", help="Policy files, shipped policies (differential), or baselines "
-        "(dynamic_window, mppi, straight, random).", autocompletion=console.POLICIES)],
-    model: Annotated[str | None, Option("--model", "--robot", autocompletion=console.ROBOTS,
-        help="A model's folder, or a shipped robot; else the policy's own.")] = None,
+    policies: Annotated[
+        list[str],
+        Argument(
+            metavar="POLICY...",
+            help="Policy files, shipped policies (differential), or baselines "
+            "(dynamic_window, mppi, straight, random).",
+            autocompletion=console.POLICIES,
+        ),
+    ],
+    model: Annotated[
+        str | None,
+        Option(
+            "--model",
+            "--robot",
+            autocompletion=console.ROBOTS,
+            help="A model's folder, or a shipped robot; else the policy's own.",
+        ),
+    ] = None,
     task: console.TaskOption = None,
-    world: Annotated[str, Option("--world", "--scene", autocompletion=console.WORLDS,
-        help="A shipped world (circles) or a YAML file.")] = "circles",
-    places: Annotated[list[str] | None, Option(
-        "--in", help="fast, dds or mujoco_dds; repeatable; by default all that work here.")] = None,
-    episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
+    world: Annotated[
+        str,
+        Option(
+            "--world",
+            "--scene",
+            autocompletion=console.WORLDS,
+            help="A shipped world (circles) or a YAML file.",
+        ),
+    ] = "circles",
+    places: Annotated[
+        list[str] | None,
+        Option(
+            "--in",
+            help="fast, dds or mujoco_dds; repeatable; by default all that work here.",
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")
+    ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 1_000_000,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
-    fallback: Annotated[str, Option(
-        metavar="PLANNER", help="dynamic_window or mppi: acts where the policy asks for what can't "
-        "be stopped before a touch.")] = "",
+    fallback: Annotated[
+        str,
+        Option(
+            metavar="PLANNER",
+            help="dynamic_window or mppi: acts where the policy asks for what can't "
+            "be stopped before a touch.",
+        ),
+    ] = "",
     out: Annotated[Path, Option(help="Folder for all output.")] = Path("runs/evaluate"),
-    shadow: Annotated[Path | None, Option(help="Compare policies with the drive in a bag.")] = None,
-    topic: Annotated[list[str] | None, Option(
-        metavar="ROLE=TOPIC", help="For --shadow: for example scan=/front/scan.")] = None,
-    ahead: Annotated[float, Option(
-        help="For --shadow without --goal: goal: where the robot is this much later [s].")] = 4.0,
-    backend: Annotated[str | None, Option(help="dds, with --hardware.", metavar="dds")] = None,
-    hardware: Annotated[bool, Option(
-        "--hardware", help="Drive the vehicle, through command_gate.")] = False,
-    start: Annotated[str, Option(
-        help="For --hardware: wait until it stands at the start, or start where it is.")] = "wait",
-    goal: Annotated[str | None, Option(
-        metavar="X,Y", help="Goal [m], see --goal-frame; else the world's. For --shadow: in map.",
-    )] = None,
-    goal_frame: Annotated[str | None, Option(
-        metavar="robot|map", help="For --hardware: the goal is ahead and left of where the robot "
-        "starts, or in map; robot with --start present, else map.")] = None,
-    confirm_beyond: Annotated[float, Option(
-        metavar="METRES", help="For --hardware: a goal that is farther away is confirmed.")] = 5.0,
-    namespace: Annotated[str, Option(help="For --hardware: namespace of its topics.")] = "",
-    pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
-    imu: Annotated[str, Option(metavar="TOPIC", help="For --hardware: topic of the gyro that turns "
-        "odometry; auto: imu or imu/data, if the model was made with one; none.")] = "auto",
-    yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
-    arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
+    shadow: Annotated[
+        Path | None, Option(help="Compare policies with the drive in a bag.")
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        Option(
+            metavar="ROLE=TOPIC", help="For --shadow: for example scan=/front/scan."
+        ),
+    ] = None,
+    ahead: Annotated[
+        float,
+        Option(
+            help="For --shadow without --goal: goal: where the robot is this much later [s]."
+        ),
+    ] = 4.0,
+    backend: Annotated[
+        str | None, Option(help="dds, with --hardware.", metavar="dds")
+    ] = None,
+    hardware: Annotated[
+        bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
+    ] = False,
+    start: Annotated[
+        str,
+        Option(
+            help="For --hardware: wait until it stands at the start, or start where it is."
+        ),
+    ] = "wait",
+    goal: Annotated[
+        str | None,
+        Option(
+            metavar="X,Y",
+            help="Goal [m], see --goal-frame; else the world's. For --shadow: in map.",
+        ),
+    ] = None,
+    goal_frame: Annotated[
+        str | None,
+        Option(
+            metavar="robot|map",
+            help="For --hardware: the goal is ahead and left of where the robot "
+            "starts, or in map; robot with --start present, else map.",
+        ),
+    ] = None,
+    confirm_beyond: Annotated[
+        float,
+        Option(
+            metavar="METRES",
+            help="For --hardware: a goal that is farther away is confirmed.",
+        ),
+    ] = 5.0,
+    namespace: Annotated[
+        str, Option(help="For --hardware: namespace of its topics.")
+    ] = "",
+    pose_type: Annotated[
+        str, Option(help="For --hardware: type of `pose`, in map.")
+    ] = "none",
+    imu: Annotated[
+        str,
+        Option(
+            metavar="TOPIC",
+            help="For --hardware: topic of the gyro that turns "
+            "odometry; auto: imu or imu/data, if the model was made with one; none.",
+        ),
+    ] = "auto",
+    yes: Annotated[
+        bool, Option("--yes", help="For --hardware: ask no questions.")
+    ] = False,
+    arm: Annotated[
+        bool, Option("--arm", help="For --hardware: arm command_gate.")
+    ] = False,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Drives policies through the same episodes, and compares them."""
     place = _point(goal)
     if backend not in (None, "dds"):
-        raise ConfigError(f"--backend {backend!r}: must be dds; simulators are chosen by --in.")
+        raise ConfigError(
+            f"--backend {backend!r}: must be dds; simulators are chosen by --in."
+        )
     if hardware != (backend == "dds"):
         reason = "belong together; the fast simulator over DDS is --in dds."
         raise ConfigError(f"--hardware and --backend dds {reason}")
     check_above(out / "evaluation.json")
     if hardware and len(policies) > 1:
-        raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
+        raise ConfigError(
+            f"--hardware drives one policy at a time, not {', '.join(policies)}."
+        )
     if shadow is not None:
         _shadow(shadow, policies, model, topic or [], place, ahead, out, as_json)
         return
@@ -78,7 +159,14 @@ def evaluate(
     count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
     under = Conditions(lidar, randomisation, gate, fallback, kind=task)
     order = driving.EvaluationOrder(
-        policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
+        policies,
+        out,
+        model,
+        world,
+        count,
+        seed,
+        tuple(dict.fromkeys(places or ())),
+        under,
     )
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
@@ -91,7 +179,9 @@ def evaluate(
             "confirm": partial(_confirm, yes),
             "confirm_beyond_m": confirm_beyond,
         }
-        driven = partial(driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes))
+        driven = partial(
+            driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes)
+        )
         with console.needs_ros("nics evaluate --hardware"):
             evaluated = [driven(**options)]
     else:
@@ -134,9 +224,15 @@ def _point(text: str | None) -> tuple[float, float] | None:
 
 
 def _shadow(
-    bag: Path, policies: list[str], model: str | None, topics: list[str],
-    goal: tuple[float, float] | None, ahead: float, out: Path, as_json: bool,
-) -> None:  # fmt: skip
+    bag: Path,
+    policies: list[str],
+    model: str | None,
+    topics: list[str],
+    goal: tuple[float, float] | None,
+    ahead: float,
+    out: Path,
+    as_json: bool,
+) -> None:
     from nics_drl_bridge.commands.episodes import contracts_of, model_name, short_name
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
@@ -145,27 +241,48 @@ def _shadow(
     rows, lines, told = list[tuple[str, ...]](), list[str](), list[dict[str, Any]]()
     for policy in policies:
         name = model_name(model, contracts_of([policy], model))
-        made = shadow(bag, open_model(name), policy, console.roles_of(topics), goal, ahead)
-        place, differences = out / f"shadow_{short_name(policy, policies)}", made.differences()
+        made = shadow(
+            bag, open_model(name), policy, console.roles_of(topics), goal, ahead
+        )
+        place, differences = (
+            out / f"shadow_{short_name(policy, policies)}",
+            made.differences(),
+        )
         write_bytes(place.with_suffix(".png"), shadow_picture(made))
         data = {
-            "bag": str(bag), "policy": policy, "model": name, "goal": goal,
-            "ahead_s": None if goal else ahead, "compared": len(made.time),
-            "skipped": dict(made.skipped), "resets": made.resets, "commands": differences,
-        }  # fmt: skip
+            "bag": str(bag),
+            "policy": policy,
+            "model": name,
+            "goal": goal,
+            "ahead_s": None if goal else ahead,
+            "compared": len(made.time),
+            "skipped": dict(made.skipped),
+            "resets": made.resets,
+            "commands": differences,
+        }
         write_text(place.with_suffix(".json"), json_of(data) + "\n")
         told.append(data)
-        for (command, figures), unit in zip(differences.items(), made.units, strict=True):
+        for (command, figures), unit in zip(
+            differences.items(), made.units, strict=True
+        ):
             *amounts, opposite = figures.values()
             cells = (f"{value:.3g}" for value in amounts)
             rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
         compared = f"{policy}: compared at {len(made.time)} times"
-        left_out = ", ".join(f"{count} {why}" for why, count in made.skipped.items() if count)
+        left_out = ", ".join(
+            f"{count} {why}" for why, count in made.skipped.items() if count
+        )
         anew = f"; its state began anew after {made.resets} gaps" if made.resets else ""
         lines.append(f"{compared}; left out: {left_out or 'none'}{anew}")
     heads = (
-        "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
-        "greatest", "opposite sign",
-    )  # fmt: skip
+        "policy",
+        "command",
+        "unit",
+        "mean",
+        "mean size",
+        *(f"{q} %" for q in PERCENTILES),
+        "greatest",
+        "opposite sign",
+    )
     lines = [console.table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"]
     console.say(as_json, "\n".join(lines), policies=told)

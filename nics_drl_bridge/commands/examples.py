@@ -7,22 +7,36 @@ from nics_drl_bridge.commands.console import checked
 EXAMPLES = {
     "list": ("nics list robots", "nics list worlds --json"),
     "drive": ("nics drive --robot my_robot.yaml --out my_robot",),
-    "generate": ("nics generate drive.npz --robot ackermann --out my_robot",
-        "nics generate drive.csv --map drive.yaml --out my_robot"),
+    "generate": (
+        "nics generate drive.npz --robot ackermann --out my_robot",
+        "nics generate drive.csv --map drive.yaml --out my_robot",
+    ),
     "inspect": ("nics inspect drive.csv --map drive.yaml",),
     "import": ("nics import drive.csv --map drive.yaml --out drive.npz",),
-    "record": ("nics record --robot my_robot.yaml --out drive.npz --preview",
-        "nics record --robot my_robot.yaml --out drive.npz --bound 2 --speed 0.3"),
+    "record": (
+        "nics record --robot my_robot.yaml --out drive.npz --preview",
+        "nics record --robot my_robot.yaml --out drive.npz --bound 2 --speed 0.3",
+    ),
     "explain": ("nics explain ~/.ros/black_box/stop.jsonl",),
-    "doctor": ("nics doctor --install", "nics doctor drive_bag --model my_robot",
-        "nics doctor --policy policy.onnx --namespace robot1"),
+    "doctor": (
+        "nics doctor --install",
+        "nics doctor drive_bag --model my_robot",
+        "nics doctor --policy policy.onnx --namespace robot1",
+    ),
     "urdf": ("nics urdf my_robot --out my_robot.urdf",),
-    "train": ("nics train --robot differential --world circles --out runs/first",
-        "nics train --robot my_robot.yaml --world doorway --out runs/mine"),
-    "evaluate": ("nics evaluate differential dynamic_window --world circles --in fast",
-        "nics evaluate runs/mine/seed_0/policy.onnx --world doorway --episodes 100"),
-    "watch": ("nics watch differential --world circles", "nics watch --bag drive",
-        "nics watch jackal --world clutter --record episode.gif"),
+    "train": (
+        "nics train --robot differential --world circles --out runs/first",
+        "nics train --robot my_robot.yaml --world doorway --out runs/mine",
+    ),
+    "evaluate": (
+        "nics evaluate differential dynamic_window --world circles --in fast",
+        "nics evaluate runs/mine/seed_0/policy.onnx --world doorway --episodes 100",
+    ),
+    "watch": (
+        "nics watch differential --world circles",
+        "nics watch --bag drive",
+        "nics watch jackal --world clutter --record episode.gif",
+    ),
     "demo": ("nics demo", "nics demo --recording drive.npz --robot my_robot.yaml"),
     "warmup": ("nics warmup",),
     "policy info": ("nics policy info differential --json",),
@@ -36,7 +50,7 @@ EXAMPLES = {
     "bag replay": ("nics bag replay drive --rate 2",),
     "bag export": ("nics bag export drive --lerobot dataset --model my_robot",),
     "bag salvage": ("nics bag salvage damaged whole",),
-}  # fmt: skip
+}
 
 
 def complete(app: typer.Typer, group: str = "") -> None:
@@ -46,7 +60,9 @@ def complete(app: typer.Typer, group: str = "") -> None:
         name = command.name or str(getattr(command.callback, "__name__", ""))
         if found := EXAMPLES.get(f"{group}{name}"):
             # A line with this character alone keeps the lines below as they are.
-            command.epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in found)
+            command.epilog = "\b\nExamples:\n" + "\n".join(
+                f"  {line}" for line in found
+            )
     for each in app.registered_groups:
         if each.typer_instance is not None:
             complete(each.typer_instance, f"{each.name} ")

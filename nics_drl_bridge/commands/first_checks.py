@@ -22,7 +22,9 @@ def check_writable(path: Path) -> None:
             pass
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ConfigError(f"--out {path}: {above}: {reason}; choose another place.") from None
+        raise ConfigError(
+            f"--out {path}: {above}: {reason}; choose another place."
+        ) from None
 
 
 def check_robot(name: str) -> None:
@@ -41,21 +43,29 @@ def check_robot(name: str) -> None:
         fix = "or give a model's folder, or a robot's YAML file"
         raise ModelError(f"unknown robot {name!r}; {nearest(name, shipped)} ({fix}).")
     if not (folder / "model.yaml").is_file():
-        raise ModelError(f"{folder}: holds no model.yaml; make a model with `nics generate`.")
+        raise ModelError(
+            f"{folder}: holds no model.yaml; make a model with `nics generate`."
+        )
 
 
 def check_task(name: str) -> None:
     """Raises ConfigError unless a task, shipped or of the user's own file, is there."""
     file = Path(name.rpartition(":")[0] or name)
     if file.suffix == ".py" and not file.is_file():
-        raise ConfigError(f"task {str(file)!r}: no such file; give path/to/file.py:ClassName.")
+        raise ConfigError(
+            f"task {str(file)!r}: no such file; give path/to/file.py:ClassName."
+        )
     from nics_drl_bridge.env.registry import class_for
 
     class_for(name, {})
 
 
 def check_training(
-    task: str, robot: str | None, worlds: Sequence[str], seeds: Sequence[int], out: Path | None
+    task: str,
+    robot: str | None,
+    worlds: Sequence[str],
+    seeds: Sequence[int],
+    out: Path | None,
 ) -> None:
     """Raises ConfigError or ModelError for the first name, seed or place that can't be used."""
     from nics_drl_bridge.seeds import checked_seeds
@@ -65,7 +75,9 @@ def check_training(
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
     if out is not None:
         if out.exists() and not out.is_dir():
-            raise ConfigError(f"--out {out}: is a file, not a folder; give the name of a folder.")
+            raise ConfigError(
+                f"--out {out}: is a file, not a folder; give the name of a folder."
+            )
         check_writable(out / "settings.yaml")
     if robot is not None:
         check_robot(robot)
@@ -82,7 +94,10 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
     """Raises ConfigError unless settings of a training can be read and take the changes."""
     from nics_drl_bridge.config import find_config
 
-    if settings is not None and not (file := find_config(settings, "training")).is_file():
+    if (
+        settings is not None
+        and not (file := find_config(settings, "training")).is_file()
+    ):
         raise ConfigError(f"--settings {file}: no such file; check the path.")
     from nics_drl_bridge.policy.training_settings import chosen_settings
 

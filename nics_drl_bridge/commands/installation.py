@@ -22,10 +22,17 @@ EXTRAS = {  # what each brings, by the modules that it needs
     "distributed": ("training on a Ray cluster", ("ray",)),
 }
 MESSAGES = {  # message packages that have no wheels, and what is left out without them
-    "tf2_msgs": "/tf and /tf_static", "ackermann_msgs": "recordings of AckermannDrive",
+    "tf2_msgs": "/tf and /tf_static",
+    "ackermann_msgs": "recordings of AckermannDrive",
     "simulation_interfaces": "the standard services of simulators",
-}  # fmt: skip
-COMPILED = ("env.vector_env", "env.bridge_env", "policy.policies", "gate.shield", "middleware.ekf")
+}
+COMPILED = (
+    "env.vector_env",
+    "env.bridge_env",
+    "policy.policies",
+    "gate.shield",
+    "middleware.ekf",
+)
 
 
 class Check(NamedTuple):
@@ -39,8 +46,14 @@ class Check(NamedTuple):
 
 def checks() -> list[Check]:
     """Checks all parts; compiles nothing and starts nothing."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    cores = Check("cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", "")
+    usable = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count()
+    )
+    cores = Check(
+        "cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", ""
+    )
     return [_python(), *_extras(), *_ros(), cores, _kernels()]
 
 
@@ -48,11 +61,17 @@ def _python() -> Check:
     needed = ">=3.10,<3.15"
     with suppress(PackageNotFoundError):  # a source tree that was never installed
         needed = metadata(PACKAGE)["Requires-Python"] or needed
-    parts = sorted(needed.replace(" ", "").split(","), key=lambda part: not part.startswith(">="))
-    low, high = (tuple(map(int, part.lstrip("<>=").split(".")[:2])) for part in parts[:2])
+    parts = sorted(
+        needed.replace(" ", "").split(","), key=lambda part: not part.startswith(">=")
+    )
+    low, high = (
+        tuple(map(int, part.lstrip("<>=").split(".")[:2])) for part in parts[:2]
+    )
     found = sys.version_info[:2]
     fix = f"use a Python {needed}"
-    return Check("Python", low <= found < high, ".".join(map(str, sys.version_info[:3])), fix)
+    return Check(
+        "Python", low <= found < high, ".".join(map(str, sys.version_info[:3])), fix
+    )
 
 
 def _extras() -> list[Check]:
@@ -68,7 +87,14 @@ def _extras() -> list[Check]:
 def _ros() -> list[Check]:
     if find_spec("rclpy") is None:
         reason = MISSING_ROS.format(module="rclpy").partition("; ")[2].rstrip(".")
-        return [Check("ROS 2", False, "driving over topics: none is sourced or installed", reason)]
+        return [
+            Check(
+                "ROS 2",
+                False,
+                "driving over topics: none is sourced or installed",
+                reason,
+            )
+        ]
     try:
         release = version("rclpy")
     except PackageNotFoundError:
@@ -79,7 +105,10 @@ def _ros() -> list[Check]:
     fix = "it comes with a ROS 2 installation; there is no wheel"
     return [
         Check("ROS 2", True, told),
-        *(Check(name, find_spec(name) is not None, what, fix) for name, what in MESSAGES.items()),
+        *(
+            Check(name, find_spec(name) is not None, what, fix)
+            for name, what in MESSAGES.items()
+        ),
     ]
 
 

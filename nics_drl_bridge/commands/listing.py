@@ -38,11 +38,14 @@ def robots() -> list[Row]:
     return [
         {
             "name": name,
-            "commands": ", ".join(f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in one.command),
-            "lidar": lidar_of(one).name, "description": one.description,
+            "commands": ", ".join(
+                f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in one.command
+            ),
+            "lidar": lidar_of(one).name,
+            "description": one.description,
         }
         for name, one in ((name, load_robot(name)) for name in shipped_names("robots"))
-    ]  # fmt: skip
+    ]
 
 
 def worlds() -> list[Row]:
@@ -58,14 +61,25 @@ def worlds() -> list[Row]:
         counts = [group.counts for group in world.obstacles]
         low, high = sum(least for least, _ in counts), sum(most for _, most in counts)
         obstacles = f"{low}" if low == high else f"{low} to {high}"
-        rows.append(_world(name, f"{x2 - x1:g} x {y2 - y1:g}", world.goal_distance, obstacles))
-    rows.append(_world(BARN, f"a set of {len(barn_numbers())} worlds, as barn/7", (), ""))
-    return rows + [_world(name, "a set of worlds", (), "") for name in shipped_names("world_sets")]
+        rows.append(
+            _world(name, f"{x2 - x1:g} x {y2 - y1:g}", world.goal_distance, obstacles)
+        )
+    rows.append(
+        _world(BARN, f"a set of {len(barn_numbers())} worlds, as barn/7", (), "")
+    )
+    return rows + [
+        _world(name, "a set of worlds", (), "") for name in shipped_names("world_sets")
+    ]
 
 
 def _world(name: str, size: str, distance: tuple[float, ...], obstacles: str) -> Row:
     far = " to ".join(f"{value:g}" for value in distance)
-    return {"name": name, "size [m]": size, "goal_distance [m]": far, "obstacles": obstacles}
+    return {
+        "name": name,
+        "size [m]": size,
+        "goal_distance [m]": far,
+        "obstacles": obstacles,
+    }
 
 
 def lidars() -> list[Row]:
@@ -76,12 +90,14 @@ def lidars() -> list[Row]:
 
     return [
         {
-            "name": name, "beams": spec.beams,
+            "name": name,
+            "beams": spec.beams,
             "view [deg]": round(degrees(spec.angle_max - spec.angle_min)),
-            "range [m]": f"{spec.range_min:g} to {spec.range_max:g}", "scans [Hz]": spec.rate,
+            "range [m]": f"{spec.range_min:g} to {spec.range_max:g}",
+            "scans [Hz]": spec.rate,
         }
         for name, spec in ((name, load_lidar(name)) for name in shipped_names("lidars"))
-    ]  # fmt: skip
+    ]
 
 
 def policies() -> list[Row]:
@@ -89,9 +105,14 @@ def policies() -> list[Row]:
     from nics_drl_bridge.policy.policies import POLICIES, shipped_policies
 
     trained = [{"name": name, "kind": "policy file"} for name in shipped_policies()]
-    return trained + [{"name": name, "kind": "baseline, any robot"} for name in sorted(POLICIES)]
+    return trained + [
+        {"name": name, "kind": "baseline, any robot"} for name in sorted(POLICIES)
+    ]
 
 
 ROWS: dict[Listed, Callable[[], list[Row]]] = {
-    Listed.ROBOTS: robots, Listed.WORLDS: worlds, Listed.LIDARS: lidars, Listed.POLICIES: policies,
-}  # fmt: skip
+    Listed.ROBOTS: robots,
+    Listed.WORLDS: worlds,
+    Listed.LIDARS: lidars,
+    Listed.POLICIES: policies,
+}

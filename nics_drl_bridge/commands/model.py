@@ -22,29 +22,57 @@ if TYPE_CHECKING:
 
 
 def record(
-    out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
+    out: Annotated[
+        Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")
+    ],
     robot: console.RobotOption = DEFAULT_ROBOT,
-    bound: Annotated[float, Option(help="Radius around the start to keep within [m].")] = 2.0,
+    bound: Annotated[
+        float, Option(help="Radius around the start to keep within [m].")
+    ] = 2.0,
     duration: Annotated[float, Option(help="Duration of the drive [s].")] = 60.0,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
     seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
-    remap: Annotated[list[str] | None, Option(help="Rename a topic: odom:=/wheels.")] = None,
-    topics: Annotated[Path | None, Option(help="YAML: joints of state and wheels.")] = None,
-    stamped: Annotated[bool | None, Option(help="Send cmd_vel as TwistStamped.")] = None,
-    imu: Annotated[str, Option(metavar="TOPIC",
-        help="Topic of an IMU to record; auto: imu or imu/data, if there is one; none.")] = "auto",
-    use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
-    preview: Annotated[bool, Option("--preview", help="Only show the planned drive.")] = False,
-    yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
+    remap: Annotated[
+        list[str] | None, Option(help="Rename a topic: odom:=/wheels.")
+    ] = None,
+    topics: Annotated[
+        Path | None, Option(help="YAML: joints of state and wheels.")
+    ] = None,
+    stamped: Annotated[
+        bool | None, Option(help="Send cmd_vel as TwistStamped.")
+    ] = None,
+    imu: Annotated[
+        str,
+        Option(
+            metavar="TOPIC",
+            help="Topic of an IMU to record; auto: imu or imu/data, if there is one; none.",
+        ),
+    ] = "auto",
+    use_sim_time: Annotated[
+        bool, Option("--use-sim-time", help="Take time from /clock.")
+    ] = False,
+    preview: Annotated[
+        bool, Option("--preview", help="Only show the planned drive.")
+    ] = False,
+    yes: Annotated[
+        bool, Option("--yes", help="Do not ask before the robot moves.")
+    ] = False,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Drives a robot through its full range of motion and records it."""
     arguments = node_arguments(namespace, remap or ())
     given = {
-        "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
-        "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time, "imu": imu,
-    } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
+        "robot": robot,
+        "out": str(out),
+        "bound": bound,
+        "duration": duration,
+        "speed": speed,
+        "seed": seed,
+        "topics": str(topics or ""),
+        "use_sim_time": use_sim_time,
+        "imu": imu,
+    } | ({} if stamped is None else {"stamped": stamped})
     check_drive(given)
     if not preview:
         # First: with ROS 2 from wheels it restarts Python.
@@ -76,7 +104,9 @@ def node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     rules = [f"__ns:={space}"] if (space := namespace_of(namespace)) else []
     for rule in remap:
         if not all(rule.partition(":=")):
-            raise ConfigError(f"--remap {rule!r}: must be NAME:=OTHER, as in odom:=/wheel_odom.")
+            raise ConfigError(
+                f"--remap {rule!r}: must be NAME:=OTHER, as in odom:=/wheel_odom."
+            )
         rules.append(rule)
     flags = [word for rule in rules for word in ("-r", rule)]
     return ["nics", "--ros-args", *flags] if flags else ["nics"]
@@ -93,7 +123,9 @@ def preview_lines(given: dict[str, Any]) -> tuple[str, ...]:
 
     robot, out = load_robot(given["robot"]), check_out(Path(given["out"]))
     topic_roles(given["topics"] or None)  # reports a wrong file before the robot moves
-    plan = DrivePlan(robot, *(given[name] for name in ("bound", "duration", "speed", "seed")))
+    plan = DrivePlan(
+        robot, *(given[name] for name in ("bound", "duration", "speed", "seed"))
+    )
     pattern = plan.preview()
     picture = out.parent / f"{out.stem}_preview.png"
     write_bytes(picture, drive_picture(pattern, robot))
@@ -107,7 +139,10 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
     from nics_drl_bridge.identify.excitation import coverage
     from nics_drl_bridge.robot.spec import load_robot
 
-    out, place = Path(given["out"]), recording.pose.values[:, :2] - recording.pose.values[0, :2]
+    out, place = (
+        Path(given["out"]),
+        recording.pose.values[:, :2] - recording.pose.values[0, :2],
+    )
     path, reach = np.hypot(*np.diff(place, axis=0).T).sum(), np.hypot(*place.T).max()
     return (
         f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
@@ -118,10 +153,12 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
 
 def inspect(
     source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
-    mapping: Annotated[Path | None, Option("--map",
-        help="YAML file to write: a draft mapping, with guesses.")] = None,
+    mapping: Annotated[
+        Path | None,
+        Option("--map", help="YAML file to write: a draft mapping, with guesses."),
+    ] = None,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Lists the contents of any recording and drafts its mapping."""
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.recording.guess import DOUBT, NOT_USED, first_mapping
@@ -140,11 +177,15 @@ def inspect(
     if written is not None:
         write_text(written, text)
     doubts = [
-        line.removeprefix(f"{DOUBT} ") for line in text.splitlines() if line.startswith(DOUBT)
+        line.removeprefix(f"{DOUBT} ")
+        for line in text.splitlines()
+        if line.startswith(DOUBT)
     ]
     needless = ""
     if why:
-        needless = f"{source}: {why}, and needs no mapping: nics generate {source} --out MODEL"
+        needless = (
+            f"{source}: {why}, and needs no mapping: nics generate {source} --out MODEL"
+        )
     if as_json:
         facts = {"tables": [asdict(table) for table in tables], "doubts": doubts}
         facts |= {"mapping": written and str(written), "needs_mapping": not why}
@@ -153,13 +194,17 @@ def inspect(
     for line in (*([needless] if needless else ()), *doubts):
         typer.echo(line)
     for table in tables:
-        found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
+        found = "".join(
+            f"\n  {finding}" for finding in table.regularity + table.findings
+        )
         typer.echo(f"{table.name}: {table.rows} rows{found}")
         rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
         if rows:
             typer.echo(console.table(("column", "least", "greatest"), rows))
     if is_own:
-        typer.echo(f"no mapping was written: {needless}" if mapping is not None else needless)
+        typer.echo(
+            f"no mapping was written: {needless}" if mapping is not None else needless
+        )
         return
     if mapping is None:
         typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
@@ -167,7 +212,9 @@ def inspect(
     for line in text.splitlines():
         if line.startswith(NOT_USED):
             typer.echo(line.removeprefix("# "))
-    typer.echo(f"a first mapping is in {mapping}: edit it, then nics import or nics generate")
+    typer.echo(
+        f"a first mapping is in {mapping}: edit it, then nics import or nics generate"
+    )
 
 
 def import_(
@@ -175,7 +222,7 @@ def import_(
     mapping: Annotated[Path, Option("--map", help="YAML mapping, docs/recordings.md.")],
     out: Annotated[Path, Option(help="The .npz file to write.")],
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Converts a recording of any format to .npz, using its mapping."""
     from nics_drl_bridge.recording.readers import read_recording
     from nics_drl_bridge.recording.recording import save_recording
@@ -190,11 +237,14 @@ def import_(
     streams = stream_facts(drive)
     rows = [
         (
-            s["stream"], f"{s['rows']}", f"{s['rate_hz']:.1f} Hz",
-            f"{s['from_s']:.2f} to {s['to_s']:.2f} s", s["clock"],
+            s["stream"],
+            f"{s['rows']}",
+            f"{s['rate_hz']:.1f} Hz",
+            f"{s['from_s']:.2f} to {s['to_s']:.2f} s",
+            s["clock"],
         )
         for s in streams
-    ]  # fmt: skip
+    ]
     table = console.table(("stream", "rows", "rate", "time", "clock"), rows)
     text = "\n".join((table, *drive.repairs, f"recording written to {out}"))
     facts = {"streams": streams, "repairs": drive.repairs, "robot": drive.robot}
@@ -205,39 +255,67 @@ def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
     """Returns name, number of rows, rate, first and last time, and clock of each stream."""
     return [
         {
-            "stream": name, "rows": len(s.t),
+            "stream": name,
+            "rows": len(s.t),
             "rate_hz": (len(s.t) - 1) / max(float(s.t[-1] - s.t[0]), 1e-9),
-            "from_s": float(s.t[0]), "to_s": float(s.t[-1]), "clock": s.clock,
+            "from_s": float(s.t[0]),
+            "to_s": float(s.t[-1]),
+            "clock": s.clock,
         }
         for name, s in drive.streams.items()
-    ]  # fmt: skip
+    ]
 
 
 def generate(
-    recording: Annotated[list[Path], Argument(
-        help="A bag, an .npz recording, or tables with a --map; several of one robot.")],
+    recording: Annotated[
+        list[Path],
+        Argument(
+            help="A bag, an .npz recording, or tables with a --map; several of one robot."
+        ),
+    ],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: console.DrivenRobotOption = None,
-    mapping: Annotated[Path | None, Option("--map",
-        help="YAML mapping of the recording, docs/recordings.md.")] = None,
+    mapping: Annotated[
+        Path | None,
+        Option("--map", help="YAML mapping of the recording, docs/recordings.md."),
+    ] = None,
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
     lidar: console.LidarOption = None,
-    sensor: Annotated[list[Path] | None,
-        Option(help="YAML of an additional sensor, docs/sensors.md; repeatable.")] = None,
-    order: Annotated[str, Option(help="Order of the Taylor model, 1 to 4, or auto.")] = "auto",
-    alpha: Annotated[str, Option(help="Pruning of Eq. 2, 0 to 1, or auto for the knee; "
-            "no effect where the motion is the state.")] = "auto",
-    assume_textbook: Annotated[bool,
-        Option(help="Fill in from the textbook what the drive did not show.")] = False,
-    strict: Annotated[bool, Option(help="Refuse if an input was not moved on its own.")] = False,
+    sensor: Annotated[
+        list[Path] | None,
+        Option(help="YAML of an additional sensor, docs/sensors.md; repeatable."),
+    ] = None,
+    order: Annotated[
+        str, Option(help="Order of the Taylor model, 1 to 4, or auto.")
+    ] = "auto",
+    alpha: Annotated[
+        str,
+        Option(
+            help="Pruning of Eq. 2, 0 to 1, or auto for the knee; "
+            "no effect where the motion is the state."
+        ),
+    ] = "auto",
+    assume_textbook: Annotated[
+        bool, Option(help="Fill in from the textbook what the drive did not show.")
+    ] = False,
+    strict: Annotated[
+        bool, Option(help="Refuse if an input was not moved on its own.")
+    ] = False,
     salvage: console.SalvageOption = False,
-    anyway: Annotated[bool, Option("--anyway",
-        help="Write the model even if its predictions of unseen data are useless.")] = False,
-    pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
+    anyway: Annotated[
+        bool,
+        Option(
+            "--anyway",
+            help="Write the model even if its predictions of unseen data are useless.",
+        ),
+    ] = False,
+    pictures: Annotated[
+        bool, Option(help="Draw the fit into the model's pictures/.")
+    ] = False,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Generates a simulator from recordings and writes its folder."""
     from nics_drl_bridge.generator import check_place, lidar_of, save_model
     from nics_drl_bridge.generator import generate as generate_model
@@ -257,16 +335,26 @@ def generate(
     named = ", ".join(map(str, recording))
     roles = topic_roles(topics, topic or ())
     with ExitStack() as stack:
-        whole = [stack.enter_context(console.intact(each, salvage)) for each in recording]
+        whole = [
+            stack.enter_context(console.intact(each, salvage)) for each in recording
+        ]
         stack.enter_context(console.progress_bar(f"reading {named}"))
         spec, drives = robot_and_drives(whole, robot, roles, mapping)
     pairs = zip(drives, names_of_sources(recording), strict=True)
     drives = [replace(drive, source=name) for drive, name in pairs]
     with console.progress_bar("generating"):
         model, identified = generate_model(
-            drives if len(drives) > 1 else drives[0], spec, lidar_of(spec, lidar), shapes, terms,
-            threshold, assume_textbook, strict, anyway, further,
-        )  # fmt: skip
+            drives if len(drives) > 1 else drives[0],
+            spec,
+            lidar_of(spec, lidar),
+            shapes,
+            terms,
+            threshold,
+            assume_textbook,
+            strict,
+            anyway,
+            further,
+        )
         save_model(model, out)
     from nics_drl_bridge.identify.report import opening
     from nics_drl_bridge.report.fit_page import write_fit_page
@@ -278,10 +366,11 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
     why = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
     lines = (
-        f"{opening(model.report)}\n", f"its lidar is {model.lidar.name!r}{why}",
+        f"{opening(model.report)}\n",
+        f"its lidar is {model.lidar.name!r}{why}",
         f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
         f"model written to {out}",
-    )  # fmt: skip
+    )
     console.say(as_json, "\n".join(lines), **fit_facts(out, spec.name, identified))
 
 
@@ -290,7 +379,9 @@ def names_of_sources(recordings: Sequence[Path]) -> list[str]:
     if len(recordings) == 1:
         return [str(recordings[0])]
     names = [path.name for path in recordings]
-    return names if len(set(names)) == len(names) else [str(path) for path in recordings]
+    return (
+        names if len(set(names)) == len(names) else [str(path) for path in recordings]
+    )
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:
@@ -299,23 +390,32 @@ def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]
     from nics_drl_bridge.identify.report import equations_with_errors
 
     return {
-        "model": str(out), "robot": robot, **conclude(identified)._asdict(),
+        "model": str(out),
+        "robot": robot,
+        **conclude(identified)._asdict(),
         "equations": equations_with_errors(identified.model),
         "errors": [asdict(each) for each in identified.judgement],
-        "report": str(out / "report.txt"), "page": str(out / "report.html"),
-    }  # fmt: skip
+        "report": str(out / "report.txt"),
+        "page": str(out / "report.html"),
+    }
 
 
 def drive(
-    out: Annotated[Path | None, Option(help="Folder to write; by default <robot>_model.")] = None,
+    out: Annotated[
+        Path | None, Option(help="Folder to write; by default <robot>_model.")
+    ] = None,
     robot: console.RobotOption = DEFAULT_ROBOT,
-    recording: Annotated[Path | None,
-        Option(help="An .npz to save the drive in, like one of a real robot.")] = None,
+    recording: Annotated[
+        Path | None,
+        Option(help="An .npz to save the drive in, like one of a real robot."),
+    ] = None,
     lidar: console.LidarOption = None,
-    duration: Annotated[float, Option(min=5.0, max=3600.0, help="Duration [s].")] = 60.0,
+    duration: Annotated[
+        float, Option(min=5.0, max=3600.0, help="Duration [s].")
+    ] = 60.0,
     seed: Annotated[int, Option(min=0, help="Seed of the random commands.")] = 0,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Generates a simulator from a drive of a robot's textbook model.
 
     For training without a recording; `nics generate` makes a more accurate simulator from one.
@@ -342,15 +442,24 @@ def drive(
     made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
     lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
     facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
-    console.say(as_json, "\n".join(lines), **facts, recording=recording and str(recording))
+    console.say(
+        as_json, "\n".join(lines), **facts, recording=recording and str(recording)
+    )
 
 
 def urdf(
-    model: Annotated[str, Argument(autocompletion=console.ROBOTS,
-        help="A shipped robot, or the folder of a model.")],
-    out: Annotated[Path | None, Option(help="File to write; by default <robot>.urdf.")] = None,
+    model: Annotated[
+        str,
+        Argument(
+            autocompletion=console.ROBOTS,
+            help="A shipped robot, or the folder of a model.",
+        ),
+    ],
+    out: Annotated[
+        Path | None, Option(help="File to write; by default <robot>.urdf.")
+    ] = None,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Writes a robot's URDF, for RViz and robot_state_publisher."""
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.generator import open_model

@@ -11,30 +11,47 @@ from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, say
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_bytes
 
-policy = typer.Typer(help="Checks, exports and imports policy files.", no_args_is_help=True)
+policy = typer.Typer(
+    help="Checks, exports and imports policy files.", no_args_is_help=True
+)
 
 
 @policy.command()
 def info(
-    file: Annotated[str, Argument(autocompletion=POLICIES,
-        help="A policy file, the name of a shipped one, or a foreign one's mapping.")],
+    file: Annotated[
+        str,
+        Argument(
+            autocompletion=POLICIES,
+            help="A policy file, the name of a shipped one, or a foreign one's mapping.",
+        ),
+    ],
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Checks a policy file and shows its training and requirements."""
     from nics_drl_bridge.policy.foreign import load_any
     from nics_drl_bridge.policy.policy_file import summary
 
     facts = summary(load_any(file))
-    say(as_json, "\n".join(f"{name:<18} {value}" for name, value in _lines(facts)), **facts)
+    say(
+        as_json,
+        "\n".join(f"{name:<18} {value}" for name, value in _lines(facts)),
+        **facts,
+    )
 
 
 @policy.command()
 def export(
-    file: Annotated[str, Argument(autocompletion=POLICIES,
-        help="A policy file, or the name of a shipped one.")],
-    leapp: Annotated[Path, Option(help="Folder of the bundle: network, YAML file, start values.")],
+    file: Annotated[
+        str,
+        Argument(
+            autocompletion=POLICIES, help="A policy file, or the name of a shipped one."
+        ),
+    ],
+    leapp: Annotated[
+        Path, Option(help="Folder of the bundle: network, YAML file, start values.")
+    ],
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Converts a policy file to another format: Isaac's LEAPP."""
     from nics_drl_bridge.policy.foreign import load_any
     from nics_drl_bridge.policy.leapp import export_bundle
@@ -45,13 +62,24 @@ def export(
 
 @policy.command(name="import")
 def import_(
-    source: Annotated[Path,
-        Argument(help="A LEAPP bundle, or the mapping (YAML) of a foreign policy.")],
-    out: Annotated[Path, Option("--out", "-o", help="The policy file to write (*.onnx).")],
-    robot: Annotated[str | None, Option("--robot", "--model", autocompletion=ROBOTS,
-        help="A shipped robot, or the folder of a model.")] = None,
+    source: Annotated[
+        Path,
+        Argument(help="A LEAPP bundle, or the mapping (YAML) of a foreign policy."),
+    ],
+    out: Annotated[
+        Path, Option("--out", "-o", help="The policy file to write (*.onnx).")
+    ],
+    robot: Annotated[
+        str | None,
+        Option(
+            "--robot",
+            "--model",
+            autocompletion=ROBOTS,
+            help="A shipped robot, or the folder of a model.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Makes a policy file from a policy trained elsewhere."""
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.contract import SUFFIX
@@ -59,7 +87,9 @@ def import_(
     from nics_drl_bridge.policy.policy_file import policy_of
 
     if out.suffix != SUFFIX:
-        raise ConfigError(f"--out {out}: a policy file ends with {SUFFIX!r}; change the name.")
+        raise ConfigError(
+            f"--out {out}: a policy file ends with {SUFFIX!r}; change the name."
+        )
     data = import_policy(source, None if robot is None else open_model(robot))
     contract = policy_of(data, out).contract  # what can't be loaded is not written
     write_bytes(out, data)
@@ -81,13 +111,18 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
         )
     lines = {
         "file": f"{facts['file']}, {facts['bytes'] / 1024:.0f} kB, all checks passed",
-        "robot": f"{facts['robot']['name']}: {', '.join(commands)}", "task": facts["task"]["name"],
-        "actions": facts["actions"], "scan": observed,
+        "robot": f"{facts['robot']['name']}: {', '.join(commands)}",
+        "task": facts["task"]["name"],
+        "actions": facts["actions"],
+        "scan": observed,
         "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
         "observation": f"{seen['size']} parts, {seen['scan_parts']} of them the scan",
         "control period": f"{facts['control_period']:g} s",
-        "time limit": "not told" if steps is None else f"{steps * facts['control_period']:g} s",
-        "model": facts["model_fingerprint"], "graph": facts["graph_sha256"][:16],
-    }  # fmt: skip
+        "time limit": "not told"
+        if steps is None
+        else f"{steps * facts['control_period']:g} s",
+        "model": facts["model_fingerprint"],
+        "graph": facts["graph_sha256"][:16],
+    }
     provenance = {name: str(value) for name, value in facts["provenance"].items()}
     return [*lines.items(), *provenance.items()]

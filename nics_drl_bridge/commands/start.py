@@ -51,9 +51,13 @@ def _note_and_end(number: int, frame: FrameType | None) -> None:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    while frame is not None and not frame.f_code.co_name.startswith("_raw_object_cache"):
+    while frame is not None and not frame.f_code.co_name.startswith(
+        "_raw_object_cache"
+    ):
         frame = frame.f_back
-    if frame is not None:  # llvmlite's callback, out of which no exception comes: a little later
+    if (
+        frame is not None
+    ):  # llvmlite's callback, out of which no exception comes: a little later
         threading.Timer(0.01, signal.raise_signal, (number,)).start()
     elif number == signal.SIGINT:
         raise KeyboardInterrupt
@@ -68,7 +72,10 @@ def main() -> None:
     try:
         _run()
     except SystemExit as end:
-        if _interrupts and end.code not in (0, None):  # unless the command has dealt with it
+        if _interrupts and end.code not in (
+            0,
+            None,
+        ):  # unless the command has dealt with it
             _leave_interrupted()
         raise
 
@@ -90,7 +97,9 @@ def _leave_interrupted() -> NoReturn:
     Python would end it by the signal instead, where Ctrl-C came while the text of a function was
     run (as dataclasses make them), and with other codes where libraries end beside their threads.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one changes nothing any more
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # a second one changes nothing any more
     with contextlib.suppress(Exception):
         atexit._run_exitfuncs()  # zero commands, files and processes of the command
     for stream in (sys.stdout, sys.stderr):

@@ -22,48 +22,90 @@ from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 DEFAULT_EPISODES = 500
-OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.PpoSettings`
+OWN = (
+    "lean",
+    "sb3",
+)  # the engines of PPO in this process, see `training_settings.PpoSettings`
 
 
 def train(
     more_seeds: Annotated[list[str] | None, Argument(hidden=True)] = None,
-    task: Annotated[str, Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
-    robot: Annotated[str | None, Option("--robot", "--model", autocompletion=console.ROBOTS,
-        help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.")] = None,
-    settings: Annotated[str | None,
-        Option(help="Shipped settings (navigation_differential), or a YAML file; else those of the "
-        "robot, or of the shipped robot that moves like it.",
-        autocompletion=console.completing("training"))] = None,
-    world: Annotated[list[str] | None, Option(autocompletion=console.WORLDS,
-        help="Train in this world only; repeat to train in several.")] = None,
+    task: Annotated[
+        str, Option(help="A task, or path/to/file.py:ClassName.")
+    ] = "navigation",
+    robot: Annotated[
+        str | None,
+        Option(
+            "--robot",
+            "--model",
+            autocompletion=console.ROBOTS,
+            help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.",
+        ),
+    ] = None,
+    settings: Annotated[
+        str | None,
+        Option(
+            help="Shipped settings (navigation_differential), or a YAML file; else those of the "
+            "robot, or of the shipped robot that moves like it.",
+            autocompletion=console.completing("training"),
+        ),
+    ] = None,
+    world: Annotated[
+        list[str] | None,
+        Option(
+            autocompletion=console.WORLDS,
+            help="Train in this world only; repeat to train in several.",
+        ),
+    ] = None,
     algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
-    seeds: Annotated[list[int] | None, Option(help="One or more: --seeds 0 1 2.")] = None,
+    seeds: Annotated[
+        list[int] | None, Option(help="One or more: --seeds 0 1 2.")
+    ] = None,
     steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
-    episodes: Annotated[int, Option(
-        min=1, help="Evaluation episodes in each world.")] = DEFAULT_EPISODES,
+    episodes: Annotated[
+        int, Option(min=1, help="Evaluation episodes in each world.")
+    ] = DEFAULT_EPISODES,
     out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, Option(help="Continue an interrupted --out.")] = False,
-    engine: Annotated[str | None,
-        Option(help="lean or sb3 (Stable-Baselines3), in this process; ray: a cluster.")] = None,
-    address: Annotated[str | None,
-        Option(help="Ray cluster: auto (this machine's) or HOST:PORT; else a new one.")] = None,
-    env_runners: Annotated[int | None, Option(min=1,
-        help="Ray processes that share the worlds; default: one per CPU.")] = None,
+    engine: Annotated[
+        str | None,
+        Option(
+            help="lean or sb3 (Stable-Baselines3), in this process; ray: a cluster."
+        ),
+    ] = None,
+    address: Annotated[
+        str | None,
+        Option(help="Ray cluster: auto (this machine's) or HOST:PORT; else a new one."),
+    ] = None,
+    env_runners: Annotated[
+        int | None,
+        Option(
+            min=1, help="Ray processes that share the worlds; default: one per CPU."
+        ),
+    ] = None,
     as_json: console.JsonOption = False,
-    watch: Annotated[bool, Option("--watch",
-        help="Show some of the worlds on a page, as nics watch does.")] = False,
-) -> None:  # fmt: skip
+    watch: Annotated[
+        bool,
+        Option(
+            "--watch", help="Show some of the worlds on a page, as nics watch does."
+        ),
+    ] = False,
+) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
     given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
     given["engine"] = engine if engine in OWN else None
     named = {name: value for name, value in given.items() if value}
     if resume and (settings or named):
         option = next(iter(named), "settings")
-        raise ConfigError(f"--{option}: a resumed run has its own settings; leave it out.")
+        raise ConfigError(
+            f"--{option}: a resumed run has its own settings; leave it out."
+        )
     if resume and out is None:
         raise ConfigError("--resume needs --out, the folder of the run to go on with.")
     if watch and engine is not None and engine not in OWN:
-        reason = "worlds of other processes are not shown; leave out --watch, or --engine"
+        reason = (
+            "worlds of other processes are not shown; leave out --watch, or --engine"
+        )
         raise ConfigError(f"--watch --engine {engine}: {reason}.")
     further_seeds = seeds_of_words(more_seeds or [], seeds is not None)
     every_seed = [*(seeds or []), *further_seeds]
@@ -76,7 +118,9 @@ def train(
         from nics_drl_bridge.policy import train as train_run
 
     own_task = task if ":" in task else None
-    resumed = train_run.settings_of(out, own_task) if resume and out is not None else None
+    resumed = (
+        train_run.settings_of(out, own_task) if resume and out is not None else None
+    )
     chosen = resumed or _told(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])
@@ -84,7 +128,9 @@ def train(
         typer.echo(f"seeds that were begun: {begun}; --seeds names others", err=True)
     every = [*(seeds or begun or [0]), *further_seeds]
     order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
-    again = ResumeCommand(folder, every, episodes, own_task, engine, address, env_runners)
+    again = ResumeCommand(
+        folder, every, episodes, own_task, engine, address, env_runners
+    )
     with (
         told_if_interrupted(again, train_run.seeds_of),
         _learner(engine, address, env_runners, chosen.num_envs) as learn,
@@ -134,7 +180,9 @@ def told_if_interrupted(
             if seeds_of(again.out):
                 typer.echo(f"to go on from the last checkpoint: {again.line}", err=True)
             else:
-                typer.echo(f"{again.out}: no checkpoint was written yet; begin anew.", err=True)
+                typer.echo(
+                    f"{again.out}: no checkpoint was written yet; begin anew.", err=True
+                )
         raise
 
 
@@ -150,7 +198,12 @@ def seeds_of_words(words: Sequence[str], after_seeds: bool) -> list[int]:
 def _plain(result: Any) -> dict[str, Any]:
     worlds = {world: asdict(summary) for world, summary in result.summaries.items()}
     run = result.trained
-    return {"seed": result.seed, "steps": run.steps, "seconds": run.wall_s, "worlds": worlds}
+    return {
+        "seed": result.seed,
+        "steps": run.steps,
+        "seconds": run.wall_s,
+        "worlds": worlds,
+    }
 
 
 def _told(task: str, settings: str | None, named: dict[str, Any]) -> Any:
@@ -171,7 +224,9 @@ def check_engine(engine: str | None, of_clusters: dict[str, Any]) -> None:
     if engine is None or engine in OWN:
         for name, value in of_clusters.items():
             if value is not None:
-                raise ConfigError(f"--{name}: belongs to --engine ray; add that, or leave it out.")
+                raise ConfigError(
+                    f"--{name}: belongs to --engine ray; add that, or leave it out."
+                )
 
 
 @contextmanager
@@ -209,9 +264,12 @@ def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
 
 
 def _run(
-    train_run: Any, order: Any, learn: Any, as_json: bool,
+    train_run: Any,
+    order: Any,
+    learn: Any,
+    as_json: bool,
     note: Callable[[str], None] = lambda _: None,
-) -> None:  # fmt: skip
+) -> None:
     def told(progress: Any) -> None:
         what = f"seed {progress.seed}: {progress.line}"
         if not math.isnan(progress.held_out):
@@ -223,7 +281,9 @@ def _run(
         trained = result.trained
         if as_json:
             return
-        typer.echo(f"seed {result.seed}: {trained.steps:,} steps in {trained.wall_s:.0f} s")
+        typer.echo(
+            f"seed {result.seed}: {trained.steps:,} steps in {trained.wall_s:.0f} s"
+        )
         for world, summary in result.summaries.items():
             typer.echo(f"  {world}: {train_run.line_of(summary)}")
 
@@ -237,9 +297,19 @@ def _run(
     if as_json:
         typer.echo(json_of({"out": str(folder), "seeds": list(map(_plain, results))}))
         return
-    typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")
-    policy, (world, *_) = folder / f"seed_{results[0].seed}" / "policy.onnx", results[0].summaries
+    typer.echo(
+        f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}"
+    )
+    policy, (world, *_) = (
+        folder / f"seed_{results[0].seed}" / "policy.onnx",
+        results[0].summaries,
+    )
     task = f" --task {own}" if ":" in (own := order.settings.task) else ""
-    if task and not any(one.success.value for each in results for one in each.summaries.values()):
-        typer.echo("no episode was a success: does `info` of the task tell `is_success`?", err=True)
+    if task and not any(
+        one.success.value for each in results for one in each.summaries.values()
+    ):
+        typer.echo(
+            "no episode was a success: does `info` of the task tell `is_success`?",
+            err=True,
+        )
     typer.echo(f"see it drive: nics watch {policy} --world {world}{task}")

@@ -33,7 +33,9 @@ class GoalOrder:
     """
 
     point: Point | None = None  # x, y [m]; None: the world's own, of each episode
-    frame: str | None = None  # None: `robot` where the start is the present place, else `map`
+    frame: str | None = (
+        None  # None: `robot` where the start is the present place, else `map`
+    )
     start: str = WAIT  # or PRESENT
     localised: bool = False  # a pose sensor tells where the robot is in `map`
     confirm_beyond_m: float = FAR_M
@@ -44,7 +46,9 @@ class GoalOrder:
                 f"--goal-frame {self.frame!r}: {nearest(str(self.frame), GOAL_FRAMES)}"
             )
         if self.start not in (WAIT, PRESENT):
-            raise ConfigError(f"--start {self.start!r}: {nearest(self.start, (WAIT, PRESENT))}")
+            raise ConfigError(
+                f"--start {self.start!r}: {nearest(self.start, (WAIT, PRESENT))}"
+            )
         if not self.confirm_beyond_m >= 0.0:
             told = f"--confirm-beyond {self.confirm_beyond_m:g}"
             raise ConfigError(f"{told}: must be a distance of 0 m or more.")
@@ -110,7 +114,9 @@ class VehicleEpisode:
     def options(self) -> dict[str, Array]:
         """Options of the env's reset."""
         given = (
-            {} if self.order.point is None and not self.order.needs_pose else {"goal": self.goal}
+            {}
+            if self.order.point is None and not self.order.needs_pose
+            else {"goal": self.goal}
         )
         if self.order.lays_map and self.order.point is not None:
             given["start"] = self.start
@@ -125,7 +131,9 @@ class VehicleEpisode:
         if self.order.start == PRESENT:
             if self.order.relative:
                 return f"it will drive to {sides} of where it stands"
-            return f"it will drive to {place}, {self.distance:.2f} m from where it stands"
+            return (
+                f"it will drive to {place}, {self.distance:.2f} m from where it stands"
+            )
         x, y, heading = self.start
         stand = f"place the vehicle at ({x:.2f} m, {y:.2f} m, {heading:.2f} rad)"
         return f"{stand}; it will drive to {place}, {self.distance:.2f} m from there"
@@ -141,7 +149,9 @@ class VehicleEpisode:
         confirm(told)
 
 
-UNATTENDED = "say --yes to drive there without a question, or --confirm-beyond with more metres."
+UNATTENDED = (
+    "say --yes to drive there without a question, or --confirm-beyond with more metres."
+)
 
 
 def confirm_at_terminal(question: str) -> None:

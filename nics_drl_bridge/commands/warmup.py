@@ -22,17 +22,24 @@ def warmup(as_json: JsonOption = False) -> None:
     # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
     with (
         progress_bar("compiling"),
-        get_context("spawn").Pool(2, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool,
+        get_context("spawn").Pool(
+            2, signal.signal, (signal.SIGINT, signal.SIG_IGN)
+        ) as pool,
     ):
         *first, model = pool.apply(_compiled_by, (_model,))
-        others = [pool.apply_async(_compiled_by, (part, model)) for part in (_simulate, _drive)]
+        others = [
+            pool.apply_async(_compiled_by, (part, model))
+            for part in (_simulate, _drive)
+        ]
         done = [first, *(each.get()[:2] for each in others)]
     count, cpu_s = sum(each[0] for each in done), sum(each[1] for each in done)
     took = time.monotonic() - begin
     if as_json:
         typer.echo(json_of({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
     else:
-        typer.echo(f"compiled {count} kernels in {took:.0f} s ({cpu_s:.0f} s of CPU)", err=True)
+        typer.echo(
+            f"compiled {count} kernels in {took:.0f} s ({cpu_s:.0f} s of CPU)", err=True
+        )
 
 
 def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any]:

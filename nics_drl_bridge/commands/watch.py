@@ -15,14 +15,33 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 
 def watch(
-    policy: Annotated[str | None, Argument(
-        help=f"A policy file, a shipped policy ({DEFAULT_ROBOT}, the default) or a baseline "
-        "(dynamic_window).", autocompletion=console.POLICIES)] = None,
-    model: Annotated[str | None, Option("--model", "--robot", autocompletion=console.ROBOTS,
-        help="A model's folder, or a shipped robot; else the policy's own.")] = None,
-    world: Annotated[list[str] | None, Option(
-        "--world", "--scene", help="A shipped world (circles) or a YAML file; several times: side "
-        "by side.", autocompletion=console.WORLDS)] = None,
+    policy: Annotated[
+        str | None,
+        Argument(
+            help=f"A policy file, a shipped policy ({DEFAULT_ROBOT}, the default) or a baseline "
+            "(dynamic_window).",
+            autocompletion=console.POLICIES,
+        ),
+    ] = None,
+    model: Annotated[
+        str | None,
+        Option(
+            "--model",
+            "--robot",
+            autocompletion=console.ROBOTS,
+            help="A model's folder, or a shipped robot; else the policy's own.",
+        ),
+    ] = None,
+    world: Annotated[
+        list[str] | None,
+        Option(
+            "--world",
+            "--scene",
+            help="A shipped world (circles) or a YAML file; several times: side "
+            "by side.",
+            autocompletion=console.WORLDS,
+        ),
+    ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 1_000_000,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
@@ -31,15 +50,29 @@ def watch(
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
     namespace: Annotated[str, Option(help="For --ros: namespace of its topics.")] = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
-    topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC", help="For --bag: as "
-        "odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
-    record: Annotated[Path | None, Option(
-        metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page.")] = None,
-    episodes: Annotated[int, Option(min=1, help="For --record: number of episodes.")] = 1,
-    port: Annotated[int | None, Option(
-        min=0, max=65535, help="Port of the page; 0 takes any (default 8765).")] = None,
+    topic: Annotated[
+        list[str] | None,
+        Option(
+            metavar="ROLE=TOPIC",
+            help="For --bag: as "
+            "odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
+        ),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page."
+        ),
+    ] = None,
+    episodes: Annotated[
+        int, Option(min=1, help="For --record: number of episodes.")
+    ] = 1,
+    port: Annotated[
+        int | None,
+        Option(min=0, max=65535, help="Port of the page; 0 takes any (default 8765)."),
+    ] = None,
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
-) -> None:  # fmt: skip
+) -> None:
     """Shows a policy, live topics or a bag on a page in the browser."""
     given = {"lidar": lidar, "randomisation": randomisation, "gate": gate, "task": task}
     if record is None:  # before the source is opened, which may take a while
@@ -53,7 +86,9 @@ def watch(
     elif ros:
         source = _ros(model, world, namespace)
     else:
-        source = _episodes(policy or DEFAULT_ROBOT, model, world or ["circles"], seed, given)
+        source = _episodes(
+            policy or DEFAULT_ROBOT, model, world or ["circles"], seed, given
+        )
     with closing(source):
         if record is not None:
             _record(record, source, episodes)
@@ -62,7 +97,11 @@ def watch(
 
 
 def _episodes(
-    policy: str, name: str | None, worlds: list[str], seed: int, given: dict[str, str | None]
+    policy: str,
+    name: str | None,
+    worlds: list[str],
+    seed: int,
+    given: dict[str, str | None],
 ) -> Any:
     from nics_drl_bridge.commands import episodes as driving
     from nics_drl_bridge.commands.conditions import Conditions
@@ -70,19 +109,25 @@ def _episodes(
     from nics_drl_bridge.sim.world_set import load_worlds
     from nics_drl_bridge.watch.episode import EpisodeSource
 
-    under = Conditions(given["lidar"], given["randomisation"], given["gate"], kind=given["task"])
+    under = Conditions(
+        given["lidar"], given["randomisation"], given["gate"], kind=given["task"]
+    )
     own = [driving.robot_of(*each) for each in driving.contracts_of([policy]).items()]
     model = open_model(name or (own or [DEFAULT_ROBOT])[0], under.lidar)
 
     def make(policy: str, world: Any) -> Any:
         options = {"estimator": True, "randomisation": under.ranges}
-        within = driving.limited(under, driving.contracts_of([policy]), model, world, typer.echo)
+        within = driving.limited(
+            under, driving.contracts_of([policy]), model, world, typer.echo
+        )
         return driving.env_of(policy, model, world, "sim", within, **options)
 
     return EpisodeSource(make, policy, [load_worlds(each) for each in worlds], seed)
 
 
-def _bag(bag: Path, name: str | None, worlds: list[str] | None, topics: dict[str, str]) -> Any:
+def _bag(
+    bag: Path, name: str | None, worlds: list[str] | None, topics: dict[str, str]
+) -> Any:
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.watch.bag import BagSource
 

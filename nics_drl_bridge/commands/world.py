@@ -17,18 +17,29 @@ if TYPE_CHECKING:
     from nics_drl_bridge.sim.sections import Standing
 
 world = typer.Typer(
-    help="Imports worlds made by other tools, draws worlds, writes maps.", no_args_is_help=True
+    help="Imports worlds made by other tools, draws worlds, writes maps.",
+    no_args_is_help=True,
 )
 
 SDF, MAPS, PICTURES = (".world", ".sdf"), (".yaml", ".yml"), (".png", ".pgm", ".bmp")
 HEIGHT = 0.2  # default of the height that counts [m]: TurtleBot3's lidar is at 0.18 m
 CLEARANCE = 0.1  # default [m]: fields of others are often narrow
 NEAREST = 2.0  # default of the least distance from start to goal [m]
-NAV2 = {"origin": [0.0, 0.0, 0.0], "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.25}
+NAV2 = {
+    "origin": [0.0, 0.0, 0.0],
+    "negate": 0,
+    "occupied_thresh": 0.65,
+    "free_thresh": 0.25,
+}
 Keys = dict[str, Any]  # of a YAML file
-Shown = Annotated[str, Argument(
-    metavar="WORLD", help="A shipped one, a YAML file, or a set.", autocompletion=console.WORLDS
-)]  # fmt: skip
+Shown = Annotated[
+    str,
+    Argument(
+        metavar="WORLD",
+        help="A shipped one, a YAML file, or a set.",
+        autocompletion=console.WORLDS,
+    ),
+]
 
 
 class Written(NamedTuple):
@@ -41,38 +52,85 @@ class Written(NamedTuple):
 
 @world.command("import")
 def import_(
-    files: Annotated[list[Path], Argument(
-        metavar="FILE...", help="Gazebo's .world or .sdf, Nav2's map .yaml, or a picture.")],
-    out: Annotated[Path | None, Option(
-        help="The .yaml to write, or a folder; by default named after the file, here.")] = None,
-    name: Annotated[str | None, Option(help="Name of the world; else that of the file.")] = None,
-    start: Annotated[tuple[float, float, float] | None, Option(
-        metavar="X Y HEADING", help="Where robots start [m, rad]; else anywhere.")] = None,
-    goal: Annotated[tuple[float, float] | None, Option(
-        metavar="X Y", help="Where the goal lies [m]; else anywhere.")] = None,
-    goal_distance: Annotated[tuple[float, float] | None, Option(
-        metavar="LEAST GREATEST", help="From start to goal [m]; else from 2 m on.")] = None,
-    clearance: Annotated[float, Option(help="Free space around the footprint [m].")] = CLEARANCE,
-    height: Annotated[float, Option(
-        help="For SDF: height above z = 0 at which geometry counts, the lidar's [m].")] = HEIGHT,
-    bounds: Annotated[tuple[float, float, float, float] | None, Option(
-        metavar="X1 Y1 X2 Y2", help="For SDF: the field [m]; else just all obstacles.")] = None,
-    without: Annotated[list[str] | None, Option(
-        metavar="MODEL", help="For SDF: a model to leave out, such as a robot; * matches anything. "
-        "May be given several times.")] = None,
-    skip_unknown: Annotated[bool, Option(
-        "--skip-unknown", help="For SDF: leave out, and list, meshes and other unknowns.")
+    files: Annotated[
+        list[Path],
+        Argument(
+            metavar="FILE...",
+            help="Gazebo's .world or .sdf, Nav2's map .yaml, or a picture.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        Option(
+            help="The .yaml to write, or a folder; by default named after the file, here."
+        ),
+    ] = None,
+    name: Annotated[
+        str | None, Option(help="Name of the world; else that of the file.")
+    ] = None,
+    start: Annotated[
+        tuple[float, float, float] | None,
+        Option(
+            metavar="X Y HEADING", help="Where robots start [m, rad]; else anywhere."
+        ),
+    ] = None,
+    goal: Annotated[
+        tuple[float, float] | None,
+        Option(metavar="X Y", help="Where the goal lies [m]; else anywhere."),
+    ] = None,
+    goal_distance: Annotated[
+        tuple[float, float] | None,
+        Option(
+            metavar="LEAST GREATEST", help="From start to goal [m]; else from 2 m on."
+        ),
+    ] = None,
+    clearance: Annotated[
+        float, Option(help="Free space around the footprint [m].")
+    ] = CLEARANCE,
+    height: Annotated[
+        float,
+        Option(
+            help="For SDF: height above z = 0 at which geometry counts, the lidar's [m]."
+        ),
+    ] = HEIGHT,
+    bounds: Annotated[
+        tuple[float, float, float, float] | None,
+        Option(
+            metavar="X1 Y1 X2 Y2",
+            help="For SDF: the field [m]; else just all obstacles.",
+        ),
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        Option(
+            metavar="MODEL",
+            help="For SDF: a model to leave out, such as a robot; * matches anything. "
+            "May be given several times.",
+        ),
+    ] = None,
+    skip_unknown: Annotated[
+        bool,
+        Option(
+            "--skip-unknown",
+            help="For SDF: leave out, and list, meshes and other unknowns.",
+        ),
     ] = False,
-    resolution: Annotated[float | None, Option(help="For a picture: side of a pixel [m].")] = None,
+    resolution: Annotated[
+        float | None, Option(help="For a picture: side of a pixel [m].")
+    ] = None,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Imports Gazebo worlds, Nav2 maps, or pictures as worlds."""
     from nics_drl_bridge.sim.sdf import read_sdf
 
     keys = {
-        "name": name, "bounds": bounds, "clearance": clearance, "goal_distance": goal_distance,
-        "starts": start and {"at": [start]}, "goals": goal and {"at": [goal]},
-    }  # fmt: skip
+        "name": name,
+        "bounds": bounds,
+        "clearance": clearance,
+        "goal_distance": goal_distance,
+        "starts": start and {"at": [start]},
+        "goals": goal and {"at": [goal]},
+    }
     keys = {key: value for key, value in keys.items() if value is not None}
     made = list[Written]()
     for file, place in _places(files, out, name).items():
@@ -104,13 +162,20 @@ def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path,
     if out is not None and one:
         return {files[0]: out}
     ends = [".yaml" if file.suffix.lower() in SDF else "_world.yaml" for file in files]
-    places = [(out or Path()) / f"{file.stem}{end}" for file, end in zip(files, ends, strict=True)]
+    places = [
+        (out or Path()) / f"{file.stem}{end}"
+        for file, end in zip(files, ends, strict=True)
+    ]
     if twice := {str(place) for place in places if places.count(place) > 1}:
-        raise ConfigError(f"{min(twice)}: two files would be written there; import them in turn.")
+        raise ConfigError(
+            f"{min(twice)}: two files would be written there; import them in turn."
+        )
     return dict(zip(files, places, strict=True))
 
 
-def _standing(file: Path, place: Path, standing: "Standing", keys: Keys, height: float) -> Written:
+def _standing(
+    file: Path, place: Path, standing: "Standing", keys: Keys, height: float
+) -> Written:
     """The world of what stands in an SDF file."""
     at = [keys[key]["at"][0] for key in ("starts", "goals") if key in keys]
     x1, y1, x2, y2 = field = keys.get("bounds") or standing.bounds(*at)
@@ -122,11 +187,15 @@ def _standing(file: Path, place: Path, standing: "Standing", keys: Keys, height:
     head += [f"Left out: {each}." for each in standing.left_out]
     known = {"name": file.stem, "bounds": field, "obstacles": groups}
     text = _text(file, head, known | keys, (x2 - x1, y2 - y1))
-    line = f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
+    line = (
+        f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
+    )
     return Written(place, text, "\n  left out: ".join([line, *standing.left_out]))
 
 
-def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> list[Written]:
+def _mapped(
+    file: Path, place: Path, keys: Keys, resolution: float | None
+) -> list[Written]:
     """The world of a map; and of a picture without one, the map's own file before it."""
     from nics_drl_bridge.config import dump_yaml, validate
     from nics_drl_bridge.lidar.maps import MapFile, load_map, read_image
@@ -134,7 +203,10 @@ def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> li
     if file.suffix not in MAPS and file.suffix.lower() not in PICTURES:
         kinds = ", ".join((*SDF, *MAPS, *PICTURES))
         raise ConfigError(f"{file}: unknown kind of file; give one of {kinds}.")
-    map_file, made = file.with_suffix(".yaml") if file.suffix.lower() in PICTURES else file, []
+    map_file, made = (
+        file.with_suffix(".yaml") if file.suffix.lower() in PICTURES else file,
+        [],
+    )
     if file.suffix.lower() in PICTURES and resolution is not None:
         map_file = place.with_name(f"{place.stem}_map.yaml")
         about = {"image": _seen_from(place, file), "resolution": resolution, **NAV2}
@@ -146,7 +218,9 @@ def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> li
         (rows, columns), resolution = grid.cells.shape, grid.resolution
     else:
         fix = "give the side of its pixels in metres as --resolution"
-        raise ConfigError(f"{file}: there is no {map_file.name} beside the picture; {fix}.")
+        raise ConfigError(
+            f"{file}: there is no {map_file.name} beside the picture; {fix}."
+        )
     x, y = columns * resolution, rows * resolution
     known = {"name": file.stem, "map": _seen_from(place, map_file)}
     text = _text(file, [f"The map {map_file.name}."], known | keys, (x, y))
@@ -166,7 +240,9 @@ def _text(file: Path, head: list[str], known: Keys, size: tuple[float, float]) -
     from nics_drl_bridge.sim.world import World, check_places
 
     far = round(math.hypot(*size), 3)
-    least = 0.0 if {"starts", "goals"} <= set(known) else min(NEAREST, round(far / 4.0, 3))
+    least = (
+        0.0 if {"starts", "goals"} <= set(known) else min(NEAREST, round(far / 4.0, 3))
+    )
     known = {"goal_distance": (least, far), **known}
     lines = [f"# {' '.join(line.split())}" for line in head]
     for key in ("name", "map"):
@@ -199,7 +275,11 @@ def _text(file: Path, head: list[str], known: Keys, size: tuple[float, float]) -
 def _flow(value: Any) -> str:
     """Numbers, words, lists and mappings as YAML on one line."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items())
+            + "}"
+        )
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_flow, value)) + "]"
     return str(value)
@@ -208,12 +288,16 @@ def _flow(value: Any) -> str:
 @world.command()
 def draw(
     name: Shown,
-    out: Annotated[Path | None, Option(help="File to write; by default <world>_drawn.png.")] = None,
+    out: Annotated[
+        Path | None, Option(help="File to write; by default <world>_drawn.png.")
+    ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
-    footprint: Annotated[float | None, Option(help="Radius of a round robot instead [m].")] = None,
+    footprint: Annotated[
+        float | None, Option(help="Radius of a round robot instead [m].")
+    ] = None,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Draws the world of an episode, with start and goal.
 
     For a set, such as barn or a folder of files, it draws the world of the episode.
@@ -246,19 +330,25 @@ def _spare(worlds: Any, given: Path, *written: Path) -> None:
 
     for one in worlds.members:
         own = given, Path(one.source), *(files_of(one.map) if one.map else ())
-        for file in {each.resolve() for each in written} & {each.resolve() for each in own}:
-            raise ConfigError(f"{file}: the world itself is made of it; name another as --out.")
+        for file in {each.resolve() for each in written} & {
+            each.resolve() for each in own
+        }:
+            raise ConfigError(
+                f"{file}: the world itself is made of it; name another as --out."
+            )
 
 
 @world.command("map")
 def map_(
     name: Shown,
-    out: Annotated[Path | None, Option(help="File to write; by default <world>_map.yaml.")] = None,
+    out: Annotated[
+        Path | None, Option(help="File to write; by default <world>_map.yaml.")
+    ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Writes the map of an episode for Nav2's map_server.
 
     Moving obstacles are left out. `nics world map room`, then
@@ -286,6 +376,11 @@ def map_(
     map_files(grid, file)
     rows, columns = grid.cells.shape
     size = f"{columns} x {rows} cells of {grid.resolution:.4g} m"
-    facts = {"file": str(file), "world": opened.name, "seed": seed, "cells": [columns, rows]}
+    facts = {
+        "file": str(file),
+        "world": opened.name,
+        "seed": seed,
+        "cells": [columns, rows],
+    }
     line = f"{file}: the map of {opened.name!r}, seed {seed}, {size}"
     console.say(as_json, line, **facts, resolution_m=grid.resolution)

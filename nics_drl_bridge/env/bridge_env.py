@@ -16,7 +16,14 @@ from nics_drl_bridge.env.guard import give, halts_on_error, refused_after_close
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import completed, make_backend
 from nics_drl_bridge.env.snapshot import Snapshot, gate_of, goals_of
-from nics_drl_bridge.env.task import Episodes, Memory, Observation, Task, still, team_space
+from nics_drl_bridge.env.task import (
+    Episodes,
+    Memory,
+    Observation,
+    Task,
+    still,
+    team_space,
+)
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array, Backend, RobotView, Start
@@ -97,18 +104,24 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
-        "render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS,
-    }  # fmt: skip
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": RENDER_FPS,
+    }
 
     @checked_arguments("BridgeEnv")
     def __init__(
-        self, backend: str | Backend = "sim", model: str | SimulatorModel | None = None,
-        world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
-        task_options: dict[str, Any] | None = None, estimator: bool | None = None,
+        self,
+        backend: str | Backend = "sim",
+        model: str | SimulatorModel | None = None,
+        world: str | AnyWorld = "arena",
+        task: str | type[Task] | Task = "navigation",
+        task_options: dict[str, Any] | None = None,
+        estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,
-        randomisation: str | Randomisation | None = None, render_mode: str | None = None,
+        randomisation: str | Randomisation | None = None,
+        render_mode: str | None = None,
         simulator: str | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         check_render_mode(render_mode, self.metadata)
         check_options("backend_options", backend_options)
         self.render_mode = render_mode
@@ -134,9 +147,11 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if isinstance(backend, str):
             robots = self.robots if self.robots > 1 else None
             own = {
-                "estimator": estimator, "robots": robots, "randomisation": randomisation,
+                "estimator": estimator,
+                "robots": robots,
+                "randomisation": randomisation,
                 "simulator": simulator,
-            }  # fmt: skip
+            }
             given = {name: value for name, value in own.items() if value is not None}
             options = {**(backend_options or {}), **given}
             backend = make_backend(backend, self.model, self.world, **options)
@@ -151,12 +166,17 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         guard.check_reset(seed, options)
         super().reset(seed=seed)
         if seed is not None or self._episode < 0:
-            self._seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
+            self._seed = (
+                int(self.np_random.integers(2**31)) if seed is None else int(seed)
+            )
             self._episode = 0
         else:
             self._episode += 1
         episode = int(episode_seed(self._seed, self._episode))
-        radius, draw = self.model.robot.footprint_radius, self._backend.facts().get("scenes")
+        radius, draw = (
+            self.model.robot.footprint_radius,
+            self._backend.facts().get("scenes"),
+        )
         one = self.world, radius, episode, self.robots
         self.scene = draw([episode])[0] if draw else sample_scene(*one)
         starts = np.array(self.scene.starts)
@@ -170,7 +190,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         guard.override(memory, options, "start")
         if options and "goal" in options:
             guard.check_places("goal", memory["goal"], [self.scene], self.world)
-        self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
+        self._view = self._lifted(
+            self._backend.reset(Start(episode, self._row(starts)))
+        )
         self.memory = memory
         self._command, self._facts, self._steps = self._rest, {}, 0
         self.ended = np.zeros(self.robots, np.bool_)
@@ -195,17 +217,27 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     @refused_after_close
     @halts_on_error
-    def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: NDArray[Any]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self.advance(action)
         values = {name: term.tolist() for name, term in terms.items()}
         # In the order of the vector env's sum.
         each = [reduce(add, own, 0.0) for own in zip(*values.values(), strict=True)]
         alone = self.robots == 1
-        info["reward_terms"] = {name: v[0] for name, v in values.items()} if alone else terms
+        info["reward_terms"] = (
+            {name: v[0] for name, v in values.items()} if alone else terms
+        )
         if self.render_mode == "human":
             self.render()
-        return observation.reshape(-1), reduce(add, each, 0.0), bool(self.ended.all()), False, info
+        return (
+            observation.reshape(-1),
+            reduce(add, each, 0.0),
+            bool(self.ended.all()),
+            False,
+            info,
+        )
 
     @refused_after_close
     @halts_on_error
@@ -231,7 +263,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         outcome = self.task.step_into(out, before, view, self.memory)
         terms = {name: term[0] for name, term in outcome.terms.items()}
         if waiting:
-            terms = {name: np.where(self.ended, 0.0, term) for name, term in terms.items()}
+            terms = {
+                name: np.where(self.ended, 0.0, term) for name, term in terms.items()
+            }
         self.ended = (self.ended & waiting) | outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
@@ -248,15 +282,23 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         lead = (1, self.robots, -1)
         sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
         return RobotView(
-            view.pose.reshape(lead), view.twist.reshape(lead), view.ranges.reshape(lead),
-            view.stamp_s, view.scan_age_s, view.odom_age_s, sensed, view.sensed_age_s,
-        )  # fmt: skip
+            view.pose.reshape(lead),
+            view.twist.reshape(lead),
+            view.ranges.reshape(lead),
+            view.stamp_s,
+            view.scan_age_s,
+            view.odom_age_s,
+            sensed,
+            view.sensed_age_s,
+        )
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[0] if self.robots == 1 else rows
 
     def _info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
-        shown = {name: self._row(self.memory[name][0]).copy() for name in self.task.shown}
+        shown = {
+            name: self._row(self.memory[name][0]).copy() for name in self.task.shown
+        }
         ages = {"scan_age_s": view.scan_age_s, "odom_age_s": view.odom_age_s}
         ages |= {"sensed_age_s": view.sensed_age_s} if view.sensed else {}
         return {**shown, "pose": self._row(view.pose[0]).copy(), **ages, **facts}
@@ -273,7 +315,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     def _make_picture(self) -> Any:
         if self.render_mode == "human":
-            return extensions.load("viewers", "human")(self.model, self.world, RENDER_FPS)
+            return extensions.load("viewers", "human")(
+                self.model, self.world, RENDER_FPS
+            )
         from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
 
         return WorldPicture(self.model, self.world)
@@ -286,12 +330,18 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         covariance = told.get("covariance")
         return Snapshot(
             poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),
-            ranges=view.ranges[0], bodies=facts.get("bodies", self.scene.bodies),
-            goals=goals_of(self.memory).copy(), member=int(np.asarray(self.scene.member)),
-            step=self._steps, estimates=view.pose[0],
-            covariance=None if covariance is None else np.reshape(covariance, (-1, 3, 3)),
-            commands=np.reshape(self._command, (self.robots, -1)), gate=gate_of(told),
-        )  # fmt: skip
+            ranges=view.ranges[0],
+            bodies=facts.get("bodies", self.scene.bodies),
+            goals=goals_of(self.memory).copy(),
+            member=int(np.asarray(self.scene.member)),
+            step=self._steps,
+            estimates=view.pose[0],
+            covariance=None
+            if covariance is None
+            else np.reshape(covariance, (-1, 3, 3)),
+            commands=np.reshape(self._command, (self.robots, -1)),
+            gate=gate_of(told),
+        )
 
     @halts_on_error
     def close(self) -> None:

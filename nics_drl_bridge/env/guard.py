@@ -26,7 +26,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def halts_on_error(method: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
+def halts_on_error(
+    method: Callable[Concatenate[Any, P], T],
+) -> Callable[Concatenate[Any, P], T]:
     """Makes a method `halt` its robot if any exception leaves it, including Ctrl-C."""
 
     @wraps(method)
@@ -98,7 +100,9 @@ def override(
             continue
         if name not in memory:
             valid = {*memory, *of_env}
-            raise ConfigError(f"unknown reset option {name!r}; {nearest(str(name), valid)}")
+            raise ConfigError(
+                f"unknown reset option {name!r}; {nearest(str(name), valid)}"
+            )
         give(memory[name], name, value)
 
 
@@ -119,33 +123,51 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
 
 
 def check_places(
-    option: str, places: NDArray[np.float64], scenes: Iterable[Scene], world: AnyWorld,
+    option: str,
+    places: NDArray[np.float64],
+    scenes: Iterable[Scene],
+    world: AnyWorld,
     radius: float = 0.0,
-) -> None:  # fmt: skip
+) -> None:
     """Raises ConfigError for starts of a footprint, or goals, (n, ..., 2 or 3) off the field.
 
     Or in a wall; and for starts where an obstacle stands in the scenes of all n episodes.
     """
     free = not radius
     for scene, rows in zip(scenes, places, strict=True):
-        member, at = world.members[int(np.asarray(scene.member))], rows.reshape(-1, rows.shape[-1])
+        member, at = (
+            world.members[int(np.asarray(scene.member))],
+            rows.reshape(-1, rows.shape[-1]),
+        )
         for x, y in at[:, :2].tolist():
             check_place(f"reset option {option!r}", member, x, y, radius)
         shapes, pairs = world.shapes, product(at[:, :2].tolist(), scene.bodies)
-        free = free or not any(_on(x, y, radius, body, shapes) for (x, y), body in pairs)
+        free = free or not any(
+            _on(x, y, radius, body, shapes) for (x, y), body in pairs
+        )
     if not free and len(places):
         fix = "move it, or take another seed"
-        raise ConfigError(f"reset option {option!r}: {at.tolist()} is on an obstacle; {fix}.")
+        raise ConfigError(
+            f"reset option {option!r}: {at.tolist()} is on an obstacle; {fix}."
+        )
 
 
-def _on(x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]) -> bool:
+def _on(
+    x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]
+) -> bool:
     """True if a disc is on a body."""
     (dx, dy), (c, s), reach = (x, y) - body[:2], body[[COS, SIN]], body[RADIUS]
     if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
         return False
     shape = shapes[int(body[SHAPE]) % len(shapes)]  # in one of some sizes
-    corners, at = shape.outline * (reach / shape.radius), (c * dx + s * dy, c * dy - s * dx)
-    return not len(corners) or outline_point(*at, Outline(corners, 0, len(corners))) < radius
+    corners, at = (
+        shape.outline * (reach / shape.radius),
+        (c * dx + s * dy, c * dy - s * dx),
+    )
+    return (
+        not len(corners)
+        or outline_point(*at, Outline(corners, 0, len(corners))) < radius
+    )
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
@@ -155,7 +177,9 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
     except ValueError as error:  # a ragged list
         raise gymnasium.error.InvalidAction(f"{name}: {error}") from None
     if given.dtype.kind not in "fiub":
-        raise gymnasium.error.InvalidAction(f"{name} of {given.dtype}: must be real numbers.")
+        raise gymnasium.error.InvalidAction(
+            f"{name} of {given.dtype}: must be real numbers."
+        )
     if given.shape != space.shape:
         needed = f"must be of shape {space.shape}."
         raise gymnasium.error.InvalidAction(f"{name} of shape {given.shape}: {needed}")

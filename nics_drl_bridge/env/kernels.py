@@ -15,7 +15,9 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
-LIMIT = 1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
+LIMIT = (
+    1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
+)
 ONE = np.float32(1.0).view(np.int32)
 BLOCK = 64  # Beams that are looked at together
 FURTHEST = np.float32(0.04)  # What a beam may say for or against a contact, at most [m]
@@ -25,7 +27,9 @@ class ScanScale(NamedTuple):
     """Conversion of a scan to parts of an observation, and to contacts."""
 
     per_metre: np.float32  # 1 / the range that a share of 1 stands for [1/m], float32
-    leaves: NDArray[np.float32]  # (B,) float32 range at which each beam leaves the footprint [m]
+    leaves: NDArray[
+        np.float32
+    ]  # (B,) float32 range at which each beam leaves the footprint [m]
     beside: int  # number of beams on either side that a contact is judged from, too
     sectors: int  # number of sectors that are observed; 0 if the beams themselves are
     plan: SectorPlan  # mapping of beams to sectors
@@ -102,7 +106,9 @@ def contact(ranges, scale):  # type: ignore[no-untyped-def]
 @kernel(inline=True)
 def _gap(b, ranges, scale):  # type: ignore[no-untyped-def]
     gap = np.float32(0.0)
-    for k in range(max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])):
+    for k in range(
+        max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])
+    ):
         beyond = ranges[k] - scale.leaves[k]
         if beyond == beyond:  # else unknown
             gap += min(max(beyond, -FURTHEST), FURTHEST)

@@ -14,7 +14,10 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Places = NDArray[np.intp]
 SIGNS = np.array([1.0, -1.0, -1.0])  # of vx, vy and wz in a mirror
 MOST_SEARCHED, TRIED = 4, 8  # commands that can be searched; twists that have to agree
-NEAR_RAD, NEAR_M = 1e-4, 1e-6  # by which a scan may be off its mirror image: angles are float32
+NEAR_RAD, NEAR_M = (
+    1e-4,
+    1e-6,
+)  # by which a scan may be off its mirror image: angles are float32
 
 
 def mirror_of(task: Task, signs: ArrayLike) -> Mirror:
@@ -32,8 +35,12 @@ def mirror_of(task: Task, signs: ArrayLike) -> Mirror:
     factors = np.concatenate([np.ones(len(scan)), parts])
     space = task.observation_space
     if places.shape != space.shape:
-        fault = f"mirrors {len(places)} parts of an observation, which has {space.shape[0]}"
-        raise ConfigError(f"task {name}: {fault}; give a sign to each that follows the scan.")
+        fault = (
+            f"mirrors {len(places)} parts of an observation, which has {space.shape[0]}"
+        )
+        raise ConfigError(
+            f"task {name}: {fault}; give a sign to each that follows the scan."
+        )
     ends = np.stack([factors * space.low[places], factors * space.high[places]])
     wrong = (ends.min(axis=0) != space.low) | (ends.max(axis=0) != space.high)
     if wrong.any():
@@ -50,14 +57,20 @@ def _mirrored_scan(sight: Sight) -> Places:
     off = np.abs(wrap_angle(sight.angles + sight.angles[places]))
     if off.max() > NEAR_RAD or abs(float(sight.origin[1])) > NEAR_M:
         fault = "the scan does not look alike to the left and to the right"
-        raise ConfigError(f"{fault}; choose sectors by the task option scan, or no ppo.mirror.")
+        raise ConfigError(
+            f"{fault}; choose sectors by the task option scan, or no ppo.mirror."
+        )
     return places
 
 
 def _mirrored_actions(task: Task) -> tuple[Places, Array, Array]:
     places, signs = mirrored_commands(task.robot)
     if task.actions == "discrete":
-        return _mirrored_drives(task.discrete_commands, places, signs), np.zeros(0), np.zeros(0)
+        return (
+            _mirrored_drives(task.discrete_commands, places, signs),
+            np.zeros(0),
+            np.zeros(0),
+        )
     low, high = task.command_limits
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return places, signs * half[places] / half, (signs * middle[places] - middle) / half
@@ -80,12 +93,16 @@ def mirrored_commands(spec: RobotSpec) -> tuple[NDArray[np.intp], Array]:
     if has_textbook(spec) and count <= MOST_SEARCHED:
         tried = np.random.default_rng(0).uniform(-1.0, 1.0, (TRIED, count))
         wanted = steady_twist(spec, tried) * SIGNS
-        for order, signs in product(permutations(range(count)), product((1.0, -1.0), repeat=count)):
+        for order, signs in product(
+            permutations(range(count)), product((1.0, -1.0), repeat=count)
+        ):
             places, factors = np.array(order, np.intp), np.array(signs)
             if np.allclose(steady_twist(spec, tried[:, places] * factors), wanted):
                 return places, factors
     fault = "which of its commands drive its mirror image is not known"
-    raise ConfigError(f"robot {spec.name!r}: {fault}; give them `cmd_vel` fields, or {fix}")
+    raise ConfigError(
+        f"robot {spec.name!r}: {fault}; give them `cmd_vel` fields, or {fix}"
+    )
 
 
 def _outline_is_symmetric(spec: RobotSpec) -> bool:
@@ -104,6 +121,8 @@ def _mirrored_drives(commands: Array, places: Places, signs: Array) -> Places:
         alike = np.flatnonzero(np.isclose(commands, wanted).all(axis=1) & ~taken)
         if not len(alike):
             fault = "a discrete action has no mirror image, as limits of the commands differ"
-            raise ConfigError(f"{fault}; use continuous actions, or leave out ppo.mirror.")
+            raise ConfigError(
+                f"{fault}; use continuous actions, or leave out ppo.mirror."
+            )
         found[k], taken[alike[0]] = alike[0], True
     return found

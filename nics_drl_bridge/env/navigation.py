@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.env.mirror import mirror_of
-from nics_drl_bridge.env.task import Episodes, Flags, Memory, Mirror, Observation, Outcome, Task
+from nics_drl_bridge.env.task import (
+    Episodes,
+    Flags,
+    Memory,
+    Mirror,
+    Observation,
+    Outcome,
+    Task,
+)
 from nics_drl_bridge.interface import Array, RobotView
 
 
@@ -87,7 +95,9 @@ class Navigation(Task):
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
-        out = np.empty((*view.pose.shape[:-1], *self.observation_space.shape), np.float32)
+        out = np.empty(
+            (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
+        )
         self._see(out, view.pose, view, memory)
         return out
 
@@ -95,10 +105,14 @@ class Navigation(Task):
         self, view: RobotView, memory: Memory, before: RobotView | None = None
     ) -> GoalProgress:
         """Judges which robots are at their goals, and which touch something."""
-        out = np.empty((*view.pose.shape[:-1], *self.observation_space.shape), np.float32)
+        out = np.empty(
+            (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
+        )
         return self._see(out, (before or view).pose, view, memory)
 
-    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+    def reward(
+        self, before: RobotView, after: RobotView, memory: Memory
+    ) -> dict[str, Array]:
         """The terms (...,) of the reward for a step; their sum is the reward."""
         return self._terms(self.judge(after, memory, before))
 
@@ -123,17 +137,25 @@ class Navigation(Task):
         """Sine of the bearing, velocity to the left and turn rate change their signs."""
         return mirror_of(self, [1, 1, -1, 1, -1, -1])
 
-    def _see(self, out: Observation, before: Array, now: RobotView, memory: Memory) -> GoalProgress:
+    def _see(
+        self, out: Observation, before: Array, now: RobotView, memory: Memory
+    ) -> GoalProgress:
         lead = now.pose.shape[:-1]
         approach, flags, own = np.empty(lead), np.empty((*lead, 3), np.bool_), out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
-            own.reshape(-1, own.shape[-1]), approach.reshape(-1), flags.reshape(-1, 3),
-            before.reshape(-1, 3), now.pose.reshape(-1, 3), now.twist.reshape(-1, 3),
-            now.ranges.reshape(-1, now.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
-            self.scale, self.goal_radius,
-        )  # fmt: skip
+            own.reshape(-1, own.shape[-1]),
+            approach.reshape(-1),
+            flags.reshape(-1, 3),
+            before.reshape(-1, 3),
+            now.pose.reshape(-1, 3),
+            now.twist.reshape(-1, 3),
+            now.ranges.reshape(-1, now.ranges.shape[-1]),
+            memory["goal"].reshape(-1, 2),
+            self.scale,
+            self.goal_radius,
+        )
         if self.sensors:
             np.concatenate([own, self.sensor_shares(now)], axis=-1, out=out)
         return GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])

@@ -45,29 +45,42 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own declaration
-        "name": "nics_bridge_v0", "render_modes": ["human", "rgb_array"],
-        "render_fps": RENDER_FPS, "is_parallelizable": True,
-    }  # fmt: skip
+        "name": "nics_bridge_v0",
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": RENDER_FPS,
+        "is_parallelizable": True,
+    }
 
     @checked_arguments("BridgeParallelEnv")
     def __init__(
-        self, model: str | SimulatorModel | None = None, world: str | AnyWorld = "arena",
+        self,
+        model: str | SimulatorModel | None = None,
+        world: str | AnyWorld = "arena",
         task: str | type[Task] | Task = "cooperative_reaching",
-        task_options: dict[str, Any] | None = None, max_episode_steps: int = MAX_EPISODE_STEPS,
-        randomisation: str | Randomisation | None = None, render_mode: str | None = None,
-    ) -> None:  # fmt: skip
+        task_options: dict[str, Any] | None = None,
+        max_episode_steps: int = MAX_EPISODE_STEPS,
+        randomisation: str | Randomisation | None = None,
+        render_mode: str | None = None,
+    ) -> None:
         check_count("max_episode_steps", max_episode_steps)
         self.env = BridgeEnv(
-            "sim", model, world, task, task_options,
-            randomisation=randomisation, render_mode=render_mode,
-        )  # fmt: skip
+            "sim",
+            model,
+            world,
+            task,
+            task_options,
+            randomisation=randomisation,
+            render_mode=render_mode,
+        )
         self.render_mode, self._limit, self._steps = render_mode, max_episode_steps, 0
         self.possible_agents = [f"robot_{m}" for m in range(self.env.robots)]
         self.agents: list[str] = []
         of = self.env.task
         # One space for each agent: a space has its own random generator.
         agents = self.possible_agents
-        self.observation_spaces = {name: deepcopy(of.observation_space) for name in agents}
+        self.observation_spaces = {
+            name: deepcopy(of.observation_space) for name in agents
+        }
         self.action_spaces = {name: deepcopy(of.action_space) for name in agents}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
@@ -83,18 +96,28 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
         """Begins an episode with all agents; see PettingZoo."""
-        if isinstance(options, dict):  # PettingZoo's checker resets with an option "options"
-            options = {name: value for name, value in options.items() if name != "options"}
+        if isinstance(
+            options, dict
+        ):  # PettingZoo's checker resets with an option "options"
+            options = {
+                name: value for name, value in options.items() if name != "options"
+            }
         observation, info = self.env.reset(seed=seed, options=options)
         self.agents, self._steps = list(self.possible_agents), 0
-        seen = dict(zip(self.agents, observation.reshape(len(self.agents), -1), strict=True))
+        seen = dict(
+            zip(self.agents, observation.reshape(len(self.agents), -1), strict=True)
+        )
         return seen, {name: self._of(info, m) for m, name in enumerate(self.agents)}
 
     @halts_on_error
     def step(
         self, actions: dict[str, NDArray[Any]]
     ) -> tuple[
-        Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+        Observations,
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
     ]:
         """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
         given: object = actions
@@ -102,12 +125,16 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
             needed = "must be a dict of an action for each agent"
             raise ConfigError(f"actions of type {type(given).__name__}: {needed}.")
         if missing := sorted(set(self.agents) - set(actions)):
-            raise ConfigError(f"no action for {', '.join(missing)}; each agent that is left acts.")
+            raise ConfigError(
+                f"no action for {', '.join(missing)}; each agent that is left acts."
+            )
         space = self.env.task.action_space
         rest: Any = np.zeros(space.shape or (), space.dtype)
         # The env stops the robots that left, whatever their action.
         joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
-        action = joint[0] if self.env.robots == 1 else np.array(joint, space.dtype).ravel()
+        action = (
+            joint[0] if self.env.robots == 1 else np.array(joint, space.dtype).ravel()
+        )
         observation, terms, info = self.env.advance(action)
         if self.render_mode == "human":
             self.env.render()
@@ -133,8 +160,13 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         """Robot m's row of a fact, or of each in a dict; a fact of the world unchanged."""
         if isinstance(value, dict):
             of_world = ("goal", "bodies")
-            return {n: one if n in of_world else self._of(one, m) for n, one in value.items()}
-        return value[m] if self.env.robots > 1 and isinstance(value, np.ndarray) else value
+            return {
+                n: one if n in of_world else self._of(one, m)
+                for n, one in value.items()
+            }
+        return (
+            value[m] if self.env.robots > 1 and isinstance(value, np.ndarray) else value
+        )
 
     @halts_on_error
     def render(self) -> Any:

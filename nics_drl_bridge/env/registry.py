@@ -32,7 +32,9 @@ TASKS = {  # module and class of each
 
 
 def make_task(
-    task: str | type[Task] | Task, model: SimulatorModel, options: dict[str, Any] | None = None
+    task: str | type[Task] | Task,
+    model: SimulatorModel,
+    options: dict[str, Any] | None = None,
 ) -> Task:
     """Makes a task for the robot of a model. Raises ConfigError if it does not fit.
 
@@ -56,7 +58,9 @@ def make_task(
         return found(model.robot, model.lidar, **options)
     except TypeError as error:
         reason = str(error).removeprefix(f"{found.__name__}.__init__() ")
-        raise ConfigError(f"task {found.__name__}, task_options {options}: {reason}.") from None
+        raise ConfigError(
+            f"task {found.__name__}, task_options {options}: {reason}."
+        ) from None
 
 
 def _sensor(name: Any, model: SimulatorModel) -> Sensor:
@@ -64,7 +68,9 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
     given = name.name if isinstance(name, Sensor) else str(name)
     if given not in known:
         hint = nearest(given, known)
-        raise ConfigError(f"task option sensors: the model has no sensor {given!r}; {hint}")
+        raise ConfigError(
+            f"task option sensors: the model has no sensor {given!r}; {hint}"
+        )
     return known[given]
 
 
@@ -72,13 +78,17 @@ def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
     """Returns a task's class; ConfigError if there is none, or it does not take the options."""
     found = task if isinstance(task, type) else _class_of(task)
     if not issubclass(found, Task):
-        raise ConfigError(f"task {found.__name__}: is no subclass of env.task.Task; derive it.")
+        raise ConfigError(
+            f"task {found.__name__}: is no subclass of env.task.Task; derive it."
+        )
     known = signature(found).parameters
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
     for name, value in options.items():
         if name not in known and not free:
             hint = nearest(name, set(known) - {"robot", "lidar"})
-            raise ConfigError(f"task {found.__name__}: unknown task option {name!r}; {hint}")
+            raise ConfigError(
+                f"task {found.__name__}: unknown task option {name!r}; {hint}"
+            )
         if name in known:
             check_kind(f"task option {name}", value, known[name].annotation)
     return found
@@ -87,7 +97,9 @@ def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
 def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
     name = type(task).__name__
     if options:
-        raise ConfigError(f"task {name} is already made; give {sorted(options)} to it, not beside.")
+        raise ConfigError(
+            f"task {name} is already made; give {sorted(options)} to it, not beside."
+        )
     if task.robot != model.robot or task.lidar != model.lidar:
         raise ConfigError(
             f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
@@ -107,7 +119,9 @@ def _class_of(name: Any) -> type[Task]:
     if not colon:
         if name not in TASKS:
             hint = nearest(name, TASKS)
-            raise ConfigError(f"unknown task {name!r}; {hint} (or give path/to/file.py:ClassName).")
+            raise ConfigError(
+                f"unknown task {name!r}; {hint} (or give path/to/file.py:ClassName)."
+            )
         return _class_of(TASKS[name])
     module = extensions.module_at(path, "task")
     found = getattr(module, attribute, None)
@@ -115,7 +129,9 @@ def _class_of(name: Any) -> type[Task]:
         tasks = _tasks_in(module)
         if not tasks:
             raise ConfigError(f"task {name!r}: {path} {NO_TASK}")
-        raise ConfigError(f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}")
+        raise ConfigError(
+            f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}"
+        )
     return found
 
 
@@ -144,9 +160,11 @@ COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
 PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
 TASK = "NicsBridge/Task-v0"
 ENVIRONMENTS = {  # id -> arguments that define it
-    NAVIGATION: {"task": "navigation"}, COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
-    PURSUIT_EVASION: {"task": "pursuit_evasion"}, TASK: {},
-}  # fmt: skip
+    NAVIGATION: {"task": "navigation"},
+    COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
+    PURSUIT_EVASION: {"task": "pursuit_evasion"},
+    TASK: {},
+}
 MAX_EPISODE_STEPS = 300
 
 
@@ -155,23 +173,34 @@ def register_envs() -> None:
     for name, arguments in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(
-                name, entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
+                name,
+                entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
                 vector_entry_point="nics_drl_bridge.env.vector_env:BridgeVectorEnv",
-                max_episode_steps=MAX_EPISODE_STEPS, kwargs=dict(arguments),
-            )  # fmt: skip
+                max_episode_steps=MAX_EPISODE_STEPS,
+                kwargs=dict(arguments),
+            )
 
 
 register_envs()
 
 
-OF_GYMNASIUM = ("max_episode_steps", "disable_env_checker")  # arguments of `gymnasium.make` itself
+OF_GYMNASIUM = (
+    "max_episode_steps",
+    "disable_env_checker",
+)  # arguments of `gymnasium.make` itself
 
 
-def make(task: str | type[Task] | Task = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
+def make(
+    task: str | type[Task] | Task = "navigation", **arguments: Any
+) -> gymnasium.Env[Any, Any]:
     """Makes an env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
-    single = import_module("nics_drl_bridge.env.bridge_env")  # which imports this module
+    single = import_module(
+        "nics_drl_bridge.env.bridge_env"
+    )  # which imports this module
     in_own_word("make", "model", arguments)
-    refuse_unknown("make", arguments, {*keywords_of(single.BridgeEnv), "robot", *OF_GYMNASIUM})
+    refuse_unknown(
+        "make", arguments, {*keywords_of(single.BridgeEnv), "robot", *OF_GYMNASIUM}
+    )
     single.check_render_mode(arguments.get("render_mode"), single.BridgeEnv.metadata)
     if (most := arguments.get("max_episode_steps")) is not None:
         check_count("make: max_episode_steps", most)
@@ -182,10 +211,14 @@ def make_vec(
     task: str | type[Task] | Task = "navigation", num_envs: int = 1, **arguments: Any
 ) -> Any:
     """Makes a `BridgeVectorEnv`: a task in many worlds at once, for training."""
-    vectors = import_module("nics_drl_bridge.env.vector_env")  # which imports this module
+    vectors = import_module(
+        "nics_drl_bridge.env.vector_env"
+    )  # which imports this module
     first: object = task
     if isinstance(first, int) and not isinstance(first, bool):
-        raise ConfigError(f"make_vec: task={first}: the task comes first; give num_envs={first}.")
+        raise ConfigError(
+            f"make_vec: task={first}: the task comes first; give num_envs={first}."
+        )
     if "vectorization_mode" in arguments:
         mode = shown(arguments["vectorization_mode"])
         reason = "one process steps all worlds together; leave it out, threads=2 uses two cores"

@@ -32,7 +32,10 @@ class WorldPicture:
         self._model, self._world = model, world
         low, high = np.array(world.extent).reshape(2, 2)
         width, depth = (SIZE_IN * (high - low) / (high - low).max()).tolist()
-        self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
+        self._low, self._high = (
+            low - MARGIN * (high - low),
+            high + MARGIN * (high - low),
+        )
         figure = Figure(figsize=(width, depth), dpi=DPI)
         self._canvas: Any = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -47,24 +50,41 @@ class WorldPicture:
         axes.set_ylim(self._low[1], self._high[1])
         draw_world(axes, self._world, shot.bodies, shot.member)
         for goal in shot.goals:
-            axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)
+            axes.plot(
+                *goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL
+            )
         for m, trail in enumerate(trails):
-            axes.plot(*np.transpose(trail), color=ROBOTS[m % len(ROBOTS)], linewidth=1.5)
+            axes.plot(
+                *np.transpose(trail), color=ROBOTS[m % len(ROBOTS)], linewidth=1.5
+            )
         for m, (pose, scan) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
             self._robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
+    def _robot(
+        self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str
+    ) -> None:
         hits, robot = hits_of(self._model.lidar, pose, ranges), self._model.robot
         axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
-        draw_robot(axes, pose, robot.footprint_radius, robot.footprint, color=colour, zorder=1.0)
+        draw_robot(
+            axes,
+            pose,
+            robot.footprint_radius,
+            robot.footprint,
+            color=colour,
+            zorder=1.0,
+        )
 
 
 def draw_robot(
-    axes: Axes, pose: Array, radius: float, outline: Sequence[tuple[float, float]] | None,
-    zorder: float, **look: Any,
-) -> None:  # fmt: skip
+    axes: Axes,
+    pose: Array,
+    radius: float,
+    outline: Sequence[tuple[float, float]] | None,
+    zorder: float,
+    **look: Any,
+) -> None:
     """Draws a robot that is round, or has an outline (V, 2) [m], and a line to its front."""
     if outline is None:
         axes.add_patch(Disc((pose[0], pose[1]), radius, zorder=zorder, **look))
@@ -72,11 +92,15 @@ def draw_robot(
         radius = np.max(outline, axis=0)[0]
         corners = geometry.rotate(outline, pose[2]) + pose[:2]
         axes.add_patch(Outline(corners, closed=True, zorder=zorder, **look))
-    ends = np.stack([pose[:2], pose[:2] + radius * np.array([np.cos(pose[2]), np.sin(pose[2])])])
+    ends = np.stack(
+        [pose[:2], pose[:2] + radius * np.array([np.cos(pose[2]), np.sin(pose[2])])]
+    )
     axes.plot(*ends.T, color="white", linewidth=2.0, zorder=zorder + 1.0)
 
 
-def draw_world(axes: Axes, world: AnyWorld, bodies: NDArray[np.float64], member: int = 0) -> None:
+def draw_world(
+    axes: Axes, world: AnyWorld, bodies: NDArray[np.float64], member: int = 0
+) -> None:
     """Draws map, walls and obstacles (K, 7), see `sim.scenes.Scene`; x and y in `map` [m]."""
     place = world.members[member]
     if (grid := place.grid) is not None:
@@ -86,7 +110,9 @@ def draw_world(axes: Axes, world: AnyWorld, bodies: NDArray[np.float64], member:
         axes.pcolormesh(x, y, shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True)
     if place.bounds is not None:
         low, high = np.array(place.bounds).reshape(2, 2)
-        axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, color=EDGE, ls="--"))
+        axes.add_patch(
+            Rectangle(tuple(low), *(high - low), fill=False, color=EDGE, ls="--")
+        )
     for x1, y1, x2, y2 in place.all_walls():
         axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
     for body in bodies:
@@ -101,4 +127,6 @@ def _patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:
     outline = shape.outline * (body[RADIUS] / shape.radius)
     c, s = np.cos(body[HEADING]), np.sin(body[HEADING])
     corners = outline @ np.array([[c, s], [-s, c]]) + body[:2]
-    return Outline(corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2)
+    return Outline(
+        corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2
+    )

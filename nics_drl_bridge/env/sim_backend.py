@@ -12,7 +12,14 @@ from nics_drl_bridge.arguments import check_count, checked_arguments
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView, Start, stacked
+from nics_drl_bridge.interface import (
+    NS_PER_S,
+    Backend,
+    BackendFacts,
+    RobotView,
+    Start,
+    stacked,
+)
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -36,14 +43,23 @@ class SimBackend:
 
     @checked_arguments("backend 'sim'", FastSimulator, without=("worlds",))
     def __init__(
-        self, model: SimulatorModel, world: AnyWorld, renderer: Renderer = "baked",
-        estimator: bool = False, robots: int = 1, **simulation: Any,
-    ) -> None:  # fmt: skip
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        renderer: Renderer = "baked",
+        estimator: bool = False,
+        robots: int = 1,
+        **simulation: Any,
+    ) -> None:
         check_count("robots", robots)
         check_count("threads", simulation.get("threads", 1))
         self._robot = model.robot
-        self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
-        self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]
+        self.simulator = FastSimulator(
+            model, world, robots=robots, renderer=renderer, **simulation
+        )
+        self._middlewares = [
+            Middleware(model) for _ in range(robots if estimator else 0)
+        ]
         self._period_ns = round(model.control_period * NS_PER_S)
         self._row: Any = (0, 0) if robots == 1 else 0
         self._now_ns = 0
@@ -53,7 +69,9 @@ class SimBackend:
         robots = self.simulator.data.pose.shape[1]
         self.simulator.reset([start.seed], starts=start.pose.reshape(1, robots, 3))
         self._now_ns = 0
-        for middleware, pose in zip(self._middlewares, start.pose.reshape(-1, 3), strict=False):
+        for middleware, pose in zip(
+            self._middlewares, start.pose.reshape(-1, 3), strict=False
+        ):
             middleware.reset(self._now_ns, pose)
         return self._measure()
 
@@ -61,7 +79,9 @@ class SimBackend:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
         if self._middlewares:
-            command = self._robot.through_cmd_vel(command)  # as over ROS 2: both round alike
+            command = self._robot.through_cmd_vel(
+                command
+            )  # as over ROS 2: both round alike
         commands = command.reshape(data.pose.shape[1], -1)
         for middleware, one in zip(self._middlewares, commands, strict=False):
             middleware.command(self._now_ns, one)
@@ -69,7 +89,9 @@ class SimBackend:
         self._now_ns += self._period_ns
         told, view = {"stamp_ns": self._now_ns, **self._truth()}, self._measure()
         if self._middlewares:  # as of this view
-            every = np.array([each.estimator.covariance[:3, :3] for each in self._middlewares])
+            every = np.array(
+                [each.estimator.covariance[:3, :3] for each in self._middlewares]
+            )
             told["covariance"] = every[0] if len(every) == 1 else every
         return view, told
 
@@ -77,10 +99,14 @@ class SimBackend:
         """Returns the truth, the obstacles and the draws; see `interface.Backend`."""
         simulator = self.simulator
         known: BackendFacts = {
-            **self._truth(), "bodies": simulator.obstacles[0], "scenes": simulator.scenes,
-        }  # fmt: skip
+            **self._truth(),
+            "bodies": simulator.obstacles[0],
+            "scenes": simulator.scenes,
+        }
         if drawn := simulator.drawn:
-            known["randomisation"] = {name: self._of_episode(each) for name, each in drawn.items()}
+            known["randomisation"] = {
+                name: self._of_episode(each) for name, each in drawn.items()
+            }
         return known
 
     def _truth(self) -> BackendFacts:
@@ -88,7 +114,9 @@ class SimBackend:
         collided = data.collided[row]
         return {
             "true_pose": data.pose[row].copy(),
-            "true_collision": bool(collided) if collided.ndim == 0 else collided.astype(np.bool_),
+            "true_collision": bool(collided)
+            if collided.ndim == 0
+            else collided.astype(np.bool_),
         }
 
     def _of_episode(self, draws: NDArray[Any]) -> Any:
@@ -97,13 +125,21 @@ class SimBackend:
 
     def _measure(self) -> RobotView:
         data, now, row = self.simulator.data, self._now_ns, self._row
-        odom, twist, ranges = data.odom[row].copy(), data.twist[row].copy(), data.ranges[row].copy()
+        odom, twist, ranges = (
+            data.odom[row].copy(),
+            data.twist[row].copy(),
+            data.ranges[row].copy(),
+        )
         if not self._middlewares:
-            sensed = {name: each[row].copy() for name, each in self.simulator.readings.items()}
+            sensed = {
+                name: each[row].copy() for name, each in self.simulator.readings.items()
+            }
             return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0, sensed)
         views = []
         for m, middleware in enumerate(self._middlewares):
-            middleware.odometry(now, now, _sent(data.odom[0, m]), data.twist[0, m].copy())
+            middleware.odometry(
+                now, now, _sent(data.odom[0, m]), data.twist[0, m].copy()
+            )
             middleware.scan(now, now, data.ranges[0, m].copy())
             for name, readings in self.simulator.readings.items():
                 middleware.sense(name, now, now, readings[0, m].copy())
@@ -161,22 +197,32 @@ def completed(backend: Any, still: Array) -> Backend:
     if isinstance(backend, Backend):
         return backend
     needed = ("reset", "step", "close")
-    if missing := [name for name in needed if not callable(getattr(backend, name, None))]:
+    if missing := [
+        name for name in needed if not callable(getattr(backend, name, None))
+    ]:
         kind, lacks = type(backend).__name__, ", no ".join(missing)
-        raise ConfigError(f"backend of type {kind}: has no {lacks}; see interface.Backend.")
+        raise ConfigError(
+            f"backend of type {kind}: has no {lacks}; see interface.Backend."
+        )
     return CompletedBackend(backend, still)
 
 
-def make_backend(name: str, model: SimulatorModel, world: AnyWorld, **options: Any) -> Any:
+def make_backend(
+    name: str, model: SimulatorModel, world: AnyWorld, **options: Any
+) -> Any:
     """Makes a backend by the name under which it is registered, see `extensions`."""
     make = extensions.load("backends", name)
     try:
         signature(make).bind(model, world, **options)
     except TypeError as error:
-        raise ConfigError(f"backend {name!r}: {error}; look at its arguments.") from None
+        raise ConfigError(
+            f"backend {name!r}: {error}; look at its arguments."
+        ) from None
     try:
         return make(model, world, **options)
     except TypeError as error:  # of what such a function passes on
         if not any(f"argument '{name}'" in str(error) for name in options):
             raise
-        raise ConfigError(f"backend {name!r}: {error}; look at its arguments.") from None
+        raise ConfigError(
+            f"backend {name!r}: {error}; look at its arguments."
+        ) from None

@@ -27,7 +27,15 @@ Flags = NDArray[np.bool_]
 Actions = Literal["continuous", "discrete"]
 # Memory of a task during an episode: name -> array with leading (n, M), or (n,) per world.
 Memory = dict[str, NDArray[Any]]
-DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (-1, 0, -1))
+DRIVES = (
+    (0, 0, 0),
+    (1, 0, 0),
+    (1, 0, 1),
+    (1, 0, -1),
+    (-1, 0, 0),
+    (-1, 0, 1),
+    (-1, 0, -1),
+)
 """Stop; ahead, to the left, to the right; and back: signs of linear.x, linear.y, angular.z, as in
 the authors' code (efc-robot/MultiVehicleEnv). What can't reverse stays, and turns if it can."""
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
@@ -54,7 +62,9 @@ class Mirror:
 class Episodes:
     """Episodes at their start, in n worlds with M robots."""
 
-    seeds: NDArray[np.int64]  # (n,); all draws must follow from them, by `random_kernels.uniform`
+    seeds: NDArray[
+        np.int64
+    ]  # (n,); all draws must follow from them, by `random_kernels.uniform`
     starts: Array  # (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`
     goals: Array  # (n, M, 2) free points that the world drew, one per robot [m]
 
@@ -90,15 +100,23 @@ class Task(ABC):
 
     # True if a method uses `before.ranges`; otherwise these may be the new ones, without a copy
     keeps_last_scan: ClassVar[bool] = True
-    observes_sensors: ClassVar[bool] = False  # True if it observes the further `sensors`
-    shown: ClassVar[tuple[str, ...]] = ()  # names of memory arrays that `info` always contains
+    observes_sensors: ClassVar[bool] = (
+        False  # True if it observes the further `sensors`
+    )
+    shown: ClassVar[
+        tuple[str, ...]
+    ] = ()  # names of memory arrays that `info` always contains
 
     robot: RobotSpec  # gives commands, their limits, and the footprint
     lidar: LidarSpec  # gives the scan
-    actions: Actions = "continuous"  # a Box, or `discrete`: the paper's drives, see `DRIVES`
+    actions: Actions = (
+        "continuous"  # a Box, or `discrete`: the paper's drives, see `DRIVES`
+    )
     # returns this close to the footprint count as a contact [m], in the mean of `CONTACT_ANGLE`
     contact_margin: float = 0.02
-    top_speed: float | None = None  # of commands in m/s, where the robot's limits are wider [m/s]
+    top_speed: float | None = (
+        None  # of commands in m/s, where the robot's limits are wider [m/s]
+    )
     # sectors instead of beams, to mean the same for any lidar; contact is judged from the beams
     scan: ScanLayout | None = None
     sensors: tuple[Sensor, ...] = ()  # further ones, whose shares end each observation
@@ -114,12 +132,18 @@ class Task(ABC):
     def __post_init__(self) -> None:
         if self.actions not in ("continuous", "discrete"):
             known = nearest(str(self.actions), ("continuous", "discrete"))
-            raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
+            raise ConfigError(
+                f"task option actions={self.actions!r}: no such actions; {known}"
+            )
         if self.top_speed is not None and not self.top_speed > 0.0:
-            raise ConfigError(f"task option top_speed={self.top_speed!r}: must be above 0 m/s.")
+            raise ConfigError(
+                f"task option top_speed={self.top_speed!r}: must be above 0 m/s."
+            )
         if self.sensors and not self.observes_sensors:
             name = type(self).__name__
-            raise ConfigError(f"task option sensors: {name} observes no further sensors.")
+            raise ConfigError(
+                f"task option sensors: {name} observes no further sensors."
+            )
         _ = self.plan  # a lidar that can't fill the layout is refused here
 
     def check_above_zero(self, option: str, metres: float) -> None:
@@ -153,7 +177,9 @@ class Task(ABC):
         """Returns the observation of each robot, (..., O) float32."""
 
     @abstractmethod
-    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+    def reward(
+        self, before: RobotView, after: RobotView, memory: Memory
+    ) -> dict[str, Array]:
         """Returns the terms (...) of the reward for a step."""
 
     @abstractmethod
@@ -185,14 +211,22 @@ class Task(ABC):
         given = dict(memory)
         self.update(before, after, memory)
         if memory.keys() != given.keys():
-            raise self._wrong(f"memory {sorted(memory)}", f"must keep {sorted(given)} of `reset`")
+            raise self._wrong(
+                f"memory {sorted(memory)}", f"must keep {sorted(given)} of `reset`"
+            )
         # What is bound anew goes into the rows, which are an env's; one may be another of before.
-        anew = {n: np.array(memory[n]) for n, rows in given.items() if memory[n] is not rows}
+        anew = {
+            n: np.array(memory[n]) for n, rows in given.items() if memory[n] is not rows
+        }
         for name, new in anew.items():
             rows = memory[name] = given[name]
-            if new.shape != rows.shape or not np.can_cast(new.dtype, rows.dtype, "same_kind"):
+            if new.shape != rows.shape or not np.can_cast(
+                new.dtype, rows.dtype, "same_kind"
+            ):
                 like = f"must stay {rows.dtype} of {rows.shape} in `update`"
-                raise self._wrong(f"memory {name!r}", f"{like}, not {new.dtype} of {new.shape}")
+                raise self._wrong(
+                    f"memory {name!r}", f"{like}, not {new.dtype} of {new.shape}"
+                )
             rows[...] = new
         out[...] = self.valid("observation", self.observation(after, memory), out.shape)
         terms, each = self.reward(before, after, memory), out.shape[:-1]
@@ -207,14 +241,18 @@ class Task(ABC):
         ended = self.valid("end", self.end(after, memory), each)
         if np.asarray(ended).dtype != np.bool_:
             kind = np.asarray(ended).dtype
-            raise self._wrong("end", f"must be True or False for each robot, and is {kind}")
+            raise self._wrong(
+                "end", f"must be True or False for each robot, and is {kind}"
+            )
         return Outcome(terms, ended, info)
 
     def begun(self, episodes: Episodes) -> Memory:
         """Returns the memory of `reset`. Raises ConfigError if it does not fit or lacks `shown`."""
         memory = self.reset(episodes)
         if not isinstance(memory, dict) or not memory.keys() >= set(self.shown):
-            raise self._wrong("reset", f"must give a dictionary of arrays, with {[*self.shown]}")
+            raise self._wrong(
+                "reset", f"must give a dictionary of arrays, with {[*self.shown]}"
+            )
         lead = episodes.starts.shape[:2]
         for name, rows in memory.items():
             self._leads(f"memory {name!r}", rows, lead[:1])
@@ -225,7 +263,9 @@ class Task(ABC):
     def _leads(self, what: str, given: Any, lead: tuple[int, ...]) -> None:
         if not isinstance(given, np.ndarray) or given.shape[: len(lead)] != lead:
             fault = f"must be an array whose shape begins with {lead}"
-            raise self._wrong(what, f"{fault}, and is {type(given).__name__} of {np.shape(given)}")
+            raise self._wrong(
+                what, f"{fault}, and is {type(given).__name__} of {np.shape(given)}"
+            )
 
     def _wrong(self, what: str, fault: str) -> ConfigError:
         return ConfigError(f"task {type(self).__name__}: its {what} {fault}.")
@@ -257,8 +297,12 @@ class Task(ABC):
 
         A training asks for it if `ppo.mirror` says so. Raises ConfigError if there is none.
         """
-        fault = f"task {type(self).__name__} does not tell what it looks like in a mirror"
-        raise ConfigError(f"{fault}; give it a method `mirror`, or leave out ppo.mirror.")
+        fault = (
+            f"task {type(self).__name__} does not tell what it looks like in a mirror"
+        )
+        raise ConfigError(
+            f"{fault}; give it a method `mirror`, or leave out ppo.mirror."
+        )
 
     # Building blocks of tasks.
 
@@ -267,8 +311,12 @@ class Task(ABC):
         parts, further = self.scan_parts, sum(sensor.parts for sensor in self.sensors)
         low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         return gymnasium.spaces.Box(
-            np.concatenate([np.zeros(parts, np.float32), low, np.zeros(further, np.float32)]),
-            np.concatenate([np.ones(parts, np.float32), high, np.ones(further, np.float32)]),
+            np.concatenate(
+                [np.zeros(parts, np.float32), low, np.zeros(further, np.float32)]
+            ),
+            np.concatenate(
+                [np.ones(parts, np.float32), high, np.ones(further, np.float32)]
+            ),
             dtype=np.float32,
         )
 
@@ -304,7 +352,9 @@ class Task(ABC):
         if (layout := self.scan) is not None:
             return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
         x, y, heading = self.lidar.mount
-        return Sight(self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max)
+        return Sight(
+            self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max
+        )
 
     @cached_property
     def plan(self) -> SectorPlan:
@@ -355,7 +405,9 @@ def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]
     several = gymnasium.vector.utils.batch_space(space, robots)
     if not isinstance(several, gymnasium.spaces.Box):
         return several
-    return gymnasium.spaces.Box(several.low.ravel(), several.high.ravel(), dtype=np.float32)
+    return gymnasium.spaces.Box(
+        several.low.ravel(), several.high.ravel(), dtype=np.float32
+    )
 
 
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
@@ -388,7 +440,9 @@ def total(values: Array) -> Array:
     return np.asarray(summed)
 
 
-def contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> NDArray[np.float32]:
+def contact_ranges(
+    robot: RobotSpec, lidar: LidarSpec, margin: float
+) -> NDArray[np.float32]:
     """Ranges (B,) at which each beam leaves the footprint and a margin [m]; else -inf."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading

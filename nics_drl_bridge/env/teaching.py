@@ -28,18 +28,28 @@ class Curriculum(Schema):
 
     begin: Share = 0.2  # the first level
     step: Share = 0.1  # from one level to the next, up to 1: starts as they are drawn
-    success: Share = 0.7  # least share of the episodes at a level after which the next one begins
+    success: Share = (
+        0.7  # least share of the episodes at a level after which the next one begins
+    )
 
 
 class Teaching(Schema):
     """Rewards by what only the simulator knows, repetition, easy starts; nothing by default."""
 
-    contact: float | None = None  # reward of a contact that the task misses, which ends the episode
-    path: float = 0.0  # reward of each metre by which the way around obstacles gets shorter
-    retries: int = Field(default=0, ge=0, le=1000)  # times that a failed episode is driven again
+    contact: float | None = (
+        None  # reward of a contact that the task misses, which ends the episode
+    )
+    path: float = (
+        0.0  # reward of each metre by which the way around obstacles gets shorter
+    )
+    retries: int = Field(
+        default=0, ge=0, le=1000
+    )  # times that a failed episode is driven again
     # by which robots are larger all around while they learn [m], to keep away from what stands
     margin: float = Field(default=0.0, ge=0.0, le=1.0)
-    curriculum: Curriculum | None = None  # starts near the goal first; None: as worlds draw them
+    curriculum: Curriculum | None = (
+        None  # starts near the goal first; None: as worlds draw them
+    )
 
 
 class Teacher:
@@ -48,13 +58,21 @@ class Teacher:
     def __init__(self, given: Teaching, simulator: FastSimulator) -> None:
         self._given, self._data = given, simulator.data
         self._guide: Guide | None = None
-        self._left = np.zeros(simulator.data.pose.shape[:2])  # (N, M) lengths of the ways [m]
-        self._tries = np.zeros(len(self._left), np.int64)  # (N,) of the running episode again
+        self._left = np.zeros(
+            simulator.data.pose.shape[:2]
+        )  # (N, M) lengths of the ways [m]
+        self._tries = np.zeros(
+            len(self._left), np.int64
+        )  # (N,) of the running episode again
         self._level = np.zeros(1, np.int64)
-        self._begun = np.zeros(len(self._left), np.int64)  # (N,) level of the running episode
+        self._begun = np.zeros(
+            len(self._left), np.int64
+        )  # (N,) level of the running episode
         self._results = np.zeros(2, np.int64)  # at this level: failures and successes
         if given.curriculum is not None and simulator.data.pose.shape[1] > 1:
-            raise ConfigError("teaching.curriculum: moves a single robot's start; leave it out.")
+            raise ConfigError(
+                "teaching.curriculum: moves a single robot's start; leave it out."
+            )
         if given.path or given.curriculum:
             footprint = footprint_shape(simulator.model.robot)
             self._guide = Guide(simulator.sampler, footprint, len(self._left))
@@ -66,14 +84,22 @@ class Teacher:
         if self._guide is not None:
             known |= {"guide": self._guide.fields, "left": self._left}
         if self._given.curriculum is not None:
-            known |= {"level": self._level, "begun": self._begun, "results": self._results}
+            known |= {
+                "level": self._level,
+                "begun": self._begun,
+                "results": self._results,
+            }
         return known
 
     @property
     def level(self) -> float:
         """Share of the way with which episodes begin."""
         given = self._given.curriculum
-        return 1.0 if given is None else min(given.begin + given.step * int(self._level[0]), 1.0)
+        return (
+            1.0
+            if given is None
+            else min(given.begin + given.step * int(self._level[0]), 1.0)
+        )
 
     def places(self, worlds: NDArray[np.intp], scenes: Scenes) -> Array:
         """Finds the ways of episodes that begin in some worlds (n,); returns starts (n, M, 3)."""
@@ -82,7 +108,9 @@ class Teacher:
             return scenes.starts
         self._guide.begin(worlds, scenes)
         level = self.level
-        return scenes.starts if level == 1.0 else self._guide.nearer(worlds, scenes, level)
+        return (
+            scenes.starts if level == 1.0 else self._guide.nearer(worlds, scenes, level)
+        )
 
     def begin(self, worlds: NDArray[np.intp]) -> None:
         """Begins episodes in some worlds (n,), where the robots now are."""
@@ -103,7 +131,9 @@ class Teacher:
             ended = ended | unseen
         return Outcome(terms, ended, info)
 
-    def again(self, over: NDArray[np.bool_], success: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def again(
+        self, over: NDArray[np.bool_], success: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
         """Chooses the worlds (N,) that begin the episode which is over again.
 
         Raises the level, if there is a curriculum and enough episodes at this one succeeded.
@@ -117,7 +147,9 @@ class Teacher:
         given = self._given.curriculum
         if given is None or self.level == 1.0:
             return
-        counted = over & (self._begun == self._level)  # not those that began at an easier one
+        counted = over & (
+            self._begun == self._level
+        )  # not those that began at an easier one
         self._results += (counted & ~success).sum(), (counted & success).sum()
         count = int(self._results.sum())
         if count >= max(len(over), FEWEST):

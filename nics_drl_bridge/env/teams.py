@@ -82,7 +82,9 @@ class CooperativeReaching(Task):
         super().__post_init__()
         self.check_above_zero("goal_radius", self.goal_radius)
         if self.robots < 2:
-            raise ConfigError(f"task option robots={self.robots}: a team has at least 2.")
+            raise ConfigError(
+                f"task option robots={self.robots}: a team has at least 2."
+            )
 
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
@@ -102,30 +104,42 @@ class CooperativeReaching(Task):
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
         """Marks the goals that a robot is at."""
-        there = (task.distance(*pairs(after.pose, memory["goal"])) < self.goal_radius).any(axis=-2)
+        there = (
+            task.distance(*pairs(after.pose, memory["goal"])) < self.goal_radius
+        ).any(axis=-2)
         memory["newly"][...] = there & ~memory["reached"]
         memory["reached"] |= there
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., M, O) of views (..., M)."""
         goals = task.bearing(*pairs(view.pose, memory["goal"]))
-        reached = np.broadcast_to(memory["reached"][..., None, :, None], (*goals.shape[:-1], 1))
+        reached = np.broadcast_to(
+            memory["reached"][..., None, :, None], (*goals.shape[:-1], 1)
+        )
         lead = view.pose.shape[:-1]
         parts = [
             self.free_share(view.ranges),
             np.concatenate([goals, reached], axis=-1).reshape(*lead, -1),
-            others(task.bearing(*pairs(view.pose, view.pose[..., :2]))).reshape(*lead, -1),
+            others(task.bearing(*pairs(view.pose, view.pose[..., :2]))).reshape(
+                *lead, -1
+            ),
             task.limited(view.twist),
         ]
         return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 
-    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+    def reward(
+        self, before: RobotView, after: RobotView, memory: Memory
+    ) -> dict[str, Array]:
         """The terms (..., M)."""
         lead = after.pose.shape[:-1]
-        ways = (task.distance(*pairs(view.pose, memory["goal"])) for view in (before, after))
+        ways = (
+            task.distance(*pairs(view.pose, memory["goal"])) for view in (before, after)
+        )
         gaps = [way.min(axis=-2) for way in ways]
         # A goal just reached still pays its last approach.
-        approach = np.where(~memory["reached"] | memory["newly"], gaps[0] - gaps[1], 0.0)
+        approach = np.where(
+            ~memory["reached"] | memory["newly"], gaps[0] - gaps[1], 0.0
+        )
         share, nearer = 1.0 / self.robots, task.total(approach)
         newly = task.total(memory["newly"].astype(np.float64))
         return {
@@ -137,12 +151,16 @@ class CooperativeReaching(Task):
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True where a robot touches something, or all goals are reached."""
-        return np.asarray(self.touches(view.ranges) | memory["reached"].all(-1, keepdims=True))
+        return np.asarray(
+            self.touches(view.ranges) | memory["reached"].all(-1, keepdims=True)
+        )
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Success of the team, contacts, and the goals that have been reached (..., M)."""
         return {
-            "is_success": np.full(view.pose.shape[:-1], memory["reached"].all(-1, keepdims=True)),
+            "is_success": np.full(
+                view.pose.shape[:-1], memory["reached"].all(-1, keepdims=True)
+            ),
             "collision": self.touches(view.ranges),
             "reached": memory["reached"].copy(),
         }
@@ -252,23 +270,31 @@ class PursuitEvasion(Task):
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., M, O) of views (..., M)."""
         lead = view.pose.shape[:-1]
-        mates = np.broadcast_to(self.pursues[:, None] == self.pursues, (*lead, self.robots))
+        mates = np.broadcast_to(
+            self.pursues[:, None] == self.pursues, (*lead, self.robots)
+        )
         out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
         places = task.bearing(*pairs(view.pose, view.pose[..., :2]))
         known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
         parts: list[NDArray[Any]] = [
-            self.free_share(view.ranges), others(known).reshape(*lead, -1),
-            np.broadcast_to(self.pursues[:, None], (*lead, 1)), task.limited(view.twist),
-        ]  # fmt: skip
+            self.free_share(view.ranges),
+            others(known).reshape(*lead, -1),
+            np.broadcast_to(self.pursues[:, None], (*lead, 1)),
+            task.limited(view.twist),
+        ]
         return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 
-    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+    def reward(
+        self, before: RobotView, after: RobotView, memory: Memory
+    ) -> dict[str, Array]:
         """The terms (..., M)."""
         # Evaders caught in this step still count for this step.
         known = {**memory, "out": memory["out"] & ~memory["newly"]}
         gap = [self._gaps(view, known) for view in (before, after)]
         free = np.isfinite(gap[0]) & np.isfinite(gap[1])
-        nearer = np.where(free, np.where(free, gap[0], 0.0) - np.where(free, gap[1], 0.0), 0.0)
+        nearer = np.where(
+            free, np.where(free, gap[0], 0.0) - np.where(free, gap[1], 0.0), 0.0
+        )
         side = np.where(self.pursues, 1.0, -1.0)
         captures = memory["newly"].sum(axis=-1)[..., None]
         newly = np.where(self.pursues, captures, -1.0 * memory["newly"])
@@ -276,7 +302,9 @@ class PursuitEvasion(Task):
             "pursuit": self.pursuit_reward * side * nearer,
             "capture": self.capture_reward * newly,
             "time": np.full(nearer.shape, self.time_reward * side),
-            "collision": np.multiply(self.collision_reward, self._collided(after, memory)),
+            "collision": np.multiply(
+                self.collision_reward, self._collided(after, memory)
+            ),
         }
 
     def _collided(self, view: RobotView, memory: Memory) -> Flags:
@@ -285,7 +313,10 @@ class PursuitEvasion(Task):
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns the robots that are out; all of them when one side has none left."""
         out = memory["out"]
-        over = [out[..., side].all(-1, keepdims=True) for side in (self.pursues, ~self.pursues)]
+        over = [
+            out[..., side].all(-1, keepdims=True)
+            for side in (self.pursues, ~self.pursues)
+        ]
         return np.asarray(out | over[0] | over[1])
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:

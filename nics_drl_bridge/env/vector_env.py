@@ -17,7 +17,15 @@ from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.snapshot import Snapshot, goals_of
-from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
+from nics_drl_bridge.env.task import (
+    Episodes,
+    Memory,
+    Outcome,
+    Task,
+    still,
+    team_space,
+    total,
+)
 from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -30,13 +38,19 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Facts = Mapping[str, Any]  # name -> array whose first dimension is the world, or such a mapping
+Facts = Mapping[
+    str, Any
+]  # name -> array whose first dimension is the world, or such a mapping
 Rows = slice | NDArray[np.intp] | Flags
 LARGE = 2**20  # Size from which zeros come fresh from the operating system [bytes]
-MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
+MODES = {
+    mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+}
 
 
-class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
+class BridgeVectorEnv(
+    gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]
+):
     """A task in `num_envs` worlds at once, for training.
 
     ## Description
@@ -66,18 +80,26 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
-        "render_modes": ["rgb_array"], "render_fps": RENDER_FPS,
+        "render_modes": ["rgb_array"],
+        "render_fps": RENDER_FPS,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }  # fmt: skip
+    }
 
     @checked_arguments("BridgeVectorEnv", FastSimulator, without=("worlds", "robots"))
     def __init__(
-        self, num_envs: int = 1, model: str | SimulatorModel | None = None,
-        world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
-        task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
-        render_mode: str | None = None, **simulation: Any,
-    ) -> None:  # fmt: skip
+        self,
+        num_envs: int = 1,
+        model: str | SimulatorModel | None = None,
+        world: str | AnyWorld = "arena",
+        task: str | type[Task] | Task = "navigation",
+        task_options: dict[str, Any] | None = None,
+        max_episode_steps: int = 300,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        *,
+        render_mode: str | None = None,
+        **simulation: Any,
+    ) -> None:
         self._pictures: list[Any] = []
         check_render_mode(render_mode, self.metadata)
         check_count("num_envs", num_envs)
@@ -88,21 +110,31 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.render_mode = render_mode
         self._limit = max_episode_steps
         self.copy = copy
-        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        mode = (
+            autoreset_mode.value
+            if isinstance(autoreset_mode, AutoresetMode)
+            else autoreset_mode
+        )
         if not isinstance(mode, str) or mode not in MODES:
-            raise ConfigError(f"autoreset_mode {shown(mode)}: must be one of {', '.join(MODES)}.")
+            raise ConfigError(
+                f"autoreset_mode {shown(mode)}: must be one of {', '.join(MODES)}."
+            )
         self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(DEFAULT_ROBOT if model is None else model)
         self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
-        self.single_observation_space = team_space(self.task.observation_space, self.robots)
+        self.single_observation_space = team_space(
+            self.task.observation_space, self.robots
+        )
         self.single_action_space = team_space(self.task.action_space, self.robots)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         simulation = {"renderer": "baked", **simulation}
-        self.simulator = FastSimulator(self.model, self.world, num_envs, self.robots, **simulation)
+        self.simulator = FastSimulator(
+            self.model, self.world, num_envs, self.robots, **simulation
+        )
         self._teacher: Teacher | None = None
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
@@ -121,7 +153,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
-        self.ready = False  # False after an exception too, which leaves worlds between two steps
+        self.ready = (
+            False  # False after an exception too, which leaves worlds between two steps
+        )
 
     def teach(self, given: Teaching) -> None:
         """Adds rewards beside the task's from the next reset on, and retries in `SameStep`."""
@@ -136,24 +170,34 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def changing(self) -> dict[str, NDArray[Any]]:
         """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
-            "ended": self.ended, "over": self._over, "first": self._first,
-            "episode": self._episode, "starts": self._starts, "bodies": self._bodies,
-        }  # fmt: skip
-        data = {f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()}
+            "ended": self.ended,
+            "over": self._over,
+            "first": self._first,
+            "episode": self._episode,
+            "starts": self._starts,
+            "bodies": self._bodies,
+        }
+        data = {
+            f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()
+        }
         known = self._teacher.changing if self._teacher else {}
         return {**own, **data, **known, "goals": self.simulator.goals}
 
     @guard.refused_after_close
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None,
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[Observation, dict[str, Any]]:  # fmt: skip
+    ) -> tuple[Observation, dict[str, Any]]:
         """Begins an episode in every world; world i takes its seeds from `seed + i`."""
         guard.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = chosen_worlds(options, self.num_envs)
         if not (self.ready or chosen.all()):
-            raise gymnasium.error.ResetNeeded("call reset() of all worlds before one of some.")
+            raise gymnasium.error.ResetNeeded(
+                "call reset() of all worlds before one of some."
+            )
         seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
         self.ready = False
         self._first[fresh], self._episode[fresh] = seeds[fresh], -1
@@ -165,7 +209,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         return flat(self._out.copy() if self.copy else self._out), infos
 
     def _begin(
-        self, worlds: NDArray[np.intp], out: Observation, options: dict[str, Any] | None = None
+        self,
+        worlds: NDArray[np.intp],
+        out: Observation,
+        options: dict[str, Any] | None = None,
     ) -> None:
         if not len(worlds):
             return
@@ -181,7 +228,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             if starts is not None:
                 radius = self.model.robot.footprint_radius
                 guard.check_places("start", starts, scenes, self.world, radius)
-            moved = None if self._teacher is None else self._teacher.places(worlds, scenes)
+            moved = (
+                None if self._teacher is None else self._teacher.places(worlds, scenes)
+            )
             return moved if starts is None else starts
 
         scenes = self.simulator.reset(seeds, worlds, places)
@@ -189,22 +238,30 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             self._teacher.begin(worlds)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
-        fresh = self.task.begun(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
+        fresh = self.task.begun(
+            Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds])
+        )
         guard.override(fresh, options, "start", "reset_mask")
         if options and "goal" in options:
             guard.check_places("goal", fresh["goal"], scenes, self.world)
         for name, rows in fresh.items():
             if name not in self.memory:
-                self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
+                self.memory[name] = np.zeros(
+                    (self.num_envs, *rows.shape[1:]), rows.dtype
+                )
             self.memory[name][worlds] = rows
         self.ended[worlds], self._over[worlds] = False, False
         seen = self.task.observation(self._view(worlds), fresh)
-        out[worlds] = self.task.valid("observation", seen, (len(worlds), *out.shape[1:]))
+        out[worlds] = self.task.valid(
+            "observation", seen, (len(worlds), *out.shape[1:])
+        )
 
     def _view(self, rows: Rows) -> RobotView:
         data, readings = self.simulator.data, self.simulator.readings
         seen = data.odom[rows], data.twist[rows], data.ranges[rows]
-        return RobotView(*seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings})
+        return RobotView(
+            *seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings}
+        )
 
     @guard.refused_after_close
     def step(
@@ -213,7 +270,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """One control period in every world; see Gymnasium."""
         if not self.ready:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        given = guard.check_action(actions, self.action_space, "actions").reshape(self._each)
+        given = guard.check_action(actions, self.action_space, "actions").reshape(
+            self._each
+        )
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and are reset
@@ -229,7 +288,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             "true_pose": self._row(self.simulator.data.pose).copy(),
             "true_collision": self._row(self.simulator.data.collided).astype(np.bool_),
             **{name: self._row(values).copy() for name, values in outcome.info.items()},
-            "reward_terms": {name: self._row(t).copy() for name, t in outcome.terms.items()},
+            "reward_terms": {
+                name: self._row(t).copy() for name, t in outcome.terms.items()
+            },
         }
         if self._mode is AutoresetMode.SAME_STEP:
             self._end_at_once(out, over, facts, infos)
@@ -243,14 +304,20 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
         data, ended = self.simulator.data, self.ended[part]
-        command = guard.check_command(self.task.command(actions), (*ended.shape, len(self._still)))
+        command = guard.check_command(
+            self.task.command(actions), (*ended.shape, len(self._still))
+        )
         if self.robots > 1 and ended.any():
             command = np.where(ended[..., None], self._still, command)
         ranges = data.ranges[part]
         before = RobotView(
-            data.odom[part].copy(), data.twist[part].copy(),
-            ranges.copy() if self.task.keeps_last_scan else ranges, 0.0, 0.0, 0.0,
-        )  # fmt: skip
+            data.odom[part].copy(),
+            data.twist[part].copy(),
+            ranges.copy() if self.task.keeps_last_scan else ranges,
+            0.0,
+            0.0,
+            0.0,
+        )
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}
         outcome = self.task.step_into(out[part], before, self._view(part), memory)
@@ -265,18 +332,26 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         return Outcome(terms, outcome.ended, outcome.info)
 
     def _end_at_once(
-        self, out: Observation, over: Flags, facts: dict[str, Any], infos: dict[str, Any]
+        self,
+        out: Observation,
+        over: Flags,
+        facts: dict[str, Any],
+        infos: dict[str, Any],
     ) -> None:
         """SAME_STEP: resets the worlds that ended; `infos` gets their last observation and info."""
         if over.any():
             shown = np.full(self.num_envs, None, dtype=object)
-            for n in np.flatnonzero(over):  # only those that ended: each needs its own object
+            for n in np.flatnonzero(
+                over
+            ):  # only those that ended: each needs its own object
                 shown[n] = flat(out)[n].copy()
             infos |= masked({"final_obs": shown}, over)
             infos |= masked({"final_info": self._known() | facts}, over, True)
             if self._teacher is not None:
                 success = np.reshape(facts.get("is_success", over), (self.num_envs, -1))
-                self._episode[self._teacher.again(over, np.asarray(success.all(axis=1)))] -= 1
+                self._episode[
+                    self._teacher.again(over, np.asarray(success.all(axis=1)))
+                ] -= 1
             run = self.simulator.run_parts
             run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
         self._tell(infos, facts, over)
@@ -292,7 +367,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _known(self) -> dict[str, Any]:
         shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
-        pose, ages = self._row(self.simulator.data.odom).copy(), np.zeros((2, self.num_envs))
+        pose, ages = (
+            self._row(self.simulator.data.odom).copy(),
+            np.zeros((2, self.num_envs)),
+        )
         return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
 
     def _beginnings(self) -> dict[str, Any]:
@@ -301,9 +379,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             for name, values in self.simulator.drawn.items()
         }
         return {
-            "episode_seed": self.simulator.data.seeds, "start": self._row(self._starts),
-            "bodies": self._bodies, **({"randomisation": drawn} if drawn else {}),
-        }  # fmt: skip
+            "episode_seed": self.simulator.data.seeds,
+            "start": self._row(self._starts),
+            "bodies": self._bodies,
+            **({"randomisation": drawn} if drawn else {}),
+        }
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[:, 0] if self.robots == 1 else rows
@@ -320,15 +400,26 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if not self._pictures:
             from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
 
-            self._pictures = [WorldPicture(self.model, self.world) for _ in range(self.num_envs)]
-        return tuple(picture.draw(self.snapshot(n)) for n, picture in enumerate(self._pictures))
+            self._pictures = [
+                WorldPicture(self.model, self.world) for _ in range(self.num_envs)
+            ]
+        return tuple(
+            picture.draw(self.snapshot(n)) for n, picture in enumerate(self._pictures)
+        )
 
     def snapshot(self, n: int) -> Snapshot:
         """All that a picture of world n shows now; `step` does not change its arrays."""
-        data, bodies = self.simulator.data, self.simulator.obstacles_of(np.array([n]))[0]
-        goals = goals_of({name: rows[n] for name, rows in self.memory.items() if name == "goal"})
+        data, bodies = (
+            self.simulator.data,
+            self.simulator.obstacles_of(np.array([n]))[0],
+        )
+        goals = goals_of(
+            {name: rows[n] for name, rows in self.memory.items() if name == "goal"}
+        )
         seen = data.pose[n].copy(), data.ranges[n].copy(), bodies, goals.copy()
-        return Snapshot(*seen, int(data.member[n]), int(data.steps[n]), data.odom[n].copy())
+        return Snapshot(
+            *seen, int(data.member[n]), int(data.steps[n]), data.odom[n].copy()
+        )
 
 
 def flat(observations: Observation) -> Observation:
@@ -340,8 +431,14 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
-    terms = {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms}
-    info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
+    terms = {
+        name: np.concatenate([part.terms[name] for part in parts])
+        for name in parts[0].terms
+    }
+    info = {
+        name: np.concatenate([part.info[name] for part in parts])
+        for name in parts[0].info
+    }
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
 
 
@@ -357,7 +454,10 @@ def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
 
 
 def named_seeds(
-    seed: int | Sequence[int | None] | None, chosen: Flags, unnamed: Flags, rng: np.random.Generator
+    seed: int | Sequence[int | None] | None,
+    chosen: Flags,
+    unnamed: Flags,
+    rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], Flags]:
     """Seeds (N,) that a reset gives to worlds, and a mask (N,) of those that begin anew with them.
 

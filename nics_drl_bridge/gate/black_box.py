@@ -24,8 +24,12 @@ FORMAT = "nics_drl_bridge/black_box/4"
 KEPT_S = 30.0
 LATEST_S = 1e12
 MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
-MOST_VALUES = 1_000_000  # greatest number of values in such a file; 30 s of a gate have 100,000
-MOST_INPUTS = 20_000  # greatest number of inputs that are decided on again; each takes some 30 us
+MOST_VALUES = (
+    1_000_000  # greatest number of values in such a file; 30 s of a gate have 100,000
+)
+MOST_INPUTS = (
+    20_000  # greatest number of inputs that are decided on again; each takes some 30 us
+)
 
 
 class Entry(NamedTuple):
@@ -62,7 +66,9 @@ def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> N
 
 def _lines_of(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]:
     """Yields the lines one by one: memory must not grow at a stop."""
-    yield from sealed(chain([head_line(config, entries[0].before)], map(entry_line, entries)))
+    yield from sealed(
+        chain([head_line(config, entries[0].before)], map(entry_line, entries))
+    )
 
 
 def head_line(config: GateConfig, state: GateState) -> bytes:
@@ -76,14 +82,19 @@ def entry_line(entry: Entry) -> bytes:
 
 
 def _line(record: dict[str, Any]) -> bytes:
-    return json.dumps({key: to_plain(part) for key, part in record.items()}).encode() + b"\n"
+    return (
+        json.dumps({key: to_plain(part) for key, part in record.items()}).encode()
+        + b"\n"
+    )
 
 
 class Replay(NamedTuple):
     """Content of a black box, with the recorded decisions."""
 
     entries: tuple[Entry, ...]
-    differing: tuple[int, ...]  # indices of the entries that are now decided differently
+    differing: tuple[
+        int, ...
+    ]  # indices of the entries that are now decided differently
 
     @property
     def story(self) -> list[str]:
@@ -100,7 +111,9 @@ class Replay(NamedTuple):
             before = rule
         verdict = "all decided the same again"
         if self.differing:
-            verdict = f"{len(self.differing)} decided otherwise, first {self.differing[0]}"
+            verdict = (
+                f"{len(self.differing)} decided otherwise, first {self.differing[0]}"
+            )
         spent = f"{len(self.entries)} inputs over {end - self.entries[0].now:.3f} s"
         return [*lines, f"{spent}: {verdict}"]
 
@@ -110,13 +123,17 @@ def replay(path: str | Path) -> Replay:
     head, *lines = _lines(path)
     try:
         config, state = from_plain(head["config"]), from_plain(head["state"])
-        given = [(line["now"], from_plain(line["given"]), line["decision"]) for line in lines]
+        given = [
+            (line["now"], from_plain(line["given"]), line["decision"]) for line in lines
+        ]
         recorded = [from_plain(decision) for *_, decision in given]
         _check_kinds(config, state, given, recorded)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
         raise _damaged(path, error) from None
     entries, differing = [], []
-    for index, ((now, event, plain), decision) in enumerate(zip(given, recorded, strict=True)):
+    for index, ((now, event, plain), decision) in enumerate(
+        zip(given, recorded, strict=True)
+    ):
         entries.append(Entry(now, event, state, decision))
         try:
             state, anew = decide(config, state, event, now)
@@ -128,14 +145,24 @@ def replay(path: str | Path) -> Replay:
 
 
 def _damaged(path: str | Path, error: Exception) -> ConfigError:
-    return ConfigError(f"{path}: is damaged ({shortened(str(error), 120)}); it can't be replayed.")
+    return ConfigError(
+        f"{path}: is damaged ({shortened(str(error), 120)}); it can't be replayed."
+    )
 
 
-def _check_kinds(config: Any, state: Any, given: list[Any], recorded: list[Any]) -> None:
+def _check_kinds(
+    config: Any, state: Any, given: list[Any], recorded: list[Any]
+) -> None:
     """Raises TypeError or ValueError unless everything that was read belongs in a black box."""
     if len(given) > MOST_INPUTS:
-        raise ValueError(f"{len(given)} inputs, where at most {MOST_INPUTS} are replayed")
-    kinds = ((config, GateConfig), (state, GateState), *((one, Decision) for one in recorded))
+        raise ValueError(
+            f"{len(given)} inputs, where at most {MOST_INPUTS} are replayed"
+        )
+    kinds = (
+        (config, GateConfig),
+        (state, GateState),
+        *((one, Decision) for one in recorded),
+    )
     for value, kind in kinds:
         if not isinstance(value, kind):
             raise TypeError(f"a {type(value).__name__} stands for a {kind.__name__}")
@@ -150,17 +177,23 @@ def _lines(path: str | Path) -> list[dict[str, Any]]:
     text = read_text(path, MOST_BYTES)
     values = sum(map(text.count, ",[{"))
     if values > MOST_VALUES:
-        raise ConfigError(f"{path}: holds {values} values, no black box more than {MOST_VALUES}.")
+        raise ConfigError(
+            f"{path}: holds {values} values, no black box more than {MOST_VALUES}."
+        )
     try:
         lines = [json.loads(line) for line in text.splitlines()]
     except (ValueError, RecursionError):
-        raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
+        raise ConfigError(
+            f"{path}: is no JSON, line by line; it can't be replayed."
+        ) from None
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
     content = text.encode()
     rest = content[: -len(SEAL % sha256(b"").encode())]
     if content != rest + SEAL % sha256(rest).encode():
-        raise ConfigError(f"{path}: is damaged (its checksum does not fit); it can't be replayed.")
+        raise ConfigError(
+            f"{path}: is damaged (its checksum does not fit); it can't be replayed."
+        )
     return lines[:-1]
 
 
@@ -176,11 +209,18 @@ KINDS: dict[str, type] = {
 def to_plain(value: Any) -> Any:
     """Returns a record of the gate as plain data for JSON; arrays and floats keep their bits."""
     if is_dataclass(value) and not isinstance(value, type):
-        content = {each.name: to_plain(getattr(value, each.name)) for each in fields(value)}
+        content = {
+            each.name: to_plain(getattr(value, each.name)) for each in fields(value)
+        }
         return {KIND: type(value).__name__, **content}
     if isinstance(value, np.ndarray):
         data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
-        return {KIND: "array", "type": value.dtype.str, "shape": list(value.shape), "data": data}
+        return {
+            KIND: "array",
+            "type": value.dtype.str,
+            "shape": list(value.shape),
+            "data": data,
+        }
     if isinstance(value, tuple):
         return [to_plain(each) for each in value]
     return value.item() if isinstance(value, np.generic) else value
@@ -197,7 +237,11 @@ def from_plain(value: Any) -> Any:
     try:
         if kind == "array":
             data = base64.b64decode(content["data"])
-            return np.frombuffer(data, np.dtype(content["type"])).reshape(content["shape"]).copy()
+            return (
+                np.frombuffer(data, np.dtype(content["type"]))
+                .reshape(content["shape"])
+                .copy()
+            )
         return KINDS[kind](**{name: from_plain(each) for name, each in content.items()})
     except (KeyError, TypeError) as error:
         raise ValueError(f"{kind!r} can't be read ({error})") from None

@@ -67,11 +67,15 @@ def track_estimate(
     return EstimateTrack(marks, "", track.last_fault)
 
 
-def _jump(config: GateConfig, before: Estimate, after: Estimate, passed_s: float) -> str:
+def _jump(
+    config: GateConfig, before: Estimate, after: Estimate, passed_s: float
+) -> str:
     """Returns what is wrong with a pose that the robot can't have driven to, or nothing."""
     x, y, turn = between(before.pose, after.pose).tolist()
     path = math.hypot(x, y)
-    speed, turn_rate = greatest_speeds(config.limits) if config.limits else (math.inf, math.inf)
+    speed, turn_rate = (
+        greatest_speeds(config.limits) if config.limits else (math.inf, math.inf)
+    )
     far = config.estimate_position + SLIP * speed * passed_s
     round_ = config.estimate_heading + SLIP * turn_rate * passed_s
     if path <= far and abs(turn) <= round_:
@@ -79,10 +83,15 @@ def _jump(config: GateConfig, before: Estimate, after: Estimate, passed_s: float
     return f"it jumped by {path:.3g} m and {abs(turn):.3g} rad in {passed_s:.2f} s"
 
 
-def _uncertain(config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float) -> str:
+def _uncertain(
+    config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float
+) -> str:
     """Returns by how much an estimate has become too uncertain; empty if it has not."""
     grown = growth_since(origin, estimate)
-    if grown.position <= config.estimate_position and grown.heading <= config.estimate_heading:
+    if (
+        grown.position <= config.estimate_position
+        and grown.heading <= config.estimate_heading
+    ):
         return ""
     return (
         f"it became uncertain by {grown.position:.3g} m and {grown.heading:.3g} rad in "
@@ -95,7 +104,9 @@ def begin_anew(state: GateState) -> EstimateTrack:
     """Returns the track of which the newest estimate is the origin, as at arming."""
     if state.estimate is None:
         return EstimateTrack()
-    newest = EstimateMark(state.estimate_s, state.estimate.pose, state.estimate.covariance)
+    newest = EstimateMark(
+        state.estimate_s, state.estimate.pose, state.estimate.covariance
+    )
     return EstimateTrack((newest,))
 
 

@@ -5,7 +5,15 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Ranges, Sameness, replace
+from nics_drl_bridge.gate.state import (
+    Cause,
+    GateConfig,
+    GateState,
+    Push,
+    Ranges,
+    Sameness,
+    replace,
+)
 from nics_drl_bridge.gate.stops import ODOM, SCAN
 from nics_drl_bridge.geometry import between, compose
 from nics_drl_bridge.interface import Array
@@ -17,7 +25,10 @@ RESPONSE = 0.1  # least share of the commanded distance or angle that a robot co
 LEAST_PATH, LEAST_TURN = 0.03, 0.25
 """Least motion commanded within the window for the robot to be judged [m, rad]."""
 WINDOW = 0.75  # length of the window as a share of `stuck_s`; the rest is for the delay of odometry
-MARK_S, PAUSE_S = 0.05, 0.2  # between two marks; least time without motion between pushes [s]
+MARK_S, PAUSE_S = (
+    0.05,
+    0.2,
+)  # between two marks; least time without motion between pushes [s]
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
 """A robot slower than this, plus the noise of its odometry, stands still [m/s, rad/s]."""
 NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
@@ -47,7 +58,10 @@ def look(
     if np.count_nonzero(telling) >= LEAST_BEAMS and still:
         why = f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
         return (*others, known), why
-    return (*others, Sameness(ranges, 1, pose)), ""  # the scene may really look the same
+    return (
+        *others,
+        Sameness(ranges, 1, pose),
+    ), ""  # the scene may really look the same
 
 
 def stands_still(config: GateConfig, twist: Array) -> bool:
@@ -75,10 +89,14 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
     if now - marks[-1][0] >= MARK_S:
         start = now - WINDOW * config.stuck_s
         # The first mark that is kept lies at or before the start of the window.
-        first = next((k for k, one in enumerate(marks[1:]) if one[0] > start), len(marks) - 1)
+        first = next(
+            (k for k, one in enumerate(marks[1:]) if one[0] > start), len(marks) - 1
+        )
         marks = (*marks[first:], (now, told, state.odometry.pose))
     moved_s = now if moving.any() else push.moving_s
-    return replace(state, push=replace(push, last_s=now, moving_s=moved_s, told=told, marks=marks))
+    return replace(
+        state, push=replace(push, last_s=now, moving_s=moved_s, told=told, marks=marks)
+    )
 
 
 def odom_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -107,15 +125,27 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
         turned = turn >= LEAST_TURN and abs(moved[2]) >= RESPONSE * turn
         if drove or turned:
             return None
-    detail = f"no motion in {now - time:.2f} s, told were {path:.2f} m and {turn:.2f} rad"
+    detail = (
+        f"no motion in {now - time:.2f} s, told were {path:.2f} m and {turn:.2f} rad"
+    )
     return Cause("no_motion", ODOM, detail)
 
 
-SAME_SHARE = 0.99  # two scans with this share of equal beams are the same; one may always differ
-TELLING_SHARE = 0.9  # a scan is old if this share of the beams that must have changed did not
+SAME_SHARE = (
+    0.99  # two scans with this share of equal beams are the same; one may always differ
+)
+TELLING_SHARE = (
+    0.9  # a scan is old if this share of the beams that must have changed did not
+)
 CHANGE = 0.02  # least change of a beam that must have changed [m]
-HEADINGS = (-0.03, 0.0, 0.03)  # errors of odometry for all of which a beam must have changed [rad]
-NEIGHBOURS = 1.5  # an old beam is compared with beams at most this many beam spacings away
+HEADINGS = (
+    -0.03,
+    0.0,
+    0.03,
+)  # errors of odometry for all of which a beam must have changed [rad]
+NEIGHBOURS = (
+    1.5  # an old beam is compared with beams at most this many beam spacings away
+)
 LEAST_BEAMS = 3
 
 
@@ -140,7 +170,9 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> Flags:
     far = config.range_max or float(ranges[np.isfinite(ranges)].max())
     length = np.where(open_, far, ranges)[known].astype(np.float64)
     angles = config.beam_angles[known]
-    ends = np.stack([length * np.cos(angles), length * np.sin(angles), 0.0 * length], axis=1)
+    ends = np.stack(
+        [length * np.cos(angles), length * np.sin(angles), 0.0 * length], axis=1
+    )
     changed = np.isfinite(ranges)
     for error in HEADINGS:
         seen = between(moved + np.array([0.0, 0.0, error]), ends)
@@ -161,8 +193,13 @@ def _changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
     above = np.clip(np.searchsorted(bearing, wrapped), 1, len(bearing) - 1)
     below = above - 1
     spacing = abs(angles[1] - angles[0]) if len(angles) > 1 else turn
-    low, high = np.minimum(length[below], length[above]), np.maximum(length[below], length[above])
-    nearest = np.where(wrapped - bearing[below] < bearing[above] - wrapped, below, above)
+    low, high = (
+        np.minimum(length[below], length[above]),
+        np.maximum(length[below], length[above]),
+    )
+    nearest = np.where(
+        wrapped - bearing[below] < bearing[above] - wrapped, below, above
+    )
     close = np.abs(wrapped - bearing[nearest]) <= NEIGHBOURS * spacing
     nearer = (ranges < low - CHANGE) & close
     farther = (ranges > high + CHANGE) & close & ~is_open[below] & ~is_open[above]

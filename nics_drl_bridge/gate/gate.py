@@ -24,13 +24,22 @@ from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
 
 Taken = tuple[GateState, str]  # and the reason why an input is not taken, or ""
-GREATEST_SPEED = 100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
+GREATEST_SPEED = (
+    100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
+)
 SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
 """A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
-LEAP, LEAP_TURN = 0.1, 0.2  # jump of an odometry pose that may come from imprecision [m, rad]
-ANGLE_TOLERANCE = 1e-3  # greatest deviation of the last beam from its declared angle [rad]
+LEAP, LEAP_TURN = (
+    0.1,
+    0.2,
+)  # jump of an odometry pose that may come from imprecision [m, rad]
+ANGLE_TOLERANCE = (
+    1e-3  # greatest deviation of the last beam from its declared angle [rad]
+)
 BEHIND_S = 0.2  # by which irregular stamps may fall behind while the gate settles
-Check = Callable[[GateConfig, GateState, inputs.Arm, float], str]  # what is wrong; or empty
+Check = Callable[
+    [GateConfig, GateState, inputs.Arm, float], str
+]  # what is wrong; or empty
 
 
 def decide(
@@ -46,14 +55,20 @@ def decide(
     state, answer, granted = _serve(config, state, given, now)
     was_moving = bool(state.value.any())
     judged = ((rule.judge(config, state, now), rule.latches) for rule in STOPS)
-    cause, latches = next((found for found in judged if found[0] is not None), (None, False))
+    cause, latches = next(
+        (found for found in judged if found[0] is not None), (None, False)
+    )
     publish = shielded = False
     if cause is not None:
         if latches and state.armed:
             state = replace(state, latched=cause)
         publish = was_moving or isinstance(given, inputs.Tick)
-        state = _stopped(config, state, now if publish else state.moved_s, disarm=latches)
-    elif isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S:
+        state = _stopped(
+            config, state, now if publish else state.moved_s, disarm=latches
+        )
+    elif (
+        isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S
+    ):
         publish, still = True, np.zeros(len(config.fields))
         wish = still if state.command is None else config.command(state.command.twist)
         motion = Motion(wish, still)
@@ -65,12 +80,18 @@ def decide(
         else:
             value, recent = motion.value, _recent(config, state, motion.value, now)
             state = replace(
-                state, value=value, slope=motion.slope, moved_s=now, recent=recent,
+                state,
+                value=value,
+                slope=motion.slope,
+                moved_s=now,
+                recent=recent,
                 shielded=motion.shielded,
-            )  # fmt: skip
+            )
             state, shielded = frozen.watch_motion(config, state, now), motion.shielded
     twist = limits.flush_denormals(config.cmd_vel(state.value))
-    return state, records.Decision(twist, publish, cause, refused, answer, granted, shielded)
+    return state, records.Decision(
+        twist, publish, cause, refused, answer, granted, shielded
+    )
 
 
 def _serve(
@@ -81,16 +102,31 @@ def _serve(
         answers = ((name, check(config, state, given, now)) for name, check in CHECKS)
         if failed := [f"{name}: {answer}" for name, answer in answers if answer]:
             return state, "; ".join(failed), False
-        sensors = tuple(replace(each, arrivals=settled(each.arrivals)) for each in state.sensors)
-        ground = shield.ground_of(config, state.views, None)  # it may have been carried here
+        sensors = tuple(
+            replace(each, arrivals=settled(each.arrivals)) for each in state.sensors
+        )
+        ground = shield.ground_of(
+            config, state.views, None
+        )  # it may have been carried here
         if ground is not None:
             seen = shield.obstacles(config, state.views[-1].ranges, state.views, ground)
             state = replace(state, ground=ground, obstacles=seen)
-        return replace(
-            state, armed=True, scans=settled(state.scans),
-            odometries=settled(state.odometries), sensors=sensors, seen=(), frozen="", push=None,
-            scan_motion=ScanMotion(), estimates=estimates.begin_anew(state),
-        ), "armed", True  # fmt: skip
+        return (
+            replace(
+                state,
+                armed=True,
+                scans=settled(state.scans),
+                odometries=settled(state.odometries),
+                sensors=sensors,
+                seen=(),
+                frozen="",
+                push=None,
+                scan_motion=ScanMotion(),
+                estimates=estimates.begin_anew(state),
+            ),
+            "armed",
+            True,
+        )
     if isinstance(given, inputs.Reset):
         # The latch is cleared, unless the emergency stop is still pressed.
         stop = replace(state.e_stop, latched=state.e_stop.held, reason="")
@@ -101,13 +137,20 @@ def _serve(
     return state, "", False
 
 
-def _stopped(config: GateConfig, state: GateState, moved_s: float, disarm: bool) -> GateState:
+def _stopped(
+    config: GateConfig, state: GateState, moved_s: float, disarm: bool
+) -> GateState:
     zero, published = np.zeros_like(state.value), moved_s > state.moved_s
     return replace(
-        state, value=zero, slope=zero, moved_s=moved_s, push=None, shielded=False,
+        state,
+        value=zero,
+        slope=zero,
+        moved_s=moved_s,
+        push=None,
+        shielded=False,
         recent=_recent(config, state, zero, moved_s) if published else state.recent,
         armed=state.armed and not disarm,
-    )  # fmt: skip
+    )
 
 
 def _recent(
@@ -116,7 +159,10 @@ def _recent(
     """Returns a new command after those since the newest scan, or within the latency before it."""
     if config.shield is None:
         return ()
-    since, sent = now - config.shield.latency_s - config.scan_age_s, (*state.recent, (now, value))
+    since, sent = (
+        now - config.shield.latency_s - config.scan_age_s,
+        (*state.recent, (now, value)),
+    )
     # A command from before `since` was in force until the next one.
     return tuple(one for one, after in pairwise((*sent, sent[-1])) if after[0] >= since)
 
@@ -171,14 +217,19 @@ def command_implausible(config: GateConfig, command: inputs.Command) -> str:
 
 
 REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
-    (inputs.Scan, scan_malformed), (inputs.Odometry, odom_malformed),
-    (inputs.SensorReading, reading_malformed), (inputs.Estimate, estimate_malformed),
-    (inputs.Command, command_not_finite), (inputs.Command, command_implausible),
-)  # fmt: skip
+    (inputs.Scan, scan_malformed),
+    (inputs.Odometry, odom_malformed),
+    (inputs.SensorReading, reading_malformed),
+    (inputs.Estimate, estimate_malformed),
+    (inputs.Command, command_not_finite),
+    (inputs.Command, command_implausible),
+)
 """By the type of the input, in order: what is wrong with it; empty if nothing is."""
 
 
-def take(config: GateConfig, state: GateState, given: inputs.Input, now: float) -> Taken:
+def take(
+    config: GateConfig, state: GateState, given: inputs.Input, now: float
+) -> Taken:
     """Takes an input into the state, or returns the reason why not."""
     state = replace(state, jumped="", leap="", mixed="")
     if state.estimates.fault:
@@ -204,7 +255,9 @@ def take(config: GateConfig, state: GateState, given: inputs.Input, now: float) 
         state = _take_command(state, given, now)
     elif isinstance(given, inputs.EStop):
         pressed, known = given.pressed, state.e_stop
-        stop = replace(known, latched=known.latched or pressed, held=pressed, heard_s=now)
+        stop = replace(
+            known, latched=known.latched or pressed, held=pressed, heard_s=now
+        )
         state = replace(state, e_stop=stop)
     elif isinstance(given, inputs.Press):
         stop = replace(state.e_stop, latched=True, reason=given.reason)
@@ -220,12 +273,19 @@ def _take_command(state: GateState, command: inputs.Command, now: float) -> Gate
         return replace(state, pending=command, pending_s=since)
     behind = scans.stamps_ns.index(command.stamp_ns)
     return replace(
-        state, command=command, command_s=now, behind_s=scans.times[behind] - scans.late[behind],
-        malformed="", pending=None, pending_s=None,
-    )  # fmt: skip
+        state,
+        command=command,
+        command_s=now,
+        behind_s=scans.times[behind] - scans.late[behind],
+        malformed="",
+        pending=None,
+        pending_s=None,
+    )
 
 
-def _take_scan(config: GateConfig, state: GateState, scan: inputs.Scan, now: float) -> Taken:
+def _take_scan(
+    config: GateConfig, state: GateState, scan: inputs.Scan, now: float
+) -> Taken:
     arrivals, fault = stops.arrived(
         config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
     )
@@ -237,10 +297,16 @@ def _take_scan(config: GateConfig, state: GateState, scan: inputs.Scan, now: flo
     views = shield.remember(config, state, scan)
     ground = shield.ground_of(config, views, state.ground)
     state = replace(
-        state, scans=arrivals, scan=scan, seen=seen, frozen=why, views=views, ground=ground,
+        state,
+        scans=arrivals,
+        scan=scan,
+        seen=seen,
+        frozen=why,
+        views=views,
+        ground=ground,
         scan_motion=scan_motion.watch_scan(config, state, scan),
         obstacles=shield.obstacles(config, scan.ranges, views, ground),
-    )  # fmt: skip
+    )
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
         state = _take_command(state, state.pending, now)
     return state, ""
@@ -254,13 +320,17 @@ def _take_odometry(
     )
     if fault:
         jumped = stops.ODOM if fault == "jumped" else ""
-        return replace(state, odometries=arrivals, jumped=jumped), f"odom: its stamp {fault}"
+        return replace(
+            state, odometries=arrivals, jumped=jumped
+        ), f"odom: its stamp {fault}"
     leap = _leap(config, state, odometry, now)
     if leap:  # later poses are judged relative to this one
         state = replace(state, odometry=odometry, leap=leap, push=None, seen=())
         return replace(state, scan_motion=ScanMotion()), f"odom: {leap}"
     restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
-    return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""
+    return replace(
+        state, odometries=arrivals, odometry=odometry, restless_s=restless
+    ), ""
 
 
 def _take_reading(
@@ -269,17 +339,26 @@ def _take_reading(
     place = config.sensors.index(reading.name)
     before, after = state.sensors[:place], state.sensors[place + 1 :]
     arrivals, fault = stops.arrived(
-        config, state.sensors[place].arrivals, reading.stamp_ns, now, config.scan_age_s, state.armed
+        config,
+        state.sensors[place].arrivals,
+        reading.stamp_ns,
+        now,
+        config.scan_age_s,
+        state.armed,
     )
     points = state.sensors[place].points if fault else reading.points
-    state = replace(state, sensors=(*before, records.SensorState(arrivals, points), *after))
+    state = replace(
+        state, sensors=(*before, records.SensorState(arrivals, points), *after)
+    )
     if fault:
         jumped = reading.name if fault == "jumped" else ""
         return replace(state, jumped=jumped), f"{reading.name}: its stamp {fault}"
     return state, ""
 
 
-def _leap(config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float) -> str:
+def _leap(
+    config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
+) -> str:
     """Returns what is wrong with a pose that the robot can't have reached; empty if nothing is."""
     before, bounds = state.odometry, config.limits
     if before is None or bounds is None:
@@ -294,23 +373,34 @@ def _leap(config: GateConfig, state: GateState, odometry: inputs.Odometry, now: 
     path = float(np.hypot(x, y))
     if path <= far and abs(heading) <= round_:
         return ""
-    return f"its pose jumped by {path:.3g} m and {abs(heading):.3g} rad in {passed:.3f} s"
+    return (
+        f"its pose jumped by {path:.3g} m and {abs(heading):.3g} rad in {passed:.3f} s"
+    )
 
 
-def _fresh(topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float) -> str:
+def _fresh(
+    topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float
+) -> str:
     unbroken = now - arrivals.unbroken_s >= config.settle_s
     if arrivals.times and unbroken and now - arrivals.times[-1] <= limit_s:
         return ""
     return f"{topic} has not been fresh for {config.settle_s} s"
 
 
-def _sensors(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+def _sensors(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
     both = zip(config.sensors, state.sensors, strict=True)
-    wrong = (_fresh(name, each.arrivals, config.scan_age_s, config, now) for name, each in both)
+    wrong = (
+        _fresh(name, each.arrivals, config.scan_age_s, config, now)
+        for name, each in both
+    )
     return next(filter(None, wrong), "")
 
 
-def _rate(topic: str, arrivals: Arrivals, declared: float, config: GateConfig, now: float) -> str:
+def _rate(
+    topic: str, arrivals: Arrivals, declared: float, config: GateConfig, now: float
+) -> str:
     """Judges a rate: by stamps too few and too many data are wrong, by arrival only too few."""
     arriving, stamped = stops.rate(arrivals, now, config.settle_s)
     low = declared * (1.0 - config.rate_tolerance)
@@ -321,7 +411,9 @@ def _rate(topic: str, arrivals: Arrivals, declared: float, config: GateConfig, n
     return f"{topic} comes at {rates}, declared are {declared:.1f} Hz"
 
 
-def _odom_rate(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+def _odom_rate(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
     """Odometry comes at its rate; where none was declared, at least as often as is needed."""
     arrivals = state.odometries
     if config.odom_rate_declared:
@@ -334,12 +426,16 @@ def _odom_rate(config: GateConfig, state: GateState, request: inputs.Arm, now: f
     return f"odom comes at {rates}, {needed}, unless the parameter 'odom_rate' declares less"
 
 
-def _clocks(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+def _clocks(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
     """The clocks that stamp scan and odometry agree, and keep pace with this machine's clock."""
     scans, odometries = state.scans, state.odometries
     if not (scans.times and odometries.times):
         return "scan and odom have not both come"
-    stamped = (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * S_PER_NS / config.clock_rate
+    stamped = (
+        (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * S_PER_NS / config.clock_rate
+    )
     apart = stamped - (scans.times[-1] - odometries.times[-1])
     if abs(apart) > config.clock_jump_s:
         return f"the stamps of scan are {apart:.3f} s ahead of those of odom"
@@ -348,12 +444,16 @@ def _clocks(config: GateConfig, state: GateState, request: inputs.Arm, now: floa
         behind = 0.0 if config.simulated else -ahead
         if ahead > stops.AHEAD_S or behind > BEHIND_S:
             away = f"run away from this machine's clock, by {ahead:+.3f} s in a moment"
-            advice = "a simulation that is not in real time needs the parameter 'clock_rate'"
+            advice = (
+                "a simulation that is not in real time needs the parameter 'clock_rate'"
+            )
             return f"the stamps of {topic} {away}; {advice}"
     return ""
 
 
-def _estimator(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+def _estimator(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
     """The middleware knows where the robot is, and that it stands still."""
     estimate = state.estimate
     if not config.estimate_required:
@@ -362,42 +462,66 @@ def _estimator(config: GateConfig, state: GateState, request: inputs.Arm, now: f
         return "odometry/filtered is silent, start the middleware_node"
     if doubt := estimates.unsteady(config, state, now):
         return doubt
-    return "" if frozen.stands_still(config, estimate.twist) else "odometry/filtered shows motion"
+    return (
+        ""
+        if frozen.stands_still(config, estimate.twist)
+        else "odometry/filtered shows motion"
+    )
 
 
-def _publishers(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+def _publishers(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
     count = request.publishers
     return "" if count == 1 else f"cmd_vel has {count} publishers, not this gate alone"
 
 
-def _policies(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+def _policies(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
     return state.last_mixed if now - state.mixed_s < config.settle_s else ""
 
 
-def _standing(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+def _standing(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
     still = state.odometry is not None and now - state.restless_s >= config.settle_s
     return "" if still else f"the robot has not stood still for {config.settle_s} s"
 
 
-def _e_stop(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
-    cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(config, state, now)
+def _e_stop(
+    config: GateConfig, state: GateState, request: inputs.Arm, now: float
+) -> str:
+    cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(
+        config, state, now
+    )
     return "" if cause is None else cause.line
 
 
 UNLIMITED = "no limits are set, name their file in `limits`"
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("limits_set", lambda c, *_: UNLIMITED if c.limits is None else ""),
-    ("nothing_latched",
-     lambda _, s, *__: "" if s.latched is None else f"call ~/reset first: {s.latched.line}"),
+    (
+        "nothing_latched",
+        lambda _, s, *__: (
+            "" if s.latched is None else f"call ~/reset first: {s.latched.line}"
+        ),
+    ),
     ("e_stop_released", _e_stop),
     ("scan_fresh", lambda c, s, _, now: _fresh(SCAN, s.scans, c.scan_age_s, c, now)),
     ("scan_rate", lambda c, s, _, now: _rate(SCAN, s.scans, c.scan_rate, c, now)),
     ("sensors_fresh", _sensors),
-    ("odom_fresh", lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now)),
+    (
+        "odom_fresh",
+        lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now),
+    ),
     ("odom_rate", _odom_rate),
-    ("clocks_agree", _clocks), ("estimator_converged", _estimator), ("one_publisher", _publishers),
-    ("standing_still", _standing), ("one_policy", _policies),
-)  # fmt: skip
+    ("clocks_agree", _clocks),
+    ("estimator_converged", _estimator),
+    ("one_publisher", _publishers),
+    ("standing_still", _standing),
+    ("one_policy", _policies),
+)
 
 
 class Rule(NamedTuple):
@@ -414,23 +538,41 @@ def latched(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 def disarmed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The gate has not been armed."""
-    return None if state.armed else Cause("disarmed", "", "call ~/arm to let commands pass")
+    return (
+        None
+        if state.armed
+        else Cause("disarmed", "", "call ~/arm to let commands pass")
+    )
 
 
 STOPS: tuple[Rule, ...] = (
-    Rule(stops.e_stop_pressed, latches=True), Rule(latched), Rule(disarmed), Rule(stops.own_clock),
-    Rule(stops.e_stop_silent, latches=True), Rule(stops.stamps_jumped, latches=True),
-    Rule(frozen.odom_jumped, latches=True), Rule(frozen.scan_frozen, latches=True),
-    Rule(frozen.no_motion, latches=True), Rule(scan_motion.body_held, latches=True),
-    Rule(estimates.estimate_lost, latches=True), Rule(stops.two_policies, latches=True),
-    Rule(stops.scan_silent), Rule(stops.sensor_silent),
-    Rule(stops.odom_silent), Rule(stops.command_malformed), Rule(stops.command_missing),
-    Rule(stops.command_silent), Rule(stops.scan_behind_unknown), Rule(stops.scan_behind_old),
-)  # fmt: skip
+    Rule(stops.e_stop_pressed, latches=True),
+    Rule(latched),
+    Rule(disarmed),
+    Rule(stops.own_clock),
+    Rule(stops.e_stop_silent, latches=True),
+    Rule(stops.stamps_jumped, latches=True),
+    Rule(frozen.odom_jumped, latches=True),
+    Rule(frozen.scan_frozen, latches=True),
+    Rule(frozen.no_motion, latches=True),
+    Rule(scan_motion.body_held, latches=True),
+    Rule(estimates.estimate_lost, latches=True),
+    Rule(stops.two_policies, latches=True),
+    Rule(stops.scan_silent),
+    Rule(stops.sensor_silent),
+    Rule(stops.odom_silent),
+    Rule(stops.command_malformed),
+    Rule(stops.command_missing),
+    Rule(stops.command_silent),
+    Rule(stops.scan_behind_unknown),
+    Rule(stops.scan_behind_old),
+)
 """In order of evaluation; the first rule that returns a cause names the stop."""
 
 
-def saturate(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+def saturate(
+    config: GateConfig, state: GateState, motion: Motion, now: float
+) -> Motion:
     """Brings the value within its limits, see `limits.saturate`; without limits it is zero."""
     if config.limits is None:
         return Motion(np.zeros_like(motion.value), np.zeros_like(motion.slope))
@@ -458,10 +600,15 @@ def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) ->
         value = limits.flush_denormals(motion.value)
         return replace(motion, value=value, slope=limits.flush_denormals(motion.slope))
     zero = np.zeros_like(motion.value)
-    return Motion(zero, zero, motion.shielded, f"a motion of {motion.value.tolist()} came out")
+    return Motion(
+        zero, zero, motion.shielded, f"a motion of {motion.value.tolist()} came out"
+    )
 
 
 # Stages that a passing command goes through.
 SHAPERS: tuple[Callable[[GateConfig, GateState, Motion, float], Motion], ...] = (
-    saturate, follow, shield.shield, bounded,
-)  # fmt: skip
+    saturate,
+    follow,
+    shield.shield,
+    bounded,
+)

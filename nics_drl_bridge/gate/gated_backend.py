@@ -24,18 +24,27 @@ class GatedBackend:
     that stopped a command as `stopped_by`, else "", and as `shielded` if the shield reduced it.
     """
 
-    def __init__(self, backend: interface.Backend, model: SimulatorModel, limits: str) -> None:
+    def __init__(
+        self, backend: interface.Backend, model: SimulatorModel, limits: str
+    ) -> None:
         model.robot.require_cmd_vel()
         given = load_limits(limits, model.robot)
         shield, _ = shield_config(model, given, limits)
         self._backend, self._model = backend, model
         self._period_ns = round(model.control_period * interface.NS_PER_S)
         self._config = gate_config(
-            model, given, shield, simulated=True, e_stop_required=False, estimate_required=False
+            model,
+            given,
+            shield,
+            simulated=True,
+            e_stop_required=False,
+            estimate_required=False,
         )
         if not self._period_ns * interface.S_PER_NS < GateConfig.gap_s:
             slow = f"commands come every {model.control_period:g} s, and it stops after"
-            raise ConfigError(f"the gate can't be simulated: {slow} {GateConfig.gap_s:g} s.")
+            raise ConfigError(
+                f"the gate can't be simulated: {slow} {GateConfig.gap_s:g} s."
+            )
 
     def reset(self, start: interface.Start) -> interface.RobotView:
         """Begins the episode of a seed; see `interface.Backend`."""
@@ -44,7 +53,9 @@ class GatedBackend:
         self._now_ns = FIRST_NS
         return self._seen(self._backend.reset(start))
 
-    def step(self, command: interface.Array) -> tuple[interface.RobotView, dict[str, Any]]:
+    def step(
+        self, command: interface.Array
+    ) -> tuple[interface.RobotView, dict[str, Any]]:
         """Applies what the gate makes of a command for one period; see `interface.Backend`."""
         robot = self._model.robot
         self._give(inputs.Command(self._now_ns, robot.to_cmd_vel(command)))
@@ -52,7 +63,11 @@ class GatedBackend:
         view, facts = self._backend.step(robot.from_cmd_vel(decision.twist))
         self._now_ns += self._period_ns
         cause = "" if decision.cause is None else decision.cause.rule
-        return self._seen(view), {**facts, "stopped_by": cause, "shielded": decision.shielded}
+        return self._seen(view), {
+            **facts,
+            "stopped_by": cause,
+            "shielded": decision.shielded,
+        }
 
     def _seen(self, view: interface.RobotView) -> interface.RobotView:
         lidar, now = self._model.lidar, self._now_ns

@@ -13,11 +13,18 @@ from nics_drl_bridge.sim.collision_kernels import Outline
 
 CELL, CELLS = 0.05, 48
 """Width of a cell [m], and their number along each side of what is remembered."""
-REMEMBERED_S = 30.0  # time after which ground is forgotten, but for what is beside the robot [s]
+REMEMBERED_S = (
+    30.0  # time after which ground is forgotten, but for what is beside the robot [s]
+)
 
 
 def look(
-    before: Ground | None, view: View, lidar: MountedBeams, body: Body, far: float, tolerance: float
+    before: Ground | None,
+    view: View,
+    lidar: MountedBeams,
+    body: Body,
+    far: float,
+    tolerance: float,
 ) -> Ground:
     """Returns the ground after a view; without an earlier one that around the robot may be free.
 
@@ -37,7 +44,9 @@ def look(
     if before is None:
         since, times = view.stamp_ns, np.full((CELLS, CELLS), -np.inf, np.float32)
         disc = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0), radius=0.0)
-        shield_kernels.cover(times, place, disc, min(room, _nearest(view.ranges, lidar)), 0.0)
+        shield_kernels.cover(
+            times, place, disc, min(room, _nearest(view.ranges, lidar)), 0.0
+        )
     else:
         since, moved = before.since_ns, np.subtract(corner, before.corner)
         times = shield_kernels.shifted(before.times, *moved.tolist())

@@ -41,7 +41,9 @@ class Estimate:
 
     twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s]
     pose: Array  # (3,) x [m], y [m], heading [rad] in `map`
-    covariance: Array  # (3, 3) of that pose, which grows with the way from the origin of `map`
+    covariance: (
+        Array  # (3, 3) of that pose, which grows with the way from the origin of `map`
+    )
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,9 @@ class Command:
 
     stamp_ns: int  # of the scan it was computed from
     twist: Array  # (3,) linear.x, linear.y, angular.z of `cmd_vel`
-    source: str = ""  # its publisher, in words; empty if the middleware does not tell it
+    source: str = (
+        ""  # its publisher, in words; empty if the middleware does not tell it
+    )
     publishers: int = 1  # then: how many publish on its topic
 
 
@@ -85,4 +89,15 @@ class Tick:
     """The gate's own clock ticked: the only input at which a motion is published."""
 
 
-Input = Scan | Odometry | SensorReading | Estimate | Command | EStop | Press | Arm | Reset | Tick
+Input = (
+    Scan
+    | Odometry
+    | SensorReading
+    | Estimate
+    | Command
+    | EStop
+    | Press
+    | Arm
+    | Reset
+    | Tick
+)

@@ -13,18 +13,28 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
-IMPLAUSIBLE = 10.0  # a command beyond this multiple of its limit is a fault, and refused
-LEAST_STEP_S = 1e-3  # motions closer in time are not published: their derivatives would be noise
+IMPLAUSIBLE = (
+    10.0  # a command beyond this multiple of its limit is a fault, and refused
+)
+LEAST_STEP_S = (
+    1e-3  # motions closer in time are not published: their derivatives would be noise
+)
 PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the whole range within one is a typo
 SNAP = 1e-12  # a value this close to its target, as a share of the greatest value, has reached it
 GREATEST = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
 STILL = 1e-9
-LEAST_NORMAL = float(np.finfo(np.float64).tiny)  # numbers nearer to zero lose digits: denormal
-LEAST_MOTION = 0.01  # if no speed may exceed this, the robot can't be driven [m/s or rad/s]
+LEAST_NORMAL = float(
+    np.finfo(np.float64).tiny
+)  # numbers nearer to zero lose digits: denormal
+LEAST_MOTION = (
+    0.01  # if no speed may exceed this, the robot can't be driven [m/s or rad/s]
+)
 LONGEST_START_S, STARTED = 10.0, 0.01
 """Within the first [s] a command must be able to reach the second (share of its greatest value)."""
 SPEED, TURN = "m/s", "rad/s"
-CAR_TURN = 4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
+CAR_TURN = (
+    4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
+)
 
 
 class CommandLimit(Schema):
@@ -45,10 +55,16 @@ class CommandLimit(Schema):
 class Stopping(Schema):
     """Stopping behaviour, for the shield: distance = v latency + v^2 / (2 deceleration)."""
 
-    latency: float = Field(ge=0.0)  # from a command until the robot follows it, with lags [s]
+    latency: float = Field(
+        ge=0.0
+    )  # from a command until the robot follows it, with lags [s]
     deceleration: float = Field(gt=0.0)  # of the braking that follows [m/s^2]
-    margin: float = Field(default=0.05, ge=0.0)  # clearance kept around the footprint [m]
-    obstacle_speed: float = Field(default=1.0, ge=0.0)  # of approaching ones; 0: static [m/s]
+    margin: float = Field(
+        default=0.05, ge=0.0
+    )  # clearance kept around the footprint [m]
+    obstacle_speed: float = Field(
+        default=1.0, ge=0.0
+    )  # of approaching ones; 0: static [m/s]
 
 
 class LimitsFile(Schema):
@@ -81,11 +97,19 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     names = [variable.name for variable in robot.command]
     for given in file.commands:
         if given not in names:
-            raise ConfigError(f"{path}: unknown key 'commands.{given}'; {nearest(given, names)}")
+            raise ConfigError(
+                f"{path}: unknown key 'commands.{given}'; {nearest(given, names)}"
+            )
     for variable in robot.command:
         if variable.name not in file.commands:
-            raise ConfigError(f"{path}: the key 'commands.{variable.name}' is missing; add it.")
-        _check(f"{path}: key 'commands.{variable.name}", file.commands[variable.name], variable)
+            raise ConfigError(
+                f"{path}: the key 'commands.{variable.name}' is missing; add it."
+            )
+        _check(
+            f"{path}: key 'commands.{variable.name}",
+            file.commands[variable.name],
+            variable,
+        )
     low, high, rate, jerk = (
         np.array([getattr(file.commands[each], bound) for each in names])
         for bound in ("min", "max", "rate", "jerk")
@@ -93,9 +117,13 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     units = np.array([variable.unit for variable in robot.command])
     limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
     speeds = limits.linear | limits.turn
-    if (speeds.any() or robot.takes_cmd_vel) and greatest(limits, speeds) < LEAST_MOTION:
+    if (speeds.any() or robot.takes_cmd_vel) and greatest(
+        limits, speeds
+    ) < LEAST_MOTION:
         fault = f"none of its speeds and turn rates may reach {LEAST_MOTION:g}"
-        raise ConfigError(f"{path}: the robot could never move: {fault}; raise a `max`.")
+        raise ConfigError(
+            f"{path}: the robot could never move: {fault}; raise a `max`."
+        )
     return limits
 
 
@@ -116,7 +144,9 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
         if value > most:
             fault = f"{value:g} {unit}{per} crosses the robot's whole range"
             within = f"within a period of the gate, {PERIOD_S:g} s, and limits nothing"
-            raise ConfigError(f"{key}.{name}': {fault} {within}; give at most {most:g}.")
+            raise ConfigError(
+                f"{key}.{name}': {fault} {within}; give at most {most:g}."
+            )
         if reach < STARTED * far:
             come = f"after {LONGEST_START_S:g} s it has come to {reach:.2g} of {far:g} {unit}"
             fault = f"{value:g} would never let it move: {come}"
@@ -137,7 +167,9 @@ def greatest_speeds(limits: Limits) -> tuple[float, float]:
 
 def implausible(command: Array, limits: Limits) -> bool:
     """True if a command (C,) is so far out of range that it must be a fault."""
-    return bool((np.abs(command) / IMPLAUSIBLE > np.maximum(-limits.low, limits.high)).any())
+    return bool(
+        (np.abs(command) / IMPLAUSIBLE > np.maximum(-limits.low, limits.high)).any()
+    )
 
 
 def within(value: Array, limits: Limits) -> bool:
@@ -165,7 +197,12 @@ def saturate(command: Array, limits: Limits) -> Array:
 
 
 def follow(
-    value: Array, slope: Array, target: Array, dt: float, limits: Limits, waits: bool = True
+    value: Array,
+    slope: Array,
+    target: Array,
+    dt: float,
+    limits: Limits,
+    waits: bool = True,
 ) -> tuple[Array, Array]:
     """Moves a command (C,) and its slope towards its target as fast as rate and jerk allow."""
     # The turn waits for the speed, so that an accelerating robot is on its path from the start.
@@ -173,7 +210,9 @@ def follow(
     given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
     for turning in (False, True):
         if turning and waits:
-            wanted[limits.turn] *= _progress(after[limits.linear], target[limits.linear])
+            wanted[limits.turn] *= _progress(
+                after[limits.linear], target[limits.linear]
+            )
         for i in np.flatnonzero(limits.turn == turning):
             after[i], change[i] = _follow_one(dt, *(float(each[i]) for each in given))
     return after, change
@@ -189,9 +228,15 @@ def _progress(speed: Array, wanted: Array) -> float:
 
 
 def _follow_one(
-    dt: float, value: float, slope: float, target: float, least_value: float, most_value: float,
-    rate: float, jerk: float,
-) -> tuple[float, float]:  # fmt: skip
+    dt: float,
+    value: float,
+    slope: float,
+    target: float,
+    least_value: float,
+    most_value: float,
+    rate: float,
+    jerk: float,
+) -> tuple[float, float]:
     # A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
     # intervals, as the sum over them lies below the integral: a value that far within the bounds
     # stays so. In shares of the greatest value and steps of this interval, nothing overflows.
@@ -203,7 +248,9 @@ def _follow_one(
     rate_step, before = min(rate * step, most), min(max(slope * step, least), most)
     jerk_step = min(jerk * dt * step, 2.0 * most)
     wanted = _step_towards(there - here, jerk_step)
-    wanted = min(max(wanted, before - jerk_step, -rate_step), before + jerk_step, rate_step)
+    wanted = min(
+        max(wanted, before - jerk_step, -rate_step), before + jerk_step, rate_step
+    )
     wanted = min(wanted, _step_towards(high - here, jerk_step))
     wanted = max(wanted, _step_towards(low - here, jerk_step))
     after = here + wanted

@@ -71,8 +71,12 @@ class Settings:
     sector_share: float = 0.45
     held_share: float = 0.2
     greatest_changed: float = 0.5
-    confirmed_s: float = 0.15  # time over which scans must say so, without one that says otherwise
-    forgotten_s: float = 1.0  # time after which an unconfirmed contradiction is forgotten
+    confirmed_s: float = (
+        0.15  # time over which scans must say so, without one that says otherwise
+    )
+    forgotten_s: float = (
+        1.0  # time after which an unconfirmed contradiction is forgotten
+    )
 
 
 SETTINGS = Settings()
@@ -100,7 +104,11 @@ def watch_scan(
 ) -> ScanMotion:
     """Returns what is known about the motion in scans after a new one."""
     before = state.scan_motion
-    if not config.stop_when_held or state.odometry is None or len(config.beam_angles) < 2:
+    if (
+        not config.stop_when_held
+        or state.odometry is None
+        or len(config.beam_angles) < 2
+    ):
         return ScanMotion()
     newest = ReducedScan(
         scan.stamp_ns,
@@ -138,9 +146,12 @@ def _held_since(
 
 
 def _contradiction(
-    kept: tuple[ReducedScan, ...], newest: ReducedScan, verdict: Verdict,
-    held_since_ns: int | None, settings: Settings,
-) -> str:  # fmt: skip
+    kept: tuple[ReducedScan, ...],
+    newest: ReducedScan,
+    verdict: Verdict,
+    held_since_ns: int | None,
+    settings: Settings,
+) -> str:
     """Returns a sentence once scans have contradicted odometry for long enough, else nothing."""
     if not verdict.held or held_since_ns is None:
         return ""
@@ -153,7 +164,10 @@ def _contradiction(
 
 
 def judge_motion(
-    config: GateConfig, kept: tuple[ReducedScan, ...], newest: ReducedScan, settings: Settings
+    config: GateConfig,
+    kept: tuple[ReducedScan, ...],
+    newest: ReducedScan,
+    settings: Settings,
 ) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
     old = _reference(kept, newest, settings)
@@ -217,7 +231,9 @@ def _motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
     path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
     turn = abs(_turn(old, new))
     tiny = 1e-9  # of a control whose least motion is zero
-    return max(path / max(settings.least_path, tiny), turn / max(settings.least_turn, tiny))
+    return max(
+        path / max(settings.least_path, tiny), turn / max(settings.least_turn, tiny)
+    )
 
 
 def _turn(old: ReducedScan, new: ReducedScan) -> float:
@@ -236,16 +252,23 @@ def directions_of(config: GateConfig, settings: Settings = SETTINGS) -> Directio
     """Returns the directions of a lidar's reduced scans."""
     angles = config.beam_angles
     return _directions(
-        len(angles), float(angles[0]), float(angles[1] - angles[0]),
-        settings.spacing, settings.window,
-    )  # fmt: skip
+        len(angles),
+        float(angles[0]),
+        float(angles[1] - angles[0]),
+        settings.spacing,
+        settings.window,
+    )
 
 
 @cache
-def _directions(beams: int, first: float, step: float, spacing: float, window: float) -> Directions:
+def _directions(
+    beams: int, first: float, step: float, spacing: float, window: float
+) -> Directions:
     count = min(beams, max(1, round(beams * step / spacing)))
     each = beams / count
-    reach = min(int(window / step + 1e-6), (kernels.LARGEST_WINDOW - 1) // 2, (beams - 1) // 2)
+    reach = min(
+        int(window / step + 1e-6), (kernels.LARGEST_WINDOW - 1) // 2, (beams - 1) // 2
+    )
     full_circle = beams * step > FULL_CIRCLE - 0.5 * step
     middle = first + (int(0.5 * each)) * step
     return Directions(middle, each * step, each, reach, full_circle)
@@ -269,7 +292,11 @@ def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
 def rehearse(config: GateConfig) -> None:
     """Compiles what a new scan calls: that takes seconds, which a moving robot does not have."""
     view = ReducedScan(
-        0, np.zeros(3), _reduce(config, np.ones(len(config.beam_angles), np.float32), SETTINGS)
+        0,
+        np.zeros(3),
+        _reduce(config, np.ones(len(config.beam_angles), np.float32), SETTINGS),
     )
-    seen = tuple(replace(view, stamp_ns=k, pose=np.array([0.1 * k, 0.0, 0.0])) for k in range(3))
+    seen = tuple(
+        replace(view, stamp_ns=k, pose=np.array([0.1 * k, 0.0, 0.0])) for k in range(3)
+    )
     judge_motion(config, seen[:2], seen[2], SETTINGS)

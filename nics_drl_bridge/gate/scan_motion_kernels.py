@@ -7,7 +7,9 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 
-LARGEST_WINDOW = 129  # beams; a direction of a denser lidar is the median of some of its beams
+LARGEST_WINDOW = (
+    129  # beams; a direction of a denser lidar is the median of some of its beams
+)
 
 
 class Directions(NamedTuple):
@@ -80,7 +82,10 @@ def predict_scan(ranges, directions, moved, gap, out):  # type: ignore[no-untype
         if not abs(near - far) <= gap * min(near, far):
             continue
         bearing = directions.first + k * directions.step
-        ax, ay = near * math.cos(bearing) - moved[0], near * math.sin(bearing) - moved[1]
+        ax, ay = (
+            near * math.cos(bearing) - moved[0],
+            near * math.sin(bearing) - moved[1],
+        )
         bearing += directions.step
         bx, by = far * math.cos(bearing) - moved[0], far * math.sin(bearing) - moved[1]
         ax, ay = cosine * ax + sine * ay, cosine * ay - sine * ax
@@ -139,7 +144,9 @@ def compare_sectors(old, new, predicted, sector, noise, thresholds):  # type: ig
                 continue
             std = noise.constant + noise.proportional * old[k]
             telling = max(thresholds.telling, thresholds.telling_deviations * std)
-            if abs(observed_change) > max(thresholds.visible, thresholds.visible_deviations * std):
+            if abs(observed_change) > max(
+                thresholds.visible, thresholds.visible_deviations * std
+            ):
                 visible += 1
             most = 2.0 * abs(predicted_change)
             known += 1

@@ -16,7 +16,14 @@ from nics_drl_bridge.gate import ground, shield_kernels
 from nics_drl_bridge.gate import state as records
 from nics_drl_bridge.gate.inputs import Scan
 from nics_drl_bridge.gate.scan_motion import pose_at
-from nics_drl_bridge.gate.state import GateConfig, GateState, Ground, Motion, ShieldConfig, View
+from nics_drl_bridge.gate.state import (
+    GateConfig,
+    GateState,
+    Ground,
+    Motion,
+    ShieldConfig,
+    View,
+)
 from nics_drl_bridge.gate.stops import age
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.sim.collision_kernels import Outline
@@ -28,7 +35,9 @@ FINEST = 6  # bisections of the scale
 SPEEDS, TURNS = 3, 9
 """Arcs of the family: number of speeds along each axis, and number of turn rates."""
 CREEP = 0.1  # a speed that is not safe at this [m/s] would use up what a turn on the spot needs
-MOVING = 0.1  # above this speed the ratio of turn rate to speed gives the curvature [m/s]
+MOVING = (
+    0.1  # above this speed the ratio of turn rate to speed gives the curvature [m/s]
+)
 CALM = 0.5  # share of its deceleration with which the robot should stop when nothing is sudden
 STEP = 0.02  # distance between two checked places of the footprint on an arc [m]
 WALL_M = 0.05  # greatest distance between places of a wall on the footprint [m]
@@ -46,7 +55,9 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
     kept: list[View] = []
     for view in state.views:
         young = (scan.stamp_ns - view.stamp_ns) * S_PER_NS <= MEMORY_S
-        if young and (not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S):
+        if young and (
+            not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S
+        ):
             kept.append(view)
     return (*kept, View(scan.stamp_ns, pose, scan.ranges))
 
@@ -62,35 +73,54 @@ def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) ->
     for view in views[:-1]:
         moved = geometry.between(view.pose, newest.pose)
         shield_kernels.entered(
-            marked, newest.ranges, view.ranges, lidar, moved, shield.range_max,
+            marked,
+            newest.ranges,
+            view.ranges,
+            lidar,
+            moved,
+            shield.range_max,
             (TOLERANCE_M + noise, share),
-        )  # fmt: skip
+        )
     beside = np.zeros_like(marked)
     beside[1:] |= marked[:-1]
     beside[:-1] |= marked[1:]
     return marked & beside
 
 
-def returns(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+def returns(
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
+) -> Array:
     """Returns end points (P, 3) of the beams [m], and how fast each may approach [m/s]."""
     hit = np.isfinite(ranges)
     speeds = np.where(moves[hit], shield.obstacle_speed, 0.0)
-    return _ends(config, config.beam_angles[hit], ranges[hit].astype(np.float64), speeds)
+    return _ends(
+        config, config.beam_angles[hit], ranges[hit].astype(np.float64), speeds
+    )
 
 
-def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+def too_close(
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
+) -> Array:
     """Returns points (P, 3) at the least range for beams too close to measure (`-inf`) [m]."""
     near = np.isneginf(ranges)
-    return _ends(config, config.beam_angles[near], np.full(near.sum(), config.range_min), 0.0)
+    return _ends(
+        config, config.beam_angles[near], np.full(near.sum(), config.range_min), 0.0
+    )
 
 
-def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+def unknown(
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
+) -> Array:
     """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown."""
     bearings, wall = _sides(shield, config.mount, len(ranges))
     angles, half = config.beam_angles + config.mount[2], shield.unknown_width / 2.0
-    known, every = (_within(bearings, some, half) for some in (angles[~np.isnan(ranges)], angles))
+    known, every = (
+        _within(bearings, some, half) for some in (angles[~np.isnan(ranges)], angles)
+    )
     spacing = angles[1] - angles[0] if len(ranges) > 1 else 2.0 * np.pi
-    whole = shield.unknown_width / spacing  # at the end of the lidar's view it has fewer
+    whole = (
+        shield.unknown_width / spacing
+    )  # at the end of the lidar's view it has fewer
     least = (1.0 - shield.unknown_share) * np.where(every < int(whole), every, whole)
     return np.pad(wall[known < least], ((0, 0), (0, 1)))
 
@@ -115,20 +145,28 @@ def _within(bearings: Array, angles: Array, half: float) -> NDArray[np.int64]:
     """Returns how many angles (B,) lie around each bearing (M,), up to an angle [rad] beside it."""
     angles = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
     around = np.concatenate([angles - 2.0 * np.pi, angles, angles + 2.0 * np.pi])
-    return np.searchsorted(around, bearings + half) - np.searchsorted(around, bearings - half)
+    return np.searchsorted(around, bearings + half) - np.searchsorted(
+        around, bearings - half
+    )
 
 
 EVIDENCE = (returns, too_close, unknown)
 
 
-def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | float) -> Array:
+def _ends(
+    config: GateConfig, angles: Array, ranges: Array, speeds: Array | float
+) -> Array:
     x, y, heading = config.mount
     angles = angles + heading
     speeds = np.broadcast_to(speeds, ranges.shape)
-    return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles), speeds], axis=1)
+    return np.stack(
+        [x + ranges * np.cos(angles), y + ranges * np.sin(angles), speeds], axis=1
+    )
 
 
-def ground_of(config: GateConfig, views: tuple[View, ...], before: Ground | None) -> Ground | None:
+def ground_of(
+    config: GateConfig, views: tuple[View, ...], before: Ground | None
+) -> Ground | None:
     """Returns what is known after the newest view of where the lidar never looks, if anywhere."""
     given, angles = config.shield, config.beam_angles
     if given is None or not views or len(angles) < 2:
@@ -137,11 +175,16 @@ def ground_of(config: GateConfig, views: tuple[View, ...], before: Ground | None
     seen = abs(lidar.step) * len(angles)
     if 2.0 * np.pi - seen < given.unknown_share * given.unknown_width:
         return None
-    return ground.look(before, views[-1], lidar, body_of(given), given.range_max, TOLERANCE_M)
+    return ground.look(
+        before, views[-1], lidar, body_of(given), given.range_max, TOLERANCE_M
+    )
 
 
 def obstacles(
-    config: GateConfig, ranges: Ranges, views: tuple[View, ...], known: Ground | None = None
+    config: GateConfig,
+    ranges: Ranges,
+    views: tuple[View, ...],
+    known: Ground | None = None,
 ) -> Array | None:
     """Returns obstacles (P, 3) in a scan (B,): x, y [m], greatest speed [m/s]; None if off."""
     given = config.shield
@@ -166,7 +209,9 @@ def body_of(shield: ShieldConfig) -> shield_kernels.Body:
     reach = float(np.hypot(*corners.T).max(initial=0.0))
     outline = Outline(corners, 0, len(corners))
     radius = shield.footprint_radius
-    return shield_kernels.Body(outline, radius, reach, shield.margin, shield.lever, shield.order)
+    return shield_kernels.Body(
+        outline, radius, reach, shield.margin, shield.lever, shield.order
+    )
 
 
 def rehearse() -> None:
@@ -174,10 +219,17 @@ def rehearse() -> None:
     shield_kernels.grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
     body = body_of(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
     shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
-    lidar, scan = shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
-    shield_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))
+    lidar, scan = (
+        shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0),
+        np.ones(1, np.float32),
+    )
+    shield_kernels.entered(
+        np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0)
+    )
     view = View(0, np.zeros(3), scan)
-    ground.look(ground.look(None, view, lidar, body, 1.0, 0.0), view, lidar, body, 1.0, 0.0)
+    ground.look(
+        ground.look(None, view, lidar, body, 1.0, 0.0), view, lidar, body, 1.0, 0.0
+    )
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
@@ -185,7 +237,10 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
     linear, turn = config.limits.linear, config.limits.turn
-    turning, speed = motion.value[turn].any(), np.abs(motion.value[linear]).max(initial=0.0)
+    turning, speed = (
+        motion.value[turn].any(),
+        np.abs(motion.value[linear]).max(initial=0.0),
+    )
     if not (turning or speed):
         return motion
 
@@ -205,9 +260,13 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     if on_the_spot and low * speed < CREEP:
         if turns:
             low = 0.0
-        elif speed and safe(CREEP / speed, 0.0):  # nor does a turn that is barred bar the way back
+        elif speed and safe(
+            CREEP / speed, 0.0
+        ):  # nor does a turn that is barred bar the way back
             value = part(_greatest(lambda share: safe(share, 0.0)), 0.0)
-            return records.replace(motion, value=value, slope=0.0 * value, shielded=True)
+            return records.replace(
+                motion, value=value, slope=0.0 * value, shielded=True
+            )
     value = part(low, 1.0 if turns else low)
     slope = np.where(turn & turns, motion.slope, 0.0)
     return records.replace(motion, value=value, slope=slope, shielded=True)
@@ -234,15 +293,29 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     points = np.concatenate([points, *seen_further])
     body = body_of(given)
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
-    old = max(0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors))
+    old = max(
+        0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors)
+    )
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
-    late = given.latency_s if given.turn is None else max(given.latency_s, given.turn.reaction_s)
+    late = (
+        given.latency_s
+        if given.turn is None
+        else max(given.latency_s, given.turn.reaction_s)
+    )
     since, ends = now - old - late, [time for time, _ in state.recent[1:]]
-    past = [one[1] for one, end in zip(state.recent, [*ends, now], strict=False) if end >= since]
+    past = [
+        one[1]
+        for one, end in zip(state.recent, [*ends, now], strict=False)
+        if end >= since
+    ]
     react = given.hold_s + given.latency_s
     calm = 1.0 / config.scan_rate + react + given.latency_s
     hard = old + react
-    standing = points * (1.0, 1.0, 0.0)  # static: against fast obstacles a calm stop is no use
+    standing = points * (
+        1.0,
+        1.0,
+        0.0,
+    )  # static: against fast obstacles a calm stop is no use
     for seen, commands, twist, blind, share, latencies in (
         (standing, [value], None, calm, CALM, 2.0),
         (points, [*past, state.value, value], odometry, hard, 1.0, 1.0),
@@ -255,7 +328,11 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
 
 
 def sweeps(
-    given: ShieldConfig, body: shield_kernels.Body, blind: float, share: float, latencies: float
+    given: ShieldConfig,
+    body: shield_kernels.Body,
+    blind: float,
+    share: float,
+    latencies: float,
 ) -> list[tuple[shield_kernels.Body, float, float]]:
     """Returns body, time before it brakes [s] and deceleration [m/s^2] of the stops to sweep.
 
@@ -281,7 +358,9 @@ def sweeps(
     for path_share, turn_share in shares:
         path_blind = blind - (1.0 - path_share) * given.latency_s
         turn_latencies = latencies - (1.0 - turn_share)
-        turn_blind = blind - latencies * given.latency_s + turn_latencies * turn.reaction_s
+        turn_blind = (
+            blind - latencies * given.latency_s + turn_latencies * turn.reaction_s
+        )
         braked = body._replace(
             turn_later=turn_blind - path_blind,
             turn_deceleration=share * turn.deceleration / turn_share,
@@ -329,7 +408,9 @@ def _car_family(wheelbase: float, commands: Array, odometry: Array | None) -> Ar
         speeds.append(odometry[0])
         if abs(odometry[0]) > MOVING:
             bends.append(odometry[2] / odometry[0])
-    grid = np.linspace(min(bends), max(bends), 2 * TURNS if max(bends) > min(bends) else 1)
+    grid = np.linspace(
+        min(bends), max(bends), 2 * TURNS if max(bends) > min(bends) else 1
+    )
     ends = [speed for speed in sorted({max(speeds), min(speeds)}) if speed != 0.0]
     speed, bend = np.meshgrid(ends, grid)
     return np.stack([speed, np.zeros_like(speed), speed * bend], axis=-1).reshape(-1, 3)

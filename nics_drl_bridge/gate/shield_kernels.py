@@ -94,18 +94,24 @@ def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-un
             continue
         duration = blind + pace / (2.0 * deceleration)
         each = duration / steps
-        slowest = each + math.sqrt(2.0 * pace * each / deceleration)  # time of the last step
+        slowest = each + math.sqrt(
+            2.0 * pace * each / deceleration
+        )  # time of the last step
         made = False
         if body.turn_deceleration > 0.0 and near.shape[0] > 0:
             made = True
             some = places[: steps + 1]
-            slowest = _follow_apart(some, twists[k], path, pace, body, blind, deceleration)
+            slowest = _follow_apart(
+                some, twists[k], path, pace, body, blind, deceleration
+            )
         for p in range(near.shape[0]):
             most_each = path / steps + near[p, 2] * slowest
             s = _steps_apart(near[p, 4] - near[p, 3], most_each, steps)
             if s <= steps and not made:
                 made = True
-                _follow(places[: steps + 1], twists[k], duration, pace, blind, deceleration)
+                _follow(
+                    places[: steps + 1], twists[k], duration, pace, blind, deceleration
+                )
             while s <= steps:
                 dx, dy = near[p, 0] - places[s, 0], near[p, 1] - places[s, 1]
                 c, sine = places[s, 2], places[s, 3]
@@ -135,7 +141,9 @@ def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
     if body.turn_deceleration > 0.0:
         turn_blind = blind + body.turn_later
         turn_time = turn_blind + abs(twist[2]) / (2.0 * body.turn_deceleration)
-        return speed * (blind + across / (2.0 * deceleration)) + turn * turn_time, across
+        return speed * (
+            blind + across / (2.0 * deceleration)
+        ) + turn * turn_time, across
     pace = max(across + abs(twist[2]) * body.lever, turn)
     return (speed + turn) * (blind + pace / (2.0 * deceleration)), pace
 
@@ -145,7 +153,9 @@ def _rest(twist, pace, body, blind, deceleration):  # type: ignore[no-untyped-de
     """Returns the time until a braking robot rests [s]."""
     rest = blind + pace / deceleration
     if body.turn_deceleration > 0.0:
-        rest = max(rest, blind + body.turn_later + abs(twist[2]) / body.turn_deceleration)
+        rest = max(
+            rest, blind + body.turn_later + abs(twist[2]) / body.turn_deceleration
+        )
     return rest
 
 
@@ -205,7 +215,13 @@ def _follow_apart(places, twist, path, pace, body, blind, deceleration):  # type
     turn_blind = blind + body.turn_later
     rest = _rest(twist, pace, body, blind, deceleration)
     steps = len(places) - 1
-    places[0, 0], places[0, 1], places[0, 2], places[0, 3], places[0, 4] = 0.0, 0.0, 1.0, 0.0, 0.0
+    places[0, 0], places[0, 1], places[0, 2], places[0, 3], places[0, 4] = (
+        0.0,
+        0.0,
+        1.0,
+        0.0,
+        0.0,
+    )
     before, moved, turned, longest = 0.0, 0.0, 0.0, 0.0
     for s in range(1, steps + 1):
         low, high = before, rest
@@ -255,7 +271,10 @@ def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-
         if out[b] or not np.isfinite(ranges[b]):
             continue
         angle = lidar.first + b * lidar.step + lidar.heading
-        x, y = lidar.x + ranges[b] * math.cos(angle), lidar.y + ranges[b] * math.sin(angle)
+        x, y = (
+            lidar.x + ranges[b] * math.cos(angle),
+            lidar.y + ranges[b] * math.sin(angle),
+        )
         dx = moved[0] + cosine * x - sine * y - lidar.x
         dy = moved[1] + sine * x + cosine * y - lidar.y
         away = math.hypot(dx, dy)
@@ -366,7 +385,10 @@ def _note_returns(times, cells, ranges, lidar):  # type: ignore[no-untyped-def]
     for b in range(len(ranges)):
         if np.isfinite(ranges[b]):
             angle = lidar.first + b * lidar.step + lidar.heading
-            x, y = lidar.x + ranges[b] * math.cos(angle), lidar.y + ranges[b] * math.sin(angle)
+            x, y = (
+                lidar.x + ranges[b] * math.cos(angle),
+                lidar.y + ranges[b] * math.sin(angle),
+            )
             j = math.floor((cells.cosine * x - cells.sine * y - cells.x) / cells.width)
             i = math.floor((cells.sine * x + cells.cosine * y - cells.y) / cells.width)
             if 0 <= i < times.shape[0] and 0 <= j < times.shape[1]:
@@ -377,7 +399,9 @@ def _note_returns(times, cells, ranges, lidar):  # type: ignore[no-untyped-def]
 def _beam(x, y, lidar):  # type: ignore[no-untyped-def]
     """Returns the number of the beam towards a point, beyond those of a scan if there is none."""
     circle = 2.0 * math.pi / abs(lidar.step)
-    at = (math.atan2(y - lidar.y, x - lidar.x) - lidar.heading - lidar.first) / lidar.step
+    at = (
+        math.atan2(y - lidar.y, x - lidar.x) - lidar.heading - lidar.first
+    ) / lidar.step
     return math.floor(at - circle * math.floor((at + 0.5) / circle) + 0.5)
 
 

@@ -21,7 +21,9 @@ def replace(record: Record, **changes: Any) -> Record:
     """Copies a frozen record without slots with changes, faster than `dataclasses.replace`."""
     held = vars(record)
     if not changes.keys() <= held.keys():
-        raise TypeError(f"{type(record).__name__} has no {sorted(changes.keys() - held.keys())}")
+        raise TypeError(
+            f"{type(record).__name__} has no {sorted(changes.keys() - held.keys())}"
+        )
     made = object.__new__(type(record))
     vars(made).update(held, **changes)
     return made
@@ -36,11 +38,20 @@ class ShieldConfig:
     margin: float  # clearance kept around the footprint [m]
     hold_s: float  # longest time until the next decision
     footprint_radius: float  # of the circle around the robot [m]
-    wheelbase: float = 0.0  # of a car, which is commanded by steering angle [m]; 0 for others
-    obstacle_speed: float = 0.0  # of moving obstacles that approach [m/s]; 0: all are static
+    wheelbase: float = (
+        0.0  # of a car, which is commanded by steering angle [m]; 0 for others
+    )
+    obstacle_speed: float = (
+        0.0  # of moving obstacles that approach [m/s]; 0: all are static
+    )
     range_max: float = INF  # of the lidar [m]
-    range_noise: tuple[float, float] = (0.0, 0.0)  # std, in metres and as a share of the range
-    unknown_share: float = 0.5  # of unknown beams from which a direction counts as blocked
+    range_noise: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # std, in metres and as a share of the range
+    unknown_share: float = (
+        0.5  # of unknown beams from which a direction counts as blocked
+    )
     unknown_width: float = 0.35  # angle over which that share is taken [rad]
     # Corners of the footprint in `base_link`, in order [m]; none of a robot that is a circle.
     outline: tuple[tuple[float, float], ...] = ()
@@ -54,27 +65,43 @@ class ShieldConfig:
 class GateConfig:
     """Fixed configuration of a gate."""
 
-    fields: tuple[int, ...]  # (C,) place of each command in linear.x, linear.y, angular.z; but
+    fields: tuple[
+        int, ...
+    ]  # (C,) place of each command in linear.x, linear.y, angular.z; but
     # of a car that takes turn rates, angular.z is that of a `bicycle` at its steering angle
     limits: Limits | None  # of the commands; None lets nothing pass
     beam_angles: Array  # (B,) of the lidar [rad]
-    mount: tuple[float, float, float]  # of the lidar in `base_link`: x [m], y [m], heading [rad]
+    mount: tuple[
+        float, float, float
+    ]  # of the lidar in `base_link`: x [m], y [m], heading [rad]
     range_min: float  # of the lidar [m]
     scan_rate: float  # declared [Hz]
     odom_rate: float  # declared [Hz]
-    odom_rate_declared: bool = True  # else it is the least that a model needs: more is as good
+    odom_rate_declared: bool = (
+        True  # else it is the least that a model needs: more is as good
+    )
     range_max: float = 0.0  # of the lidar [m]; 0 if unknown
-    scan_age_s: float = 0.30  # greatest age of the newest scan, and of the scan behind a command
+    scan_age_s: float = (
+        0.30  # greatest age of the newest scan, and of the scan behind a command
+    )
     odom_age_s: float = 0.30  # greatest age of the newest odometry
     command_age_s: float = 0.30  # greatest age of the newest command
     race_s: float = 0.05  # time by which a command may overtake its scan
-    settle_s: float = 1.0  # for which data must be fresh and the robot at rest before arming
+    settle_s: float = (
+        1.0  # for which data must be fresh and the robot at rest before arming
+    )
     rate_tolerance: float = 0.3  # relative deviation of a rate from the declared one
     # A stamp this far back, or before arming this far ahead, is a jump; if armed, see `AHEAD_S`.
     clock_jump_s: float = 0.5
-    clock_rate: float = 1.0  # of the stamps [s/s]; not 1 only in a simulation out of real time
-    simulated: bool = False  # stamps are those of a simulator, which may fall behind real time
-    gap_s: float = 0.2  # longest time between two ticks, and length of the stop after a longer one
+    clock_rate: float = (
+        1.0  # of the stamps [s/s]; not 1 only in a simulation out of real time
+    )
+    simulated: bool = (
+        False  # stamps are those of a simulator, which may fall behind real time
+    )
+    gap_s: float = (
+        0.2  # longest time between two ticks, and length of the stop after a longer one
+    )
     e_stop_required: bool = True  # one that was never heard counts as pressed
     e_stop_silence_s: float = 0.25  # after which one that was heard counts as pressed
     estimate_required: bool = True  # arming needs an estimator that has converged
@@ -82,11 +109,18 @@ class GateConfig:
     estimate_position: float = 0.5  # [m]
     estimate_heading: float = 0.3  # [rad]
     estimate_silence_s: float = 0.5  # greatest age of the estimate for that
-    frozen_distance: float = 0.2  # path over which identical scans are frozen [m, or rad turned]
+    frozen_distance: float = (
+        0.2  # path over which identical scans are frozen [m, or rad turned]
+    )
     stuck_s: float = 1.0  # time without motion while commanded that causes a stop
-    stop_when_held: bool = True  # stop when scans show none of the motion that odometry shows
+    stop_when_held: bool = (
+        True  # stop when scans show none of the motion that odometry shows
+    )
     odom_std: tuple[float, float] = (0.0, 0.0)  # of odometry's twist [m/s, rad/s]
-    range_noise: tuple[float, float] = (0.0, 0.0)  # std, in metres and as a share of the range
+    range_noise: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # std, in metres and as a share of the range
     shield: ShieldConfig | None = None
     sensors: tuple[str, ...] = ()  # further ones, which must be as fresh as the scan
     bicycle: Bicycle | None = None
@@ -148,7 +182,9 @@ class Sameness:
 
     ranges: Ranges  # (B,) of the first scan that showed it [m]
     count: int  # scans that showed it
-    first: Array | None  # (3,) odometry pose at the first; None if there was no odometry yet
+    first: (
+        Array | None
+    )  # (3,) odometry pose at the first; None if there was no odometry yet
 
 
 @dataclass(frozen=True)
@@ -173,8 +209,12 @@ class EstimateMark:
 class EstimateTrack:
     """Whether the estimate goes on from where it was."""
 
-    marks: tuple[EstimateMark, ...] = ()  # recent ones, oldest first; the first is the origin
-    fault: str = ""  # why the newest estimate does not go on from them; it is the new origin
+    marks: tuple[
+        EstimateMark, ...
+    ] = ()  # recent ones, oldest first; the first is the origin
+    fault: str = (
+        ""  # why the newest estimate does not go on from them; it is the new origin
+    )
     last_fault: str = ""  # the newest such reason
 
 
@@ -192,9 +232,13 @@ class ScanMotion:
     """Whether recent scans show the motion that odometry shows."""
 
     views: tuple[ReducedScan, ...] = ()  # recent ones, oldest first
-    held_since_ns: int | None = None  # stamp of the first scan that contradicts odometry
+    held_since_ns: int | None = (
+        None  # stamp of the first scan that contradicts odometry
+    )
     held: str = ""  # what the newest scan contradicts, once others have before
-    share: float = NAN  # of the motion by odometry that the newest scan shows; NaN: undecided
+    share: float = (
+        NAN  # of the motion by odometry that the newest scan shows; NaN: undecided
+    )
 
 
 @dataclass(frozen=True)
@@ -202,7 +246,9 @@ class Ground:
     """Ground around a robot whose lidar does not see all around it."""
 
     since_ns: int  # stamp from which times count
-    corner: tuple[int, int]  # cells from the origin of odometry to the first: along x, along y
+    corner: tuple[
+        int, int
+    ]  # cells from the origin of odometry to the first: along x, along y
     times: Ranges  # (n, n), rows along y, when a cell was last known to be free [s]; -inf: is not
     unseen: Array  # (Q, 2) middles of the cells where that ends, in `base_link` [m]
 
@@ -225,7 +271,9 @@ class EStopState:
 
     latched: bool = False  # it was pressed, and not reset since
     held: bool = False  # its topic last reported it as pressed
-    heard_s: float | None = None  # time of the last message on its topic; None if there was none
+    heard_s: float | None = (
+        None  # time of the last message on its topic; None if there was none
+    )
     reason: str = ""  # why a press may have been missed; empty if it was heard
 
 
@@ -234,7 +282,9 @@ class SensorState:
     """Known state of a further sensor."""
 
     arrivals: Arrivals = Arrivals()  # of its accepted readings
-    points: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (Q, 2) of the newest
+    points: Array = field(
+        default_factory=lambda: np.zeros((0, 2))
+    )  # (Q, 2) of the newest
 
 
 @dataclass(frozen=True)
@@ -265,12 +315,20 @@ class GateState:
     estimates: EstimateTrack = EstimateTrack()
     command_s: float = -INF
     pending: Command | None = None  # whose scan has not arrived yet
-    pending_s: float | None = None  # since when commands name such scans; None: the newest does not
-    views: tuple[View, ...] = ()  # recent ones, for the detection of motion; empty without shield
-    ground: Ground | None = None  # None if the lidar sees all around, and without shield
+    pending_s: float | None = (
+        None  # since when commands name such scans; None: the newest does not
+    )
+    views: tuple[
+        View, ...
+    ] = ()  # recent ones, for the detection of motion; empty without shield
+    ground: Ground | None = (
+        None  # None if the lidar sees all around, and without shield
+    )
     # (P, 3) in the newest scan: x, y in `base_link` [m], and greatest speed of each [m/s].
     obstacles: Array | None = None
-    behind_s: float = -INF  # arrival of the scan behind the newest command, less its delay
+    behind_s: float = (
+        -INF
+    )  # arrival of the scan behind the newest command, less its delay
     malformed: str = ""  # what is wrong with the newest command
     source: str = ""  # the publisher of the newest command that named one
     source_s: float = -INF  # its arrival

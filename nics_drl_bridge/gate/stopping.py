@@ -20,32 +20,50 @@ ANGLE = "rad"
 UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
 SHIELD_SPANS = {  # beyond them the robot could never move
-    "latency": (0, 10), "deceleration": (1e-3, 1e4), "margin": (0, 10), "obstacle_speed": (0, 100),
-}  # fmt: skip
+    "latency": (0, 10),
+    "deceleration": (1e-3, 1e4),
+    "margin": (0, 10),
+    "obstacle_speed": (0, 100),
+}
 HARDEST = SHIELD_SPANS["deceleration"][1]
-LEAST_DATA = 2  # least number that must arrive while the gate settles, for a rate to be known
+LEAST_DATA = (
+    2  # least number that must arrive while the gate settles, for a rate to be known
+)
 
 
 def gate_config(
-    model: SimulatorModel, limits: Limits | None, shield: ShieldConfig | None, **rules: Any
+    model: SimulatorModel,
+    limits: Limits | None,
+    shield: ShieldConfig | None,
+    **rules: Any,
 ) -> GateConfig:
     """Returns the configuration of a robot's gate; `rules` are further fields of it."""
     lidar, robot = model.lidar, model.robot
     least_rate = {"odom_rate": 1.0 / model.control_period, "odom_rate_declared": False}
     given = rules if "odom_rate" in rules else {**least_rate, **rules}
     return GateConfig(
-        fields=robot.cmd_vel_places, bicycle=robot.bicycle if robot.takes_turn_rate else None,
-        limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,
-        range_max=lidar.range_max, scan_rate=lidar.rate,
-        sensors=tuple(sensor.name for sensor in model.sensors), odom_std=model.noise.odometry,
-        range_noise=(lidar.noise_std, lidar.faults.noise_proportional), shield=shield, **given,
-    )  # fmt: skip
+        fields=robot.cmd_vel_places,
+        bicycle=robot.bicycle if robot.takes_turn_rate else None,
+        limits=limits,
+        beam_angles=lidar.angles,
+        mount=lidar.mount,
+        range_min=lidar.range_min,
+        range_max=lidar.range_max,
+        scan_rate=lidar.rate,
+        sensors=tuple(sensor.name for sensor in model.sensors),
+        odom_std=model.noise.odometry,
+        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        shield=shield,
+        **given,
+    )
 
 
 def shield_config(
-    model: SimulatorModel, limits: Limits | None, file: str | Path = "",
+    model: SimulatorModel,
+    limits: Limits | None,
+    file: str | Path = "",
     given: Mapping[str, float] | None = None,
-) -> tuple[ShieldConfig, str]:  # fmt: skip
+) -> tuple[ShieldConfig, str]:
     """Returns a robot's shield, and a sentence on its values; ConfigError: can't be used."""
     # It is the `shield` of a file of limits, else of model and limits; given values override it.
     path = find_config(file, "limits") if file else None
@@ -71,17 +89,27 @@ def shield_config(
             raise ConfigError(f"parameter 'shield_{name}' is {value:g}; {needed}.")
     lidar = model.lidar
     config = ShieldConfig(
-        latency_s=values.latency, deceleration=values.deceleration, margin=values.margin,
-        hold_s=GateConfig.gap_s, footprint_radius=model.robot.footprint_radius,
-        wheelbase=wheelbase(model.robot), obstacle_speed=values.obstacle_speed,
-        range_max=lidar.range_max, range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
-        outline=model.robot.footprint or (), lever=braking.lever_m,
-        order=braking.order, drift=braking.drift, turn=_turn_as_told(braking, values),
-    )  # fmt: skip
+        latency_s=values.latency,
+        deceleration=values.deceleration,
+        margin=values.margin,
+        hold_s=GateConfig.gap_s,
+        footprint_radius=model.robot.footprint_radius,
+        wheelbase=wheelbase(model.robot),
+        obstacle_speed=values.obstacle_speed,
+        range_max=lidar.range_max,
+        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        outline=model.robot.footprint or (),
+        lever=braking.lever_m,
+        order=braking.order,
+        drift=braking.drift,
+        turn=_turn_as_told(braking, values),
+    )
     source = f"by {path}" if measured is not None else "derived from model and limits"
     if given:
         source += f", but {', '.join(sorted(given))} by parameter"
-    listed = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
+    listed = ", ".join(
+        f"{name} {value:g}" for name, value in values.model_dump().items()
+    )
     return config, f"the shield is on: {listed} ({source})"
 
 
@@ -127,14 +155,20 @@ def wheelbase(robot: RobotSpec) -> float:
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
             fault = f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`"
-            known = f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad"
+            known = (
+                f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad"
+            )
             raise ConfigError(f"{known}, and {fault}.")
     if not robot.steers:
         return 0.0
     if not robot.knows_wheelbase:
-        fault = f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car"
+        fault = (
+            f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car"
+        )
         advice = "add it under `parameters:` of the robot"
-        raise ConfigError(f"{fault}; {advice}, or drive without a shield by `shield: false`.")
+        raise ConfigError(
+            f"{fault}; {advice}, or drive without a shield by `shield: false`."
+        )
     return robot.parameters["wheelbase"]
 
 
@@ -147,7 +181,9 @@ def require_possible(config: GateConfig) -> None:
         declared = f"{topic} comes every {1.0 / rate:.3g} s ({rate:g} Hz are declared)"
         if age <= 1.0 / rate:
             fault = f"{age:g} s: {declared}, so the robot could never move"
-            raise ConfigError(f"parameter '{topic}_age': {fault}; give more than {1.0 / rate:.3g}.")
+            raise ConfigError(
+                f"parameter '{topic}_age': {fault}; give more than {1.0 / rate:.3g}."
+            )
         if rate * config.settle_s < LEAST_DATA:
             fault = f"{declared}, too seldom to be judged within {config.settle_s:g} s"
             needed = f"the gate needs {LEAST_DATA / config.settle_s:g} Hz or more"

@@ -6,26 +6,51 @@
 import math
 
 from nics_drl_bridge.gate.inputs import Command, Input, Tick
-from nics_drl_bridge.gate.state import Arrivals, Cause, GateConfig, GateState, Mark, replace
+from nics_drl_bridge.gate.state import (
+    Arrivals,
+    Cause,
+    GateConfig,
+    GateState,
+    Mark,
+    replace,
+)
 from nics_drl_bridge.interface import S_PER_NS
 
 SCAN, ODOM, RAW, E_STOP = "scan", "odom", "cmd_vel_raw", "e_stop"
-KEPT = 64  # number of remembered stamps; a command on an older scan is on an unknown one
+KEPT = (
+    64  # number of remembered stamps; a command on an older scan is on an unknown one
+)
 MARK_S = 0.05  # time between two marks [s]
 DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
 SIMULATED_LAG = 0.2  # share of real time that a simulator may lose
-AHEAD_S = 0.1  # data of an armed gate that lead the envelope by this are from the future [s]
+AHEAD_S = (
+    0.1  # data of an armed gate that lead the envelope by this are from the future [s]
+)
 SOURCE_S = 1.0  # time after which another publisher's first command is no turn, but a new start [s]
-FROZEN_INPUTS = 20  # a running clock does not give this many inputs in a row the same time
+FROZEN_INPUTS = (
+    20  # a running clock does not give this many inputs in a row the same time
+)
 
 
 def arrived(
-    config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float, gap_s: float, armed: bool
+    config: GateConfig,
+    arrivals: Arrivals,
+    stamp_ns: int,
+    now: float,
+    gap_s: float,
+    armed: bool,
 ) -> tuple[Arrivals, str]:
     """Accounts for a datum; returns arrivals, and `repeated`, `jumped` or ""."""
     # If the gate is armed, the envelope is fixed; after a jump only the new datum is kept.
     fresh = Arrivals(
-        (stamp_ns,), (now,), (0.0,), (stamp_ns, now), 1, 0.0, now, ((now, stamp_ns, 1, 0.0),)
+        (stamp_ns,),
+        (now,),
+        (0.0,),
+        (stamp_ns, now),
+        1,
+        0.0,
+        now,
+        ((now, stamp_ns, 1, 0.0),),
     )
     if not arrivals.times:
         return fresh, ""
@@ -42,13 +67,21 @@ def arrived(
     passed, envelope = now - arrivals.times[-1], max(mark[3] for mark in marks)
     if armed:
         fall = SIMULATED_LAG if config.simulated else DRIFT
-        lowest, highest = arrivals.envelope - fall * passed, arrivals.envelope + DRIFT * passed
+        lowest, highest = (
+            arrivals.envelope - fall * passed,
+            arrivals.envelope + DRIFT * passed,
+        )
         envelope = min(max(lead, lowest), highest)
     return Arrivals(
-        (*arrivals.stamps_ns[1 - KEPT :], stamp_ns), (*arrivals.times[1 - KEPT :], now),
-        (*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)), arrivals.origin,
-        arrivals.count + 1, envelope, now if passed > gap_s else arrivals.unbroken_s, marks,
-    ), ""  # fmt: skip
+        (*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
+        (*arrivals.times[1 - KEPT :], now),
+        (*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)),
+        arrivals.origin,
+        arrivals.count + 1,
+        envelope,
+        now if passed > gap_s else arrivals.unbroken_s,
+        marks,
+    ), ""
 
 
 def _marked(
@@ -72,19 +105,25 @@ def age(arrivals: Arrivals, now: float) -> float:
     return now - arrivals.times[-1] + arrivals.late[-1] if arrivals.times else math.inf
 
 
-def _too_old(rule: str, topic: str, detail: str, old: float, limit: float) -> Cause | None:
+def _too_old(
+    rule: str, topic: str, detail: str, old: float, limit: float
+) -> Cause | None:
     return None if old <= limit else Cause(rule, topic, detail, old, limit)
 
 
 def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest scan is too old: the lidar has stopped."""
-    return _too_old("scan_silent", SCAN, "no fresh data", age(state.scans, now), config.scan_age_s)
+    return _too_old(
+        "scan_silent", SCAN, "no fresh data", age(state.scans, now), config.scan_age_s
+    )
 
 
 def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest reading of a further sensor is too old: it has stopped."""
     both = zip(config.sensors, state.sensors, strict=True)
-    old, name = max(((age(each.arrivals, now), name) for name, each in both), default=(0.0, ""))
+    old, name = max(
+        ((age(each.arrivals, now), name) for name, each in both), default=(0.0, "")
+    )
     return _too_old("sensor_silent", name, "no fresh data", old, config.scan_age_s)
 
 
@@ -116,21 +155,38 @@ def creep(arrivals: Arrivals) -> float:
     return max(leads[half:]) - max(leads[:half]) if half else 0.0
 
 
-def take_time(config: GateConfig, state: GateState, given: Input, now: float) -> GateState:
+def take_time(
+    config: GateConfig, state: GateState, given: Input, now: float
+) -> GateState:
     """Records the time of an input, and what is wrong with it."""
     if not math.isfinite(now) or now < state.now_s:
-        return replace(state, clock_fault=f"the steady clock went from {state.now_s} to {now} s")
+        return replace(
+            state, clock_fault=f"the steady clock went from {state.now_s} to {now} s"
+        )
     still = state.still_ticks + 1 if now == state.now_s else 0
-    fault = f"the steady clock stands still at {now} s" if still >= FROZEN_INPUTS else ""
+    fault = (
+        f"the steady clock stands still at {now} s" if still >= FROZEN_INPUTS else ""
+    )
     ticked, awake = state.tick_s, state.awake_s
-    if ticked is not None and now - ticked > config.gap_s:  # at whatever input wakes it up
-        fault, awake = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s", now
-    elif now - awake <= config.gap_s:  # a single zero may be lost: only the newest command counts
+    if (
+        ticked is not None and now - ticked > config.gap_s
+    ):  # at whatever input wakes it up
+        fault, awake = (
+            f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s",
+            now,
+        )
+    elif (
+        now - awake <= config.gap_s
+    ):  # a single zero may be lost: only the newest command counts
         fault = f"awake again for only {now - awake:.3f} s"
     return replace(
-        state, now_s=now, tick_s=now if isinstance(given, Tick) else ticked, awake_s=awake,
-        still_ticks=still, clock_fault=fault,
-    )  # fmt: skip
+        state,
+        now_s=now,
+        tick_s=now if isinstance(given, Tick) else ticked,
+        awake_s=awake,
+        still_ticks=still,
+        clock_fault=fault,
+    )
 
 
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -140,7 +196,9 @@ def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 def watch_source(state: GateState, command: Command, now: float) -> GateState:
     """Records the publisher of a command, and whether another one commanded a moment ago."""
-    mixed = f"{command.publishers} nodes publish on {RAW}" if command.publishers > 1 else ""
+    mixed = (
+        f"{command.publishers} nodes publish on {RAW}" if command.publishers > 1 else ""
+    )
     if command.source:
         recent = now - state.source_s < SOURCE_S
         if recent and state.source != command.source:
@@ -173,10 +231,14 @@ def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | 
     if state.command is None:
         return None
     old = now - state.command_s
-    return _too_old("command_silent", RAW, "no fresh command", old, config.command_age_s)
+    return _too_old(
+        "command_silent", RAW, "no fresh command", old, config.command_age_s
+    )
 
 
-def scan_behind_unknown(config: GateConfig, state: GateState, now: float) -> Cause | None:
+def scan_behind_unknown(
+    config: GateConfig, state: GateState, now: float
+) -> Cause | None:
     """Commands name scans that do not arrive, perhaps from the future. One may be in transit."""
     if state.pending is None or state.pending_s is None:
         return None
@@ -206,4 +268,6 @@ def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | N
     if heard is None and not config.e_stop_required:
         return None
     old, limit = math.inf if heard is None else now - heard, config.e_stop_silence_s
-    return _too_old("e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit)
+    return _too_old(
+        "e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit
+    )

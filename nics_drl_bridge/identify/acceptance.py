@@ -64,7 +64,9 @@ class Assessment:
     """A verdict and its reasons."""
 
     verdict: Verdict
-    reasons: tuple[str, ...]  # a sentence for each threshold that a good model keeps and this not
+    reasons: tuple[
+        str, ...
+    ]  # a sentence for each threshold that a good model keeps and this not
 
 
 def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
@@ -87,7 +89,9 @@ def comparison_noise(difference: Array, start_t: Array, horizon: float) -> float
     return float(np.sqrt(count / (count - 1.0) * float(sums @ sums)) / len(difference))
 
 
-def compare(ours: EndErrors, theirs: EndErrors, noise_m: float | None, path_m: float) -> Outcome:
+def compare(
+    ours: EndErrors, theirs: EndErrors, noise_m: float | None, path_m: float
+) -> Outcome:
     """Ranks a model beside a yardstick, by the noise of the comparison [m]."""
     tie = max(THRESHOLDS.standard_errors * (noise_m or 0.0), THRESHOLDS.alike * path_m)
     difference = ours.position_m - theirs.position_m
@@ -100,7 +104,8 @@ def loses_to_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
     """True if a model's predictions are worse than its fitted textbook's, beyond the noise."""
     return any(
         at.textbook is not None
-        and compare(at.model, at.textbook, at.textbook_noise_m, at.path_m) is Outcome.WORSE
+        and compare(at.model, at.textbook, at.textbook_noise_m, at.path_m)
+        is Outcome.WORSE
         for at in usual(judgement)
     )
 
@@ -142,7 +147,9 @@ def relative_error(at: HorizonErrors, radius: float) -> float:
     return at.model.position_m / max(at.path_m, radius, 1e-9)
 
 
-def rate(judgement: tuple[HorizonErrors, ...], radius: float, textbook: bool) -> Assessment:
+def rate(
+    judgement: tuple[HorizonErrors, ...], radius: float, textbook: bool
+) -> Assessment:
     """Rates predictions of a robot of a radius [m]; `textbook` if they are those of its textbook.
 
     Of a model that was never tried on unseen data nothing is known.
@@ -153,7 +160,9 @@ def rate(judgement: tuple[HorizonErrors, ...], radius: float, textbook: bool) ->
     (at,) = judged
     ratings = [_rate_error(at, radius), _rate_band(at), _rate_beside_twist(at)]
     if not textbook and loses_to_textbook(judgement):
-        ratings.append(Assessment(Verdict.DO_NOT_TRAIN, tuple(shortfall_of_textbook(at))))
+        ratings.append(
+            Assessment(Verdict.DO_NOT_TRAIN, tuple(shortfall_of_textbook(at)))
+        )
     return combined(ratings)
 
 
@@ -161,7 +170,9 @@ def combined(ratings: Iterable[Assessment]) -> Assessment:
     """Returns the least favourable verdict, with the reasons of all."""
     rated = tuple(ratings)
     verdict = max((each.verdict for each in rated), key=list(Verdict).index)
-    return Assessment(verdict, tuple(reason for each in rated for reason in each.reasons))
+    return Assessment(
+        verdict, tuple(reason for each in rated for reason in each.reasons)
+    )
 
 
 def rate_unseen(gap_s: float, duration_s: float) -> Assessment:
@@ -202,4 +213,6 @@ def _rate_band(at: HorizonErrors) -> Assessment:
 def _rate_beside_twist(at: HorizonErrors) -> Assessment:
     outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
     verdicts = {Outcome.BETTER: Verdict.GOOD, Outcome.ALIKE: Verdict.WITH_CARE}
-    return Assessment(verdicts.get(outcome, Verdict.DO_NOT_TRAIN), tuple(shortfall_of_twist(at)))
+    return Assessment(
+        verdicts.get(outcome, Verdict.DO_NOT_TRAIN), tuple(shortfall_of_twist(at))
+    )

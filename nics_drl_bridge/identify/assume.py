@@ -23,7 +23,9 @@ def assume_textbook(
     named = model.named
     rows = {dof: dict(terms) for dof, terms in named.terms.items()}
     point = dict(zip(model.variables, (model.low + model.high) / 2.0, strict=True))
-    found = _Completion(model.dt, spec, textbook(spec), unmoved, point, rows, list(model.assumed))
+    found = _Completion(
+        model.dt, spec, textbook(spec), unmoved, point, rows, list(model.assumed)
+    )
     for i, variable in enumerate(spec.state):
         if variable.twist:  # by definition
             rows[variable.twist] = {variable.name: 1.0}
@@ -31,7 +33,11 @@ def assume_textbook(
             found.restore_twist(i)
     for i in range(len(spec.state)):
         found.restore_rate(i)
-    update = {"terms": rows, "assumed": tuple(found.assumed), "valid": found.widened(named.valid)}
+    update = {
+        "terms": rows,
+        "assumed": tuple(found.assumed),
+        "valid": found.widened(named.valid),
+    }
     return named.model_copy(update=update).model(), tuple(found.notes)
 
 
@@ -55,9 +61,15 @@ class _Completion:
                 if name not in factors:
                     continue
                 factors.remove(name)
-                learnt, value = self.rows[dof].pop("*".join(factors) or "1", None), self.point[name]
+                learnt, value = (
+                    self.rows[dof].pop("*".join(factors) or "1", None),
+                    self.point[name],
+                )
                 if learnt is not None and abs(value) > MIN_OPERATING_POINT:
-                    coefficient, source = learnt / value, f"measured at {name} = {value:g}"
+                    coefficient, source = (
+                        learnt / value,
+                        f"measured at {name} = {value:g}",
+                    )
                 else:
                     coefficient = self._slope(d, product)
                     source = self.source
@@ -71,7 +83,9 @@ class _Completion:
 
     def _slope(self, d: int, product: str) -> float:
         """Returns the coefficient of a product of state variables in the textbook twist, at 0."""
-        index = [i for i, v in enumerate(self.spec.state) if v.name in product.split("*")]
+        index = [
+            i for i, v in enumerate(self.spec.state) if v.name in product.split("*")
+        ]
         value = 0.0
         for signs in 1.0 - 2.0 * np.array(list(np.ndindex(*(2,) * len(index)))):
             state = np.zeros(len(self.spec.state))
@@ -79,7 +93,9 @@ class _Completion:
             value += float(np.prod(signs) * self.book.twist(state)[d])
         return value / (2.0 * DIFFERENCE) ** len(index)
 
-    def widened(self, valid: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    def widened(
+        self, valid: dict[str, tuple[float, float]]
+    ) -> dict[str, tuple[float, float]]:
         """Returns the ranges, as wide as commands reach for parts of the twist that are assumed."""
         told = {dof for dof, _ in self.assumed}
         for variable in self.spec.state:
@@ -114,16 +130,26 @@ class _Completion:
         self.assumed.extend((f"d_{name}", term) for term in added)
         follows = ", ".join(term for term in added if term != name)
         self.notes.append(
-            Gap(f"Assumed, not learnt: {name} follows {follows} with a lag of {lag:.3g} s{source}.")
+            Gap(
+                f"Assumed, not learnt: {name} follows {follows} with a lag of {lag:.3g} s{source}."
+            )
         )
 
-    def _following(self, i: int, row: dict[str, float], rate: float) -> dict[str, float]:
+    def _following(
+        self, i: int, row: dict[str, float], rate: float
+    ) -> dict[str, float]:
         """Returns the terms by which a state follows commands, each on its own."""
         commands, target = self.spec.command, self.book.target
-        here, added, constant = np.array([self.point[c.name] for c in commands]), {}, 0.0
+        here, added, constant = (
+            np.array([self.point[c.name] for c in commands]),
+            {},
+            0.0,
+        )
         for j, command in enumerate(commands):
             step = np.where(np.arange(len(commands)) == j, DIFFERENCE, 0.0)
-            slope = (target(here + step)[i] - target(here - step)[i]) / (2.0 * DIFFERENCE)
+            slope = (target(here + step)[i] - target(here - step)[i]) / (
+                2.0 * DIFFERENCE
+            )
             if command.name in self.unmoved and not abs(slope) < 1e-9:
                 added[command.name] = rate * float(slope)
                 constant -= added[command.name] * here[j]
@@ -133,12 +159,17 @@ class _Completion:
                 row["1"] = constant
         return added
 
-    def _turning(self, i: int, row: dict[str, float], rate: float) -> dict[str, float] | None:
+    def _turning(
+        self, i: int, row: dict[str, float], rate: float
+    ) -> dict[str, float] | None:
         """Returns the term by which a car turns whose state is its twist; None for other rates.
 
         It is the product of speed and steering, measured at a constant if there is one.
         """
-        given, state = structure_of(self.spec), {v.twist: v.name for v in self.spec.state}
+        given, state = (
+            structure_of(self.spec),
+            {v.twist: v.name for v in self.spec.state},
+        )
         turned = self.spec.state[i].twist == "wz" and "vx" in state
         if given is None or not given[1].used or not turned:
             return None
@@ -147,7 +178,9 @@ class _Completion:
         still = [name for name in names if name in self.unmoved]
         if not still:
             return {}
-        learnt = row.pop("*".join(name for name in names if name not in still) or "1", None)
+        learnt = row.pop(
+            "*".join(name for name in names if name not in still) or "1", None
+        )
         value = float(np.prod([self.point[name] for name in still]))
         if learnt is not None and abs(value) > MIN_OPERATING_POINT:
             return {"*".join(names): learnt / value}

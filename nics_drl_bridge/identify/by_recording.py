@@ -43,7 +43,9 @@ def errors_by_recording(
     """Predicts each recording of a drive, over the longest time that all of them last."""
     sources = [episode.source for episode in drive.recording.episodes]
     for horizon in HORIZONS_S:
-        chosen = open_loop.windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
+        chosen = open_loop.windows(
+            drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S
+        )
         if not len(chosen.start_t):
             continue
         own = np.array(sources)[drive.recording.episode_at(chosen.start_t)]
@@ -63,7 +65,9 @@ def errors_by_recording(
     return []
 
 
-def about_recordings(model: TaylorModel, calibration: Calibration, drive: Drive) -> Iterator[str]:
+def about_recordings(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> Iterator[str]:
     """Yields a sentence on the errors by recording, and one on each that is off alone."""
     if not drive.recording.episodes:
         return

@@ -11,7 +11,13 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
-from nics_drl_bridge.identify.signals import Motors, inferred_states, resample, taken, unwrapped
+from nics_drl_bridge.identify.signals import (
+    Motors,
+    inferred_states,
+    resample,
+    taken,
+    unwrapped,
+)
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.curve import LONGEST_DELAY_S, InputCurve, delays
 
@@ -23,7 +29,9 @@ UNIFORM = 1e-6
 WHOLE = 1e-6  # a period of so nearly a whole number of steps has one
 SAME_STEP = 1e-3  # share of a step by which rounded stamps may change it
 SHARED = 0.5  # minimum share of rows with common stamps; only then are the other rows dropped
-STATE_GAP = 2.5  # rates are unknown between states that are this many median steps apart
+STATE_GAP = (
+    2.5  # rates are unknown between states that are this many median steps apart
+)
 
 
 @dataclass(frozen=True)
@@ -43,22 +51,41 @@ class Calibration:
     clock_offset_s: float = 0.0  # added to the pose's stamps, gives the commands' clock
     # from a command's stamp to its effect
     command_latency_s: Annotated[float, Field(le=LONGEST_DELAY_S)] = 0.0
-    rotation_rad: float = 0.0  # heading of `base_link` minus the heading of the tracked body
-    lever_arm_m: tuple[float, float] = (0.0, 0.0)  # (x, y) of the tracked point in `base_link`
-    responses: tuple[Response, ...] = ()  # of the state variables; empty if the state was measured
-    inputs: tuple[InputCurve, ...] = ()  # of the commands that do not act as they are, or at once
+    rotation_rad: float = (
+        0.0  # heading of `base_link` minus the heading of the tracked body
+    )
+    lever_arm_m: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # (x, y) of the tracked point in `base_link`
+    responses: tuple[
+        Response, ...
+    ] = ()  # of the state variables; empty if the state was measured
+    inputs: tuple[
+        InputCurve, ...
+    ] = ()  # of the commands that do not act as they are, or at once
     limits: dict[str, tuple[float, float]] = field(
         default_factory=dict
     )  # of inferred states' rates
     burst_period_s: NonNegativeFloat = 0.0  # between bursts of poses; 0 without bursts
-    position_noise_m: NonNegativeFloat = 0.0  # standard deviation of x and y of the pose
+    position_noise_m: NonNegativeFloat = (
+        0.0  # standard deviation of x and y of the pose
+    )
     heading_noise_rad: NonNegativeFloat = 0.0
-    wheel_scale: float | None = None  # speed per unit of the wheels' mean [m/s]; None if unknown
-    turn_scale: float | None = None  # yaw rate per unit of right wheel minus left [rad/s]
+    wheel_scale: float | None = (
+        None  # speed per unit of the wheels' mean [m/s]; None if unknown
+    )
+    turn_scale: float | None = (
+        None  # yaw rate per unit of right wheel minus left [rad/s]
+    )
     wheels_swapped: bool | None = None  # left and right interchanged; None if unknown
     # Standard uncertainty of each estimated value, by the names above.
-    uncertainty: dict[str, Annotated[float, AllowInfNan()]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()  # a sentence on each finding, and on what could not be learnt
+    uncertainty: dict[str, Annotated[float, AllowInfNan()]] = field(
+        default_factory=dict
+    )
+    notes: tuple[
+        str, ...
+    ] = ()  # a sentence on each finding, and on what could not be learnt
 
     @property
     def is_identity(self) -> bool:
@@ -75,7 +102,9 @@ class Calibration:
     @property
     def is_exact(self) -> bool:
         """True if there is nothing to correct, not even noise: a textbook recording."""
-        return self.is_identity and self.position_noise_m == self.heading_noise_rad == 0.0
+        return (
+            self.is_identity and self.position_noise_m == self.heading_noise_rad == 0.0
+        )
 
     @property
     def motors(self) -> Motors:
@@ -83,7 +112,9 @@ class Calibration:
         limits = [self.limits.get(r.state, (-np.inf, np.inf)) for r in self.responses]
         fall, rise = np.array(limits).reshape(-1, 2).T
         dead = {curve.command: curve.dead for curve in self.inputs}
-        return Motors(fall, rise, np.array([dead.get(r.command, 0.0) for r in self.responses]))
+        return Motors(
+            fall, rise, np.array([dead.get(r.command, 0.0) for r in self.responses])
+        )
 
     @property
     def mounting(self) -> Array:
@@ -103,18 +134,25 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     """Puts a drive on one time axis, at `base_link`; RecordingError: no overlap in time."""
     # Without corrections it is used bit for bit; else noisy poses are smoothed by local parabolas.
     recording, period = drive.recording, drive.settings.control_period_s
-    if calibration.is_exact and (shared := _shared_stamps(recording, period)) is not None:
+    if (
+        calibration.is_exact
+        and (shared := _shared_stamps(recording, period)) is not None
+    ):
         samples = samples_on_one_clock(*shared)
         return replace(samples, dt=part_of(period, samples.dt))
     grid, step = _grid(recording, calibration, period)
     half_width = SMOOTHING_BURSTS * calibration.burst_period_s
-    if not half_width and (calibration.position_noise_m or calibration.heading_noise_rad):
+    if not half_width and (
+        calibration.position_noise_m or calibration.heading_noise_rad
+    ):
         half_width = SMOOTHING_S
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
-        grid, poses_at(drive, calibration, grid, half_width), states_at(drive, calibration, grid),
+        grid,
+        poses_at(drive, calibration, grid, half_width),
+        states_at(drive, calibration, grid),
         taken(recording.command, drive.spec, calibration.inputs, begin, begin + step),
-    )  # fmt: skip
+    )
     known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
     if recording.state is not None:
         known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
@@ -128,17 +166,23 @@ def part_of(period: float, step: float) -> float:
     return step if abs(count - whole) < WHOLE else period / whole
 
 
-def poses_at(drive: Drive, calibration: Calibration, grid: Array, half_width: float) -> Array:
+def poses_at(
+    drive: Drive, calibration: Calibration, grid: Array, half_width: float
+) -> Array:
     """Returns poses (T, 3) of `base_link` at times on the commands' clock, by a half-width [s]."""
     t, pose = drive.sample_t + calibration.clock_offset_s, drive.recording.pose
-    return calibration.to_base(resample(t, unwrapped(pose.values), grid, half_width, pose.weights))
+    return calibration.to_base(
+        resample(t, unwrapped(pose.values), grid, half_width, pose.weights)
+    )
 
 
 def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     """Returns states (T, S), measured or inferred, at uniform times (T,) on the commands' clock."""
     recording = drive.recording
     if recording.state is not None:
-        states = [np.interp(grid, recording.state.t, c) for c in recording.state.values.T]
+        states = [
+            np.interp(grid, recording.state.t, c) for c in recording.state.values.T
+        ]
         return np.stack(states, axis=-1) if states else np.zeros((*grid.shape, 0))
     lags = np.array([r.lag_s for r in calibration.responses])
     gains = np.array([r.gain for r in calibration.responses])
@@ -147,11 +191,15 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     longer = np.concatenate([grid[0] + step * np.arange(-lead, 0), grid])
     late = delays([r.command for r in calibration.responses], calibration.inputs)
     latency, motors = calibration.command_latency_s + late, calibration.motors
-    inferred = inferred_states(recording.command, drive.spec, lags, latency, longer, motors)
+    inferred = inferred_states(
+        recording.command, drive.spec, lags, latency, longer, motors
+    )
     return np.asarray(gains * inferred[lead:])
 
 
-def _shared_stamps(recording: Recording, period: float) -> tuple[Array, Array, Array, Array] | None:
+def _shared_stamps(
+    recording: Recording, period: float
+) -> tuple[Array, Array, Array, Array] | None:
     """Returns stamps (T,), poses, states, commands of the rows on one grid, a part of a period."""
     pose, state, command = recording.pose, recording.state, recording.command
     if state is None or not (usual := float(np.median(np.diff(pose.t)))) > 0.0:
@@ -161,7 +209,9 @@ def _shared_stamps(recording: Recording, period: float) -> tuple[Array, Array, A
         return None
     since = [s.t - pose.t[0] for s in (pose, state, command)]
     tick = [np.round(t / step) for t in since]
-    off = max(float(np.abs(t - n * step).max()) for t, n in zip(since, tick, strict=True))
+    off = max(
+        float(np.abs(t - n * step).max()) for t, n in zip(since, tick, strict=True)
+    )
     if off > UNIFORM * max(1.0, float(pose.t[-1] - pose.t[0])):
         return None
     ticks, at_pose, at_state = np.intersect1d(tick[0], tick[1], return_indices=True)
@@ -169,17 +219,27 @@ def _shared_stamps(recording: Recording, period: float) -> tuple[Array, Array, A
     if len(ticks) < SHARED * max(map(len, tick)):
         return None
     at = at_pose[both]
-    return pose.t[at], pose.values[at], state.values[at_state[both]], command.values[at_command]
+    return (
+        pose.t[at],
+        pose.values[at],
+        state.values[at_state[both]],
+        command.values[at_command],
+    )
 
 
-def _grid(recording: Recording, calibration: Calibration, period: float) -> tuple[Array, float]:
+def _grid(
+    recording: Recording, calibration: Calibration, period: float
+) -> tuple[Array, float]:
     """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock.
 
     And their step [s], a part of a period [s].
     """
     pose = recording.pose.t + calibration.clock_offset_s
     step = float(np.median(np.diff(pose)))
-    if calibration.burst_period_s > 0.0 or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]:
+    if (
+        calibration.burst_period_s > 0.0
+        or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]
+    ):
         step = STEP_S
     step = part_of(period, step)
     first = max(pose[0], recording.command.t[0] + calibration.command_latency_s)
@@ -189,7 +249,9 @@ def _grid(recording: Recording, calibration: Calibration, period: float) -> tupl
     count = int(np.floor((last - first) / step + 1e-6))
     if count < MIN_STAMPS:
         fault = f"commands and poses overlap for {max(last - first, 0.0):.2f} s only"
-        raise RecordingError(f"{recording.source}: {fault}; check that they are of one drive.")
+        raise RecordingError(
+            f"{recording.source}: {fault}; check that they are of one drive."
+        )
     return np.asarray(first + step * np.arange(count + 1)), step
 
 

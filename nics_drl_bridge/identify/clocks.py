@@ -13,20 +13,34 @@ from nics_drl_bridge.identify import signals
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import Motors
-from nics_drl_bridge.identify.statistics import minimise, standard_errors, uncertainty, unexplained
+from nics_drl_bridge.identify.statistics import (
+    minimise,
+    standard_errors,
+    uncertainty,
+    unexplained,
+)
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Target = tuple[Array, Array, Array]  # start (n,), end (n,) of intervals, a signal's means (n, K)
-Residual = Callable[[Array], Array]  # of a trial delay [s] and maybe the logarithms of lags
-Left = Callable[..., Array]  # residual by lags (S,), delays () or (S,) [s], and maybe motors
+Target = tuple[
+    Array, Array, Array
+]  # start (n,), end (n,) of intervals, a signal's means (n, K)
+Residual = Callable[
+    [Array], Array
+]  # of a trial delay [s] and maybe the logarithms of lags
+Left = Callable[
+    ..., Array
+]  # residual by lags (S,), delays () or (S,) [s], and maybe motors
 
 STEP_S = 0.01
 LEAD_S = 2.0  # for the states to forget their initial values
 STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 5.0
-BOUNDS = ((-0.5, np.log(0.005)), (0.5, np.log(2.0)))  # of the delay [s], of log(lag / s)
+BOUNDS = (
+    (-0.5, np.log(0.005)),
+    (0.5, np.log(2.0)),
+)  # of the delay [s], of log(lag / s)
 MAX_ROWS, FEW_ROWS = 2000, 1000
 EXACT = 1e-6
 LONG_STEP = 1.5  # a step longer than this many usual steps is a gap
@@ -38,11 +52,21 @@ MIN_TIME_S = 5e-4
 CERTAIN = 3.0  # a correction below this many standard uncertainties is not made
 CLUSTER_S = 2.5  # residuals further apart are independent
 NO_LAG_S = 0.005
-MOST_UNEXPLAINED = 0.5  # share of a motion's variance, beyond which no delay is believed
-EARLY_WORTH = 0.8  # a motion precedes its commands if that takes what is left to this share
+MOST_UNEXPLAINED = (
+    0.5  # share of a motion's variance, beyond which no delay is believed
+)
+EARLY_WORTH = (
+    0.8  # a motion precedes its commands if that takes what is left to this share
+)
 # The delay is sought in so many parts of a drive, this far around that of the whole. It drifts if
 # it grows by more than the least, and the parts lie on a line to this share of its growth.
-DRIFT_PARTS, DRIFT_REACH_S, DRIFT_STEP_S, LEAST_DRIFT_S, DRIFT_OFF = 4, 0.6, 0.03, 0.12, 0.25
+DRIFT_PARTS, DRIFT_REACH_S, DRIFT_STEP_S, LEAST_DRIFT_S, DRIFT_OFF = (
+    4,
+    0.6,
+    0.03,
+    0.12,
+    0.25,
+)
 MIN_EARLY_S = 0.03  # smaller ones may be a lag of another form
 TOLD_S = 0.005  # a latency that is less certain can't be told from a lag
 
@@ -59,9 +83,12 @@ class DelayEstimate:
 
 
 def delay_of_response(
-    command: Stream, spec: RobotSpec, target: Target, centers: tuple[float, ...] = (0.0,),
+    command: Stream,
+    spec: RobotSpec,
+    target: Target,
+    centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
-) -> DelayEstimate:  # fmt: skip
+) -> DelayEstimate:
     """Estimates a signal's delay around centers [s], and the moved commands' lags if unknown."""
     moved = signals.moved_inputs(command, spec)[: len(spec.state)]
     free = np.flatnonzero(moved if lags is None else [])
@@ -79,14 +106,18 @@ def delay_of_response(
     return replace(found, lags=tau, lag_sigma=sigma)
 
 
-def response_residual(command: Stream, spec: RobotSpec, target: Target, order: int = 2) -> Left:
+def response_residual(
+    command: Stream, spec: RobotSpec, target: Target, order: int = 2
+) -> Left:
     """Returns the residual of a signal explained by commands, given lags and delays (S,) [s]."""
     (start, end, signal), moved = target, signals.moved_inputs(command, spec)
     powers = taylor.exponents(len(moved), order)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
-    def residual(lags: Array, delay: Array | float, motors: Motors | None = None) -> Array:
+    def residual(
+        lags: Array, delay: Array | float, motors: Motors | None = None
+    ) -> Array:
         if not spec.state:
             means = signals.held(command, spec, start - delay, end - delay, powers)
             return unexplained(means, signal)
@@ -108,7 +139,9 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
 
     def residual(theta: Array) -> Array:
         u = signals.held(command, spec, start - theta[0], end - theta[0])
-        return unexplained(np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates)
+        return unexplained(
+            np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates
+        )
 
     return residual
 
@@ -133,27 +166,40 @@ def residual_by_shift(state: Stream, target: Target) -> Residual:
     return residual
 
 
-def _search_or_zero(residual: Residual, centers: tuple[float, ...] = (0.0,)) -> DelayEstimate:
+def _search_or_zero(
+    residual: Residual, centers: tuple[float, ...] = (0.0,)
+) -> DelayEstimate:
     if np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
         return DelayEstimate(0.0, 0.0, np.zeros(0), np.zeros(0), 1.0)
     return _search(residual, centers, np.zeros(0))
 
 
-def _search(residual: Residual, centers: tuple[float, ...], lags: Array) -> DelayEstimate:
+def _search(
+    residual: Residual, centers: tuple[float, ...], lags: Array
+) -> DelayEstimate:
     """Finds the delay on ever finer grids, then refines it together with the lags' logarithms."""
     around, log_lags = np.array(centers), np.log(lags)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
-        tries = np.add.outer(around, np.arange(-reach, reach + step / 2.0, step)).ravel()
+        tries = np.add.outer(
+            around, np.arange(-reach, reach + step / 2.0, step)
+        ).ravel()
         cost = [float((residual(np.append(d, log_lags)) ** 2).sum()) for d in tries]
         around = tries[[int(np.argmin(cost))]]
     start = np.append(around, log_lags)
-    low, high = (np.append(start[0] + reach, np.full(len(lags), limit)) for reach, limit in BOUNDS)
-    found, jacobian, rest = minimise(residual, start, np.full(len(start), 0.1), (low, high))
+    low, high = (
+        np.append(start[0] + reach, np.full(len(lags), limit))
+        for reach, limit in BOUNDS
+    )
+    found, jacobian, rest = minimise(
+        residual, start, np.full(len(start), 0.1), (low, high)
+    )
     if float((rest**2).sum()) >= min(cost):
         found, rest = start, residual(start)
     sigma, tau = uncertainty(jacobian, rest), np.exp(found[1:])
     explained = 1.0 - float((rest**2).mean())
-    return DelayEstimate(float(found[0]), float(sigma[0]), tau, sigma[1:] * tau, explained)
+    return DelayEstimate(
+        float(found[0]), float(sigma[0]), tau, sigma[1:] * tau, explained
+    )
 
 
 @dataclass(frozen=True)
@@ -166,8 +212,12 @@ class TimingEstimate:
     lags: Array  # (S,) of the inferred states [s]; empty if the state was measured
     lag_sigma: Array  # (S,) [s]; NaN for a nominal lag
     separated: bool  # True if offset and latency could be separated
-    early: float = 0.0  # by which motion on the commands' clock precedes them: no clock of it [s]
-    drift: float = 0.0  # by which the pose's clock gains on the commands' [s/s]; 0 if none shows
+    early: float = (
+        0.0  # by which motion on the commands' clock precedes them: no clock of it [s]
+    )
+    drift: float = (
+        0.0  # by which the pose's clock gains on the commands' [s/s]; 0 if none shows
+    )
     # (S,) by which inferred states follow their commands after the latency, beside lags [s]
     delays: Array = field(default_factory=lambda: np.zeros(1))
     motors: Motors | None = None  # of inferred states; None if nothing holds them back
@@ -182,11 +232,15 @@ def timing_of(drive: Drive) -> TimingEstimate:
         fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
         inspect = f"`nics inspect {place} --map my.yaml`"
         advice = f"begin a mapping, whose robots need none, with {inspect}"
-        advice += ", or record the state too, or add `follows:` to the robot's YAML file"
+        advice += (
+            ", or record the state too, or add `follows:` to the robot's YAML file"
+        )
         raise RecordingError(f"{place}: {fault}; {advice}.")
     if len(twists.start) < MIN_STAMPS:
         fault = f"pose: only {len(twists.start)} usable intervals"
-        raise RecordingError(f"{place}: {fault}; record a drive of 20 s or more without long gaps.")
+        raise RecordingError(
+            f"{place}: {fault}; record a drive of 20 s or more without long gaps."
+        )
     if state is not None:
         return _timing_of_measured_state(drive, state)
     if not signals.moved_commands(command).any():
@@ -203,21 +257,29 @@ def timing_of(drive: Drive) -> TimingEstimate:
     if early and not _explains(left_over, delay):
         early = 0.0
     drift = 0.0 if recording.episodes else _drift(command, spec, target, delay)
-    return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early, drift)
+    return TimingEstimate(
+        0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early, drift
+    )
 
 
 def _explains(left_over: Left, delay: DelayEstimate) -> bool:
     """True if a delay explains a motion that no delay leaves unexplained."""
     quick = np.minimum(delay.lags, NO_LAG_S)
-    at_once = min(float((left_over(lags, 0.0) ** 2).mean()) for lags in (delay.lags, quick))
+    at_once = min(
+        float((left_over(lags, 0.0) ** 2).mean()) for lags in (delay.lags, quick)
+    )
     left = 1.0 - delay.explained
     return left < MOST_UNEXPLAINED and left < EARLY_WORTH * at_once
 
 
-def _drift(command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimate) -> float:
+def _drift(
+    command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimate
+) -> float:
     """Returns the rate [s/s] at which a delay grows over a drive; 0 if it does not steadily."""
     start, end, signal = target
-    tries = delay.value + np.arange(-DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S)
+    tries = delay.value + np.arange(
+        -DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S
+    )
     middles, found = [], []
     for part in np.array_split(np.arange(len(start)), DRIFT_PARTS):
         if len(part) < FEW_ROWS // 10:
@@ -238,18 +300,28 @@ def _drift(command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimat
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
     """Returns nominal lags and no latency: nothing was estimated."""
-    lags = signals.nominal_lags(drive.spec) if drive.recording.state is None else np.zeros(0)
+    lags = (
+        signals.nominal_lags(drive.spec)
+        if drive.recording.state is None
+        else np.zeros(0)
+    )
     return TimingEstimate(offset, 0.0, {}, lags, np.full(len(lags), np.nan), False)
 
 
-def _timing_of_two_clocks(recording: Recording, spec: RobotSpec, target: Target) -> TimingEstimate:
+def _timing_of_two_clocks(
+    recording: Recording, spec: RobotSpec, target: Target
+) -> TimingEstimate:
     """Estimates offset and latency apart if the wheels follow the commands, else their sum."""
     wheels = _wheel_delay(recording, spec)
     lags = None if wheels is None else wheels.lags
-    delay = delay_of_response(recording.command, spec, target, _likely_shifts(recording), lags)
+    delay = delay_of_response(
+        recording.command, spec, target, _likely_shifts(recording), lags
+    )
     if wheels is None:
         sigma = {"clock_offset_s": delay.sigma}
-        return TimingEstimate(-delay.value, 0.0, sigma, delay.lags, delay.lag_sigma, False)
+        return TimingEstimate(
+            -delay.value, 0.0, sigma, delay.lags, delay.lag_sigma, False
+        )
     both, latency = float(np.hypot(wheels.sigma, delay.sigma)), max(wheels.value, 0.0)
     sigma = {"clock_offset_s": both, "command_latency_s": wheels.sigma}
     offset = latency - delay.value
@@ -271,7 +343,9 @@ def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
         delay = _search_or_zero(by_shift, _likely_shifts(recording))
         sigma["clock_offset_s"] = delay.sigma
         offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
-    return TimingEstimate(offset, latency, sigma, np.zeros(0), np.zeros(0), separated, early)
+    return TimingEstimate(
+        offset, latency, sigma, np.zeros(0), np.zeros(0), separated, early
+    )
 
 
 def _likely_shifts(recording: Recording) -> tuple[float, ...]:
@@ -285,7 +359,9 @@ def _wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
     if wheels is None or wheels.clock != recording.command.clock:
         return None
     tick = float(np.median(np.diff(wheels.t)))
-    found = delay_of_response(recording.command, spec, (wheels.t - tick, wheels.t, wheels.values))
+    found = delay_of_response(
+        recording.command, spec, (wheels.t - tick, wheels.t, wheels.values)
+    )
     if not found.explained > WHEELS_EXPLAINED:
         return None
     return replace(found, sigma=float(np.hypot(found.sigma, WITHIN_TICK * tick)))
@@ -296,7 +372,9 @@ def if_certain(value: float, sigma: float, least: float) -> float:
     return value if abs(value) > max(CERTAIN * sigma, least) else 0.0
 
 
-def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate) -> Array:
+def expected_states(
+    drive: Drive, twists: TwistIntervals, timing: TimingEstimate
+) -> Array:
     """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
     command, state = drive.recording.command, drive.recording.state
     start, end = twists.on_clock(timing.offset)
@@ -304,12 +382,17 @@ def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate
         return signals.interval_means(state.t, state.values, start, end)
     grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
     late = timing.latency + timing.delays
-    states = signals.inferred_states(command, drive.spec, timing.lags, late, grid, timing.motors)
+    states = signals.inferred_states(
+        command, drive.spec, timing.lags, late, grid, timing.motors
+    )
     return signals.interval_means(grid, states, start, end)
 
 
 def responses_of(
-    drive: Drive, calibration: Calibration, timing: TimingEstimate, expected: Array | None
+    drive: Drive,
+    calibration: Calibration,
+    timing: TimingEstimate,
+    expected: Array | None,
 ) -> tuple[Response, ...]:
     """Returns the inferred states, of which a speed is scaled by that `expected` (n,) at gain 1."""
     spec = drive.spec
@@ -318,7 +401,9 @@ def responses_of(
     gains, speed = np.ones(len(spec.state)), signals.speed_index(spec)
     moved = signals.moved_inputs(drive.recording.command, spec)
     if speed is not None and expected is not None and moved[speed]:
-        gains[speed] = float(expected @ speed_along(drive, calibration) / (expected @ expected))
+        gains[speed] = float(
+            expected @ speed_along(drive, calibration) / (expected @ expected)
+        )
     return tuple(
         Response(v.name, str(v.follows), float(lag), float(gain))
         for v, lag, gain in zip(spec.state, timing.lags, gains, strict=True)
@@ -328,7 +413,9 @@ def responses_of(
 def speed_along(drive: Drive, calibration: Calibration) -> Array:
     """Returns the speed (n,) of `base_link` along x over the intervals of the twists."""
     angle, (ux, uy, wz) = calibration.rotation_rad, drive.twists.twist.T
-    return np.asarray(np.cos(angle) * ux + np.sin(angle) * uy + calibration.lever_arm_m[1] * wz)
+    return np.asarray(
+        np.cos(angle) * ux + np.sin(angle) * uy + calibration.lever_arm_m[1] * wz
+    )
 
 
 def wheel_means(drive: Drive, calibration: Calibration) -> Array | None:

@@ -14,7 +14,9 @@ from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.taylor import EndErrors
 
 OF_PATH = " of the path"
-ENOUGH_S = 60.0  # of a drive; the errors of a longer one have other causes than its length
+ENOUGH_S = (
+    60.0  # of a drive; the errors of a longer one have other causes than its length
+)
 UNSEEN = "otherwise a policy would rely on motion the model never saw"
 UNTRIED = "The drive was too short to test the model on unseen data."
 
@@ -52,7 +54,9 @@ def conclude(identified: Identified) -> Conclusion:
     )
     beyond = *narrow(identified.recording, spec), overdriven(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)
-    ready = assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed
+    ready = (
+        assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed
+    )
     advice = f"Next: {_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
     told = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
     return Conclusion(assessment.verdict, told, about, gaps, advice, ready)
@@ -73,7 +77,9 @@ def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -
     if identified.verdict is Verdict.GOOD:
         return f"train a policy in the simulator{first}"
     if identified.verdict is Verdict.WITH_CARE:
-        wide = "under a randomisation as wide as this error, and drive it slowly at first"
+        wide = (
+            "under a randomisation as wide as this error, and drive it slowly at first"
+        )
         return f"train a policy {wide}{first}"
     if duration < ENOUGH_S:
         return f"record another drive, longer than these {duration:.0f} s, and generate again"

@@ -9,13 +9,22 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Order
-from nics_drl_bridge.identify.signals import DIFFERENCE, DIFFERENCE_GAIN, GAUSSIAN_MAD, unwrapped
+from nics_drl_bridge.identify.signals import (
+    DIFFERENCE,
+    DIFFERENCE_GAIN,
+    GAUSSIAN_MAD,
+    unwrapped,
+)
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MIN_STAMPS = 20
-BURSTY = 5.0  # in bursts the mean interval is more than this many times the 30th percentile
-WITHIN_BURST = 0.25  # stamps less than this share of the period apart belong to one burst
+BURSTY = (
+    5.0  # in bursts the mean interval is more than this many times the 30th percentile
+)
+WITHIN_BURST = (
+    0.25  # stamps less than this share of the period apart belong to one burst
+)
 UNEVEN = 0.5
 LEAST_WHOLE = 0.1  # share of gap-free stretches from which on only those are used
 NEGLIGIBLE = 1e-6  # m, rad
@@ -32,8 +41,12 @@ class Settings:
 
     order: Order = ORDER  # of the Taylor expansion (Eq. 1), or `auto`
     alpha: Alpha = ALPHA  # of the pruning (Eq. 2), or `auto`
-    train_until_s: float = float("inf")  # end of the part to learn from, from the first pose
-    assume: bool = False  # completes the model by the textbook for inputs that never moved
+    train_until_s: float = float(
+        "inf"
+    )  # end of the part to learn from, from the first pose
+    assume: bool = (
+        False  # completes the model by the textbook for inputs that never moved
+    )
     strict: bool = False  # refuses a drive that did not move every input independently
     control_period_s: float = 0.1  # of which the model's step is to be a part
 
@@ -48,7 +61,9 @@ class Drive:
 
     def part(self, recording: Recording) -> "Drive":
         """Returns a drive of the same robot with other streams."""
-        return self if recording is self.recording else replace(self, recording=recording)
+        return (
+            self if recording is self.recording else replace(self, recording=recording)
+        )
 
     def under(self, settings: Settings) -> "Drive":
         """Returns the same drive, as far as it is prepared, with other options."""
@@ -74,13 +89,19 @@ class Drive:
     @cached_property
     def dated(self) -> Stream:
         """Poses with the best known time: the newest of each burst, or all."""
-        return self.recording.pose.rows(slice(None) if self.bursts is None else self.bursts.newest)
+        return self.recording.pose.rows(
+            slice(None) if self.bursts is None else self.bursts.newest
+        )
 
     def trust(self, start: Array, end: Array) -> Array:
         """Returns weights (..., 3) of motions from start to end on the pose's clock, usually 1."""
         variance = 1.0 / self.recording.pose.weights
         columns = [
-            (np.interp(start, self.sample_t, each) + np.interp(end, self.sample_t, each)) / 2.0
+            (
+                np.interp(start, self.sample_t, each)
+                + np.interp(end, self.sample_t, each)
+            )
+            / 2.0
             for each in variance.T
         ]
         return np.asarray(1.0 / np.stack(columns, axis=-1))
@@ -99,9 +120,15 @@ class Drive:
         else:
             dt = float(np.median(np.diff(t)))
             coarse = max(1, round(MAX_SPAN_S / dt))
-            far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse]))
+            far = geometry.log(
+                geometry.between(pose[:-coarse:coarse], pose[coarse::coarse])
+            )
             far = far / (coarse * dt)
-            speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
+            speed = (
+                float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean()))
+                if len(far)
+                else 0.0
+            )
             turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
             both = zip(self.pose_noise or (0.0, 0.0), (speed, turn), strict=True)
             needed = max(noise / max(SLOPE_NOISE * size, 1e-9) for noise, size in both)
@@ -109,7 +136,10 @@ class Drive:
         t, pose = t[::stride], pose[::stride]
         span = np.diff(t)
         usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
-        twist = geometry.log(geometry.between(pose[:-1], pose[1:])[usable]) / span[usable, None]
+        twist = (
+            geometry.log(geometry.between(pose[:-1], pose[1:])[usable])
+            / span[usable, None]
+        )
         return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
 
 
@@ -157,7 +187,11 @@ def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | Non
         sigma = _spread_at_rest(unwrapped(pose.values))
     else:
         rest = pose_residual(pose)
-        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD if len(rest) >= DIFFERENCE else None
+        sigma = (
+            np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
+            if len(rest) >= DIFFERENCE
+            else None
+        )
     if sigma is None:
         return None
     sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)
@@ -166,7 +200,9 @@ def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | Non
 
 def pose_residual(pose: Stream) -> Array:
     """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
-    rest = np.asarray(np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN)
+    rest = np.asarray(
+        np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+    )
     if not len(rest):
         return rest
     span = np.diff(pose.t)

@@ -13,31 +13,44 @@ from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_o
 from nics_drl_bridge.robot.spec import RobotSpec
 
 STILL = 1e-3  # a variable whose spread is below this share of its range did not move
-NOISE_ONLY = 1.5  # nor did a state below this multiple of its noise whose command did not move
+NOISE_ONLY = (
+    1.5  # nor did a state below this multiple of its noise whose command did not move
+)
 DEPENDENT = 1e-7  # a normalised feature with a smaller part orthogonal to those before is a copy
-TOGETHER = 1e-3  # commands are linearly dependent if a normalised combination is smaller
+TOGETHER = (
+    1e-3  # commands are linearly dependent if a normalised combination is smaller
+)
 MIN_SAMPLES_PER_TERM = 5
-NEGLIGIBLE = 1e-3  # a velocity component below this share of the other one is modelled as zero
+NEGLIGIBLE = (
+    1e-3  # a velocity component below this share of the other one is modelled as zero
+)
 NOISY = 5e-4  # a measured state is noisy if its noise exceeds this share of its range
 BULK = 0.75  # share of the rows used in the initial fit
 CONCENTRATIONS = 12
 FAR = 8.0  # an outlier is this many standard deviations of the bulk away
 LEAST = 1e-6  # rates below this, in SI units, are rounding errors and never outliers
-USUAL = (5.0, 95.0)  # percentiles that bound the usual range; jumps in 5 % of the rows lie outside
+USUAL = (
+    5.0,
+    95.0,
+)  # percentiles that bound the usual range; jumps in 5 % of the rows lie outside
 MOST = 0.2  # a larger share of rows is not outliers but a misfit of the model
 BEYOND = 0.5  # a value beyond its limits by this share of its range is a sensor fault
 # If there are outliers, the misfit of the rest is estimated from its tail, not from its median.
 BULK_PERCENTILE, GAUSSIAN_BULK = 90.0, 1.645
 GRID_S = 0.05
 ENDS = (2.0, 98.0)  # percentiles that bound the range of a command
-NARROW = 0.4  # a drive over a smaller share of a command's range says little about the rest
+NARROW = (
+    0.4  # a drive over a smaller share of a command's range says little about the rest
+)
 
 
 @dataclass(frozen=True)
 class Excitation:
     """Excitation of a robot's variables by a drive."""
 
-    unmoved: tuple[str, ...]  # variables that the drive never moved, so that no term contains them
+    unmoved: tuple[
+        str, ...
+    ]  # variables that the drive never moved, so that no term contains them
     together: tuple[str, ...]  # commands that moved, but were linearly dependent
     levels: dict[str, int]  # number of different values of each command, at most 10
 
@@ -56,7 +69,9 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     noise_only = spread < NOISE_ONLY * white_noise(samples.x)
     named = dict(zip(spec.variable_names, still, strict=True))
     for i, variable in enumerate(spec.state):
-        followed = [variable.follows] if variable.follows else [c.name for c in spec.command]
+        followed = (
+            [variable.follows] if variable.follows else [c.name for c in spec.command]
+        )
         still[i] |= noise_only[i] and all(named[name] for name in followed)
     return tuple(n for n, s in zip(spec.variable_names, still, strict=True) if s)
 
@@ -73,7 +88,9 @@ def combinations(samples: Samples, spec: RobotSpec) -> Array:
     reach = np.array([c.max - c.min for c in spec.command])
     moved = np.flatnonzero(command.std(axis=0) >= STILL * reach)
     unit = command[:, moved] - command[:, moved].mean(axis=0)
-    size, axes = np.linalg.svd(unit / np.linalg.norm(unit, axis=0), full_matrices=False)[1:]
+    size, axes = np.linalg.svd(
+        unit / np.linalg.norm(unit, axis=0), full_matrices=False
+    )[1:]
     found = np.zeros((np.count_nonzero(size <= TOGETHER), len(reach)))
     found[:, moved] = axes[size <= TOGETHER]
     return found
@@ -82,7 +99,9 @@ def combinations(samples: Samples, spec: RobotSpec) -> Array:
 def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
     """Returns the number of different values of each command; more than ten count as ten."""
     columns = zip(spec.command, samples.x[:, len(spec.state) :].T, strict=True)
-    return {c.name: min(10, len(np.unique(np.round(values, 9)))) for c, values in columns}
+    return {
+        c.name: min(10, len(np.unique(np.round(values, 9)))) for c, values in columns
+    }
 
 
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -91,12 +110,17 @@ def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]
     One that is nothing but zeros counts as a copy.
     """
     unit = chi / np.maximum(np.linalg.norm(chi, axis=0), np.finfo(np.float64).tiny)
-    apart = np.abs(np.diag(qr(unit, mode="r")[0])) > DEPENDENT  # no pivoting: from predecessors
+    apart = (
+        np.abs(np.diag(qr(unit, mode="r")[0])) > DEPENDENT
+    )  # no pivoting: from predecessors
     return np.flatnonzero(apart), np.flatnonzero(~apart)
 
 
 def moved_terms(
-    samples: Samples, powers: NDArray[np.int64], names: tuple[str, ...], unmoved: tuple[str, ...]
+    samples: Samples,
+    powers: NDArray[np.int64],
+    names: tuple[str, ...],
+    unmoved: tuple[str, ...],
 ) -> NDArray[np.int64]:
     """Returns the terms (K, V) of variables that moved; refuses too few samples for them."""
     still = [names.index(name) for name in unmoved]
@@ -105,7 +129,9 @@ def moved_terms(
         few = f"{len(samples.t)} samples are too few for {len(moved)} terms"
         raise FitError(f"{few}; drive for longer, or lower the order.")
     if len(unmoved) == len(names):
-        raise FitError("no command ever changed, so nothing can be learnt; vary each command.")
+        raise FitError(
+            "no command ever changed, so nothing can be learnt; vary each command."
+        )
     return moved
 
 
@@ -124,7 +150,9 @@ def terms_through_state(
 def moving_dofs(dq: Array) -> tuple[int, ...]:
     """Returns the indices of the rates (T, D) that move: vx, vy if not negligible, the others."""
     size = np.sqrt((dq**2).mean(axis=0))
-    return tuple(d for d in range(len(size)) if d > 1 or size[d] > NEGLIGIBLE * size[:2].max())
+    return tuple(
+        d for d in range(len(size)) if d > 1 or size[d] > NEGLIGIBLE * size[:2].max()
+    )
 
 
 def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
@@ -137,13 +165,17 @@ def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
     """Selects the rows of a target (T,) on features (T, K) that are no outliers."""
     everything = np.ones(len(target), dtype=np.bool_)
     plain = _left(chi, target)
-    if not (plain > max(FAR / 2.0 * float(np.median(plain)) / GAUSSIAN_MAD, usual)).any():
+    if not (
+        plain > max(FAR / 2.0 * float(np.median(plain)) / GAUSSIAN_MAD, usual)
+    ).any():
         return everything
     count = max(int(BULK * len(target)), min(len(target), chi.shape[1] + 1))
     bulk = np.argsort(np.abs(target - np.median(target)), kind="stable")[:count]
     for start in (np.argsort(plain, kind="stable")[:count], bulk):
         rest = _concentrated(chi, target, start)
-        inside = rest <= FAR * float(np.percentile(rest, BULK_PERCENTILE)) / GAUSSIAN_BULK
+        inside = (
+            rest <= FAR * float(np.percentile(rest, BULK_PERCENTILE)) / GAUSSIAN_BULK
+        )
         if inside.mean() >= 1.0 - MOST:
             return np.asarray(inside)
     return everything
@@ -154,7 +186,11 @@ def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
     low, high = np.array([[v.min, v.max] for v in (*spec.state, *spec.command)]).T
     margin = BEYOND * (high - low)
     inside = ((x >= low - margin) & (x <= high + margin)).all(axis=1)
-    return np.asarray(inside) if inside.mean() >= 1.0 - MOST else np.ones(len(x), dtype=np.bool_)
+    return (
+        np.asarray(inside)
+        if inside.mean() >= 1.0 - MOST
+        else np.ones(len(x), dtype=np.bool_)
+    )
 
 
 def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
@@ -168,9 +204,13 @@ def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
     return _left(chi, target, chosen)
 
 
-def _left(chi: Array, target: Array, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
+def _left(
+    chi: Array, target: Array, rows: NDArray[np.intp] | slice = slice(None)
+) -> Array:
     """Returns absolute residuals (T,) of the least squares on some rows."""
-    return np.abs(target - chi @ np.linalg.lstsq(chi[rows], target[rows], rcond=None)[0])
+    return np.abs(
+        target - chi @ np.linalg.lstsq(chi[rows], target[rows], rcond=None)[0]
+    )
 
 
 def usual_ranges(dq: Array) -> Array:
@@ -221,15 +261,22 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
     command = row[np.searchsorted(t, grid, side="right") - 1]
     nothing = np.zeros((len(grid), 3))
     samples = samples_on_one_clock(grid, nothing, nothing[:, :0], command)
-    found, own = Excitation.of(samples, spec.model_copy(update={"state": ()})), _own(samples.x)
+    found, own = (
+        Excitation.of(samples, spec.model_copy(update={"state": ()})),
+        _own(samples.x),
+    )
     low, high = np.percentile(command, ENDS, axis=0)
     share = (high - low) / (spec.command_high - spec.command_low)
     faults = dict.fromkeys(found.levels, "")
     faults |= dict.fromkeys(found.together, "moved only together with others")
     faults |= dict.fromkeys(found.unmoved, "never moved")
-    figures = zip(spec.command, np.stack([low, high, share, own], axis=1).tolist(), strict=True)
+    figures = zip(
+        spec.command, np.stack([low, high, share, own], axis=1).tolist(), strict=True
+    )
     return tuple(
-        CommandCoverage(c.name, c.unit, low, high, share, own, found.levels[c.name], faults[c.name])
+        CommandCoverage(
+            c.name, c.unit, low, high, share, own, found.levels[c.name], faults[c.name]
+        )
         for c, (low, high, share, own) in figures
     )
 
@@ -240,6 +287,9 @@ def _own(x: Array) -> Array:
     own = np.zeros(x.shape[1])
     for i, size in enumerate(np.linalg.norm(centred, axis=0)):
         others = np.delete(centred, i, axis=1)
-        rest = centred[:, i] - others @ np.linalg.lstsq(others, centred[:, i], rcond=None)[0]
+        rest = (
+            centred[:, i]
+            - others @ np.linalg.lstsq(others, centred[:, i], rcond=None)[0]
+        )
         own[i] = np.linalg.norm(rest) / size if size > 0.0 else 0.0
     return own

@@ -20,11 +20,15 @@ from nics_drl_bridge.threads import one_blas_thread
 
 Alpha = float | Literal["auto"]
 Order = int | Literal["auto"]
-Library = Callable[[NDArray[np.int64], RobotSpec], NDArray[np.bool_]]  # terms (D, K) of powers
+Library = Callable[
+    [NDArray[np.int64], RobotSpec], NDArray[np.bool_]
+]  # terms (D, K) of powers
 
 ALPHA: Alpha = 0.99
 ORDER = 2
-ROUNDING = 1e-9  # standardised coefficients below this share of the rates are rounding errors
+ROUNDING = (
+    1e-9  # standardised coefficients below this share of the rates are rounding errors
+)
 SAME_STEP, ROUNDING_S = 1e-3, 1e-6
 
 
@@ -50,7 +54,9 @@ class Regression:
     """Least squares of dQ/dt on all features (Eq. 1)."""
 
     samples: Samples  # T rows, without implausible ones
-    powers: NDArray[np.int64]  # (K, V) exponents of the features that moved, without copies
+    powers: NDArray[
+        np.int64
+    ]  # (K, V) exponents of the features that moved, without copies
     chi: Array  # (T, K) features
     beta: Array  # (D, K) standardised coefficients; zero where not allowed or insignificant
     inliers: NDArray[np.bool_]  # (D, T) rows that are no outliers
@@ -63,7 +69,9 @@ class Regression:
     def rows(self, d: int) -> tuple[Array, Array]:
         """Returns features (n, K) and rates (n,) of a degree of freedom without its outliers."""
         inside, target = self.inliers[d], self.samples.dq[:, d]
-        return (self.chi, target) if inside.all() else (self.chi[inside], target[inside])
+        return (
+            (self.chi, target) if inside.all() else (self.chi[inside], target[inside])
+        )
 
 
 @dataclass(frozen=True)
@@ -85,7 +93,8 @@ class Fit:
         found, names = self.regression, (self.model.dofs, self.model.variables)
         kept = {d: _kept(found, d, self.alpha, *names) for d in found.moving}
         return tuple(
-            replace(_curve(found, d, *names), kept=int(keep.sum())) for d, keep in kept.items()
+            replace(_curve(found, d, *names), kept=int(keep.sum()))
+            for d, keep in kept.items()
         )
 
     @property
@@ -96,16 +105,23 @@ class Fit:
 
 @one_blas_thread
 def fit(
-    samples: Samples, spec: RobotSpec, order: int = ORDER, alpha: Alpha = ALPHA, noisy: bool = False
+    samples: Samples,
+    spec: RobotSpec,
+    order: int = ORDER,
+    alpha: Alpha = ALPHA,
+    noisy: bool = False,
 ) -> Fit:
     """Fits and prunes a Taylor model; see `regress` and `pruned` for arguments and errors."""
     return pruned(regress(samples, spec, order, noisy), spec, alpha)
 
 
 def regress(
-    samples: Samples, spec: RobotSpec, order: int = ORDER, noisy: bool = False,
+    samples: Samples,
+    spec: RobotSpec,
+    order: int = ORDER,
+    noisy: bool = False,
     allowed: Library | None = None,
-) -> Regression:  # fmt: skip
+) -> Regression:
     """Fits all features of order 1 to 4 (Eq. 1); FitError: too few samples, or nothing moved."""
     # Of those that a library, if any, allows each degree of freedom.
     # `noisy` is any recording but an exact one: insignificant terms are dropped before Eq. 2, and
@@ -127,7 +143,10 @@ def regress(
             terms[:3] = excitation.terms_through_state(kept, spec, excited.unmoved)
     else:
         terms = allowed(kept, spec)
-    usual, moving = excitation.usual_ranges(samples.dq), excitation.moving_dofs(samples.dq)
+    usual, moving = (
+        excitation.usual_ranges(samples.dq),
+        excitation.moving_dofs(samples.dq),
+    )
     for d in moving:
         some, target = chi[:, terms[d]], samples.dq[:, d]
         used[d] = excitation.inliers(some / _scale(some), target, float(usual[d]))
@@ -140,11 +159,17 @@ def regress(
         if len(used_terms):
             beta[d, used_terms] = np.linalg.lstsq(unit, target, rcond=None)[0]
     return Regression(
-        samples, kept, chi, beta, used, moving, excited,
+        samples,
+        kept,
+        chi,
+        beta,
+        used,
+        moving,
+        excited,
         dependent=tuple(taylor.term_name(row, names) for row in powers[dependent]),
         terms_total=samples.dq.shape[1] * len(every),
         left_out=1.0 - float(believed.mean()),
-    )  # fmt: skip
+    )
 
 
 def _scale(chi: Array) -> Array:
@@ -164,7 +189,9 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
     # With the one that crosses it (Eq. 2); those up to `noise_floor` are rounding errors.
     order = by_weight(beta, noise_floor)
     size = np.abs(beta[order])
-    return np.isin(np.arange(len(beta)), order[np.cumsum(size) - size < alpha * size.sum()])
+    return np.isin(
+        np.arange(len(beta)), order[np.cumsum(size) - size < alpha * size.sum()]
+    )
 
 
 def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:
@@ -172,7 +199,11 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
     # The term that crosses the share is kept: else a differential robot would lose a wheel. `auto`
     # keeps as many terms, in the same order, as improve the cross-validated error.
     samples, shape = regression.samples, regression.beta.shape
-    coefficients, errors, conditions = np.zeros(shape), np.zeros(shape), np.ones(shape[0])
+    coefficients, errors, conditions = (
+        np.zeros(shape),
+        np.zeros(shape),
+        np.ones(shape[0]),
+    )
     noisy_state = excitation.states_are_noisy(samples, spec)
     for d in regression.moving:
         chi, target = regression.rows(d)
@@ -183,26 +214,40 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
             beta = np.linalg.lstsq(unit[:, keep], target, rcond=None)[0]
             rest = target - unit[:, keep] @ beta
             coefficients[d, keep] = beta / scale[keep]
-            errors[d, keep] = statistics.standard_errors(unit[:, keep], rest) / scale[keep]
+            errors[d, keep] = (
+                statistics.standard_errors(unit[:, keep], rest) / scale[keep]
+            )
         if noisy_state and d >= 3:
             _reestimate(coefficients[d], errors[d], d, regression, len(spec.state))
         conditions[d] = statistics.condition(chi[:, keep])
     used = np.abs(coefficients).sum(axis=0) > 0.0
     model = TaylorModel(
-        spec.variable_names, spec.dof_names, spec.dof_units, regression.powers[used],
-        coefficients[:, used], samples.dt, samples.x.min(axis=0), samples.x.max(axis=0),
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        regression.powers[used],
+        coefficients[:, used],
+        samples.dt,
+        samples.x.min(axis=0),
+        samples.x.max(axis=0),
         std_errors=errors[:, used],
-    )  # fmt: skip
+    )
     rmse, r2 = statistics.errors_of(model, samples)
     for d in regression.moving:
         if not (inside := regression.inliers[d]).all():
-            rmse[d], r2[d] = (each[d] for each in statistics.errors_of(model, samples.rows(inside)))
+            rmse[d], r2[d] = (
+                each[d] for each in statistics.errors_of(model, samples.rows(inside))
+            )
     outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
     return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
 
 
 def _kept(
-    regression: Regression, d: int, alpha: Alpha, dofs: tuple[str, ...], variables: tuple[str, ...]
+    regression: Regression,
+    d: int,
+    alpha: Alpha,
+    dofs: tuple[str, ...],
+    variables: tuple[str, ...],
 ) -> NDArray[np.bool_]:
     """Returns a mask (K,) of the terms that a degree of freedom keeps."""
     beta, floor = regression.beta[d], _floor(regression, d)
@@ -220,7 +265,10 @@ def _curve(
     regression: Regression, d: int, dofs: tuple[str, ...], variables: tuple[str, ...]
 ) -> statistics.Curve:
     """Returns the accuracy of a degree of freedom by its first terms; `kept` is the knee."""
-    order, (chi, target) = by_weight(regression.beta[d], _floor(regression, d)), regression.rows(d)
+    order, (chi, target) = (
+        by_weight(regression.beta[d], _floor(regression, d)),
+        regression.rows(d),
+    )
     names = tuple(taylor.term_name(row, variables) for row in regression.powers[order])
     return statistics.curve(dofs[d], names, (chi / _scale(chi))[:, order], target)
 
@@ -231,8 +279,14 @@ def _reestimate(
     """Replaces a state's coefficients (K,) and errors by instruments, unless these are too weak."""
     # The noise of a state is both in X and in its rate, so that least squares would mistake it for
     # a fast decay; that of the state one step earlier is independent: it is an instrument for X.
-    samples, inside, kept = regression.samples, regression.inliers[d], np.flatnonzero(coefficients)
-    follows = np.abs(np.diff(samples.t) - samples.dt) < SAME_STEP * samples.dt + ROUNDING_S
+    samples, inside, kept = (
+        regression.samples,
+        regression.inliers[d],
+        np.flatnonzero(coefficients),
+    )
+    follows = (
+        np.abs(np.diff(samples.t) - samples.dt) < SAME_STEP * samples.dt + ROUNDING_S
+    )
     now = np.flatnonzero(follows & inside[1:] & inside[:-1]) + 1
     if len(kept) == 0 or len(now) <= len(kept):
         return

@@ -19,16 +19,33 @@ from nics_drl_bridge.robot.curve import InputCurve, delays
 from nics_drl_bridge.robot.kernels import GREATEST_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 
-FREE = -np.inf, np.inf, 0.0  # fall, rise and dead zone of a motor that holds nothing back
+FREE = (
+    -np.inf,
+    np.inf,
+    0.0,
+)  # fall, rise and dead zone of a motor that holds nothing back
 LAGS_S, DELAYS_S = (0.05, 0.15, 0.4), (0.0, 0.05, 0.1, 0.2)  # tried with limits
-RATES = (0.25, 0.5, 1.0, 2.0, 4.0)  # limits that are tried, in the command's range per second
-DEAD = (0.03, 0.07, 0.15, 0.3)  # dead zones that are tried, as shares of the command's reach
+RATES = (
+    0.25,
+    0.5,
+    1.0,
+    2.0,
+    4.0,
+)  # limits that are tried, in the command's range per second
+DEAD = (
+    0.03,
+    0.07,
+    0.15,
+    0.3,
+)  # dead zones that are tried, as shares of the command's reach
 HELPS = 0.95  # what is tried must take the sum of squares to this share,
 WORTH = 0.8  # and to this one once all is adjusted to it
 # Standard deviation of a uniform distribution about one of its ends, as a share of its width: a
 # lag before a limit looks like a delay, which may be none.
 END = 3.0**-0.5
-EXPLAINED = 0.5  # a component of the twist counts if commands leave less than this share of it
+EXPLAINED = (
+    0.5  # a component of the twist counts if commands leave less than this share of it
+)
 NO_EFFECT = 1e-6  # a limit or dead zone is not determined by less than this share of the residual
 WIDER = 5.0  # times by which a limit may change while it is adjusted
 
@@ -66,26 +83,44 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     if not np.isfinite(sigma).all():
         return timing
     first = int(np.argmin(delay + clocks.CERTAIN * sigma[0]))
-    alike = np.abs(delay - delay[first]) <= clocks.CERTAIN * np.hypot(sigma[0], sigma[0, first])
-    told, motors = len(timing.sigma) > 1, found.best.motors  # True if wheels told the latency
+    alike = np.abs(delay - delay[first]) <= clocks.CERTAIN * np.hypot(
+        sigma[0], sigma[0, first]
+    )
+    told, motors = (
+        len(timing.sigma) > 1,
+        found.best.motors,
+    )  # True if wheels told the latency
     held = motors.limited
     if told and alike.all() and not (held.any() or motors.dead.any()):
         return timing
     least = float(np.average(delay[alike], weights=sigma[0, alike] ** -2.0))
     sigma = np.hypot(sigma, clocks.WITHIN_TICK * clocks.STEP_S)
     own = np.hypot(sigma[0], END * np.where(held[moved], delay - least, 0.0))
-    unsure = END * (least if timing.separated and not told else max(DELAYS_S)) * held.any()
-    errors = {n: float(np.hypot(sigma[0, first] if len(timing.sigma) == 1 else e, unsure))
-              for n, e in timing.sigma.items()}  # fmt: skip
+    unsure = (
+        END * (least if timing.separated and not told else max(DELAYS_S)) * held.any()
+    )
+    errors = {
+        n: float(np.hypot(sigma[0, first] if len(timing.sigma) == 1 else e, unsure))
+        for n, e in timing.sigma.items()
+    }
     if timing.separated and not told:
-        least = clocks.if_certain(max(least, 0.0), float(sigma[0, first]), clocks.MIN_TIME_S)
+        least = clocks.if_certain(
+            max(least, 0.0), float(sigma[0, first]), clocks.MIN_TIME_S
+        )
     if timing.separated and errors["command_latency_s"] > clocks.TOLD_S:
         names = (_of_sum(drive.spec.state[i].name) for i in moved)
         errors |= zip(names, map(float, sigma[1]), strict=True)
-    lags, lag_sigma, further = timing.lags.copy(), timing.lag_sigma.copy(), 0.0 * timing.lags
+    lags, lag_sigma, further = (
+        timing.lags.copy(),
+        timing.lag_sigma.copy(),
+        0.0 * timing.lags,
+    )
     further[moved] = np.where(alike, 0.0, np.maximum(delay - least, 0.0))
     sums = delay + found.best.lags[moved]
-    lags[moved], lag_sigma[moved] = np.maximum(sums - least - further[moved], 0.0), np.hypot(*sigma)
+    lags[moved], lag_sigma[moved] = (
+        np.maximum(sums - least - further[moved], 0.0),
+        np.hypot(*sigma),
+    )
     for i, error in zip(moved, own.tolist(), strict=True):
         if further[i] > 0.0:
             errors[f"{drive.spec.state[i].follows}.delay"] = error
@@ -94,30 +129,54 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
         errors |= {key: own for key, own in zip(keys, row, strict=True) if own > 0.0}
     latency = timing.latency if told else least if timing.separated else 0.0
     return replace(
-        timing, offset=latency - least, latency=latency, sigma=errors, lags=lags,
-        lag_sigma=lag_sigma, delays=further, motors=motors,
-    )  # fmt: skip
+        timing,
+        offset=latency - least,
+        latency=latency,
+        sigma=errors,
+        lags=lags,
+        lag_sigma=lag_sigma,
+        delays=further,
+        motors=motors,
+    )
 
 
-def late_inputs(spec: RobotSpec, timing: clocks.TimingEstimate) -> tuple[InputCurve, ...]:
+def late_inputs(
+    spec: RobotSpec, timing: clocks.TimingEstimate
+) -> tuple[InputCurve, ...]:
     """Returns the curves of commands that have a dead zone, or act later than others."""
     dead = timing.motors.dead if timing.motors else np.zeros(len(timing.delays))
     rows = zip(spec.state, timing.delays.tolist(), dead.tolist(), strict=False)
     each = {v.follows: (d, zone) for v, d, zone in rows if d > 0.0 or zone > 0.0}
-    return tuple(InputCurve(command=str(n), dead=zone, delay=d) for n, (d, zone) in each.items())
+    return tuple(
+        InputCurve(command=str(n), dead=zone, delay=d) for n, (d, zone) in each.items()
+    )
 
 
-def limits_of(spec: RobotSpec, timing: clocks.TimingEstimate) -> dict[str, tuple[float, float]]:
+def limits_of(
+    spec: RobotSpec, timing: clocks.TimingEstimate
+) -> dict[str, tuple[float, float]]:
     """Returns the greatest fall and rise of states that have them, at a gain of one."""
     if timing.motors is None:
         return {}
-    rows = zip(spec.state, timing.motors.fall.tolist(), timing.motors.rise.tolist(), strict=True)
-    return {v.name: (fall, rise) for v, fall, rise in rows if np.isfinite([fall, rise]).any()}
+    rows = zip(
+        spec.state,
+        timing.motors.fall.tolist(),
+        timing.motors.rise.tolist(),
+        strict=True,
+    )
+    return {
+        v.name: (fall, rise)
+        for v, fall, rise in rows
+        if np.isfinite([fall, rise]).any()
+    }
 
 
 def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
     """Returns the greatest fall and rise (S, 2) of the states, at the gains of their responses."""
-    limits, gains = np.tile([-np.inf, np.inf], (len(spec.state), 1)), calibration.responses
+    limits, gains = (
+        np.tile([-np.inf, np.inf], (len(spec.state), 1)),
+        calibration.responses,
+    )
     for i, v in enumerate(spec.state):
         limits[i] = calibration.limits.get(v.name, limits[i])
     return np.asarray(limits * np.array([r.gain for r in gains] or [1.0])[:, None])
@@ -128,32 +187,57 @@ def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Sa
     rates, names = samples.dq.copy(), [c.name for c in spec.command]
     for i, response in enumerate(calibration.responses):
         if response.state in calibration.limits:
-            target = response.gain * samples.x[:, len(spec.state) + names.index(response.command)]
+            target = (
+                response.gain
+                * samples.x[:, len(spec.state) + names.index(response.command)]
+            )
             share = -np.expm1(-samples.dt / max(response.lag_s, clocks.MIN_TIME_S))
             rates[:, 3 + i] = share * (target - samples.x[:, i]) / samples.dt
     return replace(samples, dq=rates)
 
 
-def _found(drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp]) -> _Adjusted:
+def _found(
+    drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp]
+) -> _Adjusted:
     """Returns how moved states follow, with limits and dead zones if they clearly explain more."""
     twists, command, spec = drive.twists, drive.recording.command, drive.spec
     rows = clocks.some_of(len(twists.start), clocks.FEW_ROWS)
     moving = list(moving_dofs(twists.twist))
-    begin, shift, size = twists.start[rows], timing.latency - timing.offset, len(timing.lags)
+    begin, shift, size = (
+        twists.start[rows],
+        timing.latency - timing.offset,
+        len(timing.lags),
+    )
     start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
     for _ in range(2):  # what commands do not explain hides what motors do
         target = (begin, twists.end[rows], twists.twist[rows][:, moving])
         left = clocks.response_residual(command, spec, target, GREATEST_ORDER)
-        unexplained = np.mean(left(*vars(start).values()).reshape(len(rows), -1) ** 2, axis=0)
+        unexplained = np.mean(
+            left(*vars(start).values()).reshape(len(rows), -1) ** 2, axis=0
+        )
         if (unexplained < EXPLAINED).all() or not (unexplained < EXPLAINED).any():
             break
-        moving = [dof for dof, rest in zip(moving, unexplained, strict=True) if rest < EXPLAINED]
-    cluster = np.repeat(((begin - begin[0]) / clocks.CLUSTER_S).astype(np.intp), len(moving))
+        moving = [
+            dof
+            for dof, rest in zip(moving, unexplained, strict=True)
+            if rest < EXPLAINED
+        ]
+    cluster = np.repeat(
+        ((begin - begin[0]) / clocks.CLUSTER_S).astype(np.intp), len(moving)
+    )
     best = _adjusted(left, start, moved, shift, cluster)
-    for tries in (_with_limits, _with_dead_zones, _with_limits):  # what one does hides another
+    for tries in (
+        _with_limits,
+        _with_dead_zones,
+        _with_limits,
+    ):  # what one does hides another
         for i in moved:
-            tried = tries(best.best, i, command.values[:, signals.followed(spec)[i]], shift)
-            options = [(float((left(*vars(each).values()) ** 2).sum()), each) for each in tried]
+            tried = tries(
+                best.best, i, command.values[:, signals.followed(spec)[i]], shift
+            )
+            options = [
+                (float((left(*vars(each).values()) ** 2).sum()), each) for each in tried
+            ]
             cost, option = min(options, key=lambda each: each[0])
             if cost < HELPS * best.cost:
                 other = _adjusted(left, option, moved, shift, cluster)
@@ -161,16 +245,22 @@ def _found(drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp])
     return best
 
 
-def _with_limits(now: _Following, i: int, reach: Array, shift: float) -> Iterator[_Following]:
+def _with_limits(
+    now: _Following, i: int, reach: Array, shift: float
+) -> Iterator[_Following]:
     """Yields ways to follow in which state i has limits, and less of a lag and a delay."""
-    for rate, lag, delay in product(RATES, LAGS_S, {*(shift + d for d in DELAYS_S), *now.delays}):
+    for rate, lag, delay in product(
+        RATES, LAGS_S, {*(shift + d for d in DELAYS_S), *now.delays}
+    ):
         size = rate * float(np.ptp(reach))
         fall, rise = _put(now.motors.fall, i, -size), _put(now.motors.rise, i, size)
         motors = now.motors._replace(fall=fall, rise=rise)
         yield _Following(_put(now.lags, i, lag), _put(now.delays, i, delay), motors)
 
 
-def _with_dead_zones(now: _Following, i: int, reach: Array, _: float) -> Iterator[_Following]:
+def _with_dead_zones(
+    now: _Following, i: int, reach: Array, _: float
+) -> Iterator[_Following]:
     for share in DEAD:
         dead = _put(now.motors.dead, i, share * float(np.abs(reach).max()))
         yield replace(now, motors=now.motors._replace(dead=dead))
@@ -181,9 +271,12 @@ def _put(values: Array, i: int, value: float) -> Array:
 
 
 def _adjusted(
-    left: clocks.Left, start: _Following, moved: NDArray[np.intp], shift: float,
+    left: clocks.Left,
+    start: _Following,
+    moved: NDArray[np.intp],
+    shift: float,
     cluster: NDArray[np.intp],
-) -> _Adjusted:  # fmt: skip
+) -> _Adjusted:
     """Adjusts delays and lags of moved states, and limits and dead zones where there are any."""
     count = len(moved)
     given = np.stack(start.motors, axis=1)  # (S, 3)
@@ -200,12 +293,18 @@ def _adjusted(
         return left(*vars(at(theta)).values())
 
     reach = np.full(len(size), np.log(WIDER))
-    low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in clocks.BOUNDS)
-    begun = np.clip(np.append(start.delays[moved], np.log(start.lags[moved])), low, high)
+    low, high = (
+        np.repeat([shift + delay, log_lag], count) for delay, log_lag in clocks.BOUNDS
+    )
+    begun = np.clip(
+        np.append(start.delays[moved], np.log(start.lags[moved])), low, high
+    )
     found, jacobian, rest = minimise(
-        residual, np.append(begun, 0.0 * reach), np.full(len(begun) + len(reach), 0.1),
+        residual,
+        np.append(begun, 0.0 * reach),
+        np.full(len(begun) + len(reach), 0.1),
         (np.append(low, -reach), np.append(high, reach)),
-    )  # fmt: skip
+    )
     best = at(found)
     by_lag = jacobian[:, count : 2 * count] / best.lags[moved]
     by_size = jacobian[:, 2 * count :] / np.abs(np.stack(best.motors, axis=1)[held])
@@ -217,9 +316,11 @@ def _adjusted(
     motor_sigma[held] = np.where(sure, sigma[2 * count :], 0.0)
     motors = np.where(motor_sigma > 0.0, np.stack(best.motors, axis=1), FREE)
     return _Adjusted(
-        replace(best, motors=Motors(*motors.T)), float((rest**2).sum()),
-        sigma[: 2 * count].reshape(2, count), motor_sigma,
-    )  # fmt: skip
+        replace(best, motors=Motors(*motors.T)),
+        float((rest**2).sum()),
+        sigma[: 2 * count].reshape(2, count),
+        motor_sigma,
+    )
 
 
 def _of_sum(state: str) -> str:
@@ -229,10 +330,14 @@ def _of_sum(state: str) -> str:
 
 def about_sums(calibration: Calibration) -> Iterator[str]:
     """Tells of latency and lags that could not be told apart."""
-    own = delays([r.command for r in calibration.responses], calibration.inputs).tolist()
+    own = delays(
+        [r.command for r in calibration.responses], calibration.inputs
+    ).tolist()
     for response, delay in zip(calibration.responses, own, strict=True):
         sigma = calibration.uncertainty.get(_of_sum(response.state))
         if sigma is not None:
             both = calibration.command_latency_s + delay + response.lag_s
-            finding = f"Latency and the lag of {response.state} can hardly be told apart"
+            finding = (
+                f"Latency and the lag of {response.state} can hardly be told apart"
+            )
             yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."

@@ -34,9 +34,15 @@ DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
 ALIKE_S = 0.01  # delays of commands that differ by less are tried as one
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
-SMALL_DEAD = 0.05  # share of a command's reach at which the search for a dead zone begins
-TWO_WAY = 0.05  # share of the rows in which a command drives backwards, to tell its gain
-NEAR_END = 0.01  # share of a command's reach by which it must exceed the end of its curve
+SMALL_DEAD = (
+    0.05  # share of a command's reach at which the search for a dead zone begins
+)
+TWO_WAY = (
+    0.05  # share of the rows in which a command drives backwards, to tell its gain
+)
+NEAR_END = (
+    0.01  # share of a command's reach by which it must exceed the end of its curve
+)
 SELDOM = 1.0  # percentage of a drive that is to exceed a limit of a rate
 STRONG = 95.0  # percentile of the rates at which limits are first sought
 LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
@@ -55,13 +61,21 @@ def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
     """Returns the best curve of the command at a place; None if a straight line does as well."""
     given = structure_of(spec)
     acts = np.ones(3) if given is None else given[0][:, place]  # what it drives
-    twists = [dof for v in spec.state if v.twist and acts[dof := POSE_RATES.index(v.twist)]]
-    found = [f for dof in twists if (f := _of_component(samples, spec, place, dof)) is not None]
+    twists = [
+        dof for v in spec.state if v.twist and acts[dof := POSE_RATES.index(v.twist)]
+    ]
+    found = [
+        f
+        for dof in twists
+        if (f := _of_component(samples, spec, place, dof)) is not None
+    ]
     best = max(found, key=lambda each: each.gain, default=None)
     return best if best and best.gain >= (WORTH if best.drives else CLEAR) else None
 
 
-def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Candidate | None:
+def _of_component(
+    samples: Samples, spec: RobotSpec, place: int, dof: int
+) -> Candidate | None:
     command = samples.x[:, len(spec.state) :]
     twist = {v.twist: samples.x[:, i] for i, v in enumerate(spec.state) if v.twist}
     target, speed = twist[POSE_RATES[dof]], twist.get("vx", np.zeros(len(samples.t)))
@@ -79,7 +93,10 @@ def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Ca
                 low = scipy.signal.lfilter([share], [1.0, share - 1.0], u)
                 columns += [low] if dof == 0 else [low, low * speed]
             chi = np.stack(columns, axis=1)[::stride]
-            rest = target[::stride] - chi @ np.linalg.lstsq(chi, target[::stride], rcond=None)[0]
+            rest = (
+                target[::stride]
+                - chi @ np.linalg.lstsq(chi, target[::stride], rcond=None)[0]
+            )
             least = min(least, float(rest @ rest))
         return least
 
@@ -93,15 +110,19 @@ def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Ca
     gain = 1.0 - least / plain
     if gain < WORTH:
         return None
-    return Candidate(_curve(spec.command[place].name, reach, dead, full), gain, dof == 0)
+    return Candidate(
+        _curve(spec.command[place].name, reach, dead, full), gain, dof == 0
+    )
 
 
 def _curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
     size = float(np.abs(reach).max())
     return InputCurve(
-        command=name, dead=dead * size, least=max(float(reach[0]), -full * size),
+        command=name,
+        dead=dead * size,
+        least=max(float(reach[0]), -full * size),
         most=min(float(reach[1]), full * size),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -113,18 +134,29 @@ class Form:
     limits: tuple[str, ...] = ()  # states with a greatest fall and rise
     back: tuple[str, ...] = ()  # commands whose curve has a gain of its own backwards
     drag: tuple[str, ...] = ()  # states with a drag by their square, and a back-EMF
-    tyres: bool = False  # True if a car turns less at speed than its textbook, and slips aside
-    delays: tuple[tuple[str, float], ...] = ()  # likely ones of all commands [s]; (): they share it
+    tyres: bool = (
+        False  # True if a car turns less at speed than its textbook, and slips aside
+    )
+    delays: tuple[
+        tuple[str, float], ...
+    ] = ()  # likely ones of all commands [s]; (): they share it
 
     def latency_at(self, inputs: shooting.Inputs, values: Array) -> float:
         """Returns the common latency of the commands for values (I,): the least delay [s]."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
-        return float(min((at[f"{name}.delay"] for name, _ in self.delays), default=at["latency"]))
+        return float(
+            min((at[f"{name}.delay"] for name, _ in self.delays), default=at["latency"])
+        )
 
-    def curves_at(self, inputs: shooting.Inputs, values: Array) -> tuple[InputCurve, ...]:
+    def curves_at(
+        self, inputs: shooting.Inputs, values: Array
+    ) -> tuple[InputCurve, ...]:
         """Returns the input curves for values (I,)."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
-        latency, curves = self.latency_at(inputs, values), {c.command: c for c in self.curves}
+        latency, curves = (
+            self.latency_at(inputs, values),
+            {c.command: c for c in self.curves},
+        )
         for name, _ in self.delays:
             curves.setdefault(name, InputCurve(command=name))
         found = (
@@ -140,23 +172,37 @@ class Form:
         )
         return tuple(c for c in found if c != InputCurve(command=c.command))
 
-    def actuated(self, model: TaylorModel, inputs: shooting.Inputs, values: Array) -> TaylorModel:
+    def actuated(
+        self, model: TaylorModel, inputs: shooting.Inputs, values: Array
+    ) -> TaylorModel:
         """Returns a model with friction, drag and limits for values (I,)."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
         states = model.variables[: model.state_size]
         friction = [max(at.get(f"{name}.friction", 0.0), 0.0) for name in states]
         drag = [max(at.get(f"{name}.drag", 0.0), 0.0) for name in states]
-        limits = [[-at.get(f"{n}.fall", np.inf), at.get(f"{n}.rise", np.inf)] for n in states]
+        limits = [
+            [-at.get(f"{n}.fall", np.inf), at.get(f"{n}.rise", np.inf)] for n in states
+        ]
         commands = model.variables[model.state_size :]
-        emf = [[max(at.get(f"{s}.back_emf.{c}", 0.0), 0.0) for c in commands] for s in states]
+        emf = [
+            [max(at.get(f"{s}.back_emf.{c}", 0.0), 0.0) for c in commands]
+            for s in states
+        ]
         return replace(
-            model, friction=np.array(friction), drag=np.array(drag), back_emf=np.array(emf),
+            model,
+            friction=np.array(friction),
+            drag=np.array(drag),
+            back_emf=np.array(emf),
             limits=np.array(limits).reshape(-1, 2),
-        )  # fmt: skip
+        )
 
 
 def problem_of(
-    drive: Drive, calibration: Calibration, samples: Samples, form: Form, inputs: shooting.Inputs
+    drive: Drive,
+    calibration: Calibration,
+    samples: Samples,
+    form: Form,
+    inputs: shooting.Inputs,
 ) -> shooting.Shooting:
     """Returns the prediction problem of a drive on one time axis."""
     command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
@@ -172,13 +218,17 @@ def problem_of(
         return form.actuated(model, inputs, values)
 
     def trust(start: Array, end: Array) -> Array:
-        return drive.trust(*(each - calibration.clock_offset_s for each in (start, end)))
+        return drive.trust(
+            *(each - calibration.clock_offset_s for each in (start, end))
+        )
 
     noise, _ = drive.pose_noise or (0.0, 0.0)
     return shooting.Shooting(samples, commands, shaped, trust, not spec.state, noise)
 
 
-def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> shooting.Inputs:
+def inputs_of(
+    drive: Drive, latency: float, samples: Samples, form: Form
+) -> shooting.Inputs:
     """Returns the values that are sought besides coefficients: latency, and those of a form."""
     rows = _rows_of_commands(drive, latency, form)
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
@@ -187,11 +237,15 @@ def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> sho
         rows[f"{name}.friction"] = (0.1 * size, 0.1 * size, 0.0, size)
     for name in form.drag:
         value = samples.x[:, [v.name for v in drive.spec.state].index(name)]
-        size = float(np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3))
+        size = float(
+            np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3)
+        )
         rows[f"{name}.drag"] = (0.1 * size, 0.1 * size, 0.0, size)
         for place in _drivers(drive.spec):
             effect = np.abs(samples.x[:, len(drive.spec.state) + place] * value)
-            size = float(np.percentile(np.abs(rates[name]), STRONG) / max(effect.mean(), 1e-3))
+            size = float(
+                np.percentile(np.abs(rates[name]), STRONG) / max(effect.mean(), 1e-3)
+            )
             key = f"{name}.back_emf.{drive.spec.command[place].name}"
             rows[key] = (0.1 * size, 0.1 * size, 0.0, size)
     for name in form.limits:
@@ -212,7 +266,10 @@ def _rows_of_commands(
 ) -> dict[str, tuple[float, float, float, float]]:
     """Returns start, scale and bounds of latency and delays [s], and of curves, by name."""
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
-    bounds = min(latency, 0.0) if one_clock else latency - LONGEST_S, latency + LONGEST_S
+    bounds = (
+        min(latency, 0.0) if one_clock else latency - LONGEST_S,
+        latency + LONGEST_S,
+    )
     shared = (latency, latency) if form.delays else bounds
     rows = {"latency": (latency, DELAY_SCALE_S, *shared)}
     rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
@@ -221,8 +278,18 @@ def _rows_of_commands(
         if np.isfinite(size):
             step = CURVE_SCALE * size
             rows |= {
-                f"{name}.dead": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
-                f"{name}.least": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
+                f"{name}.dead": (
+                    curve.dead,
+                    step,
+                    0.0,
+                    0.5 * size if curve.dead else 0.0,
+                ),
+                f"{name}.least": (
+                    curve.least,
+                    step,
+                    1.5 * curve.least,
+                    0.5 * curve.least,
+                ),
                 f"{name}.most": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
             }
         if name in form.back:
@@ -238,7 +305,9 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
         reach = command[:, place]
         if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
             low, high = float(reach.min()), float(reach.max())
-            found.append(InputCurve(command=spec.command[place].name, least=low, most=high))
+            found.append(
+                InputCurve(command=spec.command[place].name, least=low, most=high)
+            )
     return tuple(found)
 
 
@@ -252,7 +321,10 @@ def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
     """Returns a form in which each command that drives the robot has a dead zone."""
     bent = {c.command: c for c in form.curves}
     for place in _drivers(drive.spec):
-        name, reach = drive.spec.command[place].name, samples.x[:, len(drive.spec.state) + place]
+        name, reach = (
+            drive.spec.command[place].name,
+            samples.x[:, len(drive.spec.state) + place],
+        )
         low, high = min(float(reach.min()), 0.0), max(float(reach.max()), 0.0)
         curve = bent.get(name, InputCurve(command=name, least=low, most=high))
         if not curve.dead:
@@ -263,7 +335,9 @@ def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
 def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
     """Returns a form in which the commands of curves have gains of their own backwards."""
     more = tuple(c for c in curves if c.command not in {c.command for c in form.curves})
-    return replace(form, curves=form.curves + more, back=tuple(c.command for c in curves))
+    return replace(
+        form, curves=form.curves + more, back=tuple(c.command for c in curves)
+    )
 
 
 def reached(
@@ -275,19 +349,30 @@ def reached(
     effect is that of what was sent.
     """
     names, sent = [c.name for c in drive.spec.command], drive.recording.command.values
-    low, high, curves, limits = model.low.copy(), model.high.copy(), [], model.limits.copy()
+    low, high, curves, limits = (
+        model.low.copy(),
+        model.high.copy(),
+        [],
+        model.limits.copy(),
+    )
     for curve in model.inputs:
         place = names.index(curve.command)
         least, most = float(sent[:, place].min()), float(sent[:, place].max())
         beyond = NEAR_END * max(-least, most)
-        curve = curve.model_copy(update={
-            "least": curve.least if least < curve.least - beyond else -np.inf,
-            "most": curve.most if most > curve.most + beyond else np.inf,
-        })  # fmt: skip
-        low[model.state_size + place], high[model.state_size + place] = curve.of([least, most])
+        curve = curve.model_copy(
+            update={
+                "least": curve.least if least < curve.least - beyond else -np.inf,
+                "most": curve.most if most > curve.most + beyond else np.inf,
+            }
+        )
+        low[model.state_size + place], high[model.state_size + place] = curve.of(
+            [least, most]
+        )
         if curve != InputCurve(command=curve.command):
             curves.append(curve)
-    free = replace(model, limits=np.zeros((0, 2)), drag=np.zeros(0), friction=np.zeros(0))
+    free = replace(
+        model, limits=np.zeros((0, 2)), drag=np.zeros(0), friction=np.zeros(0)
+    )
     asked = free.rates(samples.x)[:, 3:]
     for i, name in enumerate(model.variables[: model.state_size]):
         fall, rise = (errors.get(f"{name}.{word}", 0.0) for word in ("fall", "rise"))
@@ -303,7 +388,9 @@ def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> fl
     tries, late = _delayed(drive, calibration, samples)
     left = [_left(drive.spec, samples, command) for command in late]
     found = np.isfinite(left).all()
-    return float(tries[int(np.argmin(left))]) if found else calibration.command_latency_s
+    return (
+        float(tries[int(np.argmin(left))]) if found else calibration.command_latency_s
+    )
 
 
 def likely_delays(
@@ -318,18 +405,26 @@ def likely_delays(
         left = [_left(drive.spec, samples, each) for each in mixed]
         if np.ptp(left) > 0.0 and np.isfinite(left).all():
             found.append((command.name, float(tries[int(np.argmin(left))])))
-    return tuple(found) if np.ptp([delay for _, delay in found] or [0.0]) > ALIKE_S else ()
+    return (
+        tuple(found) if np.ptp([delay for _, delay in found] or [0.0]) > ALIKE_S else ()
+    )
 
 
-def _delayed(drive: Drive, calibration: Calibration, samples: Samples) -> tuple[Array, Array]:
+def _delayed(
+    drive: Drive, calibration: Calibration, samples: Samples
+) -> tuple[Array, Array]:
     """Returns delays (N,) that may be [s], and the commands in effect (N, T, C) by each."""
     form, now = Form(calibration.inputs), calibration.command_latency_s
     inputs = inputs_of(drive, now, samples, form)
     problem = problem_of(drive, calibration, samples, form, inputs)
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
-    tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
+    tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (
+        0.0 if one_clock else LONGEST_S / 2.0
+    )
     late = [problem.commands(np.append(delay, inputs.start[1:])) for delay in tries]
-    return tries, np.array([as_smooth(each, samples.dt, half_width(drive)) for each in late])
+    return tries, np.array(
+        [as_smooth(each, samples.dt, half_width(drive)) for each in late]
+    )
 
 
 def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
@@ -337,4 +432,6 @@ def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
     states = len(spec.state)
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
     x = np.concatenate([samples.x[:, :states], command], axis=1)
-    return float((1.0 - linear_fit(replace(samples, x=x), spec, DELAY_ORDER).r2[free]).sum())
+    return float(
+        (1.0 - linear_fit(replace(samples, x=x), spec, DELAY_ORDER).r2[free]).sum()
+    )

@@ -20,7 +20,9 @@ from nics_drl_bridge.recording.heading import (
 from nics_drl_bridge.recording.recording import Recording
 
 LEAST_COVERED = 0.9  # share of a drive for which there must be a gyro
-UNLIKE_TRACKER = 0.1  # difference from 1 of the ratio of turns, if the gyro is to fit a tracker
+UNLIKE_TRACKER = (
+    0.1  # difference from 1 of the ratio of turns, if the gyro is to fit a tracker
+)
 
 
 def turned_by_gyro(recording: Recording) -> Recording:
@@ -32,7 +34,9 @@ def turned_by_gyro(recording: Recording) -> Recording:
     if recording.imu is None or recording.gyro is not None:
         return recording
     if recording.imu.clock != recording.pose.clock:
-        told = "The gyro is on another clock than the pose, and was not compared with it."
+        told = (
+            "The gyro is on another clock than the pose, and was not compared with it."
+        )
         return replace(recording, repairs=(*recording.repairs, told))
     turning = _compared(recording)
     if turning is None:
@@ -43,7 +47,9 @@ def turned_by_gyro(recording: Recording) -> Recording:
     pose = recording.pose
     if recording.measured_by == "odometry" and turning.contradicts:
         yaw_rate = recording.imu.values[:, 2]
-        turned, covered = turn_by_gyro(pose.t, pose.values, recording.imu.t, yaw_rate, turning)
+        turned, covered = turn_by_gyro(
+            pose.t, pose.values, recording.imu.t, yaw_rate, turning
+        )
         if covered < LEAST_COVERED:
             sentences = (
                 f"The gyro covers {covered:.0%} of the drive only, so the heading is that of "
@@ -51,7 +57,9 @@ def turned_by_gyro(recording: Recording) -> Recording:
             )
             return replace(recording, repairs=(*recording.repairs, *sentences))
         pose = replace(pose, values=turned)
-    return replace(recording, pose=pose, gyro=turning, repairs=(*recording.repairs, *sentences))
+    return replace(
+        recording, pose=pose, gyro=turning, repairs=(*recording.repairs, *sentences)
+    )
 
 
 def relative_to(recording: Recording) -> str:
@@ -119,8 +127,14 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
             f"{turning.alike:.2f}), and was not used: find out which of them is wrong."
         )
         return
-    where = f"over {turning.rest_s:.1f} s at rest" if turning.rest_s > 0.0 else "while driving"
-    bias = f"bias of {turning.bias:.4f} +- {turning.bias_std:.2g} rad/s was found {where}"
+    where = (
+        f"over {turning.rest_s:.1f} s at rest"
+        if turning.rest_s > 0.0
+        else "while driving"
+    )
+    bias = (
+        f"bias of {turning.bias:.4f} +- {turning.bias_std:.2g} rad/s was found {where}"
+    )
     agrees = recording.measured_by == "tracker" and _fits(recording, turning)
     if agrees or not turning.contradicts:
         yield (

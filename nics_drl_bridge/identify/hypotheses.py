@@ -30,7 +30,9 @@ NOTHING = 1e-4  # m, rad: what is left of a part of a mounting that was left out
 LONGEST_LAG_S = 2.0  # a state that takes longer is rolling on: it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 
-Hypothesis = tuple[int, float]  # order, 0 for the textbook's terms alone, and pull to these
+Hypothesis = tuple[
+    int, float
+]  # order, 0 for the textbook's terms alone, and pull to these
 TEXTBOOK = 0, 0.0
 
 
@@ -41,7 +43,9 @@ class Trial:
     order: int  # 0: of the textbook's terms alone
     pull: float  # to the textbook's terms
     error: float  # mean error after `HORIZON_S`, as a share of the path
-    errors: dict[float, Array]  # (W,) distances at the ends of predictions, by horizon [m]
+    errors: dict[
+        float, Array
+    ]  # (W,) distances at the ends of predictions, by horizon [m]
 
     @property
     def level(self) -> float:
@@ -71,20 +75,32 @@ class Draft:
         model, first = (model, None) if other is None else terms.together(model, other)
         free = (model.coefficients != 0.0) & ~terms.defined(spec)[:, None]
         found = shooting.fitted(
-            self.problem, model, free, self.inputs, inside, BASE_EVALUATIONS, first=first
-        )  # fmt: skip
+            self.problem,
+            model,
+            free,
+            self.inputs,
+            inside,
+            BASE_EVALUATIONS,
+            first=first,
+        )
         return replace(found, model=terms.stable(found.model, spec))
 
     def refined(
-        self, base: TaylorModel, linear: TaylorModel, inside: terms.Mask | None = None,
-        evaluations: int = shooting.EVALUATIONS, pull: float = shooting.PULL,
-    ) -> shooting.Predictive:  # fmt: skip
+        self,
+        base: TaylorModel,
+        linear: TaylorModel,
+        inside: terms.Mask | None = None,
+        evaluations: int = shooting.EVALUATIONS,
+        pull: float = shooting.PULL,
+    ) -> shooting.Predictive:
         """Adjusts the terms of a linear fit, and those of a base to which they are pulled."""
         base, first = terms.together(base, linear)
-        free = ((base.coefficients != 0.0) | (first != 0.0)) & ~terms.defined(self.spec)[:, None]
+        free = ((base.coefficients != 0.0) | (first != 0.0)) & ~terms.defined(
+            self.spec
+        )[:, None]
         return shooting.fitted(
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
-        )  # fmt: skip
+        )
 
     def error_of(self, found: shooting.Predictive) -> float:
         """Returns the mean distance of predicted ends to measured ones, over all horizons [m]."""
@@ -97,7 +113,10 @@ class Draft:
         A part without which a variable would not have moved is not left out.
         """
         samples, values = self.problem.samples, self.inputs.start
-        everything, unmoved = np.arange(len(samples.t)), unmoved_variables(samples, self.spec)
+        everything, unmoved = (
+            np.arange(len(samples.t)),
+            unmoved_variables(samples, self.spec),
+        )
         problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
         given = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
         errors: dict[Hypothesis, list[Array]] = {hypothesis: [] for hypothesis in asked}
@@ -113,11 +132,19 @@ class Draft:
         path = np.concatenate(paths)[:, -1]
         length = float(path[~np.isnan(path)].sum())
         return tuple(
-            Trial(*hypothesis, float(np.nansum(far[:, -1])) / length if length else np.nan,
-                  {h: each[~np.isnan(each)] for h, each in zip(BANDS_S, far.T, strict=True)})
+            Trial(
+                *hypothesis,
+                float(np.nansum(far[:, -1])) / length if length else np.nan,
+                {
+                    h: each[~np.isnan(each)]
+                    for h, each in zip(BANDS_S, far.T, strict=True)
+                },
+            )
             for hypothesis, blocks in errors.items()
-            for far in [np.concatenate(blocks) if blocks else np.zeros((0, len(BANDS_S)))]
-        )  # fmt: skip
+            for far in [
+                np.concatenate(blocks) if blocks else np.zeros((0, len(BANDS_S)))
+            ]
+        )
 
     def models(
         self, asked: tuple[Hypothesis, ...], inside: terms.Mask
@@ -125,11 +152,15 @@ class Draft:
         """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
         samples, base = self.problem.samples.rows(inside), self.base(inside).model
         orders = {order for order, _ in asked if order}
-        linear = {order: terms.linear_fit(samples, self.spec, order).model for order in orders}
+        linear = {
+            order: terms.linear_fit(samples, self.spec, order).model for order in orders
+        }
         for order, pull in asked:
             found = base
             if order:
-                found = self.refined(base, linear[order], inside, EVALUATIONS, pull).model
+                found = self.refined(
+                    base, linear[order], inside, EVALUATIONS, pull
+                ).model
             yield (order, pull), found
 
 
@@ -142,9 +173,12 @@ class Base:
 
 
 def base_of(
-    drive: Drive, calibration: Calibration, samples: Samples, clear: tuple[InputCurve, ...] = (),
+    drive: Drive,
+    calibration: Calibration,
+    samples: Samples,
+    clear: tuple[InputCurve, ...] = (),
     known: Base | None = None,
-) -> Base:  # fmt: skip
+) -> Base:
     """Fits the textbook with and without each part of a form; keeps what predicts.
 
     Clear curves are not doubted. A known base is fitted anew, to other data.
@@ -168,7 +202,9 @@ def base_of(
     error = error_of(best)
     if len(calibration.inputs) > len(clear):
         plain = fitted(forms.Form(clear))
-        if (other := error_of(plain)) < error or np.isinf(other):  # too short a drive tells nothing
+        if (other := error_of(plain)) < error or np.isinf(
+            other
+        ):  # too short a drive tells nothing
             best, error = plain, other
     for change, worth in changes(drive, calibration, samples):
         if (form := change(best.draft.form)) == best.draft.form:
@@ -199,7 +235,9 @@ def changes(
     if speeds:
         yield lambda form: forms.with_dead(form, drive, samples), WORTH
         yield lambda form: replace(form, limits=speeds), WORTH
-        if others := tuple(v.name for v in drive.spec.state if v.twist and not drive.spec.steers):
+        if others := tuple(
+            v.name for v in drive.spec.state if v.twist and not drive.spec.steers
+        ):
             yield lambda form: replace(form, limits=others), WORTH
         if backwards := forms.two_way(drive, samples):
             yield lambda form: forms.with_back(form, backwards), WORTH
@@ -213,7 +251,9 @@ def hypotheses(order: Order) -> tuple[Hypothesis, ...]:
 
 def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
     """Returns the first trial that none clearly improves on; of an order that was asked for."""
-    asked = [trial for trial in trials if order in ("auto", trial.order)] or list(trials)
+    asked = [trial for trial in trials if order in ("auto", trial.order)] or list(
+        trials
+    )
     best = asked[0]
     for trial in asked[1:]:
         if trial.error < WORTH * best.error:
@@ -277,22 +317,28 @@ def with_certain_mounting(
 
 def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
     """Adds the mounting that predictions show to what the calibration has."""
-    x, y, heading = map(float, geometry.compose(found.values[-3:], calibration.mounting))
+    x, y, heading = map(
+        float, geometry.compose(found.values[-3:], calibration.mounting)
+    )
     names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
     errors = zip(names, map(float, found.value_errors[-3:]), strict=True)
     sigma = {name: error for name, error in errors if not np.isnan(error)}
     y = y if "lever_arm_y_m" in sigma else calibration.lever_arm_m[1]
     x, y, heading = (0.0 if abs(each) < NOTHING else each for each in (x, y, heading))
     return replace(
-        calibration, rotation_rad=-heading, lever_arm_m=(x, y),
+        calibration,
+        rotation_rad=-heading,
+        lever_arm_m=(x, y),
         uncertainty={**calibration.uncertainty, **sigma},
-    )  # fmt: skip
+    )
 
 
 def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
     """Tells of a higher order than the usual one."""
     if trials and (best := chosen(list(trials))) is not trials[0]:
-        errors = ", ".join(f"{trial.error:.1%} by order {trial.order}" for trial in trials)
+        errors = ", ".join(
+            f"{trial.error:.1%} by order {trial.order}" for trial in trials
+        )
         finding = f"The model has terms up to order {best.order}"
         unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
         yield f"{finding}: {unseen} end {errors} of the path away."
@@ -301,11 +347,15 @@ def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
 def about_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
     """Names what a model of a motion has beside the textbook's terms, and what it gains by it."""
     form, best = base.draft.form, chosen(trials, order)
-    parts = [f"an input curve of {curve.command}" for curve in form.curves if curve.bends]
+    parts = [
+        f"an input curve of {curve.command}" for curve in form.curves if curve.bends
+    ]
     parts += ["a delay of each command"] * bool(form.delays)
     words = (
-        ("drag and back-EMF", form.drag), ("dry friction", form.friction), ("limits", form.limits),
-    )  # fmt: skip
+        ("drag and back-EMF", form.drag),
+        ("dry friction", form.friction),
+        ("limits", form.limits),
+    )
     parts += [f"{word} of {', '.join(names)}" for word, names in words if names]
     parts += ["tyres that slip"] * form.tyres
     shares = f"{trials[0].error:.1%} of the path away" + " by that" * (best.order > 0)

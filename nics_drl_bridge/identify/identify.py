@@ -9,7 +9,14 @@ import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import acceptance, followers, hypotheses, open_loop, shooting, verdict
+from nics_drl_bridge.identify import (
+    acceptance,
+    followers,
+    hypotheses,
+    open_loop,
+    shooting,
+    verdict,
+)
 from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import fit as fitting
 from nics_drl_bridge.identify import motion as motions
@@ -20,7 +27,12 @@ from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
 from nics_drl_bridge.identify.gyro import turned_by_gyro
-from nics_drl_bridge.identify.judgement import bands_of, bands_of_fixed, judged, textbook_of
+from nics_drl_bridge.identify.judgement import (
+    bands_of,
+    bands_of_fixed,
+    judged,
+    textbook_of,
+)
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.refine import refined
@@ -64,30 +76,48 @@ class Findings:
     whole: Drive  # repaired by `repair`
     timing: timings.TimingEstimate  # of `clocks`; nominal before
     repairs: tuple[str, ...] = ()  # sentences of `repair`
-    speed: Array | None = None  # (n,) expected over the training part's twists, of `mounting`
+    speed: Array | None = (
+        None  # (n,) expected over the training part's twists, of `mounting`
+    )
     mounting: Mounting | None = None  # of `mounting`
     # Of `clocks`, `mounting`, `responses` and `noise`; then of `refine`.
     calibration: Calibration = field(default_factory=Calibration)
-    noise: Noise = field(default_factory=Noise)  # the pose sensor's of `noise`; the rest of `judge`
+    noise: Noise = field(
+        default_factory=Noise
+    )  # the pose sensor's of `noise`; the rest of `judge`
     # of `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
     width: float | None = None
     samples: Samples | None = None  # of the training part on one time axis, of `fit`
     clear: tuple[InputCurve, ...] = ()  # input curves beyond doubt, of `inputs`
     base: hypotheses.Base | None = None  # of the textbook's terms, of `fit`
-    trials: tuple[hypotheses.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
+    trials: tuple[
+        hypotheses.Trial, ...
+    ] = ()  # of orders, on parts of the training part, of `fit`
     regression: fitting.Regression | None = None  # on all features (Eq. 1), of `fit`
     linear: fitting.Fit | None = None  # the pruned fit (Eq. 2), of `prune`
     model: TaylorModel | None = None  # of `prune`; then of `refine` and `complete`
     refinement: tuple[str, ...] = ()  # sentences of `refine`
     assumptions: tuple[str, ...] = ()  # sentences of `complete`
     unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
-    held_out: open_loop.OpenLoop | None = None  # open-loop errors on that part, of `judge`
-    structure: tuple[str, ...] = ()  # sentences on residuals that depend on X, of `judge`
-    judgement: tuple[HorizonErrors, ...] = ()  # on that part, beside yardsticks, of `judge`
-    yardstick: Yardstick | None = None  # the textbook fitted to the training part, of `judge`
-    replaced: str = ""  # sentence on the model in whose place the textbook was put, of `settle`
+    held_out: open_loop.OpenLoop | None = (
+        None  # open-loop errors on that part, of `judge`
+    )
+    structure: tuple[
+        str, ...
+    ] = ()  # sentences on residuals that depend on X, of `judge`
+    judgement: tuple[
+        HorizonErrors, ...
+    ] = ()  # on that part, beside yardsticks, of `judge`
+    yardstick: Yardstick | None = (
+        None  # the textbook fitted to the training part, of `judge`
+    )
+    replaced: str = (
+        ""  # sentence on the model in whose place the textbook was put, of `settle`
+    )
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
-    refit: "Findings | None" = None  # on all data, of `refit`; None if the trial's model is kept
+    refit: "Findings | None" = (
+        None  # on all data, of `refit`; None if the trial's model is kept
+    )
 
 
 Stage = Callable[[Drive, Findings], Findings]
@@ -96,7 +126,9 @@ Stage = Callable[[Drive, Findings], Findings]
 def known(found: T | None, name: str, stage: str) -> T:
     """Returns a finding that a later stage can't do without, else raises FitError."""
     if found is None:
-        raise FitError(f"{name} is missing; put the stage {stage!r} before those that need it.")
+        raise FitError(
+            f"{name} is missing; put the stage {stage!r} before those that need it."
+        )
     return found
 
 
@@ -133,11 +165,15 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
         if derived and v.follows and v.twist is None
     )
     calibration = replace(
-        findings.calibration, responses=tuple(responses), uncertainty=found.sigma,
-        inputs=followers.late_inputs(spec, found), limits=followers.limits_of(spec, found),
-        clock_offset_s=found.offset, command_latency_s=found.latency,
+        findings.calibration,
+        responses=tuple(responses),
+        uncertainty=found.sigma,
+        inputs=followers.late_inputs(spec, found),
+        limits=followers.limits_of(spec, found),
+        clock_offset_s=found.offset,
+        command_latency_s=found.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
-    )  # fmt: skip
+    )
     return replace(findings, timing=found, calibration=calibration)
 
 
@@ -157,7 +193,9 @@ def responses(drive: Drive, findings: Findings) -> Findings:
     training, calibration = findings.training, findings.calibration
     found = calibration.responses
     if not motions.by_motion(drive.spec, drive.recording):
-        found = timings.responses_of(training, calibration, findings.timing, findings.speed)
+        found = timings.responses_of(
+            training, calibration, findings.timing, findings.speed
+        )
     calibration = timings.with_wheels(training, replace(calibration, responses=found))
     return replace(findings, calibration=calibration)
 
@@ -165,7 +203,9 @@ def responses(drive: Drive, findings: Findings) -> Findings:
 def noise(drive: Drive, findings: Findings) -> Findings:
     """Measures the noise of the pose: without it, a drive without corrections is an exact one."""
     position, heading = findings.training.pose_noise or (0.0, 0.0)
-    noisy = replace(findings.calibration, position_noise_m=position, heading_noise_rad=heading)
+    noisy = replace(
+        findings.calibration, position_noise_m=position, heading_noise_rad=heading
+    )
     return replace(findings, calibration=noisy, noise=sensor_noise(findings.whole))
 
 
@@ -195,7 +235,9 @@ def inputs(drive: Drive, findings: Findings) -> Findings:
     training, samples = findings.training, aligned(findings.training, findings)
     findings = _with_delay(findings, samples)
     samples, places = aligned(training, findings), range(len(drive.spec.command))
-    curves = [c for place in places if (c := curve_of(samples, drive.spec, place)) is not None]
+    curves = [
+        c for place in places if (c := curve_of(samples, drive.spec, place)) is not None
+    ]
     calibration = replace(findings.calibration, inputs=tuple(c.curve for c in curves))
     clear = tuple(c.curve for c in curves if c.gain >= CLEAR)
     findings = replace(findings, calibration=calibration, clear=clear)
@@ -204,7 +246,9 @@ def inputs(drive: Drive, findings: Findings) -> Findings:
 
 def _with_delay(findings: Findings, samples: Samples) -> Findings:
     delay = likely_delay(findings.training, findings.calibration, samples)
-    return replace(findings, calibration=replace(findings.calibration, command_latency_s=delay))
+    return replace(
+        findings, calibration=replace(findings.calibration, command_latency_s=delay)
+    )
 
 
 def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
@@ -221,15 +265,22 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
         raise FitError(f"{drive.recording.source}: {error}") from None
     best = hypotheses.chosen(trials, order).order
     curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
-    findings = replace(findings, calibration=replace(findings.calibration, inputs=curves))
+    findings = replace(
+        findings, calibration=replace(findings.calibration, inputs=curves)
+    )
     samples = aligned(training, findings)
     linear = linear_fit(samples, spec, best or hypotheses.BASE_ORDER)
     if drive.settings.strict:
         verdict.refuse_unexcited(linear.regression.excitation, spec)
     return replace(
-        findings, samples=samples, regression=linear.regression, linear=linear,
-        model=replace(linear.model, inputs=curves), trials=trials, base=base,
-    )  # fmt: skip
+        findings,
+        samples=samples,
+        regression=linear.regression,
+        linear=linear,
+        model=replace(linear.model, inputs=curves),
+        trials=trials,
+        base=base,
+    )
 
 
 def fit(drive: Drive, findings: Findings) -> Findings:
@@ -249,7 +300,9 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     centred = "lever_arm_y_m" in calibration.uncertainty
     library = partial(through_state, centred=centred) if inferred else None
     try:
-        regression = fitting.regress(samples, spec, order, not calibration.is_exact, library)
+        regression = fitting.regress(
+            samples, spec, order, not calibration.is_exact, library
+        )
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     if settings.strict:
@@ -266,7 +319,9 @@ def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Tria
         errors = _left_out(drive, findings, order)
         if hypotheses.HORIZON_S not in errors:
             break
-        share = float(errors[hypotheses.HORIZON_S].mean() / max(float(path.mean()), 1e-9))
+        share = float(
+            errors[hypotheses.HORIZON_S].mean() / max(float(path.mean()), 1e-9)
+        )
         trials.append(hypotheses.Trial(order, 0.0, share, errors))
     return tuple(trials)
 
@@ -274,7 +329,9 @@ def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Tria
 def prune(drive: Drive, findings: Findings) -> Findings:
     """Keeps the terms of Eq. 2, and fits them anew."""
     regression = known(findings.regression, "the fit of all terms", "fit")
-    if findings.width is not None:  # what a mirror allows is kept: the predictions weigh it
+    if (
+        findings.width is not None
+    ):  # what a mirror allows is kept: the predictions weigh it
         return findings
     linear = fitting.pruned(regression, drive.spec, drive.settings.alpha)
     limits = followers.scaled_limits(findings.calibration, drive.spec)
@@ -290,7 +347,11 @@ def refine(drive: Drive, findings: Findings) -> Findings:
     if findings.calibration.is_exact:
         return findings
     tried = verdict.tried(model, findings.calibration, findings.training, 0.0)
-    if drive.settings.order == "auto" and not findings.trials and verdict.ran_away(tried):
+    if (
+        drive.settings.order == "auto"
+        and not findings.trials
+        and verdict.ran_away(tried)
+    ):
         linear = replace(drive, settings=replace(drive.settings, order=1))
         found = run((fit, prune, refine), linear, findings)
         return replace(found, refinement=(*found.refinement, verdict.LINEAR))
@@ -307,8 +368,12 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     draft, book = base.draft, base.found.model
 
     def refined_by(draft: hypotheses.Draft) -> tuple[shooting.Predictive, bool]:
-        found = draft.refined(book, linear.model, pull=best.pull) if best.order else None
-        if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(base.found):
+        found = (
+            draft.refined(book, linear.model, pull=best.pull) if best.order else None
+        )
+        if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(
+            base.found
+        ):
             return draft.base(other=book), best.order == 0  # a search may go astray
         return found, True
 
@@ -321,33 +386,44 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
             draft = certain
             found, kept_order = refined_by(certain)
     calibration = replace(
-        calibration, command_latency_s=draft.form.latency_at(draft.inputs, found.values),
+        calibration,
+        command_latency_s=draft.form.latency_at(draft.inputs, found.values),
         inputs=draft.form.curves_at(draft.inputs, found.values),
         uncertainty=calibration.uncertainty | found.named_errors(draft.inputs.names),
-    )  # fmt: skip
+    )
     values = found.values.copy()
     if draft.problem.mounted:
         calibration = hypotheses.remounted(calibration, found)
         values[-3:] = 0.0
-    base = replace(base, draft=replace(draft, inputs=replace(draft.inputs, start=values)))
+    base = replace(
+        base, draft=replace(draft, inputs=replace(draft.inputs, start=values))
+    )
     curves = draft.form.curves_at(draft.inputs, base.found.values)
     lags = hypotheses.lags_of(replace(base.found.model, inputs=curves), spec)
     sums: tuple[str, ...] = ()
     if lags:
         beside = draft.form.latency_at(draft.inputs, base.found.values)
         sums = (hypotheses.about_lags(calibration.command_latency_s, lags, beside),)
-        told = {n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"}
+        told = {
+            n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"
+        }
         calibration = replace(calibration, uncertainty=told)
     errors = hypotheses.standard_errors(found)
     model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
     model = shared(model, spec, known(findings.samples, "the training part", "fit"))
     return replace(
-        findings, calibration=calibration, model=model, base=base,
-        refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
-                    f"{max(shooting.HORIZONS_S):g} s.", *sums,
-                    *hypotheses.about_forms(base, findings.trials, drive.settings.order),
-                    *about_options(drive, best.order, kept_order)),
-    )  # fmt: skip
+        findings,
+        calibration=calibration,
+        model=model,
+        base=base,
+        refinement=(
+            f"Coefficients and latency were refined by the open-loop errors over up to "
+            f"{max(shooting.HORIZONS_S):g} s.",
+            *sums,
+            *hypotheses.about_forms(base, findings.trials, drive.settings.order),
+            *about_options(drive, best.order, kept_order),
+        ),
+    )
 
 
 def about_options(drive: Drive, order: int, kept_order: bool) -> Iterator[str]:
@@ -375,7 +451,11 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     linear, model = _fitted(findings)
     spec, whole, calibration = drive.spec, findings.whole, findings.calibration
     samples = aligned(whole, findings)
-    begin = whole.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
+    begin = (
+        whole.recording.pose.t[0]
+        + calibration.clock_offset_s
+        + drive.settings.train_until_s
+    )
     rest = samples.rows(samples.t > begin)
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
     held_out = verdict.tried(model, calibration, whole, drive.settings.train_until_s)
@@ -391,13 +471,17 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     judgement = judged(model, calibration, whole, bands, yardstick)
     rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
     findings = replace(
-        findings, model=rated, unseen=unseen, held_out=held_out, judgement=judgement,
+        findings,
+        model=rated,
+        unseen=unseen,
+        held_out=held_out,
+        judgement=judgement,
         yardstick=yardstick,
         calibration=replace(calibration, notes=_plain(findings)),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
         linear=replace(linear, model=rated) if model is linear.model else linear,
         structure=structure(findings),
-    )  # fmt: skip
+    )
     return replace(findings, notes=_notes(drive, findings))
 
 
@@ -417,7 +501,9 @@ def _with_actuators(
 
 def settle(drive: Drive, findings: Findings) -> Findings:
     """Puts the fitted textbook in the place of a model that predicts unseen data worse."""
-    if findings.yardstick is None or not acceptance.loses_to_textbook(findings.judgement):
+    if findings.yardstick is None or not acceptance.loses_to_textbook(
+        findings.judgement
+    ):
         return findings
     _, model = _fitted(findings)
     spec, until = drive.spec, drive.settings.train_until_s
@@ -461,24 +547,36 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     """All that is to be told of a model, the gravest first."""
     linear, _ = _fitted(findings)
     spec, calibration = drive.spec, findings.calibration
-    beaten = (findings.replaced,) if findings.replaced else shortfall(findings.judgement)
+    beaten = (
+        (findings.replaced,) if findings.replaced else shortfall(findings.judgement)
+    )
     return (
         *about_recordings(_fitted(findings)[1], calibration, findings.whole),
-        *beaten, *_why_replaced(drive, findings),
-        *drive.recording.repairs, *findings.repairs, *verdict.about_gaps(drive),
-        *_sentences(findings), *findings.refinement,
+        *beaten,
+        *_why_replaced(drive, findings),
+        *drive.recording.repairs,
+        *findings.repairs,
+        *verdict.about_gaps(drive),
+        *_sentences(findings),
+        *findings.refinement,
         *verdict.mirror_note(
             known(findings.samples, "the training part", "fit"), spec, calibration
         ),
         *verdict.unlearnt(
-            linear, calibration, spec,
+            linear,
+            calibration,
+            spec,
             verdict.levels_of(findings.training.recording.command, spec),
         ),
         *findings.structure,
-        *(verdict.doubts_of_fit(linear, calibration.is_exact) if findings.width is None else ()),
+        *(
+            verdict.doubts_of_fit(linear, calibration.is_exact)
+            if findings.width is None
+            else ()
+        ),
         *verdict.untried(drive, findings.held_out, findings.judgement),
         *findings.assumptions,
-    )  # fmt: skip
+    )
 
 
 def _why_replaced(drive: Drive, findings: Findings) -> Iterator[str]:
@@ -501,28 +599,44 @@ def structure(findings: Findings) -> tuple[str, ...]:
     return tuple(structures(model, samples, training.spec, still, tried))
 
 
-def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dict[float, Array]:
+def _left_out(
+    drive: Drive, findings: Findings, order: int | None = None
+) -> dict[float, Array]:
     """Returns errors (W,) by horizon [s] on left-out parts; with an order, by what was found."""
     training, stages = findings.training, STAGES[: STAGES.index(complete)]
-    pose, settings = training.recording.pose, replace(drive.settings, train_until_s=np.inf)
+    pose, settings = (
+        training.recording.pose,
+        replace(drive.settings, train_until_s=np.inf),
+    )
     if order is not None:
         stages, settings = (fit, prune, refine), replace(settings, order=order)
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
     for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
         others = np.ones(len(pose.t), dtype=np.bool_)
         others[block] = False
-        rest = training.part(replace(training.recording, pose=pose.rows(others))).under(settings)
+        rest = training.part(replace(training.recording, pose=pose.rows(others))).under(
+            settings
+        )
         try:
-            found = run(stages, rest, replace(findings, training=rest) if order else None)
+            found = run(
+                stages, rest, replace(findings, training=rest) if order else None
+            )
         except (FitError, RecordingError):
             return {}
         part = training.part(replace(training.recording, pose=pose.rows(block)))
         for horizon, errors_at in errors.items():
             chosen = open_loop.windows(
-                part, found.calibration, 0.0, part.duration_s, horizon, open_loop.SPACING_S
+                part,
+                found.calibration,
+                0.0,
+                part.duration_s,
+                horizon,
+                open_loop.SPACING_S,
             )
             if len(chosen.start_t):
-                ends = open_loop.predict(_fitted(found)[1], found.calibration, part, chosen)
+                ends = open_loop.predict(
+                    _fitted(found)[1], found.calibration, part, chosen
+                )
                 errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
     return {h: np.concatenate(each) for h, each in errors.items() if each}
 
@@ -538,10 +652,14 @@ def refit(drive: Drive, findings: Findings) -> Findings:
         stages = (motion, fit, prune, refine, complete)
         final = run(stages, replace(drive, settings=settings), start)
         error, before = (
-            open_loop.open_loop_error(_fitted(each)[1], each.calibration, each.whole, 0.0, until)
+            open_loop.open_loop_error(
+                _fitted(each)[1], each.calibration, each.whole, 0.0, until
+            )
             for each in (final, findings)
         )
-        worse = error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
+        worse = (
+            error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
+        )
     except (FitError, RecordingError):
         worse = True
     driven = drive.recording.driven_s
@@ -550,15 +668,18 @@ def refit(drive: Drive, findings: Findings) -> Findings:
         findings = replace(findings, refinement=(*findings.refinement, sentence))
         return replace(findings, notes=_notes(drive, findings))
     final = replace(
-        final, refinement=(*final.refinement, sentence),
+        final,
+        refinement=(*final.refinement, sentence),
         calibration=replace(final.calibration, notes=_plain(final)),
         model=replace(_fitted(final)[1], quality=_fitted(findings)[1].quality),
-    )  # fmt: skip
+    )
     return replace(findings, refit=replace(final, notes=_notes(drive, final)))
 
 
 def _plain(found: Findings) -> tuple[str, ...]:
-    return tuple(map(str, _sentences(found)))  # of a file, which knows no kinds of sentences
+    return tuple(
+        map(str, _sentences(found))
+    )  # of a file, which knows no kinds of sentences
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:
@@ -570,17 +691,30 @@ def _sentences(found: Findings) -> tuple[str, ...]:
             *verdict.about_clocks(drive, timed, found.timing),
         )
     return (
-        *verdict.about_stamps(drive), *verdict.about_clocks(drive, calibration, found.timing),
+        *verdict.about_stamps(drive),
+        *verdict.about_clocks(drive, calibration, found.timing),
         *followers.about_sums(calibration),
         *verdict.about_mounting(drive, calibration, found.mounting),
         *verdict.about_responses(drive, calibration, found.timing),
-    )  # fmt: skip
+    )
 
 
 STAGES: tuple[Stage, ...] = (
-    repair, clocks, mounting, responses, noise, motion, inputs, fit, prune, refine, complete, judge,
-    settle, refit,
-)  # fmt: skip
+    repair,
+    clocks,
+    mounting,
+    responses,
+    noise,
+    motion,
+    inputs,
+    fit,
+    prune,
+    refine,
+    complete,
+    judge,
+    settle,
+    refit,
+)
 """In order; each builds on what the stages before it found."""
 
 
@@ -590,7 +724,9 @@ def begun(drive: Drive) -> Findings:
     return Findings(training, drive, timings.nominal_timing(training))
 
 
-def run(stages: Sequence[Stage], drive: Drive, findings: Findings | None = None) -> Findings:
+def run(
+    stages: Sequence[Stage], drive: Drive, findings: Findings | None = None
+) -> Findings:
     """Runs a row of stages over a drive, from what is known, and returns their findings."""
     findings = findings or begun(drive)
     for stage in stages:
@@ -610,11 +746,17 @@ class Identified:
     calibration: Calibration
     fit: fitting.Fit  # the linear fit, before refinement
     samples: Samples  # that the fit used
-    unseen: Samples | None  # of the part that the trial did not see; None if there are too few
-    held_out: open_loop.OpenLoop | None  # its open-loop errors there; None if it was too short
+    unseen: (
+        Samples | None
+    )  # of the part that the trial did not see; None if there are too few
+    held_out: (
+        open_loop.OpenLoop | None
+    )  # its open-loop errors there; None if it was too short
     noise: Noise  # of sensors and motion, each level measured or assumed
     findings: Findings  # of all stages, of the trial
-    notes: tuple[str, ...]  # sentences on findings, on what was not learnt, and on assumptions
+    notes: tuple[
+        str, ...
+    ]  # sentences on findings, on what was not learnt, and on assumptions
 
     @property
     def trial(self) -> "Identified":
@@ -639,7 +781,9 @@ class Identified:
     @property
     def coverage(self) -> dict[float, float]:
         """Share of the held-out ends within the 95 % band of predictions, by horizon [s]."""
-        return {e.horizon_s: e.coverage for e in self.judgement if e.coverage is not None}
+        return {
+            e.horizon_s: e.coverage for e in self.judgement if e.coverage is not None
+        }
 
     @property
     def judgement(self) -> tuple[HorizonErrors, ...]:
@@ -655,7 +799,9 @@ class Identified:
         textbook = bool(findings.replaced)
         ratings = [
             acceptance.rate(self.judgement, spec.footprint_radius, textbook),
-            acceptance.rate_unseen(verdict.time_without_pose(self.drive), self.drive.duration_s),
+            acceptance.rate_unseen(
+                verdict.time_without_pose(self.drive), self.drive.duration_s
+            ),
         ]
         if unfit:
             ratings.append(acceptance.Assessment(acceptance.Verdict.DO_NOT_TRAIN, ()))
@@ -678,7 +824,9 @@ class Identified:
         zones = [0.0, *dead.values()]
         for i, place in enumerate(states + model.drivers):
             alone = np.arange(len(model.variables)) == place
-            gain = abs(model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum())
+            gain = abs(
+                model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum()
+            )
             if model.friction[i] * gain > 0.0:
                 zone = dead.get(model.variables[place], 0.0)
                 zones.append(zone + float(model.friction[i] / gain))
@@ -693,16 +841,22 @@ class Identified:
 @one_blas_thread
 @np.errstate(over="ignore", invalid="ignore")  # a diverging model shows in its figures
 def identify(
-    recording: Recording, spec: RobotSpec, order: fitting.Order = "auto",
-    alpha: fitting.Alpha = fitting.ALPHA, train_until: float | None = None, assume: bool = False,
+    recording: Recording,
+    spec: RobotSpec,
+    order: fitting.Order = "auto",
+    alpha: fitting.Alpha = fitting.ALPHA,
+    train_until: float | None = None,
+    assume: bool = False,
     strict: bool = False,
-) -> Identified:  # fmt: skip
+) -> Identified:
     """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
     # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.
     drive = Drive(turned_by_gyro(check(recording, spec)), spec)
     until = train_until if train_until is not None else recording.learn_until_s
     until = LEARNT_SHARE * drive.duration_s if until is None else until
-    found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))
+    found = run(
+        STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict))
+    )
     return _result(found, found.refit or found)
 
 
@@ -712,9 +866,17 @@ def _result(trial: Findings, final: Findings) -> Identified:
     if final.width is not None:
         model = reached(model, final.whole, samples, final.calibration.uncertainty)
     return Identified(
-        final.whole, model, final.calibration, linear, samples, trial.unseen, trial.held_out,
-        trial.noise, trial, final.notes,
-    )  # fmt: skip
+        final.whole,
+        model,
+        final.calibration,
+        linear,
+        samples,
+        trial.unseen,
+        trial.held_out,
+        trial.noise,
+        trial,
+        final.notes,
+    )
 
 
 def cut(recording: Recording, until: float) -> Recording:
@@ -729,6 +891,8 @@ def cut(recording: Recording, until: float) -> Recording:
     if not until > 0.0:
         fault = f"{recording.source}: the training part ends at {until:g} s"
         raise RecordingError(f"{fault}; use more than 0.")
-    parts: dict[str, Any] = {name: part(stream) for name, stream in recording.streams.items()}
+    parts: dict[str, Any] = {
+        name: part(stream) for name, stream in recording.streams.items()
+    }
     parts["command"] = part(recording.command, timings.SEARCH_S)
     return replace(recording, **parts)

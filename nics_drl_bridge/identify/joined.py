@@ -18,11 +18,15 @@ def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recordi
         raise RecordingError("no recording was given; give one or more.")
     if len(recordings) == 1:
         return recordings[0]
-    turned = [turned_by_gyro(each) for each in recordings]  # a gyro's bias is that of a drive
+    turned = [
+        turned_by_gyro(each) for each in recordings
+    ]  # a gyro's bias is that of a drive
     offsets = [clock_offset(each, spec) for each in turned]
     joined = join(turned, offsets)
     gyros = [each.gyro for each in turned]
-    return replace(joined, gyro=gyros[0] if all(each is not None for each in gyros) else None)
+    return replace(
+        joined, gyro=gyros[0] if all(each is not None for each in gyros) else None
+    )
 
 
 def clock_offset(recording: Recording, spec: RobotSpec) -> float:
@@ -34,4 +38,6 @@ def clock_offset(recording: Recording, spec: RobotSpec) -> float:
         return run((repair, clocks), drive).calibration.clock_offset_s
     except FitError as error:
         fault = f"{recording.source}: its two clocks can't be aligned by this drive alone ({error})"
-        raise RecordingError(f"{fault}; record pose and commands by one clock.") from None
+        raise RecordingError(
+            f"{fault}; record pose and commands by one clock."
+        ) from None

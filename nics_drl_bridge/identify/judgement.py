@@ -14,10 +14,21 @@ from nics_drl_bridge.identify.acceptance import comparison_noise
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.forms import problem_of
-from nics_drl_bridge.identify.open_loop import HORIZON_S, SPACING_S, Windows, predict, windows
+from nics_drl_bridge.identify.open_loop import (
+    HORIZON_S,
+    SPACING_S,
+    Windows,
+    predict,
+    windows,
+)
 from nics_drl_bridge.identify.refine import readjusted
 from nics_drl_bridge.identify.terms import defined
-from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick, kept_twist, twists_before
+from nics_drl_bridge.identify.yardstick import (
+    Yardstick,
+    fit_yardstick,
+    kept_twist,
+    twists_before,
+)
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
@@ -33,27 +44,36 @@ def textbook_of(drive: Drive, calibration: Calibration) -> Yardstick | None:
     if calibration.is_exact:
         return None
     with suppress(RecordingError):  # the training part is too short
-        return fit_yardstick(drive, drive.settings.train_until_s, calibration.clock_offset_s)
+        return fit_yardstick(
+            drive, drive.settings.train_until_s, calibration.clock_offset_s
+        )
     return None
 
 
 def judged(
-    model: TaylorModel, calibration: Calibration, drive: Drive, bands: dict[float, float],
+    model: TaylorModel,
+    calibration: Calibration,
+    drive: Drive,
+    bands: dict[float, float],
     textbook: Yardstick | None,
-) -> tuple[HorizonErrors, ...]:  # fmt: skip
+) -> tuple[HorizonErrors, ...]:
     """Compares predictions of the held-out part, by the horizons that fit into it.
 
     `bands` are distances within which 95 % of the ends are expected [m], by horizon [s].
     """
     begin, told = drive.settings.train_until_s, []
     for horizon in HORIZONS_S:
-        chosen = windows(drive, calibration, begin, drive.duration_s, horizon, SPACING_S)
+        chosen = windows(
+            drive, calibration, begin, drive.duration_s, horizon, SPACING_S
+        )
         if not len(chosen.start_t):
             break
         ends = predict(model, calibration, drive, chosen)
         twist = twists_before(drive, chosen.start_t)
         kept = kept_twist(drive, chosen, twist)
-        by_textbook = None if textbook is None else textbook.predict(drive, chosen, twist)
+        by_textbook = (
+            None if textbook is None else textbook.predict(drive, chosen, twist)
+        )
         far = distances(ends, chosen)
         band = bands.get(horizon)
         told.append(
@@ -63,7 +83,9 @@ def judged(
                 path_m=float(chosen.path.mean()),
                 model=errors_of_ends(ends, chosen),
                 kept_twist=errors_of_ends(kept, chosen),
-                textbook=None if by_textbook is None else errors_of_ends(by_textbook, chosen),
+                textbook=None
+                if by_textbook is None
+                else errors_of_ends(by_textbook, chosen),
                 band_m=band,
                 coverage=None if band is None else float((far <= band).mean()),
                 kept_twist_noise_m=noise_beside(ends, kept, chosen, horizon),
@@ -78,12 +100,16 @@ def distances(ends: Array, chosen: Windows) -> Array:
     return np.asarray(np.hypot(*(ends - chosen.end)[:, :2].T))
 
 
-def noise_beside(ends: Array, other: Array | None, chosen: Windows, horizon: float) -> float | None:
+def noise_beside(
+    ends: Array, other: Array | None, chosen: Windows, horizon: float
+) -> float | None:
     """Returns the noise [m] of a comparison of two predictions (W, 3) of the same ends."""
     if other is None:
         return None
     difference = distances(ends, chosen) - distances(other, chosen)
-    if not np.isfinite(difference).all():  # one of them runs away: there is no doubt about it
+    if not np.isfinite(
+        difference
+    ).all():  # one of them runs away: there is no doubt about it
         return 0.0
     return comparison_noise(difference, chosen.start_t, horizon)
 
@@ -101,7 +127,9 @@ def bands_of_fixed(
     """Returns the bands [m] by horizon of a model that is not adjusted to any part of a drive."""
     bands = dict[float, float]()
     for horizon in BANDED_S:
-        chosen = windows(training, calibration, 0.0, training.duration_s, horizon, SPACING_S)
+        chosen = windows(
+            training, calibration, 0.0, training.duration_s, horizon, SPACING_S
+        )
         if len(chosen.start_t) >= FEWEST:
             far = distances(predict(model, calibration, training, chosen), chosen)
             bands[horizon] = float(np.percentile(far, WITHIN))
@@ -109,9 +137,11 @@ def bands_of_fixed(
 
 
 def bands_of(
-    model: TaylorModel, calibration: Calibration, training: Drive,
+    model: TaylorModel,
+    calibration: Calibration,
+    training: Drive,
     derived: tuple[Samples, hypotheses.Base] | None,
-) -> dict[float, float]:  # fmt: skip
+) -> dict[float, float]:
     """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
 
     Parts of the training part are predicted by the model, adjusted to the others. `derived` are
@@ -135,15 +165,23 @@ def bands_of(
         for horizon, told in errors.items():
             chosen = windows(part, found[1], 0.0, part.duration_s, horizon, SPACING_S)
             if len(chosen.start_t):
-                told.append(np.hypot(*(predict(*found, part, chosen) - chosen.end)[:, :2].T))
+                told.append(
+                    np.hypot(*(predict(*found, part, chosen) - chosen.end)[:, :2].T)
+                )
     every = {h: np.concatenate(told) for h, told in errors.items() if told}
-    return {h: float(np.percentile(e, WITHIN)) for h, e in every.items() if len(e) >= FEWEST}
+    return {
+        h: float(np.percentile(e, WITHIN)) for h, e in every.items() if len(e) >= FEWEST
+    }
 
 
 def _with_motion(
-    model: TaylorModel, calibration: Calibration, training: Drive, samples: Samples,
-    base: hypotheses.Base, kept: NDArray[np.bool_],
-) -> tuple[TaylorModel, Calibration]:  # fmt: skip
+    model: TaylorModel,
+    calibration: Calibration,
+    training: Drive,
+    samples: Samples,
+    base: hypotheses.Base,
+    kept: NDArray[np.bool_],
+) -> tuple[TaylorModel, Calibration]:
     """Adjusts a model with a motion as state, and its inputs, to the rows that are kept (T,)."""
     draft = base.draft
     problem = problem_of(training, calibration, samples, draft.form, draft.inputs)
@@ -152,9 +190,10 @@ def _with_motion(
     pull = hypotheses.PULLS[-1]
     found = shooting.fitted(problem, model, free, draft.inputs, kept, EVALUATIONS, pull)
     calibration = replace(
-        calibration, command_latency_s=draft.form.latency_at(draft.inputs, found.values),
+        calibration,
+        command_latency_s=draft.form.latency_at(draft.inputs, found.values),
         inputs=draft.form.curves_at(draft.inputs, found.values),
-    )  # fmt: skip
+    )
     model = replace(found.model, inputs=calibration.inputs)
     if problem.mounted:
         calibration = hypotheses.remounted(calibration, found)

@@ -10,8 +10,12 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import bounds_of, emf_of, next_state
 
-WIDTH = 16  # windows that are predicted at a time: vector instructions take some at once
-SMALL_TURN = 0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
+WIDTH = (
+    16  # windows that are predicted at a time: vector instructions take some at once
+)
+SMALL_TURN = (
+    0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
+)
 
 
 @kernel(allocates=True)
@@ -87,7 +91,9 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
             c, s = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
             along = dt * sinc
             dx, dy = along * (c * vx - s * vy), along * (s * vx + c * vy)
-            _follow_derivatives(now, values, dof, free, dx, dy, turn, along * c, along * s, dt)
+            _follow_derivatives(
+                now, values, dof, free, dx, dy, turn, along * c, along * s, dt
+            )
             px, py, heading = px + dx, py + dy, heading + turn
         if share[w] > 0.0:
             a, b = 1.0 - share[w], share[w]
@@ -132,9 +138,19 @@ class Tangent(NamedTuple):
 def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
     """Returns scratch memory for `shoot`."""
     lanes, free = WIDTH, -(-free // WIDTH) * WIDTH
-    shapes = ((states + commands + 1, lanes), (terms, lanes), (3 + states, lanes),
-              (3 + states, states, lanes), (lanes,), (lanes,), (lanes, 3),
-              (lanes, states, free), (lanes, 3, free), (states, free), (3, free))  # fmt: skip
+    shapes = (
+        (states + commands + 1, lanes),
+        (terms, lanes),
+        (3 + states, lanes),
+        (3 + states, states, lanes),
+        (lanes,),
+        (lanes,),
+        (lanes, 3),
+        (lanes, states, free),
+        (lanes, 3, free),
+        (states, free),
+        (3, free),
+    )
     return Tangent(*map(np.zeros, shapes))
 
 
@@ -203,7 +219,11 @@ def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
                 for lane in range(slope.shape[0]):
                     slope[lane] += scratch.rest[lane]
     for i in range(terms.emf.shape[0]):
-        rate, slope, state = scratch.rate[3 + i], scratch.jacobian[3 + i, i], scratch.x[i]
+        rate, slope, state = (
+            scratch.rate[3 + i],
+            scratch.jacobian[3 + i, i],
+            scratch.x[i],
+        )
         for lane in range(rate.shape[0]):
             braking = emf_of(i, scratch.x[:, lane], terms)
             rate[lane] -= braking * state[lane]
@@ -231,7 +251,9 @@ def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
     c, s = math.cos(pose[2] + turn / 2.0), math.sin(pose[2] + turn / 2.0)
     dx, dy = along * (c * rate[0] - s * rate[1]), along * (s * rate[0] + c * rate[1])
     if sloped:
-        _follow_pose(scratch.pose_slope[lane], scratch.twist, dx, dy, along * c, along * s, dt)
+        _follow_pose(
+            scratch.pose_slope[lane], scratch.twist, dx, dy, along * c, along * s, dt
+        )
     pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
     _follow_state(lane, terms, free, first, scratch, dt)
 
@@ -270,7 +292,11 @@ def _follow_pose(pose, twist, dx, dy, along_x, along_y, dt):  # type: ignore[no-
 
 @kernel(inline=True)
 def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped-def]
-    state, before, rate = scratch.state_slope[lane], scratch.before, scratch.rate[:, lane]
+    state, before, rate = (
+        scratch.state_slope[lane],
+        scratch.before,
+        scratch.rate[:, lane],
+    )
     states, count = state.shape
     for i in range(states):
         for p in range(count):

@@ -11,13 +11,29 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, outside_gaps, poses_at
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import inferred_states, taken, unwrapped
-from nics_drl_bridge.recording.recording import Recording, Samples, Stream, samples_on_one_clock
-from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec, StateVariable
+from nics_drl_bridge.recording.recording import (
+    Recording,
+    Samples,
+    Stream,
+    samples_on_one_clock,
+)
+from nics_drl_bridge.robot.spec import (
+    POSE_RATES,
+    CommandVariable,
+    RobotSpec,
+    StateVariable,
+)
 
 WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
-NOISE = 0.02  # share of the usual speed, and turn rate, that the noise of a twist may reach
+NOISE = (
+    0.02  # share of the usual speed, and turn rate, that the noise of a twist may reach
+)
 SAMPLES = 2.5  # half a width holds at least this many samples
-FINE_S, COARSE_S, COARSE_FROM_S = 0.01, 0.02, 0.015  # steps of models, by that of the poses
+FINE_S, COARSE_S, COARSE_FROM_S = (
+    0.01,
+    0.02,
+    0.015,
+)  # steps of models, by that of the poses
 
 
 def by_motion(spec: RobotSpec, recording: Recording) -> bool:
@@ -37,12 +53,16 @@ def half_width(drive: Drive) -> float:
     position, heading = drive.pose_noise or (0.0, 0.0)
     for width in WIDTHS_S:
         gain = np.sqrt(12.0 * every / (2.0 * width)) / (2.0 * width)
-        if gain * position <= NOISE * speed and gain * heading <= NOISE * max(turn, speed):
+        if gain * position <= NOISE * speed and gain * heading <= NOISE * max(
+            turn, speed
+        ):
             break
     return float(max(width, SAMPLES * every))
 
 
-def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: float) -> Drive:
+def with_motion(
+    drive: Drive, calibration: Calibration, grid: Array, width: float
+) -> Drive:
     """Returns a drive with the state at uniform times (T,) on the commands' clock.
 
     Components of the twist of `base_link` are slopes of parabolas over twice the half-width [s];
@@ -52,23 +72,33 @@ def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: floa
     pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
     rows = 2 * max(2, round(width / step)) + 1
     rates = scipy.signal.savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
-    twist = np.concatenate([geometry.rotate(rates[:, :2], -pose[:, 2]), rates[:, 2:]], axis=1)
+    twist = np.concatenate(
+        [geometry.rotate(rates[:, :2], -pose[:, 2]), rates[:, 2:]], axis=1
+    )
     columns = [
-        twist[:, POSE_RATES.index(v.twist)] if v.twist else _following(v, drive, calibration, grid)
+        twist[:, POSE_RATES.index(v.twist)]
+        if v.twist
+        else _following(v, drive, calibration, grid)
         for v in spec.state
     ]
     values = np.array(columns).reshape(len(columns), len(grid)).T
-    return drive.part(replace(recording, state=Stream(grid, values, recording.command.clock)))
+    return drive.part(
+        replace(recording, state=Stream(grid, values, recording.command.clock))
+    )
 
 
 def as_smooth(command: Array, step: float, width: float) -> Array:
     """Returns commands (T, C) at uniform times as smooth as a twist that parabolas gave."""
     sums = np.cumsum(command, axis=0) * step
     rows = 2 * max(2, round(width / step)) + 1
-    return np.asarray(scipy.signal.savgol_filter(sums, rows, 2, deriv=1, delta=step, axis=0))
+    return np.asarray(
+        scipy.signal.savgol_filter(sums, rows, 2, deriv=1, delta=step, axis=0)
+    )
 
 
-def _following(variable: StateVariable, drive: Drive, calibration: Calibration, t: Array) -> Array:
+def _following(
+    variable: StateVariable, drive: Drive, calibration: Calibration, t: Array
+) -> Array:
     alone = drive.spec.model_copy(update={"state": (variable,)})
     lag = [r.lag_s for r in calibration.responses if r.state == variable.name]
     latency, command = calibration.command_latency_s, drive.recording.command
@@ -82,7 +112,9 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
     pose = poses_at(drive, calibration, grid, 0.5 * width)
     begin = grid - calibration.command_latency_s
-    command = taken(drive.recording.command, spec, calibration.inputs, begin, begin + step)
+    command = taken(
+        drive.recording.command, spec, calibration.inputs, begin, begin + step
+    )
     samples = samples_on_one_clock(grid, pose, state.values, command)
     known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
     return replace(samples.rows(known), dt=step)
@@ -91,7 +123,9 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
 def known_state(drive: Drive) -> Stream:
     """Returns the state of a drive `with_motion`."""
     if drive.recording.state is None:
-        raise RecordingError(f"{drive.recording.source}: its motion was not derived yet.")
+        raise RecordingError(
+            f"{drive.recording.source}: its motion was not derived yet."
+        )
     return drive.recording.state
 
 
@@ -99,9 +133,13 @@ def grid_of(drive: Drive, calibration: Calibration, period: float) -> Array:
     """Returns uniform times (T,) of poses on the commands' clock; the step divides a period [s]."""
     pose = drive.recording.pose.t + calibration.clock_offset_s
     usual = float(np.median(np.diff(drive.dated.t)))
-    step = period / max(1, round(period / (FINE_S if usual < COARSE_FROM_S else COARSE_S)))
+    step = period / max(
+        1, round(period / (FINE_S if usual < COARSE_FROM_S else COARSE_S))
+    )
     first = max(pose[0], drive.recording.command.t[0])
-    return np.asarray(first + step * np.arange(int((pose[-1] - first) / step + 1e-6) + 1))
+    return np.asarray(
+        first + step * np.arange(int((pose[-1] - first) / step + 1e-6) + 1)
+    )
 
 
 def surrogate(spec: RobotSpec) -> RobotSpec:
@@ -109,6 +147,8 @@ def surrogate(spec: RobotSpec) -> RobotSpec:
 
     def follows(command: CommandVariable) -> StateVariable:
         given = command.model_dump(include={"unit", "min", "max"})
-        return StateVariable(name=f"{command.name}_state", follows=command.name, **given)
+        return StateVariable(
+            name=f"{command.name}_state", follows=command.name, **given
+        )
 
     return spec.model_copy(update={"state": tuple(map(follows, spec.command))})

@@ -27,7 +27,9 @@ DISTINCT = 4.0  # the second direction of motion must exceed the noise by this f
 MIN_SECOND = 0.05  # it must have at least this share of the size of the first
 STILL = 1e-3
 ONE_WAY = 0.05  # share of all turning that does not count as the other way
-FLAT = 0.02  # less of the direction without extent lies in the plane: it only never turned
+FLAT = (
+    0.02  # less of the direction without extent lies in the plane: it only never turned
+)
 MIN_LENGTH = 1e-4  # m, rad
 REGULAR = 0.8
 BLOCKS = 8
@@ -54,7 +56,11 @@ class Mounting:
         along = "" if known_y else "no speed was known apart from the tracked one"
         if known_x:
             return "", along
-        ways = "the robot never turned", "all of the path had one curvature", "noise hides it"
+        ways = (
+            "the robot never turned",
+            "all of the path had one curvature",
+            "noise hides it",
+        )
         why = "slip looks alike" if self.slip and self.ways else ways[self.ways]
         return why, why
 
@@ -64,12 +70,16 @@ def mounting_of(
 ) -> Mounting | None:
     """Estimates the mounting by states (n, S) at gain one; None if the drive does not show it."""
     spec, twists = drive.spec, drive.twists
-    if not (has_textbook(spec) or spec.takes_cmd_vel):  # which way it faces is not known
+    if not (
+        has_textbook(spec) or spec.takes_cmd_vel
+    ):  # which way it faces is not known
         return None
     if spec.moves_sideways:
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
-    command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
+    command = held(
+        drive.recording.command, spec, start - timing.latency, end - timing.latency
+    )
     forward = _response(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
     found = mounting_without_lateral_motion(twists, forward, noise)
@@ -82,7 +92,9 @@ def mounting_of(
     place = speed_index(spec)
     if place is not None and np.isnan(found.lever_sigma).tolist() == [False, True]:
         speed = states[:, place]
-        found.lever[1], found.lever_sigma[1] = lateral_lever(twists, found.rotation, speed)
+        found.lever[1], found.lever_sigma[1] = lateral_lever(
+            twists, found.rotation, speed
+        )
     return found
 
 
@@ -93,7 +105,9 @@ def by_instruments(
     # They know nothing of the noise of the twists, and whatever they do along x, they do nothing
     # along y: limited information maximum likelihood (Anderson, Rubin 1949).
     powers = taylor.exponents(states.shape[1], GREATEST_ORDER)
-    chi = taylor.evaluate(states / np.maximum(np.abs(states).max(axis=0), STILL), powers)
+    chi = taylor.evaluate(
+        states / np.maximum(np.abs(states).max(axis=0), STILL), powers
+    )
     basis = orth(chi, rcond=SAME)
     count, size = basis.shape
     seen = basis @ (basis.T @ motion.twist)
@@ -121,9 +135,12 @@ def by_instruments(
         rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]
         across, across_sigma = -float(beta[-1]), float(standard_errors(even, rest)[-1])
     return Mounting(
-        travel, np.array([-normal[2], across]), float(sigma[0]),
-        np.array([sigma[1], across_sigma]), 2,
-    )  # fmt: skip
+        travel,
+        np.array([-normal[2], across]),
+        float(sigma[0]),
+        np.array([sigma[1], across_sigma]),
+        2,
+    )
 
 
 def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mounting:
@@ -141,18 +158,25 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     sigma = standard_errors(chi, along[:, 1] - chi @ beta)
     hidden = skids and _ways(speed * np.abs(turn)) < 2
     if hidden or not clocks.CERTAIN * sigma[1] < spec.footprint_radius:
-        return replace(plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan), slip=True)
+        return replace(
+            plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan), slip=True
+        )
     if abs(beta[2]) < clocks.CERTAIN * sigma[2]:
         return plain
     rotation = plain.rotation + float(np.arctan(beta[0]))
     lever = np.array([float(beta[1]), 0.0])
-    return Mounting(rotation, lever, float(sigma[0]), np.array([sigma[1], np.nan]), plain.ways)
+    return Mounting(
+        rotation, lever, float(sigma[0]), np.array([sigma[1], np.nan]), plain.ways
+    )
 
 
 def _ways(values: Array, certain: NDArray[np.bool_] | bool = True) -> int:
     """Counts the signs that values (n,) certainly have, but for a small share of all."""
     least = ONE_WAY * max(float(np.abs(values).mean()), STILL)
-    return sum(float((certain * np.maximum(s * values, 0.0)).mean()) > least for s in (1.0, -1.0))
+    return sum(
+        float((certain * np.maximum(s * values, 0.0)).mean()) > least
+        for s in (1.0, -1.0)
+    )
 
 
 def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
@@ -163,10 +187,14 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     values = map(float, (mounting.rotation, *mounting.lever))
     sigmas = tuple(map(float, (mounting.rotation_sigma, *mounting.lever_sigma)))
     both = zip(values, sigmas, strict=True)
-    rotation, x, y = (clocks.if_certain(value, sigma, MIN_LENGTH) for value, sigma in both)
+    rotation, x, y = (
+        clocks.if_certain(value, sigma, MIN_LENGTH) for value, sigma in both
+    )
     learnt = {n: s for n, s in zip(names, sigmas, strict=True) if not np.isnan(s)}
     uncertainty = {**calibration.uncertainty, **learnt}
-    return replace(calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty)
+    return replace(
+        calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty
+    )
 
 
 def mounting_without_lateral_motion(
@@ -185,7 +213,9 @@ def mounting_without_lateral_motion(
     if size[0] < STILL:
         return None
     turn, lever, lever_sigma = motion.twist[:, 2], 0.0, np.nan
-    certain = np.abs(turn) > clocks.CERTAIN * np.sqrt(2.0) * noise / (motion.end - motion.start)
+    certain = np.abs(turn) > clocks.CERTAIN * np.sqrt(2.0) * noise / (
+        motion.end - motion.start
+    )
     ways = _ways(turn, certain)
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
         sigma = size[1] / size[0] / np.sqrt(len(rows))
@@ -197,17 +227,25 @@ def mounting_without_lateral_motion(
             return None
         sigma = size[2] / size[1] / np.sqrt(len(rows)) / flat
         travel = float(np.arctan2(-normal[0], normal[1]))
-        lever, lever_sigma = -float(normal[2]) * TURN_SCALE_M / flat, sigma * TURN_SCALE_M
+        lever, lever_sigma = (
+            -float(normal[2]) * TURN_SCALE_M / flat,
+            sigma * TURN_SCALE_M,
+        )
     along = motion.twist[:, :2] @ np.array([np.cos(travel), np.sin(travel)])
     if float(along @ forward) < 0.0:
         travel, lever = travel + np.pi, -lever
     return Mounting(
-        float(wrap_angle(travel)), np.array([lever, 0.0]),
-        float(sigma), np.array([lever_sigma, np.nan]), ways,
-    )  # fmt: skip
+        float(wrap_angle(travel)),
+        np.array([lever, 0.0]),
+        float(sigma),
+        np.array([lever_sigma, np.nan]),
+        ways,
+    )
 
 
-def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tuple[float, float]:
+def lateral_lever(
+    motion: TwistIntervals, rotation: float, speed: Array
+) -> tuple[float, float]:
     """Estimates the lever arm along y and its uncertainty [m] from a speed (n,); maybe NaN."""
     # `ux = gain speed - lever_y wz`, faster outside of curves.
     along = rotate(motion.twist[:, :2], -rotation)[:, 0]
@@ -226,10 +264,14 @@ def _by_commands(
     recording, spec = drive.recording, drive.spec
     inferred = recording.state is None and any(v.twist for v in spec.state)
     if spec.state and not inferred:
-        command = _as_commands(clocks.expected_states(drive, twists, timing), drive, timing.latency)
+        command = _as_commands(
+            clocks.expected_states(drive, twists, timing), drive, timing.latency
+        )
     else:
         begin = twists.start + timing.offset - timing.latency
-        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
+        command = held(
+            recording.command, spec, begin, begin + twists.end - twists.start
+        )
     response = _response(spec, command)  # of base_link, up to one factor
     size = np.linalg.svd(response, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
@@ -241,14 +283,19 @@ def _by_commands(
     across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
     scale = float(np.hypot(gain[0, 0], gain[0, 1]))
     return Mounting(
-        float(wrap_angle(rotation)), np.array([across[1], -across[0]]), float(spread[0, 1] / scale),
-        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))), 2,
-    )  # fmt: skip
+        float(wrap_angle(rotation)),
+        np.array([across[1], -across[0]]),
+        float(spread[0, 1] / scale),
+        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))),
+        2,
+    )
 
 
 def _response(spec: RobotSpec, command: Array) -> Array:
     """Returns twists (n, 3) up to factors; the third may be a steering angle."""
-    return spec.in_fields(command) if spec.takes_cmd_vel else steady_twist(spec, command)
+    return (
+        spec.in_fields(command) if spec.takes_cmd_vel else steady_twist(spec, command)
+    )
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
@@ -279,7 +326,9 @@ def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
     if not (span < clocks.LONG_STEP * usual).mean() > REGULAR:
         return np.ones(len(start), dtype=np.bool_)
     row = np.searchsorted(command.t, start + 1e-9, "right") - 1
-    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < clocks.LONG_STEP * usual)
+    return np.asarray(
+        np.append(span, 0.0)[np.clip(row, 0, None)] < clocks.LONG_STEP * usual
+    )
 
 
 Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
@@ -305,7 +354,9 @@ def jackknifed(
         return whole
     rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in found]))
     rotation_sigma = max(whole.rotation_sigma, float(_spread(rotation)))
-    lever_sigma = np.maximum(whole.lever_sigma, _spread(np.array([p.lever for p in found])))
+    lever_sigma = np.maximum(
+        whole.lever_sigma, _spread(np.array([p.lever for p in found]))
+    )
     return replace(whole, rotation_sigma=rotation_sigma, lever_sigma=lever_sigma)
 
 

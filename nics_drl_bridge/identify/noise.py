@@ -11,7 +11,13 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
 from nics_drl_bridge.identify.signals import white_noise
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.noise import ASSUMED_STATE_DRIFT, MEASURED, Level, Noise, assumed
+from nics_drl_bridge.robot.noise import (
+    ASSUMED_STATE_DRIFT,
+    MEASURED,
+    Level,
+    Noise,
+    assumed,
+)
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 HORIZON_S = 1.0
@@ -19,12 +25,18 @@ SPACING_S = 0.25
 GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
-OUTLYING = 10.0  # a window whose error is more than this many times the median contains a jump
-RUN_AWAY_M = 1e4  # a larger error of a prediction over a second is divergence, not drift
+OUTLYING = (
+    10.0  # a window whose error is more than this many times the median contains a jump
+)
+RUN_AWAY_M = (
+    1e4  # a larger error of a prediction over a second is divergence, not drift
+)
 BLOCKS = 8
 TINY = 1e-9
 NEGLIGIBLE = 1e-4  # a smaller level is rounding: a tenth of a millimetre after a second
-WITHIN_SIGMA = 68.27  # percentage of a normal distribution within one standard deviation
+WITHIN_SIGMA = (
+    68.27  # percentage of a normal distribution within one standard deviation
+)
 MIN_ROWS = 40
 
 
@@ -36,7 +48,11 @@ def sensor_noise(drive: Drive) -> Noise:
     blocks = map(pose.rows, np.array_split(np.arange(len(pose.t)), BLOCKS))
     parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
     known = np.array([part for part in parts if part is not None])
-    spread = known.std(axis=0, ddof=1) / np.sqrt(len(known)) if len(known) > 1 else [None, None]
+    spread = (
+        known.std(axis=0, ddof=1) / np.sqrt(len(known))
+        if len(known) > 1
+        else [None, None]
+    )
     position, heading = (
         _measured(std, unit, None if u is None else float(u))
         for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)
@@ -45,7 +61,11 @@ def sensor_noise(drive: Drive) -> Noise:
 
 
 def motion_noise(
-    sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
+    sensor: Noise,
+    drive: Drive,
+    calibration: Calibration,
+    model: TaylorModel,
+    samples: Samples,
 ) -> Noise:
     """Adds drift and odometry's noise, of recorded or scaled wheels' twists, to the sensor's."""
     measured: dict[str, Any] = {"state_drift": _state_drift(drive, model, samples)}
@@ -69,9 +89,14 @@ def claimed(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
         known = column[np.isfinite(column) & (column > 0.0)]
         usual.append(float(np.median(known)) if len(known) else np.nan)
     across = [std for std in usual[:2] if std > 0.0]
-    claims = {"pose_position": float(np.mean(across)) if across else 0.0, "pose_heading": usual[2]}
+    claims = {
+        "pose_position": float(np.mean(across)) if across else 0.0,
+        "pose_heading": usual[2],
+    }
     found = {name: (getattr(sensor, name), std) for name, std in claims.items()}
-    return {name: assumed(std, at.unit) for name, (at, std) in found.items() if std > at.std}
+    return {
+        name: assumed(std, at.unit) for name, (at, std) in found.items() if std > at.std
+    }
 
 
 def _measured(std: float, unit: str, uncertainty: float | None) -> Level:
@@ -85,13 +110,17 @@ def level(variances: Array, unit: str) -> Level:
     spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
     if std < NEGLIGIBLE:
         return _measured(0.0, unit, 0.0)
-    return _measured(std, unit, spread / (2.0 * std) if std**2 > spread else float(np.sqrt(spread)))
+    return _measured(
+        std, unit, spread / (2.0 * std) if std**2 > spread else float(np.sqrt(spread))
+    )
 
 
 def _errors(
     drive: Drive, calibration: Calibration, model: TaylorModel, horizon: float
 ) -> tuple[open_loop.Windows, Array] | None:
-    chosen = open_loop.windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
+    chosen = open_loop.windows(
+        drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S
+    )
     if len(chosen.start_t) < MIN_WINDOWS:
         return None
     if (state := drive.recording.state) is None:
@@ -140,11 +169,15 @@ def drift_growth(
         if (found := _errors(drive, calibration, model, horizon)) is None:
             break
         square = np.mean(found[1] ** 2, axis=0)
-        rows.append((horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2])))
+        rows.append(
+            (horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2]))
+        )
     return tuple(np.array(rows).T) if rows else None
 
 
-def _state_drift(drive: Drive, model: TaylorModel, samples: Samples) -> dict[str, Level]:
+def _state_drift(
+    drive: Drive, model: TaylorModel, samples: Samples
+) -> dict[str, Level]:
     """Returns the drift of a measured state; assumed levels for an unmeasured one."""
     state = drive.recording.state
     nominal = {
@@ -194,7 +227,9 @@ def odometry_residual(
     rates = model.rates(samples.x)[:, :3]
     # The rates are means from each sample to the next, so they belong to the middle of the step.
     middle = samples.t + samples.dt / 2.0
-    expected = np.stack([np.interp(t[inside], middle, column) for column in rates.T], axis=1)
+    expected = np.stack(
+        [np.interp(t[inside], middle, column) for column in rates.T], axis=1
+    )
     return np.asarray(twist[inside] - expected)
 
 

@@ -18,7 +18,9 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 HORIZON_S = 5.0
 SPACING_S = 0.1
 SETTLE_S = 1.0  # windows start no sooner than this after the first command if the state is inferred
-END_TOLERANCE = 0.6  # from a window's end to the nearest sample, as a share of the period
+END_TOLERANCE = (
+    0.6  # from a window's end to the nearest sample, as a share of the period
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,9 @@ class OpenLoop:
     max_position_error_m: float
     mean_heading_error_rad: float  # absolute
     mean_path_m: float  # length of the measured path in the horizon
-    median_displacement_m: float  # from start to end: the error of predicting a standstill
+    median_displacement_m: (
+        float  # from start to end: the error of predicting a standstill
+    )
 
 
 @dataclass(frozen=True)
@@ -51,15 +55,21 @@ class Windows:
 
 
 def windows(
-    drive: Drive, calibration: Calibration, start: float, stop: float, horizon: float,
+    drive: Drive,
+    calibration: Calibration,
+    start: float,
+    stop: float,
+    horizon: float,
     spacing: float,
-) -> Windows:  # fmt: skip
+) -> Windows:
     """Selects windows of a `horizon` from `start` to `stop`, starts `spacing` apart, all in [s]."""
     t, pose = drive.dated.t, drive.dated.values
     origin, period = drive.recording.pose.t[0], float(np.median(np.diff(t)))
     first = origin + start
     if calibration.responses:
-        first = max(first, drive.recording.command.t[0] - calibration.clock_offset_s + SETTLE_S)
+        first = max(
+            first, drive.recording.command.t[0] - calibration.clock_offset_s + SETTLE_S
+        )
     begin = np.flatnonzero((t >= first) & (t + horizon <= origin + stop + period / 2.0))
     chosen: list[int] = []
     for k in begin:
@@ -75,15 +85,21 @@ def windows(
     good &= episode[begin] == episode[end]
     begin, end = begin[good], end[good]
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
-    return Windows(t[begin], t[end], pose[begin], pose[end], length[end] - length[begin])
+    return Windows(
+        t[begin], t[end], pose[begin], pose[end], length[end] - length[begin]
+    )
 
 
-def predict(model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows) -> Array:
+def predict(
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
+) -> Array:
     """Predicts poses (W, 3) at windows' ends by commands, from measured or commanded states."""
     if drive.recording.state is None:
         relative = _by_one_rollout(model, calibration, drive, chosen)
     else:
-        poses, *_, step, share = _from_measured_states(model, calibration, drive, chosen)
+        poses, *_, step, share = _from_measured_states(
+            model, calibration, drive, chosen
+        )
         row, share = np.arange(len(step)), share[:, None]
         relative = (1.0 - share) * poses[row, step] + share * poses[row, step + 1]
     return tracked_ends(chosen, calibration, relative)
@@ -91,7 +107,9 @@ def predict(model: TaylorModel, calibration: Calibration, drive: Drive, chosen: 
 
 def tracked_ends(chosen: Windows, calibration: Calibration, relative: Array) -> Array:
     """Returns poses (W, 3) of the tracked body after `base_link` moved by relative ones."""
-    return calibration.to_tracked(geometry.compose(calibration.to_base(chosen.start), relative))
+    return calibration.to_tracked(
+        geometry.compose(calibration.to_base(chosen.start), relative)
+    )
 
 
 def _by_one_rollout(
@@ -99,15 +117,24 @@ def _by_one_rollout(
 ) -> Array:
     """Returns relative poses (W, 3) from one roll-out: an inferred state needs commands only."""
     recording, spec = drive.recording, drive.spec
-    start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
+    start, end = (
+        t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t)
+    )
     lead = np.ceil((max(0.0, start.min() - recording.command.t[0]) + 1.0) / model.dt)
     # Whole steps before the first window: windows of regular poses then begin and end on the grid.
-    grid = start.min() + model.dt * np.arange(-lead, (end.max() - start.min()) / model.dt + 2.0)
+    grid = start.min() + model.dt * np.arange(
+        -lead, (end.max() - start.min()) / model.dt + 2.0
+    )
     begin = grid - calibration.command_latency_s
     command = taken(recording.command, spec, model.inputs, begin, begin + model.dt)
-    state = np.array([r.gain for r in calibration.responses]) * command[0, followed(spec)]
+    state = (
+        np.array([r.gain for r in calibration.responses]) * command[0, followed(spec)]
+    )
     path = _roll(model, state[None], command[None])[0][0, :-1]
-    at = [np.stack([np.interp(t, grid, column) for column in path.T], axis=1) for t in (start, end)]
+    at = [
+        np.stack([np.interp(t, grid, column) for column in path.T], axis=1)
+        for t in (start, end)
+    ]
     return geometry.between(at[0], at[1])
 
 
@@ -115,10 +142,14 @@ def _from_measured_states(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
     """Returns poses (W, T + 1, 3), states, commands, whole steps (W,), share (W,) of a last one."""
-    start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
+    start, end = (
+        t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t)
+    )
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    command = taken(drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt)
+    command = taken(
+        drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt
+    )
     poses, states = _roll(model, states_at(drive, calibration, start), command)
     exact = (end - start) / model.dt
     step = np.floor(exact + 1e-6).astype(np.intp)
@@ -128,16 +159,30 @@ def _from_measured_states(
 def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
     """Rolls commands (W, T, C) out to unwrapped poses (W, T + 1, 3) from the origin, and states."""
     count, steps = command.shape[:2]
-    poses, states = np.zeros((count, steps + 1, 3)), np.empty((count, steps + 1, state.shape[1]))
+    poses, states = (
+        np.zeros((count, steps + 1, 3)),
+        np.empty((count, steps + 1, state.shape[1])),
+    )
     states[:, 0] = state
-    rollout(poses, states, np.ascontiguousarray(command), term_arrays(model), SERIES, model.dt)
+    rollout(
+        poses,
+        states,
+        np.ascontiguousarray(command),
+        term_arrays(model),
+        SERIES,
+        model.dt,
+    )
     return poses, states
 
 
 def open_loop_error(
-    model: TaylorModel, calibration: Calibration, drive: Drive, start: float, stop: float,
+    model: TaylorModel,
+    calibration: Calibration,
+    drive: Drive,
+    start: float,
+    stop: float,
     horizon: float = HORIZON_S,
-) -> OpenLoop:  # fmt: skip
+) -> OpenLoop:
     """Predicts a part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
     chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:
@@ -148,10 +193,15 @@ def open_loop_error(
     position = np.hypot(error[:, 0], error[:, 1])
     moved = chosen.end - chosen.start
     return OpenLoop(
-        horizon, len(position), float(position.mean()), float(np.median(position)),
-        float(position.max()), float(np.abs(geometry.wrap_angle(error[:, 2])).mean()),
-        float(chosen.path.mean()), float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
-    )  # fmt: skip
+        horizon,
+        len(position),
+        float(position.mean()),
+        float(np.median(position)),
+        float(position.max()),
+        float(np.abs(geometry.wrap_angle(error[:, 2])).mean()),
+        float(chosen.path.mean()),
+        float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
+    )
 
 
 @dataclass(frozen=True)
@@ -168,8 +218,12 @@ def course_of(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Course:
     """Returns the course of X over windows, each started from its measured state."""
-    states, command, steps, share = _from_measured_states(model, calibration, drive, chosen)[1:]
-    x = np.concatenate([states[:, :-1], command, np.ones((*command.shape[:2], 1))], axis=2)
+    states, command, steps, share = _from_measured_states(
+        model, calibration, drive, chosen
+    )[1:]
+    x = np.concatenate(
+        [states[:, :-1], command, np.ones((*command.shape[:2], 1))], axis=2
+    )
     return Course(chosen, np.ascontiguousarray(x), steps, share)
 
 
@@ -190,11 +244,18 @@ def relative_ends(
     return ends, moved
 
 
-def tracked_slopes(course: Course, calibration: Calibration, ends: Array, moved: Array) -> Array:
+def tracked_slopes(
+    course: Course, calibration: Calibration, ends: Array, moved: Array
+) -> Array:
     """Returns derivatives (W, 3, P) of `tracked_ends`, from those of the relative poses."""
     heading = calibration.to_base(course.chosen.start)[:, 2]
-    arm = geometry.rotate(np.broadcast_to(calibration.mounting[:2], (len(ends), 2)), ends[:, 2])
-    inside = moved[:, :2] + np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None] * moved[:, 2:]
+    arm = geometry.rotate(
+        np.broadcast_to(calibration.mounting[:2], (len(ends), 2)), ends[:, 2]
+    )
+    inside = (
+        moved[:, :2]
+        + np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None] * moved[:, 2:]
+    )
     c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
     x, y = inside[:, 0], inside[:, 1]
     return np.stack([c * x - s * y, s * x + c * y, moved[:, 2]], axis=1)

@@ -14,7 +14,12 @@ from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.clocks import TOLD_S
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import speed_index
-from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors, minimise, uncertainty
+from nics_drl_bridge.identify.statistics import (
+    CERTAIN,
+    clustered_errors,
+    minimise,
+    uncertainty,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -28,7 +33,9 @@ HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distan
 OUTLYING = 10.0  # a window whose error is this many times the median contains a jump,
 OUTLYING_SHARE = 0.25  # if the error is also more than this share of the longest path
 MOST_OUTLIERS = 0.3
-STEEPEST = 1e100  # slopes of a diverging model are clipped, so that their scaling stays finite
+STEEPEST = (
+    1e100  # slopes of a diverging model are clipped, so that their scaling stays finite
+)
 TURN_RAD = 1e-5  # step of the finite difference by the rotation
 DIVERGED = 1e3
 LEAST_SCALE = 0.05
@@ -45,7 +52,9 @@ def refined(
     """Refines a linear fit by its predictions and removes terms; with a sentence on the result."""
     model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
-    why = "The training part is too short to refine the model by its errors over seconds"
+    why = (
+        "The training part is too short to refine the model by its errors over seconds"
+    )
     note = f"{why}; record a longer drive."
     if problem is not None:
         try:
@@ -113,11 +122,15 @@ def by_definition(
 def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
     """Adds standard errors: the linear fit's where a row is unchanged, else the larger of both."""
     first, rows = linear.named_errors, {}
-    for dof, old, new in zip(model.dofs, linear.coefficients, model.coefficients, strict=True):
+    for dof, old, new in zip(
+        model.dofs, linear.coefficients, model.coefficients, strict=True
+    ):
         before = dict(zip(linear.term_names, old, strict=True))
         after = zip(model.term_names, new, strict=True)
         known = first.get(dof, {})
-        rows[dof] = dict(known) if all(before.get(k, 0.0) == v for k, v in after) else {}
+        rows[dof] = (
+            dict(known) if all(before.get(k, 0.0) == v for k, v in after) else {}
+        )
         for term, error in refined.get(dof, {}).items():
             rows[dof][term] = max(error, known.get(term, 0.0))
     return model.with_errors(rows)
@@ -129,10 +142,14 @@ class Problem:
 
     drive: Drive
     chosen: tuple[open_loop.Windows, ...]  # of each horizon, without jumps of the pose
-    courses: tuple[open_loop.Course, ...]  # of X over them if the state was measured, else empty
+    courses: tuple[
+        open_loop.Course, ...
+    ]  # of X over them if the state was measured, else empty
 
 
-def problem_of(model: TaylorModel, calibration: Calibration, drive: Drive) -> Problem | None:
+def problem_of(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> Problem | None:
     """Selects the windows of a training part to predict; None if it is too short."""
     until, chosen = drive.settings.train_until_s, []
     for horizon in HORIZONS_S:
@@ -143,33 +160,49 @@ def problem_of(model: TaylorModel, calibration: Calibration, drive: Drive) -> Pr
     if not chosen:
         return None
     measured = drive.recording.state is not None
-    courses = (open_loop.course_of(model, calibration, drive, w) for w in chosen if measured)
+    courses = (
+        open_loop.course_of(model, calibration, drive, w) for w in chosen if measured
+    )
     return Problem(drive, tuple(chosen), tuple(courses))
 
 
 def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Windows:
     size = np.hypot(error[:, 0], error[:, 1])
-    far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
+    far = max(
+        OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max())
+    )
     inside = size <= far
-    if inside.all() or inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS:
+    if (
+        inside.all()
+        or inside.mean() < 1.0 - MOST_OUTLIERS
+        or inside.sum() < MIN_WINDOWS
+    ):
         return chosen
     return chosen.rows(inside)
 
 
-def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
+def prediction_errors(
+    problem: Problem, model: TaylorModel, calibration: Calibration
+) -> Array:
     """Returns the errors (n,) of all predictions: x, y and heading of each window [m]."""
     each = zip(*(vars(windows).values() for windows in problem.chosen), strict=True)
     chosen = open_loop.Windows(*map(np.concatenate, each))
     with np.errstate(all="ignore"):  # a trial step may diverge; it is then rejected
         if problem.courses:
-            ends = [open_loop.relative_ends(course, model)[0] for course in problem.courses]
-            predicted = open_loop.tracked_ends(chosen, calibration, np.concatenate(ends))
+            ends = [
+                open_loop.relative_ends(course, model)[0] for course in problem.courses
+            ]
+            predicted = open_loop.tracked_ends(
+                chosen, calibration, np.concatenate(ends)
+            )
         else:  # of all windows by one roll-out
             predicted = open_loop.predict(model, calibration, problem.drive, chosen)
         error = predicted - chosen.end
         error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
         error *= _scale(problem, chosen)
-    return np.asarray(np.clip(np.nan_to_num(error.ravel(), nan=DIVERGED), -DIVERGED, DIVERGED))
+    return np.asarray(
+        np.clip(np.nan_to_num(error.ravel(), nan=DIVERGED), -DIVERGED, DIVERGED)
+    )
 
 
 def _scale(problem: Problem, chosen: open_loop.Windows) -> Array:
@@ -188,7 +221,9 @@ def prediction_slopes(
         if "rotation_rad" in free.names:
             angles = calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
             either = (replace(calibration, rotation_rad=angle) for angle in angles)
-            right, left = (open_loop.tracked_ends(course.chosen, c, ends) for c in either)
+            right, left = (
+                open_loop.tracked_ends(course.chosen, c, ends) for c in either
+            )
             aside = (left - right)[:, :, None]
             aside[:, 2] = geometry.wrap_angle(aside[:, 2])
             slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
@@ -207,7 +242,9 @@ class _Free:
     names: tuple[str, ...]  # all such fields
 
     @classmethod
-    def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> "_Free":
+    def of(
+        cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec
+    ) -> "_Free":
         """Frees what neither definition nor measurement fixes."""
         # The rotation is defined by the direction without motion, of which an omnidirectional robot
         # has none. Where it is known apart from a lever arm, and where a time is known, they are
@@ -219,21 +256,38 @@ class _Free:
             time = "command_latency_s"
         if time and known[time] <= TOLD_S and not lag_is_measured(calibration):
             time = None
-        turn = "rotation_rad" in known and not calibration.is_exact and not spec.moves_sideways
+        turn = (
+            "rotation_rad" in known
+            and not calibration.is_exact
+            and not spec.moves_sideways
+        )
         turn &= not (calibration.responses and "lever_arm_x_m" in known)
         names = (*([time] if time else ()), *(["rotation_rad"] if turn else ()))
-        return cls(model, calibration, free_coefficients(model, calibration), time, names)
+        return cls(
+            model, calibration, free_coefficients(model, calibration), time, names
+        )
 
     def at(self, theta: Array) -> tuple[TaylorModel, Calibration]:
         """Returns model and calibration at parameters (P,); fixed gains follow their lags."""
-        coefficients, count = self.model.coefficients.copy(), int(self.coefficients.sum())
+        coefficients, count = (
+            self.model.coefficients.copy(),
+            int(self.coefficients.sum()),
+        )
         coefficients[self.coefficients] = theta[:count]
         for i, response in enumerate(self.calibration.responses):
             own, command = linear_terms(self.model, response.state, response.command)
-            if own is not None and command is not None and not self.coefficients[3 + i, command]:
+            if (
+                own is not None
+                and command is not None
+                and not self.coefficients[3 + i, command]
+            ):
                 coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
-        values: dict[str, Any] = dict(zip(self.names, map(float, theta[count:]), strict=True))
-        return replace(self.model, coefficients=coefficients), replace(self.calibration, **values)
+        values: dict[str, Any] = dict(
+            zip(self.names, map(float, theta[count:]), strict=True)
+        )
+        return replace(self.model, coefficients=coefficients), replace(
+            self.calibration, **values
+        )
 
     def bounds(self) -> tuple[Array, Array]:
         """Returns bounds (P,) by which no state that follows a command overshoots it in a step."""
@@ -243,7 +297,9 @@ class _Free:
             own, _ = linear_terms(self.model, response.state, response.command)
             if own is not None:
                 low[3 + i, own], high[3 + i, own] = -FASTEST / self.model.dt, 0.0
-        return np.append(low[self.coefficients], -rest), np.append(high[self.coefficients], rest)
+        return np.append(low[self.coefficients], -rest), np.append(
+            high[self.coefficients], rest
+        )
 
 
 def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
@@ -251,7 +307,9 @@ def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     # An inferred speed is that along the direction of travel, vx = 1 speed; known lags are fixed.
     free = model.coefficients != 0.0
     if not calibration.responses:
-        free[3:] = False  # the rates of a measured state were fitted to that state itself
+        free[3:] = (
+            False  # the rates of a measured state were fitted to that state itself
+        )
     for i, response in enumerate(calibration.responses):
         alone, command = linear_terms(model, response.state, response.command)
         if alone is None:
@@ -272,7 +330,9 @@ def lag_is_measured(calibration: Calibration) -> bool:
 
 def linear_terms(model: TaylorModel, *names: str | None) -> list[int | None]:
     """Returns the columns of the terms that are one variable alone; None without such a term."""
-    wanted = (np.array([v == name for v in model.variables], dtype=np.int64) for name in names)
+    wanted = (
+        np.array([v == name for v in model.variables], dtype=np.int64) for name in names
+    )
     hits = (np.flatnonzero((model.powers == row).all(axis=1)) for row in wanted)
     return [int(hit[0]) if len(hit) else None for hit in hits]
 
@@ -282,7 +342,9 @@ class Refined:
     """A refined model."""
 
     model: TaylorModel
-    calibration: Calibration  # with refined offset (or latency), rotation, lags and gains
+    calibration: (
+        Calibration  # with refined offset (or latency), rotation, lags and gains
+    )
     error: float  # root mean square of the open-loop errors on the training part [m]
     std_errors: Array  # (D, K) of the refined coefficients; NaN for the others
 
@@ -318,7 +380,9 @@ def _coefficient_errors(
     starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.chosen])
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
     errors = np.full(model.coefficients.shape, np.nan)
-    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[: free.coefficients.sum()]
+    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[
+        : free.coefficients.sum()
+    ]
     for d, state in enumerate(problem.drive.spec.state, start=3):
         own, command = linear_terms(model, state.name, state.follows)
         if own is None or command is None:
@@ -344,9 +408,13 @@ def _with_uncertainty(
     turned = calibration.rotation_rad
     if "rotation_rad" in free.names:
         turned = float(geometry.wrap_angle(turned))
-    responses = tuple(_response(model, i, r) for i, r in enumerate(calibration.responses))
+    responses = tuple(
+        _response(model, i, r) for i, r in enumerate(calibration.responses)
+    )
     found = {**known, **spread}
-    return replace(calibration, rotation_rad=turned, uncertainty=found, responses=responses)
+    return replace(
+        calibration, rotation_rad=turned, uncertainty=found, responses=responses
+    )
 
 
 def _response(model: TaylorModel, i: int, response: Response) -> Response:
@@ -368,18 +436,24 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
-        if not coefficients[:3].any():  # the last term: without it the robot would not move
+        if not coefficients[
+            :3
+        ].any():  # the last term: without it the robot would not move
             break
         shorter = replace(best.model, coefficients=coefficients)
         try:
             again = refine(problem, shorter, best.calibration)
-        except np.linalg.LinAlgError:  # the remaining model is unstable: its slopes overflow
+        except (
+            np.linalg.LinAlgError
+        ):  # the remaining model is unstable: its slopes overflow
             continue
         if again.error < limit:
             best = again
     used = np.abs(best.model.coefficients).sum(axis=0) > 0.0
     coefficients = np.ascontiguousarray(best.model.coefficients[:, used])
-    model = replace(best.model, powers=best.model.powers[used], coefficients=coefficients)
+    model = replace(
+        best.model, powers=best.model.powers[used], coefficients=coefficients
+    )
     return replace(best, model=model, std_errors=best.std_errors[:, used])
 
 

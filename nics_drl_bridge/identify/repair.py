@@ -11,7 +11,12 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import held, interval_means, moved_commands, unwrapped
+from nics_drl_bridge.identify.signals import (
+    held,
+    interval_means,
+    moved_commands,
+    unwrapped,
+)
 from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
@@ -30,22 +35,53 @@ STATE_SHARE = 0.2  # and than this share of the usual range, for a state
 FARTHER = 3.0  # this many times the distance at the speed (turn rate) that 95 % of the drive keep,
 SPEED_OVER_S = 0.5  # over this time,
 UNUSUAL = 12.0  # than this many usual differences (`USUAL`),
-JUMP_SHARE, JUMP_TURN = 0.5, 0.3  # than this share of the robot's radius, or than this angle [rad]
+JUMP_SHARE, JUMP_TURN = (
+    0.5,
+    0.3,
+)  # than this share of the robot's radius, or than this angle [rad]
 AROUND, TOLD = 5, 3  # steps on either side of one; jumps that are told one by one
 MOST_JUMPS = 0.02  # of the steps: more of them are noise
-MOST = 0.15  # jumps in more than this share of the rows are not faults of single samples
+MOST = (
+    0.15  # jumps in more than this share of the rows are not faults of single samples
+)
 EXCESS = 0.01  # commands may exceed their limits by this share of their range
-WRONG_UNIT = 5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
+WRONG_UNIT = (
+    5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
+)
 UNIT_PERCENTILE, STEERED_PERCENTILE = 75.0, 95.0
 # Commands are compared with the motion over this time [s], that many times or more, at any delay
-DELAYS_S, COMPARED_S, MIN_COMPARED = np.linspace(-1.0, 1.5, 26), 1.0, 20  # and offset of clocks;
-ALIKE, NEAR = 0.85, 1.2  # from this correlation on, another unit explains sizes by up to this ratio
-SCALED = 1.5  # times that a robot drives otherwise than told: less is slip, or a worn wheel
-STANDING_M, STANDING_RAD, FROZEN = 1e-3, 2e-3, 12.0  # a pose that stays within this, or this
+DELAYS_S, COMPARED_S, MIN_COMPARED = (
+    np.linspace(-1.0, 1.5, 26),
+    1.0,
+    20,
+)  # and offset of clocks;
+ALIKE, NEAR = (
+    0.85,
+    1.2,
+)  # from this correlation on, another unit explains sizes by up to this ratio
+SCALED = (
+    1.5  # times that a robot drives otherwise than told: less is slip, or a worn wheel
+)
+STANDING_M, STANDING_RAD, FROZEN = (
+    1e-3,
+    2e-3,
+    12.0,
+)  # a pose that stays within this, or this
 # many times its noise, never moved
-SWAPPED = 0.6  # least correlation of each of two commands with what the other should move
-PLACES = {"linear.x": 0, "angular.z": 1, "throttle": 0, "steering": 1}  # in speed and turn rate
-SIDEWAYS = ("linear.x", "linear.y", "angular.z")  # commands of a robot that moves sideways
+SWAPPED = (
+    0.6  # least correlation of each of two commands with what the other should move
+)
+PLACES = {
+    "linear.x": 0,
+    "angular.z": 1,
+    "throttle": 0,
+    "steering": 1,
+}  # in speed and turn rate
+SIDEWAYS = (
+    "linear.x",
+    "linear.y",
+    "angular.z",
+)  # commands of a robot that moves sideways
 CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
 # Least distance to measure a direction of travel, of the footprint's radius, of the pose's noise
 TRAVEL_SHARE, TRAVEL_NOISE = 0.1, 25.0
@@ -86,7 +122,9 @@ def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
         jumps, count = "jump away from their neighbours and back", int(jump.sum())
         if share > MOST:
             fault = f"{recording.source}: {name}: {share:.0%} of the rows {jumps}"
-            raise RecordingError(f"{fault}; look for two sources that are mixed in one stream.")
+            raise RecordingError(
+                f"{fault}; look for two sources that are mixed in one stream."
+            )
         if count:
             recording = _with_rows(recording, name, ~jump)
             some = f"{name}: {count} of {len(jump)} rows ({share:.1%})"
@@ -98,7 +136,9 @@ def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
     pose, spec, t = drive.recording.pose, drive.spec, drive.sample_t
     span = np.zeros(len(t))
     span[NEIGHBOURS:] = t[NEIGHBOURS:] - t[:-NEIGHBOURS]
-    span[:-NEIGHBOURS] = np.maximum(span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS])
+    span[:-NEIGHBOURS] = np.maximum(
+        span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS]
+    )
     speeds = [abs(v) for c in spec.command if not c.turns for v in (c.min, c.max)]
     reach = np.maximum(REACH * max(speeds, default=0.0) * span, 1e-6)
     out = [_stands_out(pose.values[:, i], reach) for i in (0, 1)]
@@ -110,7 +150,9 @@ def _jumps_of_state(state: recordings.Stream) -> NDArray[np.bool_]:
     out = np.zeros(len(state.t), dtype=np.bool_)
     for column in state.values.T:
         low, high = np.percentile(column, (5.0, 95.0))
-        out |= _stands_out(column, np.full(len(column), max(STATE_SHARE * (high - low), 1e-9)))
+        out |= _stands_out(
+            column, np.full(len(column), max(STATE_SHARE * (high - low), 1e-9))
+        )
     return out
 
 
@@ -121,20 +163,28 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     if len(span) < 2 * AROUND + 1:
         return recording
     moved = geometry.log(geometry.between(pose[:-1], pose[1:]))
-    around = np.pad(moved / np.maximum(span, 1e-9)[:, None], ((AROUND, AROUND), (0, 0)), "edge")
+    around = np.pad(
+        moved / np.maximum(span, 1e-9)[:, None], ((AROUND, AROUND), (0, 0)), "edge"
+    )
     usual = np.median(sliding_window_view(around, 2 * AROUND + 1, axis=0), axis=2)
     expected = usual * span[:, None]
-    apart = np.stack([np.hypot(*(moved - expected)[:, :2].T), np.abs((moved - expected)[:, 2])])
+    apart = np.stack(
+        [np.hypot(*(moved - expected)[:, :2].T), np.abs((moved - expected)[:, 2])]
+    )
     jump = (apart > _greatest(drive, apart)).any(axis=0)
     if not jump.any() or jump.mean() > MOST_JUMPS:
         return recording
     place, told = pose.copy(), []
     for k in np.flatnonzero(jump):
         here = geometry.compose(place[k], geometry.exp(expected[k]))
-        place[k + 1 :] = geometry.compose(here, geometry.between(place[k + 1], place[k + 1 :]))
+        place[k + 1 :] = geometry.compose(
+            here, geometry.between(place[k + 1], place[k + 1 :])
+        )
         size = f"{apart[0, k]:.2f} m, {apart[1, k]:.2f} rad"
         told.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
-    some = ", ".join(told[:TOLD]) + (f" and {len(told) - TOLD} more" if len(told) > TOLD else "")
+    some = ", ".join(told[:TOLD]) + (
+        f" and {len(told) - TOLD} more" if len(told) > TOLD else ""
+    )
     finding = f"jumps {some} as no speed of this robot explains"
     split = "the drive is split there: it goes on from where it was before"
     notes.append(Gap(f"pose: {finding}; {split}."))
@@ -148,15 +198,21 @@ def _greatest(drive: Drive, apart: Array) -> Array:
     took = np.maximum(np.diff(t[every]), 1e-9)
     gone = np.abs(np.diff(pose[every], axis=0))
     rates = np.stack([np.hypot(*gone[:, :2].T), gone[:, 2]]) / took
-    speeds = [abs(v) for c in drive.spec.command if c.unit == "m/s" for v in (c.min, c.max)]
+    speeds = [
+        abs(v) for c in drive.spec.command if c.unit == "m/s" for v in (c.min, c.max)
+    ]
     fastest = np.percentile(rates, 95.0, axis=1) if len(took) else np.zeros(2)
     fastest[0] = max(fastest[0], REACH / FARTHER * max(speeds, default=0.0))
     floor = np.array([JUMP_SHARE * drive.spec.footprint_radius, JUMP_TURN])
     floor = np.maximum(floor, UNUSUAL * np.percentile(apart, USUAL, axis=1))
-    return np.asarray(np.maximum(floor[:, None], FARTHER * fastest[:, None] * np.diff(t)))
+    return np.asarray(
+        np.maximum(floor[:, None], FARTHER * fastest[:, None] * np.diff(t))
+    )
 
 
-def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[np.bool_]:
+def _stands_out(
+    values: Array, least: Array, turning: bool = False
+) -> NDArray[np.bool_]:
     """Selects values (T,) that differ alike from both sides, by `least` and `STEPS` changes."""
     count = len(values)
     if count <= 2 * NEIGHBOURS:
@@ -169,7 +225,9 @@ def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[n
     usual = float(np.percentile(np.abs(back[0][1:]), USUAL))
     before, after = np.median(back, axis=0), np.median(ahead, axis=0)
     apart = np.minimum(np.abs(before), np.abs(after))
-    return np.asarray((before * after > 0.0) & (apart > np.maximum(STEPS * usual, least)))
+    return np.asarray(
+        (before * after > 0.0) & (apart > np.maximum(STEPS * usual, least))
+    )
 
 
 def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
@@ -214,7 +272,10 @@ def _rates_left(recording: recordings.Recording, command: Array) -> float:
 def check_units(drive: Drive) -> None:
     """Refuses states and commands, with a RecordingError, that only another unit can explain."""
     recording, spec = drive.recording, drive.spec
-    for stream, variables in ((recording.command, spec.command), (recording.state, spec.state)):
+    for stream, variables in (
+        (recording.command, spec.command),
+        (recording.state, spec.state),
+    ):
         if stream is None:
             continue
         sizes = np.percentile(np.abs(stream.values), UNIT_PERCENTILE, axis=0)
@@ -234,7 +295,9 @@ def check_units(drive: Drive) -> None:
             raise RecordingError(f"{recording.source}: {fault}; {advice}.")
 
 
-def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tuple[str, ...]:
+def check_commands(
+    drive: Drive, command: recordings.Stream | None = None
+) -> tuple[str, ...]:
     """Refuses swapped commands, with a RecordingError; tells other units and a mirrored motion.
 
     By how the speed and the turn rate that they ask for, or those before they were clipped,
@@ -256,7 +319,9 @@ def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tu
         times = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
         for other in CONFUSED.get(unit, ()) if alike[place, place] > ALIKE else ():
             if 1.0 / NEAR < times * UNITS[other].factor < NEAR:
-                finding = f"The commands ask for {times:.3g} times the {name} that was driven"
+                finding = (
+                    f"The commands ask for {times:.3g} times the {name} that was driven"
+                )
                 advice = f"write `unit: {other}` beside `from:`"
                 notes.append(Mistake(f"{finding}: if they are in {other}, {advice}."))
                 break
@@ -270,7 +335,9 @@ def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tu
 
 def _about_scale(name: str, times: float) -> str:
     """Says that a robot drives by another speed, or turn rate, than its commands ask for."""
-    finding = f"The commands ask for {times:.3g} times the {name} that was driven, steadily"
+    finding = (
+        f"The commands ask for {times:.3g} times the {name} that was driven, steadily"
+    )
     causes = "the scale of this command, or that of the pose, is wrong"
     return f"{finding}: {causes}, or the robot's own driver scales it."
 
@@ -283,8 +350,12 @@ def check_pose_moves(drive: Drive) -> None:
     position, heading = drive.pose_noise or (0.0, 0.0)
     reach = float(np.ptp(values[:, :2], axis=0).max())
     turn = float(np.ptp(values[:, 2]))
-    if reach <= max(STANDING_M, FROZEN * position) and turn <= max(STANDING_RAD, FROZEN * heading):
-        fault = f"stays within {reach:.2g} m and {turn:.2g} rad while the commands change"
+    if reach <= max(STANDING_M, FROZEN * position) and turn <= max(
+        STANDING_RAD, FROZEN * heading
+    ):
+        fault = (
+            f"stays within {reach:.2g} m and {turn:.2g} rad while the commands change"
+        )
         advice = "check that it is this robot's, that it is alive, and that nothing held the robot"
         raise RecordingError(f"{recording.source}: pose: {fault}; {advice}.")
 
@@ -293,8 +364,14 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
     """Tells of measured wheels that turn against the motion that they make by the textbook."""
     recording, spec = drive.recording, drive.spec
     state = recording.state
-    wheels = bool(spec.state) and all(v.unit == "rad/s" and not v.twist for v in spec.state)
-    if state is None or state.clock != recording.pose.clock or not (wheels and has_textbook(spec)):
+    wheels = bool(spec.state) and all(
+        v.unit == "rad/s" and not v.twist for v in spec.state
+    )
+    if (
+        state is None
+        or state.clock != recording.pose.clock
+        or not (wheels and has_textbook(spec))
+    ):
         return ()
     try:
         per_wheel = textbook(spec).twist(np.eye(len(spec.state)))  # (S, 3)
@@ -308,7 +385,9 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
     found = np.linalg.lstsq(turned, driven[inside], rcond=1e-3)[0]  # (S, 3)
     rest = driven[inside] - turned @ found
     parts = [d for d in (0, 2) if np.abs(per_wheel[:, d]).min() > 0.0]
-    explained = 1.0 - (rest**2).mean(axis=0) / np.maximum((driven[inside] ** 2).mean(axis=0), 1e-12)
+    explained = 1.0 - (rest**2).mean(axis=0) / np.maximum(
+        (driven[inside] ** 2).mean(axis=0), 1e-12
+    )
     if not parts or explained[parts].min() < SWAPPED:
         return ()
     against = (found[:, parts] * per_wheel[:, parts] < 0.0).all(axis=1)
@@ -318,12 +397,18 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
     return tuple(Mistake(f"{name} {finding}: {advice}.") for name in names)
 
 
-def _check_swapped(drive: Drive, pair: list[int], crosswise: float, straight: float) -> None:
+def _check_swapped(
+    drive: Drive, pair: list[int], crosswise: float, straight: float
+) -> None:
     """Refuses two commands that are more alike to what the other should move than to their own."""
     if crosswise > max(SWAPPED, straight):
         one, other = (drive.spec.command[place].name for place in pair)
-        fault = f"{one} and {other} are swapped: each moves the robot as the other should"
-        advice = f"write the column of `{other}:` behind `{one}:`, and the other way round"
+        fault = (
+            f"{one} and {other} are swapped: each moves the robot as the other should"
+        )
+        advice = (
+            f"write the column of `{other}:` behind `{one}:`, and the other way round"
+        )
         raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
 
 
@@ -344,14 +429,22 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     along, size = np.hypot(best[:, 0], best[:, 1]), np.abs(best)
     for k, straight in enumerate(along[:2] + size[2, 2]):
         _check_swapped(drive, [order[k], order[2]], min(along[2], size[k, 2]), straight)
-    if best[0, 1] * best[1, 0] > 0.0:  # opposite signs are of poses that are turned by 90 degrees
-        _check_swapped(drive, order[:2], min(size[0, 1], size[1, 0]), size[0, 0] + size[1, 1])
+    if (
+        best[0, 1] * best[1, 0] > 0.0
+    ):  # opposite signs are of poses that are turned by 90 degrees
+        _check_swapped(
+            drive, order[:2], min(size[0, 1], size[1, 0]), size[0, 0] + size[1, 1]
+        )
     if np.linalg.det(best[:2, :2]) > -(SWAPPED**2) or np.linalg.det(way[:2]) > 0.0:
         return ()
     one, other = (spec.command[k].name for k in order[:2])
     finding = f"The robot moves right where {other} is positive, or back where {one} is"
     cause = "one of them has the wrong sign, or the recording is a mirror image"
-    return (Mistake(f"{finding}: {cause} (y and heading reversed); the model moves as recorded."),)
+    return (
+        Mistake(
+            f"{finding}: {cause} (y and heading reversed); the model moves as recorded."
+        ),
+    )
 
 
 def _driven(drive: Drive) -> tuple[Array, Array, Array]:
@@ -360,7 +453,9 @@ def _driven(drive: Drive) -> tuple[Array, Array, Array]:
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
     first, last = np.searchsorted(t, start), np.searchsorted(t, start + COMPARED_S)
     first, last = first[last > first], last[last > first]
-    moved = geometry.log(geometry.between(drive.dated.values[first], drive.dated.values[last]))
+    moved = geometry.log(
+        geometry.between(drive.dated.values[first], drive.dated.values[last])
+    )
     return t[first], t[last], moved / (t[last] - t[first])[:, None]
 
 
@@ -378,20 +473,32 @@ def _asked_and_driven(
     None if that does not show.
     """
     spec, places, (start, end, moved) = drive.spec, _places(drive.spec), _driven(drive)
-    wheels = all(c.unit == "rad/s" for c in spec.command) and "wheel_radius" in spec.parameters
+    wheels = (
+        all(c.unit == "rad/s" for c in spec.command)
+        and "wheel_radius" in spec.parameters
+    )
     wheels = wheels and "wheel_radius" not in spec.assumed and has_textbook(spec)
     if not (places or wheels) or len(start) < MIN_COMPARED:
         return None
-    axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())  # of travel, ahead or back
+    axis = np.sqrt(
+        ((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum()
+    )  # of travel, ahead or back
     axis = axis / max(abs(axis), 1e-9)
     driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
     best = np.zeros((2, 2)), driven
     for delay in DELAYS_S:
-        sent, twist = held(command, spec, start - delay, end - delay), np.zeros_like(driven)
-        twist[:, places or [0, 1]] = sent if places else textbook(spec).steady(sent)[:, [0, 2]]
+        sent, twist = (
+            held(command, spec, start - delay, end - delay),
+            np.zeros_like(driven),
+        )
+        twist[:, places or [0, 1]] = (
+            sent if places else textbook(spec).steady(sent)[:, [0, 2]]
+        )
         with np.errstate(invalid="ignore"):  # of what never changed
             alike = np.corrcoef(twist.T, driven.T)[:2, 2:]
-        best = max(best, (np.abs(np.nan_to_num(alike)), twist), key=lambda e: e[0].sum())
+        best = max(
+            best, (np.abs(np.nan_to_num(alike)), twist), key=lambda e: e[0].sum()
+        )
     return best[1], driven, best[0]
 
 
@@ -411,21 +518,33 @@ def check_axes(drive: Drive) -> None:
         and recordings.shows_axes(some.values)
     ):
         other = some.values * np.array([1.0, 1.0, -1.0])
-        as_given, mirrored = (_explained(some.t, p, state) for p in (some.values, other))
+        as_given, mirrored = (
+            _explained(some.t, p, state) for p in (some.values, other)
+        )
         least = max(recordings.MIRRORED, recordings.BETTER + as_given)
         line = "scale: -1" if mirrored > least else ""
     if line:
-        fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
+        fault = (
+            "heading and path turn opposite ways; one of x, y and heading is reversed"
+        )
         known = "as that of a compass" if "offset" in line else "counted clockwise"
         advice = f"for a heading {known} write `heading: {{from: ..., {line}}}` below `pose:`"
-        other = "exchange x and y" if "offset" in line else "turn x or y so, or remove such a scale"
-        raise RecordingError(f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103).")
+        other = (
+            "exchange x and y"
+            if "offset" in line
+            else "turn x or y so, or remove such a scale"
+        )
+        raise RecordingError(
+            f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103)."
+        )
 
 
 def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:
     """Returns the share (0 to 1) of the body velocity between poses that the state explains."""
     span = np.diff(t)
     keep = span > 0.0
-    velocity = geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
+    velocity = (
+        geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
+    )
     means = interval_means(state.t, state.values, t[:-1][keep], t[1:][keep])
     return 1.0 - float((unexplained(means, velocity) ** 2).mean())

@@ -19,14 +19,21 @@ from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 WIDTH = 96
 CURVE_POINTS = 8
 TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_arm_y_m"
-DEAD_ZONE, EAGER = "dead zone on both sides of 0", "does more than in proportion, by minus"
+DEAD_ZONE, EAGER = (
+    "dead zone on both sides of 0",
+    "does more than in proportion, by minus",
+)
 LEAST_DIGITS = 3  # of a coefficient: the printed equations predict as the model does
-MOST_LEFT = 0.5  # share of the error of standing still above which a model is hardly better
+MOST_LEFT = (
+    0.5  # share of the error of standing still above which a model is hardly better
+)
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    spec = identified.drive.spec  # of a textbook that was written, which may have another state
+    spec = (
+        identified.drive.spec
+    )  # of a textbook that was written, which may have another state
     model = identified.model
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
     joined = bool(identified.recording.episodes)
@@ -37,12 +44,20 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     notes = identified.notes or ("Nothing had to be corrected.",)
     linear = not identified.findings.width and not identified.findings.replaced
     of = f" of {identified.fit.regression.terms_total}" if linear else ""
-    listed = partial(fill, width=WIDTH - 2, initial_indent="- ", subsequent_indent="    ")
+    listed = partial(
+        fill, width=WIDTH - 2, initial_indent="- ", subsequent_indent="    "
+    )
     sections: dict[str, Iterable[str]] = {
-        f"Fit report: robot {spec.name!r} from {source}": map(listed, conclude(identified).lines),
+        f"Fit report: robot {spec.name!r} from {source}": map(
+            listed, conclude(identified).lines
+        ),
         f"Kept {model.terms_kept}{of} terms, step {model.dt:g} s "
-        f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
-        **({"Effect of the motors (standard uncertainties):": around} if around else {}),
+        f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(
+            model
+        ),
+        **(
+            {"Effect of the motors (standard uncertainties):": around} if around else {}
+        ),
         **_linear_fit(identified),
         f"Open loop, on data held out from the fit ({apart}):": _held_out(identified),
         **_compared(identified.judgement),
@@ -51,14 +66,22 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
             + " (assumed)" * (model.bounded and f"d_{name}" in dict(model.assumed))
             for name, low, high in ranges
         ),
-        "Calibration (standard uncertainties):": (e.text for e in estimates(identified).values()),
+        "Calibration (standard uncertainties):": (
+            e.text for e in estimates(identified).values()
+        ),
         "Noise that the simulator and the estimator use (standard deviations):": (
             identified.noise.sentences()
         ),
-        **({"Latency of the device, also used by simulator_node:": latency} if latency else {}),
+        **(
+            {"Latency of the device, also used by simulator_node:": latency}
+            if latency
+            else {}
+        ),
         "Findings, and what was not learnt:": map(listed, notes),
     }
-    paragraphs = ([head, *(f"  {line}" for line in lines)] for head, lines in sections.items())
+    paragraphs = (
+        [head, *(f"  {line}" for line in lines)] for head, lines in sections.items()
+    )
     return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
 
 
@@ -70,13 +93,19 @@ def opening(report: str) -> str:
 def equations_with_errors(model: TaylorModel) -> list[str]:
     """Returns one line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
     errors, lines = model.named_errors, [curve.equation for curve in model.inputs]
-    for dof, unit, row in zip(model.dofs, model.dof_units, model.coefficients, strict=True):
+    for dof, unit, row in zip(
+        model.dofs, model.dof_units, model.coefficients, strict=True
+    ):
         text = ""
         terms = zip(model.term_names, model.shown_terms, map(float, row), strict=True)
         for name, shown, value in terms:
             if value == 0.0:
                 continue
-            sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
+            sign = (
+                ("-" if value < 0 else "")
+                if not text
+                else (" - " if value < 0 else " + ")
+            )
             mark = " (assumed)" if (dof, name) in model.assumed else ""
             number = with_error(abs(value), errors.get(dof, {}).get(name))
             text += f"{sign}{number}" + ("" if name == "1" else f"*{shown}") + mark
@@ -102,7 +131,12 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
         (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
         for curve in model.inputs
         for name, words, unit, usual in (
-            ("dead", DEAD_ZONE if curve.dead > 0.0 else EAGER, units[curve.command], 0.0),
+            (
+                "dead",
+                DEAD_ZONE if curve.dead > 0.0 else EAGER,
+                units[curve.command],
+                0.0,
+            ),
             ("least", "saturates below", units[curve.command], -np.inf),
             ("most", "saturates above", units[curve.command], np.inf),
             ("back", "gain backwards, relative to forwards", "", 1.0),
@@ -120,7 +154,13 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
         ]
     emf = zip(model.variables, model.back_emf.tolist(), strict=False)
     values += [
-        (f"{state}.back_emf.{command}", f"back-EMF, times {state} and |{command}|", value, "", 0.0)
+        (
+            f"{state}.back_emf.{command}",
+            f"back-EMF, times {state} and |{command}|",
+            value,
+            "",
+            0.0,
+        )
         for state, row in emf
         for command, value in zip(model.variables[model.state_size :], row, strict=True)
     ]
@@ -153,7 +193,9 @@ def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
     if identified.findings.width is not None or identified.findings.replaced:
         return {}
     fit, model = identified.fit, identified.model
-    rows = zip(model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True)
+    rows = zip(
+        model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True
+    )
     return {
         fill(_pruning(identified.alpha), WIDTH): (),
         "Cross-validated error against the number of terms, largest first, * for those kept:": (
@@ -171,14 +213,17 @@ def _pruning(alpha: Alpha) -> str:
         knee = "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve"
         fewest = "the fewest terms, largest standardised coefficient first"
         return f"{knee}: {fewest}, whose cross-validated error can't be told from the least."
-    pruned = f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own"
+    pruned = (
+        f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own"
+    )
     return f"{pruned}; the term that crosses the threshold is kept too."
 
 
 def _curve(curve: Curve) -> list[str]:
     shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
     points = [
-        f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %" for n in range(shown)
+        f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %"
+        for n in range(shown)
     ]
     more = f" ({len(curve.error) - 1} in all)" if shown < len(curve.error) else ""
     text = f"{curve.dof:<14} " + ", ".join(points) + more
@@ -186,7 +231,11 @@ def _curve(curve: Curve) -> list[str]:
 
 
 def _held_out(identified: Identified) -> Iterator[str]:
-    found, model, quality = identified.held_out, identified.model, identified.model.quality
+    found, model, quality = (
+        identified.held_out,
+        identified.model,
+        identified.model.quality,
+    )
     if found is None:
         yield "the drive is too short to hold data out"
     else:
@@ -201,8 +250,18 @@ def _held_out(identified: Identified) -> Iterator[str]:
             yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}"
 
 
-HEADS = ("after", "path", "model", "fitted textbook", "constant twist", "95 % within", "held")
-COMPARED = "By horizon, mean errors of position [m] (share of the path) and heading [rad]:"
+HEADS = (
+    "after",
+    "path",
+    "model",
+    "fitted textbook",
+    "constant twist",
+    "95 % within",
+    "held",
+)
+COMPARED = (
+    "By horizon, mean errors of position [m] (share of the path) and heading [rad]:"
+)
 
 
 def judgement_rows(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
@@ -216,13 +275,17 @@ def judgement_rows(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
 
     return [
         (
-            f"{at.horizon_s:g} s", f"{at.path_m:.3g} m",
-            *(cell(errors, at.path_m) for errors in (at.model, at.textbook, at.kept_twist)),
+            f"{at.horizon_s:g} s",
+            f"{at.path_m:.3g} m",
+            *(
+                cell(errors, at.path_m)
+                for errors in (at.model, at.textbook, at.kept_twist)
+            ),
             "-" if at.band_m is None else f"{at.band_m:.3g} m",
             "-" if at.coverage is None else f"{at.coverage:.1%}",
         )
         for at in judgement
-    ]  # fmt: skip
+    ]
 
 
 def _compared(judgement: Sequence[HorizonErrors]) -> dict[str, Iterator[str]]:
@@ -273,7 +336,12 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     rows = {
         "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
         "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
-        "burst_period_s": ("period of bursts", None, "s", "the poses are stamped one by one"),
+        "burst_period_s": (
+            "period of bursts",
+            None,
+            "s",
+            "the poses are stamped one by one",
+        ),
         "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", few),
         "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", hidden[0]),
         "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", hidden[1]),
@@ -284,19 +352,33 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     for key, (name, value, unit, why) in rows.items():
         values[key] = CalibratedValue(name, None, None, unit, why)
         if key in sigma:
-            zero = value == 0.0 and key in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
+            zero = value == 0.0 and key in (
+                "rotation_rad",
+                "lever_arm_x_m",
+                "lever_arm_y_m",
+            )
             remark = "below its uncertainty: taken as zero" if zero else ""
             values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
     if identified.findings.replaced:
         for key in TEXTBOOK_VALUES:
             name, value, unit, _ = rows[key]
-            values[key] = CalibratedValue(name, value, None, unit, "by the fitted textbook")
+            values[key] = CalibratedValue(
+                name, value, None, unit, "by the fitted textbook"
+            )
     if (period := found.burst_period_s) > 0.0:
-        values["burst_period_s"] = CalibratedValue("period of bursts", period, None, "s")
+        values["burst_period_s"] = CalibratedValue(
+            "period of bursts", period, None, "s"
+        )
     swapped = found.wheels_swapped
-    meaning = {None: wheels, True: "left and right are interchanged", False: "as named"}[swapped]
+    meaning = {
+        None: wheels,
+        True: "left and right are interchanged",
+        False: "as named",
+    }[swapped]
     known = None if swapped is None else float(swapped)
-    values["wheels_swapped"] = CalibratedValue("swapped wheels", known, None, "", meaning)
+    values["wheels_swapped"] = CalibratedValue(
+        "swapped wheels", known, None, "", meaning
+    )
     return values
 
 

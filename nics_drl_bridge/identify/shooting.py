@@ -22,17 +22,25 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
-Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by values (I,)
-Shape = Callable[[TaylorModel, Array], TaylorModel]  # a model with friction and limits by values
+Commands = Callable[
+    [Array], Array
+]  # those in effect (T, C) during each step, by values (I,)
+Shape = Callable[
+    [TaylorModel, Array], TaylorModel
+]  # a model with friction and limits by values
 
-Trust = Callable[[Array, Array], Array]  # weights of motions from start to end, usually 1
+Trust = Callable[
+    [Array, Array], Array
+]  # weights of motions from start to end, usually 1
 
 HORIZONS_S = (0.3, 1.0, 2.5, 5.0)  # the shortest tells a latency from a lag
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
 PULL = 0.001  # usual weight of the first coefficients against the predictions
-REFERENCE_M_S = 0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
+REFERENCE_M_S = (
+    0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
+)
 DRIFT_M_S = 0.01  # by which good predictions go astray: noise counts as time
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
 EVALUATIONS, TOLERANCE = 60, 1e-6
@@ -60,7 +68,9 @@ class Inputs:
     def begun_at(self, other: "Inputs") -> "Inputs":
         """Starts from the values of other inputs, where these have them."""
         known = dict(zip(other.names, other.start.tolist(), strict=True))
-        start = [known.get(name, at) for name, at in zip(self.names, self.start, strict=True)]
+        start = [
+            known.get(name, at) for name, at in zip(self.names, self.start, strict=True)
+        ]
         return replace(self, start=np.clip(start, self.low, self.high))
 
 
@@ -72,7 +82,9 @@ class Shooting:
     commands: Commands
     shaped: Shape
     trust: Trust
-    mounted: bool = False  # True if the last three values are the pose of what `q` is, in the base
+    mounted: bool = (
+        False  # True if the last three values are the pose of what `q` is, in the base
+    )
     noise_m: float = 0.0  # standard deviation of measured positions
     fixed: Array | None = None  # values (I,) that are used instead of those given
     horizons: tuple[float, ...] = HORIZONS_S
@@ -86,11 +98,15 @@ class Shooting:
         t, dt = self.samples.t, self.samples.dt
         last = len(t) - 1
         first = np.arange(0, last, max(1, round(self.spacing_s / dt)))
-        steps = np.tile(np.maximum(1, np.round(np.array(self.horizons) / dt)), (len(first), 1))
+        steps = np.tile(
+            np.maximum(1, np.round(np.array(self.horizons) / dt)), (len(first), 1)
+        )
         steps = steps.astype(np.intp)
         end = np.minimum(first[:, None] + steps, last)
         apart = t[end] - t[first][:, None] - steps * dt
-        whole = (end - first[:, None] == steps) & (np.abs(apart) < SAME_STEP * dt * steps)
+        whole = (end - first[:, None] == steps) & (
+            np.abs(apart) < SAME_STEP * dt * steps
+        )
         if inside is not None:
             outside = np.append(0, np.cumsum(~inside))
             whole &= outside[end] == outside[first][:, None]
@@ -104,16 +120,25 @@ class Shooting:
 
     def paths(self, first: Rows, steps: Rows) -> Array:
         """Returns the lengths (W, H) of the measured paths over windows [m]."""
-        length = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T)))
+        length = np.append(
+            0.0, np.cumsum(np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T))
+        )
         return np.asarray(length[first[:, None] + steps] - length[first][:, None])
 
     def predict(
-        self, model: TaylorModel, values: Array, first: Rows, steps: Rows, free: Mask | None = None
+        self,
+        model: TaylorModel,
+        values: Array,
+        first: Rows,
+        steps: Rows,
+        free: Mask | None = None,
     ) -> tuple[Array, Array]:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by `free` (D, K) coefficients."""
         values = values if self.fixed is None else self.fixed
         model = self.shaped(model, values)
-        free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
+        free = (
+            np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
+        )
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
         terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
@@ -121,9 +146,13 @@ class Shooting:
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
         command, state = self.commands(values), self.samples.q[:, 3:]
         shot = Shot(
-            np.ascontiguousarray(state[first]), first, np.ascontiguousarray(command), steps,
-            np.zeros((*steps.shape, 3)), np.zeros((*steps.shape, 3, len(moving))),
-        )  # fmt: skip
+            np.ascontiguousarray(state[first]),
+            first,
+            np.ascontiguousarray(command),
+            steps,
+            np.zeros((*steps.shape, 3)),
+            np.zeros((*steps.shape, 3, len(moving))),
+        )
         sizes = state.shape[1], command.shape[1], len(dofs), len(moving)
         shoot(shot, terms, moving, model.dt, tangent(*sizes))
         return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
@@ -164,7 +193,9 @@ class Predictive:
     residual: Array  # (n,)
     free: Mask  # (D, K)
     starts: Array  # (n,) start of the window of each residual [s]
-    value_errors: Array  # (I,) standard errors of the values; NaN of those that were known
+    value_errors: (
+        Array  # (I,) standard errors of the values; NaN of those that were known
+    )
 
     def named_errors(self, names: tuple[str, ...]) -> dict[str, float]:
         """Returns the errors of values that belong to a command or a state, as `throttle.dead`.
@@ -172,16 +203,24 @@ class Predictive:
         Those that the predictions do not depend on have none.
         """
         errors = zip(names, self.value_errors.tolist(), strict=True)
-        return {name: error for name, error in errors if "." in name and error > NO_ERROR}
+        return {
+            name: error for name, error in errors if "." in name and error > NO_ERROR
+        }
 
 
 NOTHING_FREE = Inputs((), *(np.zeros(0) for _ in range(4)))
 
 
 def fitted(
-    problem: Shooting, model: TaylorModel, free: Mask, inputs: Inputs, inside: Mask | None = None,
-    evaluations: int = EVALUATIONS, pull: float = PULL, first: Array | None = None,
-) -> Predictive:  # fmt: skip
+    problem: Shooting,
+    model: TaylorModel,
+    free: Mask,
+    inputs: Inputs,
+    inside: Mask | None = None,
+    evaluations: int = EVALUATIONS,
+    pull: float = PULL,
+    first: Array | None = None,
+) -> Predictive:
     """Adjusts free coefficients (D, K) and values of inputs to the least prediction errors.
 
     They are pulled to those of the model. The search starts at the `first` if these are better.
@@ -193,11 +232,18 @@ class _Search:
     """Least squares over windows, by scaled values and coefficients (I + P,): zero is the model."""
 
     def __init__(
-        self, problem: Shooting, model: TaylorModel, free: Mask, inputs: Inputs,
-        inside: Mask | None, pull: float,
-    ) -> None:  # fmt: skip
+        self,
+        problem: Shooting,
+        model: TaylorModel,
+        free: Mask,
+        inputs: Inputs,
+        inside: Mask | None,
+        pull: float,
+    ) -> None:
         self.problem, self.model, self.free, self.inputs = problem, model, free, inputs
-        size = np.sqrt((taylor.evaluate(problem.samples.x, model.powers) ** 2).mean(axis=0))
+        size = np.sqrt(
+            (taylor.evaluate(problem.samples.x, model.powers) ** 2).mean(axis=0)
+        )
         spread = np.maximum(problem.samples.dq.std(axis=0), 1e-6)
         # Coefficients (D, K) that make each term as large as the rates usually are.
         self.unit = (spread[:, None] / np.maximum(size, 1e-9))[free]
@@ -206,7 +252,9 @@ class _Search:
         weight = np.array([1.0, 1.0, HEADING_ARM_M])
         usual = np.array(problem.horizons) + problem.noise_m / DRIFT_M_S
         t = problem.samples.t
-        trust = problem.trust(t[self.first][:, None], t[self.first[:, None] + self.steps])
+        trust = problem.trust(
+            t[self.first][:, None], t[self.first[:, None] + self.steps]
+        )
         self.weight = weight / usual[:, None] * np.sqrt(trust)
         self.measured = problem.moved(self.first, self.steps)
         self.sought = inputs.sought
@@ -242,8 +290,13 @@ class _Search:
         """Returns its derivatives (n + P, I + P)."""
         count, unit = self.count, self.unit
         rest, slope = self.shot(theta, True)
-        late, slope = self.late(theta, rest), np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
-        own = np.concatenate([np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1)
+        late, slope = (
+            self.late(theta, rest),
+            np.clip(np.nan_to_num(slope * unit), -1e6, 1e6),
+        )
+        own = np.concatenate(
+            [np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1
+        )
         return np.concatenate([np.concatenate([late, slope], axis=1), own])
 
     def late(self, theta: Array, rest: Array) -> Array:
@@ -258,7 +311,9 @@ class _Search:
         begun = self.residual(start)
         if first is not None:
             other = start.copy()
-            other[count:] = (first[self.free] - self.model.coefficients[self.free]) / self.unit
+            other[count:] = (
+                first[self.free] - self.model.coefficients[self.free]
+            ) / self.unit
             if np.abs(rest := self.residual(other)).sum() < np.abs(begun).sum():
                 start, begun = other, rest
         low = np.full(len(start), -np.inf)
@@ -269,10 +324,16 @@ class _Search:
         aside = INSIDE * (high - low)[:count]  # at a bound the search would stay there
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
         found = least_squares(
-            self.residual, start, jac=self.jacobian, bounds=(low, high), loss="soft_l1",
-            f_scale=max(float(np.median(np.abs(begun))), LEAST_SCALE), max_nfev=evaluations,
-            ftol=TOLERANCE, xtol=TOLERANCE,
-        )  # fmt: skip
+            self.residual,
+            start,
+            jac=self.jacobian,
+            bounds=(low, high),
+            loss="soft_l1",
+            f_scale=max(float(np.median(np.abs(begun))), LEAST_SCALE),
+            max_nfev=evaluations,
+            ftol=TOLERANCE,
+            xtol=TOLERANCE,
+        )
         return self.predictive(found.x)
 
     def predictive(self, theta: Array) -> Predictive:
@@ -280,7 +341,9 @@ class _Search:
         best, late = self.at(theta)
         best = self.problem.shaped(best, late)
         rest, slope = self.shot(theta, True)
-        starts = np.repeat(self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1))
+        starts = np.repeat(
+            self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1)
+        )
         span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
         errors = np.full(len(self.inputs.start), np.nan)
         if self.count:

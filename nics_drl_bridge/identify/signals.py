@@ -23,7 +23,11 @@ GAUSSIAN_MAD = 0.6745
 
 
 def taken(
-    command: Stream, spec: RobotSpec, curves: tuple[InputCurve, ...], start: Array, end: Array
+    command: Stream,
+    spec: RobotSpec,
+    curves: tuple[InputCurve, ...],
+    start: Array,
+    end: Array,
 ) -> Array:
     """Returns means (..., C) of commands in effect over intervals (...) [s], by their curves."""
     names = [c.name for c in spec.command]
@@ -35,9 +39,12 @@ def taken(
 
 
 def held(
-    command: Stream, spec: RobotSpec, start: Array, end: Array,
+    command: Stream,
+    spec: RobotSpec,
+    start: Array,
+    end: Array,
     powers: NDArray[np.int64] | None = None,
-) -> Array:  # fmt: skip
+) -> Array:
     """Returns means (..., C), or of powers (K, C), of held commands over intervals (...) [s]."""
     # Before its first command a robot stands still: commands that ever change are zero then.
     still = np.clip(0.0, spec.command_low, spec.command_high)
@@ -45,7 +52,10 @@ def held(
     values = np.concatenate([before[None], command.values])
     if powers is not None:
         values = taylor.evaluate(values, powers)
-    low, high = min(start.min(), command.t[0]) - 1.0, max(end.max(), command.t[-1]) + 1.0
+    low, high = (
+        min(start.min(), command.t[0]) - 1.0,
+        max(end.max(), command.t[-1]) + 1.0,
+    )
     edges = np.concatenate([[low], command.t, [high]])
     return _means(edges, values * np.diff(edges)[:, None], start, end)
 
@@ -89,7 +99,9 @@ def speed_index(spec: RobotSpec) -> int | None:
 
 def nominal_lags(spec: RobotSpec) -> Array:
     """Returns the spec's time constants (S,) `NAME_lag` [s], else a typical one."""
-    return np.array([spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state])
+    return np.array(
+        [spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state]
+    )
 
 
 class Motors(NamedTuple):
@@ -111,9 +123,13 @@ def free_motors(states: int) -> Motors:
 
 
 def inferred_states(
-    command: Stream, spec: RobotSpec, lags: Array, latency: Array | float, grid: Array,
+    command: Stream,
+    spec: RobotSpec,
+    lags: Array,
+    latency: Array | float,
+    grid: Array,
     motors: Motors | None = None,
-) -> Array:  # fmt: skip
+) -> Array:
     """Infers states (T, S) at uniform times (T,) by lags and latencies (S,) [s], with gain one."""
     dt, follows = float(grid[1] - grid[0]), followed(spec)
     fall, rise, dead = motors or free_motors(len(follows))
@@ -171,5 +187,7 @@ def resample(
     weight = inside[..., None] * weights[index]
     basis = ((t[index] - at[:, None]) / half_width)[..., None] ** np.arange(3)
     normal = np.einsum("nki,nkd,nkj->ndij", basis, weight, basis) + 1e-9 * np.eye(3)
-    right = np.einsum("nki,nkd,nkd->ndi", basis, weight, pose[index] - pose[low][:, None])
+    right = np.einsum(
+        "nki,nkd,nkd->ndi", basis, weight, pose[index] - pose[low][:, None]
+    )
     return np.asarray(np.linalg.solve(normal, right[..., None])[:, :, 0, 0] + pose[low])

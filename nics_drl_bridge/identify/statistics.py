@@ -28,24 +28,34 @@ def unexplained(chi: Array, signal: Array) -> Array:
     scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
     norm = np.linalg.norm(chi, axis=0)
     chi = chi / np.where(norm > 0.0, norm, 1.0)
-    beta = np.linalg.lstsq(np.concatenate([np.ones((len(chi), 1)), chi], axis=1), scaled, 1e-10)[0]
+    beta = np.linalg.lstsq(
+        np.concatenate([np.ones((len(chi), 1)), chi], axis=1), scaled, 1e-10
+    )[0]
     return np.asarray(scaled - beta[0] - chi @ beta[1:]).ravel()
 
 
 def minimise(
-    residual: Callable[[Array], Array], start: Array, scale: Array,
-    bounds: tuple[Array, Array] | None = None, jacobian: Callable[[Array], Array] | None = None,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    residual: Callable[[Array], Array],
+    start: Array,
+    scale: Array,
+    bounds: tuple[Array, Array] | None = None,
+    jacobian: Callable[[Array], Array] | None = None,
+) -> tuple[Array, Array, Array]:
     """Minimises a residual (n,) within bounds (P,); returns minimum, Jacobian (n, P), residual."""
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     slope: Any = "2-point"
     if jacobian is not None:
         slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
     found = least_squares(
-        lambda z: residual(start + (z - 1.0) * scale), np.ones(len(start)), jac=slope,
+        lambda z: residual(start + (z - 1.0) * scale),
+        np.ones(len(start)),
+        jac=slope,
         bounds=((low - start) / scale + 1.0, (high - start) / scale + 1.0),
-        diff_step=DIFFERENCE, xtol=TOLERANCE, ftol=TOLERANCE, max_nfev=MAX_STEPS,
-    )  # fmt: skip
+        diff_step=DIFFERENCE,
+        xtol=TOLERANCE,
+        ftol=TOLERANCE,
+        max_nfev=MAX_STEPS,
+    )
     return start + (found.x - 1.0) * scale, found.jac / scale, np.asarray(found.fun)
 
 
@@ -55,7 +65,9 @@ def uncertainty(jacobian: Array, residual: Array) -> Array:
     power = float((rest**2).sum())
     rho = float((rest[1:] * rest[:-1]).sum()) / power if power > 0.0 else 0.0
     rho = float(np.clip(rho, 0.0, 0.95))
-    variance = power / max(1, len(residual) - jacobian.shape[1]) * (1.0 + rho) / (1.0 - rho)
+    variance = (
+        power / max(1, len(residual) - jacobian.shape[1]) * (1.0 + rho) / (1.0 - rho)
+    )
     return _deviations(np.linalg.pinv(jacobian.T @ jacobian) * variance)
 
 
@@ -72,7 +84,9 @@ def standard_errors(chi: Array, residual: Array) -> Array:
     unit = chi / scale
     middle = long_run(unit, residual)
     inverse = np.linalg.pinv(unit.T @ unit, hermitian=True)
-    return np.asarray(_deviations(inverse @ middle @ inverse * count / (count - terms)) / scale)
+    return np.asarray(
+        _deviations(inverse @ middle @ inverse * count / (count - terms)) / scale
+    )
 
 
 def long_run(chi: Array, residual: Array) -> Array:
@@ -86,7 +100,9 @@ def long_run(chi: Array, residual: Array) -> Array:
     return np.asarray(middle)
 
 
-def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]) -> Array:
+def clustered_errors(
+    jacobian: Array, residual: Array, cluster: NDArray[np.intp]
+) -> Array:
     """Returns cluster-robust standard errors (P,) (Cameron, Miller 2015), also for few clusters."""
     groups = np.unique(cluster)
     count, terms = jacobian.shape
@@ -111,7 +127,10 @@ def correlation_reach(residual: Array) -> int:
         return usual
     longest = max(usual, int(LONGEST * count))
     size = 1 << (2 * count - 1).bit_length()
-    alike = np.fft.irfft(np.abs(np.fft.rfft(rest, size)) ** 2, size)[1 : longest + 1] / power
+    alike = (
+        np.fft.irfft(np.abs(np.fft.rfft(rest, size)) ** 2, size)[1 : longest + 1]
+        / power
+    )
     unlike = np.flatnonzero(alike < UNLIKE)
     apart = int(unlike[0]) + 1 if len(unlike) else longest
     return min(max(usual, 2 * apart), longest, count - 1)
@@ -146,7 +165,9 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
     while keep.any():
         inverse = np.linalg.pinv(gram[np.ix_(keep, keep)], hermitian=True)
         beta = inverse @ moment[keep]
-        error = np.sqrt(np.maximum(np.diag(inverse) * variance, np.finfo(np.float64).tiny))
+        error = np.sqrt(
+            np.maximum(np.diag(inverse) * variance, np.finfo(np.float64).tiny)
+        )
         ratio = np.abs(beta) / error
         if ratio.min() >= CERTAIN:
             break
@@ -154,7 +175,9 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
     return keep
 
 
-def instrumental(chi: Array, instruments: Array, target: Array) -> tuple[Array, Array] | None:
+def instrumental(
+    chi: Array, instruments: Array, target: Array
+) -> tuple[Array, Array] | None:
     """Returns coefficients (K,) and errors by instruments (T, K); None if these are too weak."""
     # Two-stage least squares (Soederstroem, Stoica 1983).
     scale, size = np.linalg.norm(chi, axis=0), np.linalg.norm(instruments, axis=0)
@@ -174,7 +197,9 @@ class Curve:
 
     dof: str
     terms: tuple[str, ...]  # n in the order of Eq. 2, the largest weight first
-    error: Array  # (n + 1,) RMSE of the first 0..n terms on blocks held out of their fit
+    error: (
+        Array  # (n + 1,) RMSE of the first 0..n terms on blocks held out of their fit
+    )
     kept: int  # number of terms in the model
 
     @property
@@ -187,7 +212,11 @@ def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
     """Returns the curve of features (T, n), the largest weight first; `kept` is its knee."""
     squares = cross_validated(chi, target)
     error = np.sqrt(squares.mean(axis=0))
-    sigma = squares.std(axis=0, ddof=1) / np.sqrt(len(squares)) / (2.0 * np.maximum(error, 1e-300))
+    sigma = (
+        squares.std(axis=0, ddof=1)
+        / np.sqrt(len(squares))
+        / (2.0 * np.maximum(error, 1e-300))
+    )
     return Curve(dof, terms, error, knee(error, sigma))
 
 
@@ -202,7 +231,9 @@ def cross_validated(chi: Array, target: Array) -> Array:
     """Returns mean squared errors (B, n + 1) of 0..n features on B blocks, fitted to the others."""
     rows = np.array_split(np.arange(len(target)), BLOCKS)
     both = np.concatenate([chi, target[:, None]], axis=1)
-    triangles = [np.atleast_2d(qr(both[r], mode="r", check_finite=False)[0]) for r in rows]
+    triangles = [
+        np.atleast_2d(qr(both[r], mode="r", check_finite=False)[0]) for r in rows
+    ]
     triangles = [t[: both.shape[1]] for t in triangles]
     result = np.empty((BLOCKS, chi.shape[1] + 1))
     for block, unseen in enumerate(triangles):

@@ -21,14 +21,19 @@ ROWS = 3000  # that are looked at, as neighbours tell the same
 
 
 def structures(
-    model: TaylorModel, samples: Samples, spec: RobotSpec, unmoved: Collection[str] = (),
+    model: TaylorModel,
+    samples: Samples,
+    spec: RobotSpec,
+    unmoved: Collection[str] = (),
     tried: int = 0,
-) -> Iterator[str]:  # fmt: skip
+) -> Iterator[str]:
     """Tells, per degree of freedom, the term that explains most of the residuals, if one does.
 
     `unmoved` variables hold nothing but noise; `tried` is the greatest order that was tried.
     """
-    samples = samples.rows(np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0)
+    samples = samples.rows(
+        np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0
+    )
     block = np.floor((samples.t - samples.t[0]) / BLOCK_S).astype(np.intp)
     x, moved = samples.x, np.ptp(samples.x, axis=0) > 0.0
     moved &= [name not in unmoved for name in model.variables]
@@ -49,10 +54,16 @@ def structures(
         both = both - own @ np.linalg.lstsq(own, both, rcond=None)[0]
         most = OUTLYING * float(np.median(np.abs(both[:, 0])))
         rest, more = np.clip(both[:, 0], -most, most), both[:, 1:]
-        told = (more**2).mean(axis=0) > 1e-6 * (features**2).mean(axis=0)  # not one of its own
+        told = (more**2).mean(axis=0) > 1e-6 * (features**2).mean(
+            axis=0
+        )  # not one of its own
         share = np.where(told, _share(rest, more, block), -np.inf)
         best = int(np.argmax(share))
-        size = share[best] * (rest**2).mean() / max(float((samples.dq[:, d] ** 2).mean()), 1e-18)
+        size = (
+            share[best]
+            * (rest**2).mean()
+            / max(float((samples.dq[:, d] ** 2).mean()), 1e-18)
+        )
         if share[best] > SHARE and size > WORTH**2:
             name = taylor.term_name(powers[best], model.variables)
             finding = f"What the model leaves of {dof} depends on {name}"
@@ -62,14 +73,20 @@ def structures(
 
 def _way(model: TaylorModel, degree: int, tried: int) -> str:
     """Says what to do about a term of a degree that a model lacks."""
-    order = int(model.powers[(model.coefficients != 0.0).any(axis=0)].sum(axis=1).max(initial=1))
+    order = int(
+        model.powers[(model.coefficients != 0.0).any(axis=0)].sum(axis=1).max(initial=1)
+    )
     if degree > max(order, tried):
         way = f"try order {degree}"
     elif model.bounded or tried > order:
         way = "no order that was tried predicts better with it"
     else:
         way = "keep more terms (a higher alpha)"
-    by_terms = "" if model.bounded else ", and distrust what rests on its terms, as the mounting"
+    by_terms = (
+        ""
+        if model.bounded
+        else ", and distrust what rests on its terms, as the mounting"
+    )
     return way + by_terms
 
 

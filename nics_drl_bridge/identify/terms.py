@@ -100,7 +100,9 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
     mirror reverses, and beyond the first order the rest is odd. States lag behind their commands.
     """
     names, odd, order = spec.variable_names, mirrored(spec), powers.sum(axis=1)
-    unmoved = [name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0]
+    unmoved = [
+        name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0
+    ]
     allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
     allowed[:3] = excitation.terms_through_state(powers, spec, tuple(unmoved))
     if odd is not None and centred:
@@ -136,7 +138,10 @@ def by_textbook(
         part = POSE_RATES.index(variable.twist)
         allowed[3 + i] = False
         if tyres and paced and variable.twist != "vx":  # by the lateral acceleration
-            has(3 + i, 2 * first[speed[0]] + first[[v.twist for v in spec.state].index("wz")])
+            has(
+                3 + i,
+                2 * first[speed[0]] + first[[v.twist for v in spec.state].index("wz")],
+            )
         has(3 + i, first[i])  # without a constant: who gets no command comes to rest
         commands = first[states:][np.abs(moves[part]) > 0.0]
         if bicycle.used and variable.twist == "wz" and paced:
@@ -149,7 +154,10 @@ def by_textbook(
 
 
 def linear_fit(
-    samples: Samples, spec: RobotSpec, order: int, allowed: Callable[..., Mask] = library
+    samples: Samples,
+    spec: RobotSpec,
+    order: int,
+    allowed: Callable[..., Mask] = library,
 ) -> Fit:
     """Fits all terms of the library of an order to the rates (Eq. 1); the twist by definition."""
     variables = (*spec.state, *spec.command)
@@ -161,7 +169,9 @@ def linear_fit(
         if v.name in unmoved
     }
     held = tuple(c.name for c in spec.command if at.get(c.name))
-    found = pruned(regress(samples, spec, order, allowed=partial(allowed, held=held)), spec, 1.0)
+    found = pruned(
+        regress(samples, spec, order, allowed=partial(allowed, held=held)), spec, 1.0
+    )
     still = samples.dq.std(axis=0) <= NOTHING
     still[3:] |= np.array([v.name in at for v in spec.state], dtype=np.bool_)
     coefficients = np.where(still[:, None], 0.0, found.model.coefficients)
@@ -169,27 +179,38 @@ def linear_fit(
     return replace(found, model=_by_definition(model, spec, at))
 
 
-def _by_definition(model: TaylorModel, spec: RobotSpec, at: dict[str, float]) -> TaylorModel:
+def _by_definition(
+    model: TaylorModel, spec: RobotSpec, at: dict[str, float]
+) -> TaylorModel:
     """Sets the rows of the twist that are states; one that stayed `at` a value is a constant."""
     first = np.eye(len(model.variables), dtype=np.int64)
     rows = [0 * first[0], *first[: len(spec.state)]]
     more = [row for row in rows if not (model.powers == row).all(axis=1).any()]
-    powers = np.concatenate([model.powers, np.reshape(more, (-1, len(first))).astype(np.int64)])
+    powers = np.concatenate(
+        [model.powers, np.reshape(more, (-1, len(first))).astype(np.int64)]
+    )
     coefficients = np.zeros((len(model.dofs), len(powers)))
     coefficients[:, : len(model.powers)] = model.coefficients
-    if not spec.moves_sideways:  # what is left of lateral motion is noise, unless it is a state
+    if (
+        not spec.moves_sideways
+    ):  # what is left of lateral motion is noise, unless it is a state
         coefficients[1] = 0.0
     for i, variable in enumerate(spec.state):
         if variable.twist:
             value = at.get(variable.name)
             own, share = (first[i], 1.0) if value is None else (rows[0], value)
-            coefficients[POSE_RATES.index(variable.twist)] = share * (powers == own).all(axis=1)
+            coefficients[POSE_RATES.index(variable.twist)] = share * (
+                powers == own
+            ).all(axis=1)
     kept = coefficients.any(axis=0)
     none = np.zeros((0, 0))
     return replace(
-        model, powers=powers[kept], coefficients=coefficients[:, kept], std_errors=none,
+        model,
+        powers=powers[kept],
+        coefficients=coefficients[:, kept],
+        std_errors=none,
         bounded=True,
-    )  # fmt: skip
+    )
 
 
 def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel:
@@ -197,10 +218,22 @@ def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel
 
     By the least coefficients of all that make the same of these commands.
     """
-    still, command = excitation.combinations(samples, spec), samples.x[:, len(spec.state) :]
+    still, command = (
+        excitation.combinations(samples, spec),
+        samples.x[:, len(spec.state) :],
+    )
     parts = np.abs(still).max(axis=0, initial=0.0) > NOTHING
     constant = still / np.maximum(command.std(axis=0), NOTHING)
-    if len({c.unit for c, part in zip(spec.command, parts.tolist(), strict=True) if part}) != 1:
+    if (
+        len(
+            {
+                c.unit
+                for c, part in zip(spec.command, parts.tolist(), strict=True)
+                if part
+            }
+        )
+        != 1
+    ):
         return model
     if np.abs(constant @ command.mean(axis=0)).max() > excitation.TOGETHER:
         return model
@@ -210,7 +243,9 @@ def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel
     rows: dict[tuple[int, ...], Array] = {}
     for powers, effect in zip(model.powers.tolist(), model.coefficients.T, strict=True):
         factors = np.repeat(np.arange(len(powers)), powers)
-        for places in product(*(np.flatnonzero(np.abs(onto[f]) > NOTHING) for f in factors)):
+        for places in product(
+            *(np.flatnonzero(np.abs(onto[f]) > NOTHING) for f in factors)
+        ):
             term = np.bincount(np.array(places, dtype=np.int64), minlength=len(powers))
             share = float(np.prod(onto[factors, list(places)]))
             key = tuple(term.tolist())
@@ -219,7 +254,9 @@ def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel
     kept = (np.abs(coefficients) > NOTHING).any(axis=0)
     powers = np.array(list(rows), dtype=np.int64)[kept]
     none = np.zeros((0, 0))
-    return replace(model, powers=powers, coefficients=coefficients[:, kept], std_errors=none)
+    return replace(
+        model, powers=powers, coefficients=coefficients[:, kept], std_errors=none
+    )
 
 
 def stable(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
@@ -238,10 +275,14 @@ def together(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]
     rows |= {tuple(row): len(rows) + k for k, row in enumerate(more)}
     powers = np.array(list(rows), dtype=np.int64)
     coefficients, first = np.zeros((2, len(base.dofs), len(powers)))
-    coefficients[:, [rows[tuple(row)] for row in base.powers.tolist()]] = base.coefficients
+    coefficients[:, [rows[tuple(row)] for row in base.powers.tolist()]] = (
+        base.coefficients
+    )
     first[:, : len(other.powers)] = other.coefficients
     none = np.zeros((0, 0))
-    return replace(base, powers=powers, coefficients=coefficients, std_errors=none), first
+    return replace(
+        base, powers=powers, coefficients=coefficients, std_errors=none
+    ), first
 
 
 def defined(spec: RobotSpec) -> Mask:

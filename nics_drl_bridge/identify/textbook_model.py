@@ -20,10 +20,14 @@ from nics_drl_bridge.robot.taylor import TaylorModel, evaluate
 
 Powers = NDArray[np.int64]
 
-MARGIN = 1.25  # times the greatest value of an actuator on a drive that its range reaches
+MARGIN = (
+    1.25  # times the greatest value of an actuator on a drive that its range reaches
+)
 LEAST_COSINE = 0.1  # of a steering angle
 NEGLIGIBLE = 1e-3  # share of a rate below which a term of the expansion is left out
-UNLIMITED = 0.5  # share of the widest range that is searched: a limit beyond it was not found
+UNLIMITED = (
+    0.5  # share of the widest range that is searched: a limit beyond it was not found
+)
 
 
 def textbook_calibration(
@@ -33,7 +37,9 @@ def textbook_calibration(
     response = yardstick.response
     x, y, heading = map(float, response.mounting)
     latency = max(response.delay_s, 0.0)
-    early = max(-response.delay_s, 0.0)  # motion before its commands is of another clock
+    early = max(
+        -response.delay_s, 0.0
+    )  # motion before its commands is of another clock
     if not spec.state:  # a lag without a state acts as a delay
         used = response.gain.any(axis=1)
         latency += float(response.lag_s[used].mean())
@@ -112,8 +118,13 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
         }
         for name, unit, place in states
     ]
-    found = {"speed_lag": float(response.lag_s[0]), "steering_lag": float(response.lag_s[2])}
-    if "speed_gain" in spec.parameters:  # of a car that is told shares of throttle and steering
+    found = {
+        "speed_lag": float(response.lag_s[0]),
+        "steering_lag": float(response.lag_s[2]),
+    }
+    if (
+        "speed_gain" in spec.parameters
+    ):  # of a car that is told shares of throttle and steering
         found |= {"speed_gain": gains[0], "greatest_steering": gains[1]}
     data["parameters"] = spec.parameters | found
     return RobotSpec.model_validate(data)
@@ -178,7 +189,11 @@ class _Expansion:
     """Terms of a textbook, degree of freedom by degree of freedom."""
 
     def __init__(
-        self, response: TextbookResponse, samples: Samples, spec: RobotSpec, like: TaylorModel
+        self,
+        response: TextbookResponse,
+        samples: Samples,
+        spec: RobotSpec,
+        like: TaylorModel,
     ) -> None:
         self.response = response
         self.spec = spec
@@ -254,18 +269,24 @@ class _Expansion:
         effect = self.x[:, self.command_place(place)]
         return np.asarray(self.response.gain[0, place] * effect)
 
-    def add_bicycle(self, dofs: tuple[int, int], speed: int, steering: int, ask: Array) -> None:
+    def add_bicycle(
+        self, dofs: tuple[int, int], speed: int, steering: int, ask: Array
+    ) -> None:
         """Adds the twist of a bicycle by the variables of its speed and of its steering."""
         v, steer = self.unit(speed), self.unit(steering)
         told = self.x[:, steering]
         rows = [v, v + 2 * steer] if self.response.bicycle.front_drive else [v]
         self.add_expanded(dofs[0], self.along(ask, told), rows)
-        self.add_expanded(dofs[1], self.turn_rate(ask, told), self.steering_rows(speed, steering))
+        self.add_expanded(
+            dofs[1], self.turn_rate(ask, told), self.steering_rows(speed, steering)
+        )
 
     def add_twist_of_commands(self) -> None:
         """Adds the twist of a robot without a state."""
         if self.response.bicycle.used:
-            speed, steering = (self.command_place(c) for c in _places_of_bicycle(self.response))
+            speed, steering = (
+                self.command_place(c) for c in _places_of_bicycle(self.response)
+            )
             self.add_bicycle((0, 2), speed, steering, self.speed_target())
             return
         for dof in range(3):
@@ -292,7 +313,9 @@ class _Expansion:
 
     def add_actuators(self) -> None:
         """Adds the rates of a speed and a steering angle, and the twist by them."""
-        speed, steering = (self.command_place(c) for c in _places_of_bicycle(self.response))
+        speed, steering = (
+            self.command_place(c) for c in _places_of_bicycle(self.response)
+        )
         self.add(3, self.unit(0), -self.rate_of(0))
         drives = self.rate_of(0) * float(self.response.gain[0, speed - self.states])
         self.add(3, self.unit(speed), drives)
@@ -300,7 +323,9 @@ class _Expansion:
         gain = float(self.response.gain[2, steering - self.states])
         self.add(4, self.unit(1), -self.rate_of(2))
         self.add(4, self.unit(steering), self.rate_of(2) * gain)
-        self.add(4, self.unit(steering, 0), self.rate_of(2) * float(self.response.offset[2]))
+        self.add(
+            4, self.unit(steering, 0), self.rate_of(2) * float(self.response.offset[2])
+        )
         v, angle = self.unit(0), self.unit(1)
         bicycle, told = self.response.bicycle, self.x[:, 1]
         turning = np.sin(told) if bicycle.front_drive else np.tan(told)
@@ -327,7 +352,9 @@ class _Expansion:
                 self.add(actuator, self.unit(i), 1.0)
         if self.response.bicycle.used:
             follow = [names.index(str(v.follows)) for v in self.spec.state]
-            speed, steering = (follow.index(c) for c in _places_of_bicycle(self.response))
+            speed, steering = (
+                follow.index(c) for c in _places_of_bicycle(self.response)
+            )
             self.add_bicycle((0, 2), speed, steering, self.x[:, speed])
 
     def add_wheels(self) -> None:
@@ -336,7 +363,11 @@ class _Expansion:
         per_command = book.target(np.eye(len(self.spec.command)))  # (C, S)
         per_wheel = book.twist(np.eye(self.states))  # (S, 3)
         steady = (per_command @ per_wheel).T  # (3, C)
-        lag = [float(self.response.lag_s[d]) for d in range(3) if self.response.gain[d].any()]
+        lag = [
+            float(self.response.lag_s[d])
+            for d in range(3)
+            if self.response.gain[d].any()
+        ]
         rate = (1.0 - float(np.exp(-self.like.dt / np.mean(lag)))) / self.like.dt
         for wheel in range(self.states):
             self.add(3 + wheel, self.unit(wheel), -rate)

@@ -31,13 +31,19 @@ UNEXPLAINED = 0.5
 WORSE = 1.25  # times the trial's error on the part that both know; a refit beyond is not believed
 MANY_OUTLIERS = 0.001
 BACKWARDS = 0.3  # angle [rad] from half a turn below which a body faces backwards
-GAP_STEPS = 3.0  # a pause of the pose longer than so many usual steps, and MAX_GAP_S, is a gap
+GAP_STEPS = (
+    3.0  # a pause of the pose longer than so many usual steps, and MAX_GAP_S, is a gap
+)
 GAPS_TOLD = 4  # one by one
 LINEAR = "Predictions by terms of a higher order ran away, so the model has those of order 1 alone."
 EARLY = "The robot moves"  # begins a note on motion before its commands
-COARSE = 2.0 / 3.0  # share of a state's range between two rows that is sampled too coarsely
+COARSE = (
+    2.0 / 3.0
+)  # share of a state's range between two rows that is sampled too coarsely
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
-MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
+MIRRORED = (
+    -0.5
+)  # correlation of yaw rate and steering below which the robot turns the wrong way
 
 
 class Gap(str):
@@ -90,7 +96,9 @@ def about_gaps(drive: Drive) -> Iterator[str]:
         span, begin = t[row + 1] - t[row], t[row] - t[0]
         finding = f"The pose has a gap of {span:.1f} s, from {begin:.1f} s to {begin + span:.1f} s"
         across = f"{np.hypot(*moved[:2]):.2f} m and turns {abs(moved[2]):.2f} rad"
-        yield Gap(f"{finding}, across which it moves {across}: what happened there is not known.")
+        yield Gap(
+            f"{finding}, across which it moves {across}: what happened there is not known."
+        )
     if len(rows) > GAPS_TOLD:
         rest = [t[row + 1] - t[row] for row in rows[GAPS_TOLD:]]
         yield Gap(
@@ -99,7 +107,9 @@ def about_gaps(drive: Drive) -> Iterator[str]:
         )
 
 
-def coarsest_state(recording: Recording, spec: RobotSpec, unmoved: Sequence[str]) -> str:
+def coarsest_state(
+    recording: Recording, spec: RobotSpec, unmoved: Sequence[str]
+) -> str:
     """Names the measured state that changes by most of its range from row to row; "" if none."""
     if recording.state is None:
         return ""
@@ -117,12 +127,16 @@ def coarsest_state(recording: Recording, spec: RobotSpec, unmoved: Sequence[str]
     return f"{finding} apart, so record at a higher rate"
 
 
-def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> Iterator[str]:
+def about_clocks(
+    drive: Drive, calibration: Calibration, timing: TimingEstimate
+) -> Iterator[str]:
     """Tells of clock offset and latency."""
     sigma, recording = calibration.uncertainty, drive.recording
     clocks_differ = recording.pose.clock != recording.command.clock
     if clocks_differ and "clock_offset_s" in sigma:
-        offset = f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
+        offset = (
+            f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
+        )
         finding = "Pose and commands are stamped by different clocks"
         yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
     if timing.early > 0.0 and calibration.command_latency_s <= 0.0:
@@ -134,14 +148,23 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
     if timing.drift != 0.0:
         rate = f"{abs(timing.drift) * 1e3:.1f} ms in every second"
         finding = f"The clocks of pose and commands drift apart by {rate}"
-        yield Mistake(f"{finding}: stamp both by one clock, or correct the rate of the slower one.")
+        yield Mistake(
+            f"{finding}: stamp both by one clock, or correct the rate of the slower one."
+        )
     if not moved_commands(recording.command).any():
-        yield Gap("No command ever changed, so clock offset and latency could not be learnt.")
+        yield Gap(
+            "No command ever changed, so clock offset and latency could not be learnt."
+        )
     elif not timing.separated and clocks_differ:
         why = "since no measurement on the commands' clock follows them"
         fix = "the latency is taken as zero. Record the wheels or the state to separate them"
-        yield Gap(f"Only the sum of clock offset and command latency can be known, {why}; {fix}.")
-    latency, spread = calibration.command_latency_s, sigma.get("command_latency_s", np.inf)
+        yield Gap(
+            f"Only the sum of clock offset and command latency can be known, {why}; {fix}."
+        )
+    latency, spread = (
+        calibration.command_latency_s,
+        sigma.get("command_latency_s", np.inf),
+    )
     if timing.separated and latency > CERTAIN * spread:
         yield f"Commands take effect {latency:.4f} s (+- {spread:.4f} s) after their stamps."
 
@@ -152,16 +175,25 @@ def about_mounting(
     """Tells where and how the tracked body sits on the robot."""
     if mounting is None:
         taken = "is taken to be exactly at base_link; drive in every direction and turn"
-        yield Gap(f"How the tracked body sits on the robot could not be learnt, and {taken}.")
+        yield Gap(
+            f"How the tracked body sits on the robot could not be learnt, and {taken}."
+        )
         return
     x, y = calibration.lever_arm_m
-    names = "lever_arm_x_m", "lever_arm_y_m"  # of which predictions may have told one later
+    names = (
+        "lever_arm_x_m",
+        "lever_arm_y_m",
+    )  # of which predictions may have told one later
     found = (name in calibration.uncertainty for name in names)
-    x_hidden, y_hidden = (why * (not f) for why, f in zip(mounting.hidden, found, strict=True))
+    x_hidden, y_hidden = (
+        why * (not f) for why, f in zip(mounting.hidden, found, strict=True)
+    )
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
-        finding = f"The direction of travel lies {turned} from the tracked body's heading"
+        finding = (
+            f"The direction of travel lies {turned} from the tracked body's heading"
+        )
         if faces_backwards(calibration) and not drive.spec.steers:
             yield Doubt(
                 f"{finding}: the body faces backwards, or the speed that is commanded has the "
@@ -198,7 +230,9 @@ def about_responses(
             finding = f"{command} never changed, so how {state} follows it could not be learnt"
             yield Gap(f"{finding}; drive with {command} changing over its whole range.")
         else:
-            lag = f"{response.lag_s:.4f} s" + ("" if np.isnan(sigma) else f" (+- {sigma:.4f} s)")
+            lag = f"{response.lag_s:.4f} s" + (
+                "" if np.isnan(sigma) else f" (+- {sigma:.4f} s)"
+            )
             taken = f"with a lag of {lag} and a gain of {response.gain:.4f}"
             yield f"{state} was not measured: it is taken to follow {command} {taken}."
     if calibration.wheel_scale is not None:
@@ -211,20 +245,26 @@ def about_responses(
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     """Refuses a drive, with a FitError, that did not move every input independently."""
-    sensed = [v.name for v in spec.state if v.twist is None and v.name in excitation.unmoved]
+    sensed = [
+        v.name for v in spec.state if v.twist is None and v.name in excitation.unmoved
+    ]
     still = _commands(excitation.unmoved, spec) or sensed
     for names, fault, way in (
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
         if told := _list(names):
-            raise FitError(f"{told} {fault}; drive with {told} {way}, or allow a model without.")
+            raise FitError(
+                f"{told} {fault}; drive with {told} {way}, or allow a model without."
+            )
 
 
 def missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the variables that never moved, but for a slip aside where none can be driven."""
     slips = [v.name for v in spec.state if v.twist == "vy" and not spec.moves_sideways]
-    return tuple(name for name in linear.regression.excitation.unmoved if name not in slips)
+    return tuple(
+        name for name in linear.regression.excitation.unmoved if name not in slips
+    )
 
 
 def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
@@ -256,23 +296,37 @@ def unlearnt(
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
     if together := _list(excitation.together):
         units = {c.unit for c in spec.command if c.name in excitation.together}
-        shares = "all have a share of what they did" if len(units) == 1 else "one has all of it"
+        shares = (
+            "all have a share of what they did"
+            if len(units) == 1
+            else "one has all of it"
+        )
         told = f"{shares}, and the model holds where they move so; drive each on its own to learn"
         why = "always moved together, so their effects can't be told apart"
         yield Gap(f"{together} {why}: {told}.")
-    if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
+    if copies := _list(
+        [v.name for v in spec.state if v.name in linear.regression.dependent]
+    ):
         why = "always depended on the other variables, so their effects can't be separated"
-        yield Gap(f"{copies} {why}: the model omits them, and is valid only while that is so.")
-    moved = {name: count for name, count in levels.items() if name not in excitation.unmoved}
+        yield Gap(
+            f"{copies} {why}: the model omits them, and is valid only while that is so."
+        )
+    moved = {
+        name: count for name, count in levels.items() if name not in excitation.unmoved
+    }
     if coarse := _list([name for name, count in moved.items() if count == FEW_LEVELS]):
         finding = "between them the model is a straight line, whatever the robot does"
-        yield Gap(f"{coarse} took two values only: {finding}; drive with values in between.")
+        yield Gap(
+            f"{coarse} took two values only: {finding}; drive with values in between."
+        )
 
 
 def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
     """Tells each reason to doubt a linear fit."""
     dofs = linear.model.dofs
-    for dof, outliers, condition in zip(dofs, linear.outliers, linear.condition, strict=True):
+    for dof, outliers, condition in zip(
+        dofs, linear.outliers, linear.condition, strict=True
+    ):
         if outliers > MANY_OUTLIERS:
             yield f"{outliers:.1%} of the rows of {dof} were outliers and left out of the fit."
         if condition > ILL_CONDITIONED:
@@ -282,7 +336,9 @@ def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
             yield f"The terms of {dof} are {alike}: {useless}; {advice}."
     fitted = {dofs[d] for d in linear.regression.moving} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
-    if lost := _list([dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]):
+    if lost := _list(
+        [dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]
+    ):
         why = "the robot did not follow its commands in a way that a polynomial can describe"
         yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
 
@@ -292,7 +348,9 @@ def _list(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
-def mirror_note(samples: Samples, spec: RobotSpec, calibration: Calibration) -> Iterator[str]:
+def mirror_note(
+    samples: Samples, spec: RobotSpec, calibration: Calibration
+) -> Iterator[str]:
     """Tells if the robot turns right when commanded to turn left, and which sign explains it."""
     for i, command in enumerate(spec.command, start=len(spec.state)):
         if not command.turns:
@@ -300,20 +358,31 @@ def mirror_note(samples: Samples, spec: RobotSpec, calibration: Calibration) -> 
         turn, wanted = samples.dq[:, 2], samples.x[:, i]
         if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
-        if min(turn.std(), wanted.std()) < 1e-3 or np.corrcoef(turn, wanted)[0, 1] > MIRRORED:
+        if (
+            min(turn.std(), wanted.std()) < 1e-3
+            or np.corrcoef(turn, wanted)[0, 1] > MIRRORED
+        ):
             continue
         if command.steers and faces_backwards(calibration):
             speed = next((c.name for c in spec.command if not c.turns), "the speed")
             finding = f"The robot drives backwards where {speed} is positive"
-            yield Mistake(f"{finding}: the sign of {speed} is reversed; write `scale: -1` for it.")
+            yield Mistake(
+                f"{finding}: the sign of {speed} is reversed; write `scale: -1` for it."
+            )
             return
         finding = f"The robot turns right where {command.name} is positive"
-        cause = "the recording is a mirror image (y and heading reversed), or the sign of"
-        yield Mistake(f"{finding}: {cause} the command is; the model moves as recorded.")
+        cause = (
+            "the recording is a mirror image (y and heading reversed), or the sign of"
+        )
+        yield Mistake(
+            f"{finding}: {cause} the command is; the model moves as recorded."
+        )
         return
 
 
-def tried(model: TaylorModel, calibration: Calibration, drive: Drive, t: float) -> OpenLoop | None:
+def tried(
+    model: TaylorModel, calibration: Calibration, drive: Drive, t: float
+) -> OpenLoop | None:
     """Tries a model on a drive from t [s] on; None if that is too short."""
     try:
         return open_loop_error(model, calibration, drive, t, drive.duration_s)
@@ -342,15 +411,25 @@ def untried(
 
 
 def with_quality(
-    model: TaylorModel, linear: Fit, unseen: Samples | None, held_out: OpenLoop | None,
-    judgement: tuple[HorizonErrors, ...], spec: RobotSpec,
-) -> TaylorModel:  # fmt: skip
+    model: TaylorModel,
+    linear: Fit,
+    unseen: Samples | None,
+    held_out: OpenLoop | None,
+    judgement: tuple[HorizonErrors, ...],
+    spec: RobotSpec,
+) -> TaylorModel:
     """Returns the model with its figures of merit."""
 
     def by_dof(values: Array) -> dict[str, float]:
-        return {dof: float(value) for dof, value in zip(model.dofs, values, strict=True)}
+        return {
+            dof: float(value) for dof, value in zip(model.dofs, values, strict=True)
+        }
 
-    figures: dict[str, Any] = {"held_out_rmse": {}, "held_out_r2": {}, "judgement": judgement}
+    figures: dict[str, Any] = {
+        "held_out_rmse": {},
+        "held_out_r2": {},
+        "judgement": judgement,
+    }
     if unseen is not None:
         errors = map(by_dof, errors_of(model, unseen.rows(plausible(unseen.x, spec))))
         figures |= zip(("held_out_rmse", "held_out_r2"), errors, strict=True)
@@ -363,7 +442,9 @@ def with_quality(
         }
     measures = ("outliers", "condition", "rmse", "r2")
     figures |= {name: by_dof(getattr(linear, name)) for name in measures}
-    return replace(model, quality=Quality(samples=len(linear.regression.samples.t), **figures))
+    return replace(
+        model, quality=Quality(samples=len(linear.regression.samples.t), **figures)
+    )
 
 
 def replaced_by_textbook(lost: HorizonErrors) -> str:
@@ -379,7 +460,9 @@ def replaced_by_textbook(lost: HorizonErrors) -> str:
 def refitted(until: float, duration: float, worse: bool) -> str:
     """Says of how much of a drive a model is, and what its errors are of."""
     if worse:
-        why = f"fitted to all {duration:.1f} s, it was not shown to predict them as well"
+        why = (
+            f"fitted to all {duration:.1f} s, it was not shown to predict them as well"
+        )
         return f"The model is of the first {until:.1f} s only: {why}."
     shown = f"errors on unseen data are those of a trial that had learnt the first {until:.1f} s"
     return f"The model was fitted to all {duration:.1f} s once it had been judged; {shown}."

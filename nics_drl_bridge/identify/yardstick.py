@@ -15,21 +15,32 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import Windows, windows
 from nics_drl_bridge.identify.signals import held, unwrapped
-from nics_drl_bridge.identify.yardstick_kernels import STRAIGHT, BicycleGeometry, roll_windows
+from nics_drl_bridge.identify.yardstick_kernels import (
+    STRAIGHT,
+    BicycleGeometry,
+    roll_windows,
+)
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
 
 HORIZONS_S = (1.0, 2.5, 5.0)  # the fit's predictions end after these times
 STEP_S, SPACING_S, MOST_WINDOWS = 0.02, 0.1, 200
-BEFORE_S, FEWEST = 0.2, 4  # poses that tell the twist at a window's start: time and number
-STEADY_M_S = 0.05  # greatest standard error of a speed at a start that is taken from a parabola
+BEFORE_S, FEWEST = (
+    0.2,
+    4,
+)  # poses that tell the twist at a window's start: time and number
+STEADY_M_S = (
+    0.05  # greatest standard error of a speed at a start that is taken from a parabola
+)
 HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
 LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
 MOST_EVALUATIONS, TOLERANCE = 60, 1e-4
 GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
 JUMP = 3.0  # speeds beyond so many times the 90th percentile are jumps of the localiser
-DELAYS_S = np.arange(-0.1, 0.51, 0.05)  # at each of these delays between streams of one clock
+DELAYS_S = np.arange(
+    -0.1, 0.51, 0.05
+)  # at each of these delays between streams of one clock
 FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
 LAG_S, LAG_RANGE_S = 0.15, (0.005, 5.0)
 LIMIT, LIMIT_RANGE = 10.0, (0.05, 1e3)  # of acceleration [m/s^2]
@@ -48,7 +59,9 @@ class TextbookResponse:
     gain: Array  # (3, C) actuator per command
     offset: Array  # (3,)
     lag_s: Array  # (3,)
-    limit: Array  # (2,) greatest acceleration, deceleration of the first actuator [m/s^2]
+    limit: (
+        Array  # (2,) greatest acceleration, deceleration of the first actuator [m/s^2]
+    )
     bicycle: BicycleGeometry
     mounting: Array  # (3,) pose of the tracked body in `base_link`
 
@@ -60,12 +73,16 @@ class Yardstick:
     response: TextbookResponse
     clock_offset_s: float  # added to the pose's stamps, gives the commands' clock
 
-    def predict(self, drive: Drive, chosen: Windows, twist: Array | None = None) -> Array:
+    def predict(
+        self, drive: Drive, chosen: Windows, twist: Array | None = None
+    ) -> Array:
         """Predicts poses (W, 3) at windows' ends, from twists (W, 3) at their starts if known."""
         duration = (chosen.end_t - chosen.start_t)[:, None]
         course = _course(drive, chosen.start_t + self.clock_offset_s, duration)
         twist = twists_before(drive, chosen.start_t) if twist is None else twist
-        return geometry.compose(chosen.start, _relative_ends(self.response, course, twist)[:, 0])
+        return geometry.compose(
+            chosen.start, _relative_ends(self.response, course, twist)[:, 0]
+        )
 
 
 def kept_twist(drive: Drive, chosen: Windows, twist: Array | None = None) -> Array:
@@ -83,12 +100,17 @@ def twists_before(drive: Drive, at: Array) -> Array:
     t, pose = drive.dated.t, unwrapped(drive.dated.values)
     last = np.searchsorted(t, at + 1e-9) - 1
     first = np.minimum(np.searchsorted(t, at - BEFORE_S - 1e-9), last - FEWEST + 1)
-    noise, count = (drive.pose_noise or (0.0, 0.0))[0], float(np.median(last - first + 1))
+    noise, count = (
+        (drive.pose_noise or (0.0, 0.0))[0],
+        float(np.median(last - first + 1)),
+    )
     degree = 2 if noise * np.sqrt(192.0 / count) / BEFORE_S < STEADY_M_S else 1
     twist = np.zeros((len(at), 3))
     for w, (a, b) in enumerate(zip(np.maximum(first, 0), last + 1, strict=True)):
         if b - a > degree and t[b - 1] > t[a]:
-            rate, place = np.polyfit(t[a:b] - t[b - 1], pose[a:b] - pose[b - 1], degree)[-2:]
+            rate, place = np.polyfit(
+                t[a:b] - t[b - 1], pose[a:b] - pose[b - 1], degree
+            )[-2:]
             heading = pose[b - 1, 2] + place[2] if degree == 2 else pose[a:b, 2].mean()
             twist[w] = [*geometry.rotate(rate[:2], -heading), rate[2]]
     return twist
@@ -120,7 +142,9 @@ class _Course(NamedTuple):
 def _course(drive: Drive, start_t: Array, duration: Array) -> _Course:
     command = drive.recording.command
     grid = np.arange(command.t[0] - 1.0, command.t[-1] + 1.0, STEP_S)
-    return _Course(start_t, duration, grid, held(command, drive.spec, grid, grid + STEP_S))
+    return _Course(
+        start_t, duration, grid, held(command, drive.spec, grid, grid + STEP_S)
+    )
 
 
 def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) -> Array:
@@ -132,7 +156,9 @@ def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) ->
     actuator = _turned(twist, mounting[2]) + arm
     if bicycle.used:  # a command of zero is a stop, whatever the offset
         more = np.maximum(np.abs(target[:, 0]) + response.offset[0], 0.0)
-        target = np.stack([np.sign(target[:, 0]) * more, 0.0 * more, target[:, 2]], axis=1)
+        target = np.stack(
+            [np.sign(target[:, 0]) * more, 0.0 * more, target[:, 2]], axis=1
+        )
         target[:, 2] += response.offset[2]
         share, angle = 1.0 - np.exp(-STEP_S / response.lag_s[2]), target[:, 2]
         lag = [0.0, share], [1.0, share - 1.0]
@@ -145,9 +171,16 @@ def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) ->
         target = target + response.offset
     ends = np.empty((*course.duration.shape, 3))
     roll_windows(
-        ends, actuator, begin / STEP_S, course.duration / STEP_S, target, response.lag_s,
-        response.limit, bicycle, STEP_S,
-    )  # fmt: skip
+        ends,
+        actuator,
+        begin / STEP_S,
+        course.duration / STEP_S,
+        target,
+        response.lag_s,
+        response.limit,
+        bicycle,
+        STEP_S,
+    )
     back = geometry.between(mounting, np.zeros(3))
     return geometry.compose(back, geometry.compose(ends, mounting))
 
@@ -163,7 +196,9 @@ class _Form:
     start: TextbookResponse
     moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
     mounted: NDArray[np.bool_]  # (3,) of the mounting
-    one_limit: bool = False  # True if it speeds up and slows down by the same acceleration
+    one_limit: bool = (
+        False  # True if it speeds up and slows down by the same acceleration
+    )
 
     @property
     def slips(self) -> bool:
@@ -173,24 +208,37 @@ class _Form:
     def pack(self) -> Array:
         """Returns the free values of the start (P,); positive ones as logarithms."""
         r, rows = self.start, self.moves.any(axis=1)
-        return np.concatenate([
-            [r.delay_s], r.gain[self.moves], r.offset[rows], np.log(r.lag_s[rows]),
-            np.log(r.limit), [r.bicycle.understeer] * self.slips, r.mounting[self.mounted],
-        ])  # fmt: skip
+        return np.concatenate(
+            [
+                [r.delay_s],
+                r.gain[self.moves],
+                r.offset[rows],
+                np.log(r.lag_s[rows]),
+                np.log(r.limit),
+                [r.bicycle.understeer] * self.slips,
+                r.mounting[self.mounted],
+            ]
+        )
 
     def unpack(self, theta: Array) -> TextbookResponse:
         """Returns the response of free values (P,)."""
         r, rows = self.start, self.moves.any(axis=1)
         count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(self.slips)]
-        delay, gains, offsets, lags, limits, understeer, place = np.split(theta, np.cumsum(count))
-        gain, offset, lag, mounting = (a.copy() for a in (r.gain, r.offset, r.lag_s, r.mounting))
+        delay, gains, offsets, lags, limits, understeer, place = np.split(
+            theta, np.cumsum(count)
+        )
+        gain, offset, lag, mounting = (
+            a.copy() for a in (r.gain, r.offset, r.lag_s, r.mounting)
+        )
         gain[self.moves], offset[rows], mounting[self.mounted] = gains, offsets, place
         lag[rows] = np.exp(np.clip(lags, *np.log(LAG_RANGE_S)))
         limit = np.exp(np.clip(limits, *np.log(LIMIT_RANGE)))
         if self.one_limit:
             limit = np.full(2, limit[0])
         bicycle = r.bicycle._replace(understeer=float(understeer.sum()))
-        return TextbookResponse(float(delay[0]), gain, offset, lag, limit, bicycle, mounting)
+        return TextbookResponse(
+            float(delay[0]), gain, offset, lag, limit, bicycle, mounting
+        )
 
 
 def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
@@ -198,8 +246,14 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
         alone, together = steady_twist(spec, np.diag(half)), steady_twist(spec, half)
-        if len(half) != 2 or np.abs(alone[:, 2]).max() > NOTHING or abs(together[2]) < NOTHING:
-            return np.where(np.abs(alone) > NOTHING, alone / half[:, None], 0.0).T, STRAIGHT
+        if (
+            len(half) != 2
+            or np.abs(alone[:, 2]).max() > NOTHING
+            or abs(together[2]) < NOTHING
+        ):
+            return np.where(
+                np.abs(alone) > NOTHING, alone / half[:, None], 0.0
+            ).T, STRAIGHT
         speed = int(np.argmax(np.abs(alone[:, 0])))
         less = np.where(np.arange(2) == speed, half, 0.5 * half)
         forward, slower = alone[speed, 0], steady_twist(spec, less)
@@ -213,11 +267,16 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
         angle = 2.0 * float(np.arctan(np.sqrt(max(share, 1e-6))))
     length = abs(forward * (np.sin(angle) if front else np.tan(angle)) / together[2])
     moves = np.zeros((3, 2))
-    moves[0, speed], moves[2, 1 - speed] = forward / half[speed], angle / half[1 - speed]
+    moves[0, speed], moves[2, 1 - speed] = (
+        forward / half[speed],
+        angle / half[1 - speed],
+    )
     return moves, BicycleGeometry(True, front, float(length), 0.0)
 
 
-def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: bool) -> _Form:
+def _first_guess(
+    drive: Drive, until_s: float, clock_offset: float, offsets: bool
+) -> _Form:
     """Fits gains, lags and maybe offsets to motions over `GUESS_S` at the best delay, linearly."""
     structure = structure_of(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
@@ -227,7 +286,9 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: boo
     change = (twists_before(drive, seen.end_t) - before) / span
     command = drive.recording.command
     tried = []
-    for delay in DELAYS_S if command.clock == drive.recording.pose.clock else FAR_DELAYS_S:
+    for delay in (
+        DELAYS_S if command.clock == drive.recording.pose.clock else FAR_DELAYS_S
+    ):
         shift = clock_offset - delay
         u = held(command, drive.spec, seen.start_t + shift, seen.end_t + shift)
         expected, rotation = u @ book.T, 0.0
@@ -236,19 +297,35 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: boo
             rotation = float(np.angle((a.conj() * b).sum()))
         moved = (_turned(twist, -rotation), _turned(change, -rotation))
         left, gain, offset, lag = _regressed(u, *moved, book != 0.0, bicycle, offsets)
-        tried.append((left, TextbookResponse(
-            float(delay), gain, offset, lag, np.full(2, LIMIT), bicycle,
-            np.array([0.0, 0.0, -rotation]),
-        )))  # fmt: skip
+        tried.append(
+            (
+                left,
+                TextbookResponse(
+                    float(delay),
+                    gain,
+                    offset,
+                    lag,
+                    np.full(2, LIMIT),
+                    bicycle,
+                    np.array([0.0, 0.0, -rotation]),
+                ),
+            )
+        )
     # Wheels of unequal gain are a lever arm across; without a textbook, any gain is any mounting.
-    mounted = np.array([True, np.count_nonzero(book[0]) < 2, True]) & (structure is not None)
+    mounted = np.array([True, np.count_nonzero(book[0]) < 2, True]) & (
+        structure is not None
+    )
     return _Form(min(tried, key=lambda pair: pair[0])[1], book != 0.0, mounted)
 
 
 def _regressed(
-    u: Array, twist: Array, change: Array, moves: NDArray[np.bool_], bicycle: BicycleGeometry,
+    u: Array,
+    twist: Array,
+    change: Array,
+    moves: NDArray[np.bool_],
+    bicycle: BicycleGeometry,
     offsets: bool,
-) -> tuple[float, Array, Array, Array]:  # fmt: skip
+) -> tuple[float, Array, Array, Array]:
     """Regresses twist + lag * change on commands: what is left, gains, offsets, lags."""
     left, gain, offset, lag = 0.0, np.zeros(moves.shape), np.zeros(3), np.full(3, LAG_S)
     for i in np.flatnonzero(moves.any(axis=1)):
@@ -280,12 +357,16 @@ def fit_yardstick(
     chosen, twist = _without_jumps(drive, until_s, HORIZONS_S[-1], spacing)
     if not len(chosen.start_t):
         fault = f"the first {until_s:.1f} s hold no window of {HORIZONS_S[-1]:g} s"
-        raise RecordingError(f"{drive.recording.source}: {fault}; record a longer drive.")
+        raise RecordingError(
+            f"{drive.recording.source}: {fault}; record a longer drive."
+        )
     horizons = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
     course = _course(drive, chosen.start_t + clock_offset_s, horizons)
     at = chosen.start_t[:, None] + horizons
     pose = unwrapped(drive.dated.values)
-    ends = np.stack([np.interp(at, drive.dated.t, column) for column in pose.T], axis=-1)
+    ends = np.stack(
+        [np.interp(at, drive.dated.t, column) for column in pose.T], axis=-1
+    )
     measured = geometry.between(chosen.start[:, None], ends)
 
     def fitted(form: _Form) -> tuple[float, TextbookResponse]:
@@ -297,13 +378,22 @@ def fit_yardstick(
 
         theta = form.pack()
         found = least_squares(
-            residuals, theta, x_scale=np.maximum(np.abs(theta), 0.05), loss="soft_l1",
-            diff_step=1e-4, f_scale=LOSS_SCALE, max_nfev=MOST_EVALUATIONS, ftol=TOLERANCE,
+            residuals,
+            theta,
+            x_scale=np.maximum(np.abs(theta), 0.05),
+            loss="soft_l1",
+            diff_step=1e-4,
+            f_scale=LOSS_SCALE,
+            max_nfev=MOST_EVALUATIONS,
+            ftol=TOLERANCE,
             xtol=TOLERANCE,
-        )  # fmt: skip
+        )
         return float(found.cost), form.unpack(found.x)
 
-    guesses = [_first_guess(drive, until_s, clock_offset_s, offsets) for offsets in (True, False)]
+    guesses = [
+        _first_guess(drive, until_s, clock_offset_s, offsets)
+        for offsets in (True, False)
+    ]
     guesses = [replace(guess, one_limit=one_limit) for guess in guesses]
     best = min((fitted(guess) for guess in guesses), key=lambda pair: pair[0])
     return Yardstick(best[1], clock_offset_s)

@@ -18,10 +18,14 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
 
 TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a share of the radius
-COARSE = np.radians(2.0)  # between grid rotations, steps are of at most half of this [rad]
+COARSE = np.radians(
+    2.0
+)  # between grid rotations, steps are of at most half of this [rad]
 MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)  # least first beam of a row, relative to the bearing
-MISS = 0.02  # an edge that two corners miss by more [beams] is found by climbing the hull
+MISS = (
+    0.02  # an edge that two corners miss by more [beams] is found by climbing the hull
+)
 
 
 @dataclass(frozen=True)
@@ -35,9 +39,11 @@ class Grid:
 
 
 def bake(
-    spec: LidarSpec, shapes: Sequence[Shape], density: Density | None = None,
+    spec: LidarSpec,
+    shapes: Sequence[Shape],
+    density: Density | None = None,
     sensor_model: Function | Sequence[SensorModel] | None = None,
-) -> LidarTable:  # fmt: skip
+) -> LidarTable:
     """Scans shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
 
     Equal shapes are baked once, by default at `Density.for_beams`. The sensor model is that of the
@@ -49,24 +55,36 @@ def bake(
     density = density or Density.for_beams(spec.angle_increment)
     outlines = Outlines.of(shapes)
     grids = [grid_of(spec, outlines, h, density) for h in range(len(shapes))]
-    cells = np.concatenate([np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)])
+    cells = np.concatenate(
+        [np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)]
+    )
     sizes = cells[:, 1] * density.phases
     if sizes.sum() > MOST_NUMBERS:
         size = f"a lidar table of {len(cells)} cells with {spec.beams} beams"
-        raise ConfigError(f"{size} is too large; lower `distances`, `rotations` or `phases`.")
+        raise ConfigError(
+            f"{size} is too large; lower `distances`, `rotations` or `phases`."
+        )
     first = np.cumsum([0, *(len(g.turns) * density.distances for g in grids)])
-    about = [(g.distances[-1], len(g.turns), f) for g, f in zip(grids, first, strict=False)]
+    about = [
+        (g.distances[-1], len(g.turns), f) for g, f in zip(grids, first, strict=False)
+    ]
     table = LidarTable(
-        shapes, density, spec.angle_increment, np.array(about, dtype=np.float64).reshape(-1, 3),
-        (np.cumsum(sizes) - sizes).astype(np.int32), cells.astype(np.int16),
+        shapes,
+        density,
+        spec.angle_increment,
+        np.array(about, dtype=np.float64).reshape(-1, 3),
+        (np.cumsum(sizes) - sizes).astype(np.int32),
+        cells.astype(np.int16),
         np.zeros(int(sizes.sum()) + padding(spec.angle_increment), np.float32),
-    )  # fmt: skip
+    )
     _fill(bake_kernels.rows_of_turn, table.rows, table, grids)
     model = spec.sensor_model if sensor_model is None else sensor_model
     return apply_model(table, grids, model) if callable(model) or model else table
 
 
-def with_shapes(spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]) -> LidarTable:
+def with_shapes(
+    spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]
+) -> LidarTable:
     """Returns the table if it contains all of these shapes, or else one of equal density."""
     if set(shapes) <= set(table.shapes):
         return table
@@ -83,12 +101,16 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     round_ = isinstance(shape, Circle)
     count = 1 if round_ else max(1, -(-density.rotations // order))
     unit = 2.0 * np.pi / (count * order)
-    hull = outlines.hulls[outlines.hull[h] : (outlines.hull[h] + outlines.hull[h + 1]) // 2]
+    hull = outlines.hulls[
+        outlines.hull[h] : (outlines.hull[h] + outlines.hull[h + 1]) // 2
+    ]
     parts = 2 * max(1, math.ceil(unit / COARSE))
     turns = np.arange(-parts // 2, parts * count - parts // 2 + 1) * unit / parts
     edges = np.zeros((len(turns), density.distances, 2))
     hints = np.zeros(edges.shape, np.int64)
-    bake_kernels.silhouettes(hull, radius if round_ else 0.0, distances, turns, edges, hints)
+    bake_kernels.silhouettes(
+        hull, radius if round_ else 0.0, distances, turns, edges, hints
+    )
     cell = np.zeros((count, density.distances, 6), np.int64)
     low = _reach_of(edges[..., 0], parts, np.minimum) / spec.angle_increment
     high = _reach_of(edges[..., 1], parts, np.maximum) / spec.angle_increment
@@ -96,22 +118,32 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     cell[..., 1] = np.ceil(high + 0.5) - cell[..., 0] + 1
     if not round_:
         for side in (0, 1):
-            wound = _wound(hull, hints[..., side], edges[..., side] - turns[:, None] + side * np.pi)
+            wound = _wound(
+                hull, hints[..., side], edges[..., side] - turns[:, None] + side * np.pi
+            )
             two, climb = _candidates(wound, parts, len(hull))
             miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
-            far_off[:, 0] = True  # near contact, the rim of a cell does not bound its interior
-            cell[..., 2 + 2 * side : 4 + 2 * side] = np.where(far_off[..., None], climb, two)
+            far_off[:, 0] = (
+                True  # near contact, the rim of a cell does not bound its interior
+            )
+            cell[..., 2 + 2 * side : 4 + 2 * side] = np.where(
+                far_off[..., None], climb, two
+            )
     if cell[..., 1].max() > MOST_WIDE or cell[..., 0].min() < FIRST_BEAM:
         apart = f"{spec.angle_increment:.2g} rad apart; scan with the renderer `exact`."
-        raise ConfigError(f"{describe(shape)} covers too many beams to be baked: they are {apart}")
+        raise ConfigError(
+            f"{describe(shape)} covers too many beams to be baked: they are {apart}"
+        )
     return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
 
 def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
     """Outermost value in each cell (T, D); as two distances are blended, it extends to the next."""
     count = len(values) // parts
-    turned = outer.reduce([values[k:][: count * parts : parts] for k in range(parts + 1)])
+    turned = outer.reduce(
+        [values[k:][: count * parts : parts] for k in range(parts + 1)]
+    )
     result = turned.copy()
     result[:, :-1] = outer(result[:, :-1], turned[:, 1:])
     return np.asarray(result)
@@ -150,35 +182,59 @@ def _candidates(
 
 
 def _miss(
-    hull: Array, two: NDArray[np.int64], edge: Array, turns: Array, distances: Array, parts: int
+    hull: Array,
+    two: NDArray[np.int64],
+    edge: Array,
+    turns: Array,
+    distances: Array,
+    parts: int,
 ) -> Array:
     """Error (T, D) of the nearer of two corners against the edge at the rim of a cell [rad]."""
     count = len(two)
     worst = np.zeros(two.shape[:2])
     for k in range(parts + 1):
-        turn, true = turns[k:][: count * parts : parts], edge[k:][: count * parts : parts]
+        turn, true = (
+            turns[k:][: count * parts : parts],
+            edge[k:][: count * parts : parts],
+        )
         corner = rotate(hull[two], turn[:, None, None])
         for later in (0, 1):
             last = distances.shape[0] - later
             x = corner[:, :last, :, 0] + distances[later:, None]
-            off = np.abs(np.arctan2(corner[:, :last, :, 1], x) - true[:, later:, None]).min(axis=-1)
+            off = np.abs(
+                np.arctan2(corner[:, :last, :, 1], x) - true[:, later:, None]
+            ).min(axis=-1)
             worst[:, :last] = np.maximum(worst[:, :last], off)
     return worst
 
 
 def _fill(
-    kernel: Callable[..., None], out: NDArray[np.float32], table: LidarTable, grids: Sequence[Grid]
+    kernel: Callable[..., None],
+    out: NDArray[np.float32],
+    table: LidarTable,
+    grids: Sequence[Grid],
 ) -> None:
     outlines, distances, done = table.outlines, table.density.distances, 0
     for h, grid in enumerate(grids):
-        shape = outlines.corners[outlines.corner[h] : outlines.corner[h + 1]], outlines.radii[h]
+        shape = (
+            outlines.corners[outlines.corner[h] : outlines.corner[h + 1]],
+            outlines.radii[h],
+        )
         for t, turn in enumerate(grid.turns):
-            start = table.start[done * distances : (done + 1) * distances].astype(np.int64)
+            start = table.start[done * distances : (done + 1) * distances].astype(
+                np.int64
+            )
             layout = np.stack([start, grid.cell[t, :, 0], grid.cell[t, :, 1]])
             kernel(
-                out, layout, shape, grid.distances, turn, grid.edges[t], table.beam_angle,
+                out,
+                layout,
+                shape,
+                grid.distances,
+                turn,
+                grid.edges[t],
+                table.beam_angle,
                 table.density.phases,
-            )  # fmt: skip
+            )
             done += 1
 
 
@@ -193,14 +249,23 @@ def apply_model(
     ends = table.start + table.widths * phases
     if callable(model):
         for begin, end in zip(table.start, ends, strict=True):
-            both = (a[begin:end].reshape(phases, -1).T.ravel() for a in (table.rows, cosines))
+            both = (
+                a[begin:end].reshape(phases, -1).T.ravel()
+                for a in (table.rows, cosines)
+            )
             row, cosine = both
             changed = model(row, np.arccos(cosine.astype(np.float64)))
-            table.rows[begin:end] = np.asarray(changed, np.float32).reshape(-1, phases).T.ravel()
+            table.rows[begin:end] = (
+                np.asarray(changed, np.float32).reshape(-1, phases).T.ravel()
+            )
         return table
     bounds = np.append(table.grid[:, 2].astype(np.int64), len(ends))
-    for shape, (first, last) in zip(table.shapes, itertools.pairwise(bounds), strict=True):
+    for shape, (first, last) in zip(
+        table.shapes, itertools.pairwise(bounds), strict=True
+    ):
         part = slice(int(table.start[first]), int(ends[last - 1]))
         incidence = np.arccos(cosines[part].astype(np.float64))
-        table.rows[part] = returned(model, table.rows[part], incidence, shape.reflectivity)
+        table.rows[part] = returned(
+            model, table.rows[part], incidence, shape.reflectivity
+        )
     return replace(table, sensor_model=tuple(model))

@@ -70,7 +70,9 @@ def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore
         first += 1
     while last > first and not np.isfinite(fine[last]):
         last -= 1
-    if not np.isfinite(fine[first]):  # thinner than the spacing of the points: hit by none
+    if not np.isfinite(
+        fine[first]
+    ):  # thinner than the spacing of the points: hit by none
         fine[:] = along((edge[0] + edge[1]) / 2.0, corners, radius, distance, cos, sin)
         return
     inside = EDGE * (edge[1] - edge[0])
@@ -111,7 +113,10 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
     """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
     directions = np.stack((np.cos(angles), np.sin(angles)))
-    beams, count = exact_kernels.beams_of(directions, angles[0], step, False), len(angles)
+    beams, count = (
+        exact_kernels.beams_of(directions, angles[0], step, False),
+        len(angles),
+    )
     nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
     if corners.shape[0] == 0:
         exact_kernels.circle(nearest, beams, distance, 0.0, radius, np.inf)
@@ -147,6 +152,10 @@ def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases
         low, high = edges[d, 0] + inside, edges[d, 1] - inside
         fine = incidences(angles, step / phases, corners, radius, distances[d], c, s)
         at = np.array([low, high])
-        fine[angles < low] = incidences(at[:1], 1.0, corners, radius, distances[d], c, s)[0]
-        fine[angles > high] = incidences(at[1:], 1.0, corners, radius, distances[d], c, s)[0]
+        fine[angles < low] = incidences(
+            at[:1], 1.0, corners, radius, distances[d], c, s
+        )[0]
+        fine[angles > high] = incidences(
+            at[1:], 1.0, corners, radius, distances[d], c, s
+        )[0]
         into_phases(cosines[start : start + count], fine, width, phases)

@@ -19,19 +19,34 @@ from nics_drl_bridge.lidar import exact_kernels as exact
 ABOVE_ZERO = 2.0**24  # Added before truncation to an integer: numbers are rounded down
 PER_TURN = 0.5 / math.pi
 UNSEEN, LOOKED_UP, COMPUTED = range(3)
-ATAN = tuple(map(np.float32, (
-    0.999999881, -0.333319604, 0.199692354, -0.140165851, 0.0990609676, -0.0593671016,
-    0.0241661891, -0.00466877315,
-)))  # fmt: skip
-TABLE_SHAPE = np.dtype([  # parameters of a shape in the table
-    ("per_metre", np.float64),  # grid distances per metre
-    ("rotations", np.float64),  # in a full turn, 0 for a circle
-    ("parts_per_rotation", np.float64),  # periods of the rotational symmetry
-    ("first_cell", np.int64), ("cells_per_part", np.int64),
-    ("hull_end", np.int64),  # the corner after its last
-    ("corners_per_part", np.int64), ("corners", np.int64),
-    ("round_radius", np.float64),  # of a circle [m], 0 for others
-])  # fmt: skip
+ATAN = tuple(
+    map(
+        np.float32,
+        (
+            0.999999881,
+            -0.333319604,
+            0.199692354,
+            -0.140165851,
+            0.0990609676,
+            -0.0593671016,
+            0.0241661891,
+            -0.00466877315,
+        ),
+    )
+)
+TABLE_SHAPE = np.dtype(
+    [  # parameters of a shape in the table
+        ("per_metre", np.float64),  # grid distances per metre
+        ("rotations", np.float64),  # in a full turn, 0 for a circle
+        ("parts_per_rotation", np.float64),  # periods of the rotational symmetry
+        ("first_cell", np.int64),
+        ("cells_per_part", np.int64),
+        ("hull_end", np.int64),  # the corner after its last
+        ("corners_per_part", np.int64),
+        ("corners", np.int64),
+        ("round_radius", np.float64),  # of a circle [m], 0 for others
+    ]
+)
 
 
 class TableArrays(NamedTuple):
@@ -43,7 +58,9 @@ class TableArrays(NamedTuple):
     # to the bearing, and its width; the other and the first corner of the hull that may be its
     # right silhouette; those of the left one. Pairs are 16 bits each
     cells: NDArray[np.int32]
-    rows: NDArray[np.float32]  # (R,) ranges [m], one phase of the points after the other
+    rows: NDArray[
+        np.float32
+    ]  # (R,) ranges [m], one phase of the points after the other
     shift: int  # log2 of the phases
     hulls: NDArray[np.float64]  # (sum V, 2) corners, see `shapes.Outlines`
 
@@ -79,7 +96,9 @@ def compute(out, here, bodies, me, near, walls, lidar, found):  # type: ignore[n
     for k in near:
         if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
             body, outlines, computed = bodies[k], lidar.outlines, True
-            exact_kernels.body_into(out, lidar.beams, here, body, outlines, lidar.range_max)
+            exact_kernels.body_into(
+                out, lidar.beams, here, body, outlines, lidar.range_max
+            )
     limits = lidar.range_min, lidar.range_max
     if computed:
         exact_kernels.finish(out, lidar.range_min, lidar.range_max)
@@ -109,14 +128,22 @@ def polar(dx, dy):  # type: ignore[no-untyped-def]
 def nearest_cell(distance, bearing, radius, heading, shape, table):  # type: ignore[no-untyped-def]
     """Cell below a distance at the nearest rotation, first hull corner, share of the next cell."""
     place = (distance - radius) * shape.per_metre
-    ring = np.int32(max(min(np.int32(place), np.int32(table.distances - 2)), np.int32(0)))
+    ring = np.int32(
+        max(min(np.int32(place), np.int32(table.distances - 2)), np.int32(0))
+    )
     share = (heading - bearing) * PER_TURN
     share -= np.floor(share)
     turn = np.int32(share * shape.rotations + 0.5)
     turn = np.int32(max(min(turn, np.int32(shape.rotations)), np.int32(0)))
     part = np.int32((turn + 0.5) * shape.parts_per_rotation)
-    cell = turn * table.distances - part * shape.cells_per_part + shape.first_cell + ring
-    return cell, shape.hull_end - part * shape.corners_per_part, np.float32(place - ring)
+    cell = (
+        turn * table.distances - part * shape.cells_per_part + shape.first_cell + ring
+    )
+    return (
+        cell,
+        shape.hull_end - part * shape.corners_per_part,
+        np.float32(place - ring),
+    )
 
 
 class Seen(NamedTuple):
@@ -141,7 +168,9 @@ def silhouette(pair, hull, shape, hulls, seen, side):  # type: ignore[no-untyped
     """
     first, other = hull + (pair & 0xFFFF), pair >> 16
     if other < 0:
-        along, across = outermost(hulls, hull, shape.corners, first - hull, -other, seen, side)
+        along, across = outermost(
+            hulls, hull, shape.corners, first - hull, -other, seen, side
+        )
         return arctan2_single(np.float32(across), np.float32(along))
     one, two = hulls[np.uintp(first)], hulls[np.uintp(hull + other)]
     return tangent(seen, one[0], one[1], two[0], two[1], shape.round_radius, side)
@@ -185,7 +214,12 @@ def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-d
     hits = np.int32(min(np.int32(high), np.int32(count - 1)) - begin + 1)
     exact = (begin - middle) * np.int32(1 << shift) + ABOVE_ZERO
     point = np.int32(exact)
-    return begin, hits, np.int32(point - np.int32(ABOVE_ZERO)), np.float32(exact - point)
+    return (
+        begin,
+        hits,
+        np.int32(point - np.int32(ABOVE_ZERO)),
+        np.float32(exact - point),
+    )
 
 
 @kernel(inline=True)
@@ -193,7 +227,9 @@ def points_of(start, place, point, shift, hits):  # type: ignore[no-untyped-def]
     """Indices of the points of a row around the first beam; the next may be of the next beam."""
     phases, width = np.int32(1 << shift), np.int32(place & 0xFFFF)
     beam, phase = point >> shift, np.int32(point & (phases - 1))
-    skip = max(min(np.int32(beam - (place >> 16)), np.int32(width - hits - 1)), np.int32(0))
+    skip = max(
+        min(np.int32(beam - (place >> 16)), np.int32(width - hits - 1)), np.int32(0)
+    )
     at = np.int32(start + phase * width + skip)
     last = np.int32(phase + 1) == phases
     return at, np.int32(at - phase * width + 1 if last else at + width)
@@ -221,7 +257,9 @@ def outermost(hulls, hull, corners, first, stride, seen, side):  # type: ignore[
     local optimum is the global one. Only shapes with many corners need it, at short distances.
     """
     best = first
-    x, y = seen_from(seen, hulls[np.uintp(hull + best), 0], hulls[np.uintp(hull + best), 1])
+    x, y = seen_from(
+        seen, hulls[np.uintp(hull + best), 0], hulls[np.uintp(hull + best), 1]
+    )
     while stride > 0:
         for _ in range(corners):
             moved = False

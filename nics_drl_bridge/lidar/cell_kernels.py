@@ -43,9 +43,12 @@ def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
     rows = min(worlds, 1) if ordered else worlds
     side = max(int(math.sqrt(PER_BODY * bodies)), 1)
     cells = BodyCells(
-        np.full((worlds, side * side + 2), -1, np.int32), np.full((rows, bodies), -1, np.int32),
-        ordered, np.zeros((worlds, FRAME)), np.arange(bodies, dtype=np.int32),
-    )  # fmt: skip
+        np.full((worlds, side * side + 2), -1, np.int32),
+        np.full((rows, bodies), -1, np.int32),
+        ordered,
+        np.zeros((worlds, FRAME)),
+        np.arange(bodies, dtype=np.int32),
+    )
     cells.frame[:, SIDE] = side
     return cells
 
@@ -148,8 +151,16 @@ def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-
 @kernel(inline=True)
 def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
     """Returns the least and the greatest row, and column, of the cells around a place."""
-    frame, per_metre, side = cells.frame[n], cells.frame[n, PER_METRE], cells.frame[n, SIDE]
-    far, x, y = reach + frame[LARGEST] + frame[MOVED], x - frame[LEFT], y - frame[BOTTOM]
+    frame, per_metre, side = (
+        cells.frame[n],
+        cells.frame[n, PER_METRE],
+        cells.frame[n, SIDE],
+    )
+    far, x, y = (
+        reach + frame[LARGEST] + frame[MOVED],
+        x - frame[LEFT],
+        y - frame[BOTTOM],
+    )
     low, high = _place(y - far, per_metre, side), _place(y + far, per_metre, side)
     return low, high, _place(x - far, per_metre, side), _place(x + far, per_metre, side)
 

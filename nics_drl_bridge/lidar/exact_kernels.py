@@ -13,19 +13,33 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
-ROUNDING = 1e-6  # beams this near to an edge, in beams, are candidates; the exact test decides
+ROUNDING = (
+    1e-6  # beams this near to an edge, in beams, are candidates; the exact test decides
+)
 IN_LINE = 1e-9  # a wall whose line passes a lidar nearer than this is seen edge-on [m]
 HALF_PI = 0.5 * math.pi
 TINY = 1e-300  # avoids NaN for the angle of a zero vector
 ATAN = (
-    0.9999999996145, -0.3333332366563, 0.1999959585417, -0.1427904841688, 0.1105378475317,
-    -0.0879611755717, 0.0671011398839, -0.0442736682632, 0.0222034549106, -0.0071661648959,
+    0.9999999996145,
+    -0.3333332366563,
+    0.1999959585417,
+    -0.1427904841688,
+    0.1105378475317,
+    -0.0879611755717,
+    0.0671011398839,
+    -0.0442736682632,
+    0.0222034549106,
+    -0.0071661648959,
     0.0010844927512,
-)  # fmt: skip
+)
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
 INF, MINUS_INF = np.array([np.inf, -np.inf], np.float32).view(np.int32)
-BLOCK, UNIT, MANY = 48, 16, 1000  # Beams that meet a wall at once; of MANY a multiple of UNIT
+BLOCK, UNIT, MANY = (
+    48,
+    16,
+    1000,
+)  # Beams that meet a wall at once; of MANY a multiple of UNIT
 TOGETHER = 8  # Walls whose beams are found at once
 AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
     np.uintp(k * TOGETHER) for k in range(11)
@@ -40,7 +54,9 @@ class Beams(NamedTuple):
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
-    turns: NDArray[np.float32]  # (4 Q,) cosines, sines of turns by up to Q beams either way
+    turns: NDArray[
+        np.float32
+    ]  # (4 Q,) cosines, sines of turns by up to Q beams either way
     # (2, 2) unit vectors: what lies farther along both than its radius is behind all beams
     behind: NDArray[np.float64]
 
@@ -115,7 +131,9 @@ def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
         for i in range(count):
             c, s = beams.directions[0, i], beams.directions[1, i]
             across = c * y - s * x
-            out[i] = min(out[i], c * x + s * y + math.sqrt(max(r2 - across * across, 0.0)))
+            out[i] = min(
+                out[i], c * x + s * y + math.sqrt(max(r2 - across * across, 0.0))
+            )
         return
     bearing = math.atan2(y, x)
     half = math.asin(radius / d)
@@ -155,7 +173,9 @@ def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore
         shift = 0.0 if turns == 1 else (turn - 1) * TWO_PI
         first, hits = beam_span(low + shift, high + shift, beams)
         if hits > 0:
-            _cross(out, beams.directions, first, min(first + hits, count), cross, ex, ey)
+            _cross(
+                out, beams.directions, first, min(first + hits, count), cross, ex, ey
+            )
             _cross(out, beams.directions, 0, first + hits - count, cross, ex, ey)
 
 
@@ -194,7 +214,9 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
         gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
-        if ex * gy - ey * gx < 0.0 or cross == 0.0:  # the lidar may lie on a side towards it
+        if (
+            ex * gy - ey * gx < 0.0 or cross == 0.0
+        ):  # the lidar may lie on a side towards it
             return False
         if (ay <= 0.0) != (by <= 0.0):  # it crosses the ray ahead, or the one behind
             rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
@@ -232,7 +254,14 @@ def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-unty
             for first, end in ((FIRST, END), (FIRST_AGAIN, END_AGAIN)):
                 if found[w + first] < found[w + end]:
                     line = found[w + CROSS], found[w + EX], found[w + EY]
-                    _wall(whole, beams, int(found[w + first]), int(found[w + end]), line, limits)
+                    _wall(
+                        whole,
+                        beams,
+                        int(found[w + first]),
+                        int(found[w + end]),
+                        line,
+                        limits,
+                    )
 
 
 @kernel(inline=True)
@@ -254,12 +283,24 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         chord2, share = range_max * range_max * length2 - cross * cross, 1.0 / length2
         # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
         foot, half = -(ax * ex + ay * ey) * share, math.sqrt(max(chord2, 0.0)) * share
-        begins, ends = max(foot - half - ROUNDING, 0.0), min(foot + half + ROUNDING, 1.0)
-        seen = (chord2 >= 0.0) & (begins <= ends) & (cross * cross > IN_LINE * IN_LINE * length2)
+        begins, ends = (
+            max(foot - half - ROUNDING, 0.0),
+            min(foot + half + ROUNDING, 1.0),
+        )
+        seen = (
+            (chord2 >= 0.0)
+            & (begins <= ends)
+            & (cross * cross > IN_LINE * IN_LINE * length2)
+        )
         one = arctan2(ay + begins * ey, ax + begins * ex)
         other = arctan2(ay + ends * ey, ax + ends * ex)
-        low, wide = one if cross > 0.0 else other, (other - one if cross > 0.0 else one - other)
-        wide = wide + TWO_PI if wide < -1.0 else max(wide, 0.0)  # a whole turn, or rounding
+        low, wide = (
+            one if cross > 0.0 else other,
+            (other - one if cross > 0.0 else one - other),
+        )
+        wide = (
+            wide + TWO_PI if wide < -1.0 else max(wide, 0.0)
+        )  # a whole turn, or rounding
         low = (low - beams.first) * per_beam
         low -= np.floor(low * per_turn) * turn
         high = low + wide * per_beam
@@ -267,20 +308,42 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         found[k + FIRST] = np.ceil(low - ROUNDING)
         found[k + END] = min(np.floor(high + ROUNDING) + 1.0, count) if seen else 0.0
         found[k + FIRST_AGAIN] = max(np.ceil(low - turn - ROUNDING), 0.0)
-        found[k + END_AGAIN] = min(np.floor(high - turn + ROUNDING) + 1.0, count) if seen else 0.0
+        found[k + END_AGAIN] = (
+            min(np.floor(high - turn + ROUNDING) + 1.0, count) if seen else 0.0
+        )
 
 
 @kernel(inline=True)
 def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-def]
     count, few = whole.shape[0], BLOCK <= whole.shape[0] < MANY
-    most = min(beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count)  # a quarter turn
+    most = min(
+        beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count
+    )  # a quarter turn
     for begin in range(first, end, most):
         until = min(begin + most, end)
         width = min((until - begin + UNIT - 1) // UNIT * UNIT, count)
         if few:
-            _wall_piece(whole, beams, min(begin, count - BLOCK), BLOCK, begin, until, line, limits)
+            _wall_piece(
+                whole,
+                beams,
+                min(begin, count - BLOCK),
+                BLOCK,
+                begin,
+                until,
+                line,
+                limits,
+            )
         else:
-            _wall_piece(whole, beams, min(begin, count - width), width, begin, until, line, limits)
+            _wall_piece(
+                whole,
+                beams,
+                min(begin, count - width),
+                width,
+                begin,
+                until,
+                line,
+                limits,
+            )
 
 
 @kernel(contracts=True, inline=True)
@@ -292,8 +355,15 @@ def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: 
     as floats; of the unsigned ones, all that are negative are beyond the limit.
     """
     cross, ex, ey = np.float32(line[0]), line[1], line[2]
-    least, most = np.float32(limits[0]).view(np.int32), np.float32(limits[1]).view(np.uint32)
-    skip, hits, sines = np.int32(place - begin), np.uint32(end - begin), beams.turns.shape[0] // 2
+    least, most = (
+        np.float32(limits[0]).view(np.int32),
+        np.float32(limits[1]).view(np.uint32),
+    )
+    skip, hits, sines = (
+        np.int32(place - begin),
+        np.uint32(end - begin),
+        beams.turns.shape[0] // 2,
+    )
     one = np.uintp(begin)
     c, s = beams.directions[0, one], beams.directions[1, one]
     if (s * ey + c * ex) * line[0] > 0.0:  # it is met ever flatter

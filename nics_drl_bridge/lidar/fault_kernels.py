@@ -14,7 +14,9 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 
 # Columns of a row of faults; `faults.LidarFaults` explains them.
-NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = range(7)
+NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = (
+    range(7)
+)
 PARAMETERS = 7
 AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)  # values of TOO_CLOSE
 CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1  # values of SKEW
@@ -50,7 +52,9 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
     coarse = device.step > 0.0 and device.first <= device.last
     if faults[TOO_CLOSE] == AS_GHOST:
         _ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
-    if faults[TOO_CLOSE] == AS_RANGE_MIN or not (noisy or coarse or device.close == -np.inf):
+    if faults[TOO_CLOSE] == AS_RANGE_MIN or not (
+        noisy or coarse or device.close == -np.inf
+    ):
         _close(ranges, device.close)
     if noisy and coarse:
         _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
@@ -61,7 +65,9 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
             ranges[i] = _told(ranges[i], _coarse(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
-        _drop(ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by)
+        _drop(
+            ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by
+        )
 
 
 @kernel(inline=True)
@@ -78,17 +84,26 @@ def _device(limits, faults):  # type: ignore[no-untyped-def]
     first += single(_multiple(first, single(step), rest) < least)
     last -= single(_multiple(last, single(step), rest) > most)
     return Distortion(
-        least, most, single(close), single(faults[NOISE_STD] * random.PER_STD),
-        single(faults[NOISE_PROPORTIONAL] * random.PER_STD), single(per_step), single(step), rest,
-        first, last,
-    )  # fmt: skip
+        least,
+        most,
+        single(close),
+        single(faults[NOISE_STD] * random.PER_STD),
+        single(faults[NOISE_PROPORTIONAL] * random.PER_STD),
+        single(per_step),
+        single(step),
+        rest,
+        first,
+        last,
+    )
 
 
 @kernel(allocates=True)
 def _ghosts(ranges, device, by):  # type: ignore[no-untyped-def]
     whole = ranges.view(np.int32)
     for i in range(ranges.shape[0]):
-        ghost = device.least + random.share_of(random.bits(by, i)) * (device.most - device.least)
+        ghost = device.least + random.share_of(random.bits(by, i)) * (
+            device.most - device.least
+        )
         value = np.float32(ghost).view(np.int32)
         whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 

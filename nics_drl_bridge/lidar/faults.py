@@ -12,13 +12,16 @@ from nics_drl_bridge.lidar import fault_kernels as kernels
 TooClose = Literal["minus_inf", "range_min", "no_return", "ghost"]
 Skew = Literal["none", "counter_clockwise", "clockwise"]
 TOO_CLOSE: dict[TooClose, int] = {
-    "minus_inf": kernels.AS_MINUS_INF, "range_min": kernels.AS_RANGE_MIN,
-    "no_return": kernels.AS_NO_RETURN, "ghost": kernels.AS_GHOST,
-}  # fmt: skip
+    "minus_inf": kernels.AS_MINUS_INF,
+    "range_min": kernels.AS_RANGE_MIN,
+    "no_return": kernels.AS_NO_RETURN,
+    "ghost": kernels.AS_GHOST,
+}
 SKEW: dict[Skew, int] = {
-    "none": kernels.AT_ONCE, "clockwise": kernels.CLOCKWISE,
+    "none": kernels.AT_ONCE,
+    "clockwise": kernels.CLOCKWISE,
     "counter_clockwise": kernels.COUNTER_CLOCKWISE,
-}  # fmt: skip
+}
 
 
 class LidarFaults(Schema):
@@ -31,12 +34,24 @@ class LidarFaults(Schema):
     the square of the range, in full at range_max.
     """
 
-    skew: Skew = "none"  # which way it turns while the robot moves; none: all beams at once
-    too_close: TooClose = "minus_inf"  # what it reports for a return nearer than range_min
-    noise_proportional: float = Field(default=0.0, ge=0.0, le=10.0)  # added to noise_std, per metre
-    quantisation: float = Field(default=0.0, ge=0.0, le=1e4)  # returns are multiples of it [m]
-    dropout: float = Field(default=0.0, ge=0.0, le=1.0)  # probability that a return is lost
-    dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)  # added to dropout in full at range_max
+    skew: Skew = (
+        "none"  # which way it turns while the robot moves; none: all beams at once
+    )
+    too_close: TooClose = (
+        "minus_inf"  # what it reports for a return nearer than range_min
+    )
+    noise_proportional: float = Field(
+        default=0.0, ge=0.0, le=10.0
+    )  # added to noise_std, per metre
+    quantisation: float = Field(
+        default=0.0, ge=0.0, le=1e4
+    )  # returns are multiples of it [m]
+    dropout: float = Field(
+        default=0.0, ge=0.0, le=1.0
+    )  # probability that a return is lost
+    dropout_far: float = Field(
+        default=0.0, ge=0.0, le=1.0
+    )  # added to dropout in full at range_max
 
     @model_validator(mode="after")
     def _probable(self) -> "LidarFaults":
@@ -47,7 +62,14 @@ class LidarFaults(Schema):
     def parameters(self, noise_std: float) -> NDArray[np.float64]:
         """Returns the kernels' row (P,), in the order of the columns in `fault_kernels`."""
         too_close, skew = TOO_CLOSE[self.too_close], SKEW[self.skew]
-        return np.array([
-            noise_std, self.noise_proportional, self.dropout, self.dropout_far, too_close,
-            self.quantisation, skew,
-        ])  # fmt: skip
+        return np.array(
+            [
+                noise_std,
+                self.noise_proportional,
+                self.dropout,
+                self.dropout_far,
+                too_close,
+                self.quantisation,
+                skew,
+            ]
+        )

@@ -13,7 +13,9 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, to_device
 
-ANGLE_TOLERANCE = 1e-3  # greatest deviation of the last beam from the declared angle [rad]
+ANGLE_TOLERANCE = (
+    1e-3  # greatest deviation of the last beam from the declared angle [rad]
+)
 
 
 class FurtherLidar(Sensor):
@@ -47,13 +49,25 @@ class FurtherLidar(Sensor):
         faults = self.lidar.fault_parameters
 
         def render(out: Readings, worlds: NDArray[np.int64]) -> None:
-            lanes, cells = scan_kernels.scan_lanes(), body_cells(0, state.bodies.shape[1])
+            lanes, cells = (
+                scan_kernels.scan_lanes(),
+                body_cells(0, state.bodies.shape[1]),
+            )
             scan_kernels.scan_worlds(
-                out, state.pose, worlds, state.bodies, around.first, around.fixtures, lidar, cells,
+                out,
+                state.pose,
+                worlds,
+                state.bodies,
+                around.first,
+                around.fixtures,
+                lidar,
+                cells,
                 lanes,
-            )  # fmt: skip
+            )
             seeds = state.seeds ^ salt
-            fault_kernels.distort_worlds(out, worlds, limits, faults, seeds, state.steps)
+            fault_kernels.distort_worlds(
+                out, worlds, limits, faults, seeds, state.steps
+            )
 
         return render
 
@@ -81,7 +95,11 @@ class FurtherLidar(Sensor):
     def points(self, reading: Readings) -> NDArray[np.float64]:
         """Ends of the beams that hit something (Q, 2); what is too close counts as at range_min."""
         x, y, heading = self.mount
-        near = np.where(np.isneginf(reading), self.lidar.range_min, reading.astype(np.float64))
+        near = np.where(
+            np.isneginf(reading), self.lidar.range_min, reading.astype(np.float64)
+        )
         hit = np.isfinite(near)
         angles, ranges = self.lidar.angles[hit] + heading, near[hit]
-        return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles)], axis=1)
+        return np.stack(
+            [x + ranges * np.cos(angles), y + ranges * np.sin(angles)], axis=1
+        )

@@ -11,11 +11,17 @@ from nics_drl_bridge.lidar.shapes import place
 
 # Rings around the lidar, placements in each, bands of range; rings and bands grow geometrically.
 RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
-TOUCHING = 1e-3  # of the nearest ring from the shape's circle, as a share of the lidar's range
+TOUCHING = (
+    1e-3  # of the nearest ring from the shape's circle, as a share of the lidar's range
+)
 OUTLIER = 0.3  # greatest allowed error of any beam [m]
 DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
-SLANT = np.radians(1.5)  # between line of sight and edge at most, in the search for outliers [rad]
-NARROWEST = 0.1  # least interval of looked-up distances, as a share of the lidar's range
+SLANT = np.radians(
+    1.5
+)  # between line of sight and edge at most, in the search for outliers [rad]
+NARROWEST = (
+    0.1  # least interval of looked-up distances, as a share of the lidar's range
+)
 
 
 def lookup_distances(
@@ -38,7 +44,9 @@ def lookup_distances(
     worst = np.zeros(RINGS)
     for i in range(RINGS):
         poses = _around(exact, rings[i : i + 2], SEED + i)
-        for some in (poses, _slanted(poses, outline, SEED + i)) if len(outline) else (poses,):
+        for some in (
+            (poses, _slanted(poses, outline, SEED + i)) if len(outline) else (poses,)
+        ):
             one, other = _scans(place(some[:, None], radius, shape), exact, baked)
             both = np.isfinite(one) & np.isfinite(other)
             found, truth = other[both] - one[both], one[both]
@@ -47,11 +55,15 @@ def lookup_distances(
                 cell = np.nonzero(both)[0] * BANDS + np.searchsorted(edges, truth)
                 square = np.bincount(cell, np.square(found), PLACES * BANDS)
                 squares[i] = square.reshape(PLACES, BANDS)
-                counts[i] = np.bincount(cell, minlength=PLACES * BANDS).reshape(PLACES, BANDS)
+                counts[i] = np.bincount(cell, minlength=PLACES * BANDS).reshape(
+                    PLACES, BANDS
+                )
     return _widest(rings, squares, counts, np.where(worst <= OUTLIER, greatest, 0.0))
 
 
-def _widest(rings: Array, squares: Array, counts: Array, greatest: Array) -> tuple[float, float]:
+def _widest(
+    rings: Array, squares: Array, counts: Array, greatest: Array
+) -> tuple[float, float]:
     """Edges of the widest interval of rings in which all errors are small, or inf if too narrow."""
     best, width = (np.inf, np.inf), NARROWEST * (rings[-1] - rings[0])
     for i in range(RINGS):
@@ -75,15 +87,21 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
     return True
 
 
-def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array, Array]:
+def _scans(
+    bodies: Array, exact: LidarArrays, baked: LidarArrays
+) -> tuple[Array, Array]:
     mount, directions = exact.mount, exact.beams.directions
-    robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
+    robots = np.tile(
+        [-mount[0], -mount[1], 0.0], (PLACES, 1, 1)
+    )  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
     worlds, lanes = np.arange(PLACES), scan_kernels.scan_lanes()
     cells, nothing = body_cells(0, bodies.shape[1]), np.zeros(PLACES, np.int64)
     around = stack_fixtures([np.zeros((0, 4))], [None], nothing)
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
-        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, around, sensor, cells, lanes)
+        scan_kernels.scan_worlds(
+            ranges, robots, worlds, bodies, -1, around, sensor, cells, lanes
+        )
     one, other = scans[:, :, 0].astype(np.float64)
     return one, other
 
@@ -94,7 +112,9 @@ def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
     bearing = exact.mount[2] + beams.first
     bearing += rng.uniform(0.0, beams.step * beams.directions.shape[1], PLACES)
     heading = rng.uniform(-np.pi, np.pi, PLACES)
-    return np.stack([distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1)
+    return np.stack(
+        [distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1
+    )
 
 
 def _slanted(poses: Array, outline: Array, seed: int) -> Array:
@@ -103,8 +123,13 @@ def _slanted(poses: Array, outline: Array, seed: int) -> Array:
     along = np.roll(outline, -1, axis=0) - outline
     length = np.hypot(*along.T)
     chosen = rng.choice(len(along), len(poses), p=length**2 / np.sum(length**2))
-    aside = (along[:, 0] * outline[:, 1] - along[:, 1] * outline[:, 0]) / np.maximum(length, 1e-12)
-    distance, bearing = np.hypot(poses[:, 0], poses[:, 1]), np.arctan2(poses[:, 1], poses[:, 0])
+    aside = (along[:, 0] * outline[:, 1] - along[:, 1] * outline[:, 0]) / np.maximum(
+        length, 1e-12
+    )
+    distance, bearing = (
+        np.hypot(poses[:, 0], poses[:, 1]),
+        np.arctan2(poses[:, 1], poses[:, 0]),
+    )
     direction = np.arctan2(along[chosen, 1], along[chosen, 0])
     onto = np.arcsin(np.clip(aside[chosen] / distance, -1.0, 1.0))
     heading = bearing - direction + onto + rng.uniform(-SLANT, SLANT, len(poses))

@@ -24,7 +24,9 @@ distance [cells]; column and row relative to the lidar, index increments of one 
 the quadrant's bit shift, and the side of the free square."""
 LONGEST = 255  # side of the largest square that fits in a byte [cells]
 PARALLEL = np.float32(1e-12)  # least component of a direction: its inverse stays finite
-SLACK = 1.0 + 1e-6  # a return at exactly range_max must not be lost to rounding; `finish` decides
+SLACK = (
+    1.0 + 1e-6
+)  # a return at exactly range_max must not be lost to rounding; `finish` decides
 
 
 class GridArrays(NamedTuple):
@@ -32,7 +34,9 @@ class GridArrays(NamedTuple):
 
     # (rows + 2, columns + 2), a byte per quadrant: 0 in solid cells and the border around the map
     squares: NDArray[np.uint32]
-    frame: NDArray[np.float64]  # (5,) x, y [m], cosine, sine of its origin, resolution [m]
+    frame: NDArray[
+        np.float64
+    ]  # (5,) x, y [m], cosine, sine of its origin, resolution [m]
 
 
 @kernel(allocates=True)
@@ -53,7 +57,9 @@ def free_squares(blocked):  # type: ignore[no-untyped-def]
                     beyond = min(side[row + up, column], side[row, column + right])
                     least = min(beyond, side[row + up, column + right]) + 1
                     side[row, column] = min(least, LONGEST)
-                    squares[row, column] |= np.uint32(side[row, column]) << np.uint32(8 * quadrant)
+                    squares[row, column] |= np.uint32(side[row, column]) << np.uint32(
+                        8 * quadrant
+                    )
     return squares
 
 
@@ -117,8 +123,14 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
     if squares.size == 0:
         return
     dx, dy, cell = lidar.x - frame[0], lidar.y - frame[1], frame[4]
-    u, v = (frame[2] * dx + frame[3] * dy) / cell, (frame[2] * dy - frame[3] * dx) / cell
-    c, s = lidar.c * frame[2] + lidar.s * frame[3], lidar.s * frame[2] - lidar.c * frame[3]
+    u, v = (
+        (frame[2] * dx + frame[3] * dy) / cell,
+        (frame[2] * dy - frame[3] * dx) / cell,
+    )
+    c, s = (
+        lidar.c * frame[2] + lidar.s * frame[3],
+        lidar.s * frame[2] - lidar.c * frame[3],
+    )
     x, y, limit = math.floor(u), math.floor(v), range_max / cell * SLACK
     inside = 0.0 <= x < squares.shape[1] - 2 and 0.0 <= y < squares.shape[0] - 2
     if exact or not inside or squares[int(y) + 1, int(x) + 1] == 0:
@@ -134,14 +146,27 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
         _begin(beams.directions, first, u - x, v - y, c, s, squares.shape[1], lanes)
         while _jump(squares.reshape(-1), here, np.float32(limit), lanes):
             pass
-        _end(out[first:last], int(x), int(y), squares.shape, np.float32(limit), cell, lanes)
+        _end(
+            out[first:last],
+            int(x),
+            int(y),
+            squares.shape,
+            np.float32(limit),
+            cell,
+            lanes,
+        )
 
 
 @kernel
 def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-untyped-def]
     """Puts the beams from `first` on into lanes, each mirrored so that it points right and up."""
     c, s, u, v = np.float32(c), np.float32(s), np.float32(u), np.float32(v)
-    one, none, singles, wholes = np.float32(1.0), np.float32(0.0), lanes.single, lanes.whole
+    one, none, singles, wholes = (
+        np.float32(1.0),
+        np.float32(0.0),
+        lanes.single,
+        lanes.whole,
+    )
     for j in range(LANES):
         k, i = (
             np.uintp(j),
@@ -155,7 +180,10 @@ def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-un
         singles[k + PER_U], singles[k + PER_V] = one / du, one / dv
         singles[k + U], singles[k + V] = u if right else one - u, v if up else one - v
         singles[k + T], wholes[k + COLUMN], wholes[k + ROW] = none, 0, 0
-        wholes[k + ASIDE], wholes[k + ABOVE] = 1 if right else -1, columns if up else -columns
+        wholes[k + ASIDE], wholes[k + ABOVE] = (
+            1 if right else -1,
+            columns if up else -columns,
+        )
         wholes[k + QUADRANT] = (0 if right else 8) + (0 if up else 16)
 
 
@@ -163,15 +191,26 @@ def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-un
 def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
     """Moves each lane to the end of its free square; True if any moved."""
     singles, wholes = lanes.single, lanes.whole
-    for j in range(LANES):  # apart from the loop below, so that LLVM can vectorise that one
+    for j in range(
+        LANES
+    ):  # apart from the loop below, so that LLVM can vectorise that one
         k = np.uintp(j)
-        cell = here + wholes[k + COLUMN] * wholes[k + ASIDE] + wholes[k + ROW] * wholes[k + ABOVE]
+        cell = (
+            here
+            + wholes[k + COLUMN] * wholes[k + ASIDE]
+            + wholes[k + ROW] * wholes[k + ABOVE]
+        )
         square = flat[np.uintp(cell)] >> np.uint32(wholes[k + QUADRANT])
         wholes[k + SIDE] = np.int32(square) & np.int32(LONGEST)
     moved = np.int32(0)
     for j in range(LANES):
         k = np.uintp(j)
-        x, y, side, t = wholes[k + COLUMN], wholes[k + ROW], wholes[k + SIDE], singles[k + T]
+        x, y, side, t = (
+            wholes[k + COLUMN],
+            wholes[k + ROW],
+            wholes[k + SIDE],
+            singles[k + T],
+        )
         x_side, y_side = np.int32(x + side), np.int32(y + side)
         x_line = (np.float32(x_side) - singles[k + U]) * singles[k + PER_U]
         y_line = (np.float32(y_side) - singles[k + V]) * singles[k + PER_V]
@@ -196,7 +235,11 @@ def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped
         k = np.uintp(j)
         column = x + wholes[k + COLUMN] * wholes[k + ASIDE]
         row = y + (wholes[k + ROW] if wholes[k + ABOVE] > 0 else -wholes[k + ROW])
-        hit = (column >= 0) & (column < shape[1] - 2) & (row >= 0) & (row < shape[0] - 2)
+        hit = (
+            (column >= 0) & (column < shape[1] - 2) & (row >= 0) & (row < shape[0] - 2)
+        )
         t = singles[k + T]
         value = np.float32(resolution) * t if hit & (t < limit) else np.float32(np.inf)
-        ranges[j] = min(ranges[j], np.float32(value).view(np.int32))  # see `exact_kernels._cross`
+        ranges[j] = min(
+            ranges[j], np.float32(value).view(np.int32)
+        )  # see `exact_kernels._cross`

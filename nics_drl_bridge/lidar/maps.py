@@ -24,7 +24,9 @@ from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
-NO_MAP = map_kernels.GridArrays(np.zeros((0, 0), np.uint32), np.zeros(0))  # for the kernels
+NO_MAP = map_kernels.GridArrays(
+    np.zeros((0, 0), np.uint32), np.zeros(0)
+)  # for the kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +41,12 @@ class GridMap:
     cells: NDArray[np.int8]  # (rows, columns)
     resolution: float  # side of a cell [m]
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    unknown_stops: bool = False  # True: cells that are neither free nor occupied stop a beam
-    occupied_from: int = OCCUPIED  # least value of occupied cells; 100 as in Nav2's static layer
+    unknown_stops: bool = (
+        False  # True: cells that are neither free nor occupied stop a beam
+    )
+    occupied_from: int = (
+        OCCUPIED  # least value of occupied cells; 100 as in Nav2's static layer
+    )
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -50,7 +56,11 @@ class GridMap:
     @cached_property
     def blocked(self) -> NDArray[np.bool_]:
         """(rows, columns) cells that stop a beam."""
-        return ~self.free if self.unknown_stops else np.asarray(self.cells >= self.occupied_from)
+        return (
+            ~self.free
+            if self.unknown_stops
+            else np.asarray(self.cells >= self.occupied_from)
+        )
 
     @cached_property
     def arrays(self) -> map_kernels.GridArrays:
@@ -61,7 +71,9 @@ class GridMap:
 
     def world_to_cell(self, points: ArrayLike) -> NDArray[np.int64]:
         """Returns row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
-        place = rotate(np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2])
+        place = rotate(
+            np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2]
+        )
         return np.floor(place[..., ::-1] / self.resolution).astype(np.int64)
 
     def cell_to_world(self, cells: ArrayLike) -> NDArray[np.float64]:
@@ -98,7 +110,9 @@ MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not open
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
 PIXELS_AT_ONCE = 2**20  # of an image whose brightness is computed
 BRIGHTEST_16 = 65535.0  # of a pixel with 16 bits
-LUMA = np.array([0.212656, 0.715158, 0.072186])  # of R, G, B (Rec. 709), as ImageMagick for Nav2
+LUMA = np.array(
+    [0.212656, 0.715158, 0.072186]
+)  # of R, G, B (Rec. 709), as ImageMagick for Nav2
 
 
 class MapFile(Schema):
@@ -108,13 +122,19 @@ class MapFile(Schema):
     become 0 to 100 %. `raw`: pixels from 0 to 100 are the percentage itself.
     """
 
-    image: str = Field(min_length=1)  # path, absolute or relative to the folder of the YAML file
+    image: str = Field(
+        min_length=1
+    )  # path, absolute or relative to the folder of the YAML file
     resolution: float = Field(ge=1e-4, le=100.0)  # side of a pixel [m]
     origin: tuple[Coordinate, Coordinate, Heading]  # of the image's lower left corner
     negate: bool  # 0 or 1; True if white is occupied, rather than black
-    occupied_thresh: float = Field(ge=0.0, le=1.0)  # from this darkness on pixels are occupied
+    occupied_thresh: float = Field(
+        ge=0.0, le=1.0
+    )  # from this darkness on pixels are occupied
     free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
-    mode: Literal["trinary", "scale", "raw"] = "trinary"  # how pixels become cells, see above
+    mode: Literal["trinary", "scale", "raw"] = (
+        "trinary"  # how pixels become cells, see above
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> "MapFile":
@@ -159,9 +179,14 @@ def map_files(grid: GridMap, path: Path) -> None:
     Image.fromarray(pixels.astype(np.uint8)[::-1]).save(content, "PPM")
     write_bytes(image, content.getvalue())
     about = {
-        "image": image.name, "resolution": float(grid.resolution), "origin": list(grid.origin),
-        "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196, "mode": mode,
-    }  # fmt: skip
+        "image": image.name,
+        "resolution": float(grid.resolution),
+        "origin": list(grid.origin),
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+        "mode": mode,
+    }
     write_text(path, dump_yaml(about))
 
 
@@ -193,19 +218,33 @@ def _cells_by_brightness(file: MapFile) -> NDArray[np.int8]:
     return cells
 
 
-def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def read_image(
+    path: Path, source: str
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Reads brightness (rows, columns), and opacity if any, of a PGM (8, 16 bit), PNG or BMP.
 
     Raises ConfigError, with the `source` that names it, if it is missing, damaged or too large.
     """
     if not path.is_file():
         endings, folder = sum(FORMATS.values(), ()), path.parent
-        known = [file.name for file in folder.glob("*") if file.name.lower().endswith(endings)]
-        hint = nearest(path.name, known) if known else f"there are no images in {str(folder)!r}."
-        raise ConfigError(f"{source}: key 'image': there is no file {str(path)!r}; {hint}")
+        known = [
+            file.name
+            for file in folder.glob("*")
+            if file.name.lower().endswith(endings)
+        ]
+        hint = (
+            nearest(path.name, known)
+            if known
+            else f"there are no images in {str(folder)!r}."
+        )
+        raise ConfigError(
+            f"{source}: key 'image': there is no file {str(path)!r}; {hint}"
+        )
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_CELLS is less
+            warnings.simplefilter(
+                "ignore", Image.DecompressionBombWarning
+            )  # MAX_CELLS is less
             if path.stat().st_size > MAX_BYTES:
                 raise Image.DecompressionBombError
             with Image.open(path, formats=tuple(FORMATS)) as image:
@@ -215,7 +254,15 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.b
     except Image.DecompressionBombError:
         reason = f"has too many pixels, a map may have {MAX_CELLS}; cut or coarsen it."
         raise ConfigError(f"{path}: {reason}") from None
-    except (EOFError, IndexError, OSError, OverflowError, SyntaxError, ValueError, struct.error):
+    except (
+        EOFError,
+        IndexError,
+        OSError,
+        OverflowError,
+        SyntaxError,
+        ValueError,
+        struct.error,
+    ):
         reason = "is no whole PGM, PNG or BMP image; save the map anew in one of them."
         raise ConfigError(f"{path}: {reason}") from None
 
@@ -245,7 +292,9 @@ def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | 
 
 
 def stack_fixtures(
-    walls: Sequence[NDArray[np.float64]], grids: Sequence[GridMap | None], member: NDArray[np.int64]
+    walls: Sequence[NDArray[np.float64]],
+    grids: Sequence[GridMap | None],
+    member: NDArray[np.int64],
 ) -> Fixtures:
     """Stacks the fixtures of P worlds: walls (W, 4) and the map of each."""
     maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
@@ -267,4 +316,6 @@ def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[np.int6
     first = dict(zip(once, starts, strict=False))
     shapes = [(first[id(each)], *each.shape) for each in cells]
     flat = [each.reshape(-1) for each in once.values()]  # of one alone, no copy
-    return flat[0] if len(flat) == 1 else np.concatenate(flat), np.array(shapes, np.int64)
+    return flat[0] if len(flat) == 1 else np.concatenate(flat), np.array(
+        shapes, np.int64
+    )

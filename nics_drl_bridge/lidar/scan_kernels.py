@@ -15,12 +15,23 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel, prefetch
 from nics_drl_bridge.lidar import baked_kernels as baked
 from nics_drl_bridge.lidar import cell_kernels, exact_kernels, map_kernels
-from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
+from nics_drl_bridge.lidar.exact_kernels import (
+    COS,
+    HEADING,
+    RADIUS,
+    SHAPE,
+    SIN,
+    LidarPose,
+    X,
+    Y,
+)
 from nics_drl_bridge.lidar.fixture_kernels import grid_of, walls_of
 
 BLOCK = 16  # Beams that are fused at once
 SOON = 8  # Bodies between asking for points and fusing them
-LANES = 9 * BLOCK  # Bodies looked up together: so few that their scans stay in the L1 cache
+LANES = (
+    9 * BLOCK
+)  # Bodies looked up together: so few that their scans stay in the L1 cache
 DX, DY, TURNED, COSINE, SINE, SIZE, BEARING_0, SCAN, MIDDLE, LOW, HIGH, AT = (
     np.uintp(k * LANES) for k in range(12)
 )
@@ -32,9 +43,13 @@ RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
 """The two corners of the hull that can be the right silhouette, and the left one."""
 DISTANCE, BEARING, BLEND, SHARE = (np.uintp(k * LANES) for k in range(4))
 """The latter two are those of the farther row and of the next point."""
-KIND, CELL, HULL, CLIMBS, START, PLACE, START2, PLACE2 = (np.uintp(k * LANES) for k in range(8))
+KIND, CELL, HULL, CLIMBS, START, PLACE, START2, PLACE2 = (
+    np.uintp(k * LANES) for k in range(8)
+)
 """Shape, cell, first corner of the hull; begin and place of the row and of the farther one."""
-BLOCKS, HITS, BACK, ONE, TWO, OTHER, OTHER2 = (np.uintp(k * LANES) for k in range(8, 15))
+BLOCKS, HITS, BACK, ONE, TWO, OTHER, OTHER2 = (
+    np.uintp(k * LANES) for k in range(8, 15)
+)
 """Blocks, 0 where none fits; beams, and those before the first; points of the row, and of the
 farther one."""
 
@@ -81,7 +96,9 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, la
             while begin < count:
                 end = min(count, begin + LANES - found)
                 near = cells.found[begin:end]
-                found, more = select(found, near, bodies[n], me, here, heading, at, lidar, lanes)
+                found, more = select(
+                    found, near, bodies[n], me, here, heading, at, lidar, lanes
+                )
                 begin, computed = end, computed + more
                 if found == LANES:
                     look_up(found, ranges, lidar, lanes)
@@ -101,9 +118,17 @@ def select(found, near, bodies, me, here, heading, at, lidar, lanes):  # type: i
     for j in range(near.shape[0]):
         b, k = np.uintp(near[j]), np.uintp(found)
         dx, dy, radius = bodies[b, X] - here.x, bodies[b, Y] - here.y, bodies[b, RADIUS]
-        d2, reach, shape = dx * dx + dy * dy, lidar.range_max + radius, np.int32(bodies[b, SHAPE])
+        d2, reach, shape = (
+            dx * dx + dy * dy,
+            lidar.range_max + radius,
+            np.int32(bodies[b, SHAPE]),
+        )
         wide[k + DX], wide[k + DY], wide[k + TURNED] = dx, dy, bodies[b, HEADING]
-        wide[k + COSINE], wide[k + SINE], wide[k + SIZE] = bodies[b, COS], bodies[b, SIN], radius
+        wide[k + COSINE], wide[k + SINE], wide[k + SIZE] = (
+            bodies[b, COS],
+            bodies[b, SIN],
+            radius,
+        )
         wide[k + BEARING_0], wide[k + SCAN] = heading, at
         lanes.whole[k + KIND] = shape
         h = np.uintp(shape)
@@ -123,7 +148,10 @@ def select(found, near, bodies, me, here, heading, at, lidar, lanes):  # type: i
 def look_up(found, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
     """Fuses the bodies in the lanes into their scans (N, M, B)."""
     wide, table, flat = lanes.wide, lidar.table, ranges.reshape(-1).view(np.int32)
-    padded, turn = (found + BLOCK - 1) // BLOCK * BLOCK, 2.0 * math.pi / lidar.beams.step
+    padded, turn = (
+        (found + BLOCK - 1) // BLOCK * BLOCK,
+        2.0 * math.pi / lidar.beams.step,
+    )
     count = np.int32(ranges.shape[2])
     places(padded, lanes)
     cells(found, table, lanes)
@@ -162,7 +190,12 @@ def cells(found, table, lanes):  # type: ignore[no-untyped-def]
         k = np.uintp(j)
         shape, distance = table.shapes[np.uintp(whole[k + KIND])], single[k + DISTANCE]
         whole[k + CELL], whole[k + HULL], single[k + BLEND] = baked.nearest_cell(
-            distance, single[k + BEARING], wide[k + SIZE], wide[k + TURNED], shape, table
+            distance,
+            single[k + BEARING],
+            wide[k + SIZE],
+            wide[k + TURNED],
+            shape,
+            table,
         )
         wide[k + SIZE] = shape.round_radius
 
@@ -182,7 +215,10 @@ def fetch(found, table, lanes):  # type: ignore[no-untyped-def]
             one = table.hulls[np.uintp(hull + (pair & 0xFFFF))]
             two = table.hulls[np.uintp(hull + max(pair >> 16, 0))]
             wide[k + at], wide[k + at + np.uintp(LANES)] = one[0], one[1]
-            wide[k + at + np.uintp(2 * LANES)], wide[k + at + np.uintp(3 * LANES)] = two[0], two[1]
+            wide[k + at + np.uintp(2 * LANES)], wide[k + at + np.uintp(3 * LANES)] = (
+                two[0],
+                two[1],
+            )
 
 
 @kernel(contracts=True)
@@ -191,11 +227,23 @@ def spans(padded, beams, lanes):  # type: ignore[no-untyped-def]
     wide = lanes.wide
     for j in range(padded):
         k = np.uintp(j)
-        seen = baked.seen_at(wide[k + DX], wide[k + DY], wide[k + COSINE], wide[k + SINE])
+        seen = baked.seen_at(
+            wide[k + DX], wide[k + DY], wide[k + COSINE], wide[k + SINE]
+        )
         radius = wide[k + SIZE]
-        x, y, x2, y2 = wide[k + RIGHT_X], wide[k + RIGHT_Y], wide[k + RIGHT_X2], wide[k + RIGHT_Y2]
+        x, y, x2, y2 = (
+            wide[k + RIGHT_X],
+            wide[k + RIGHT_Y],
+            wide[k + RIGHT_X2],
+            wide[k + RIGHT_Y2],
+        )
         right = baked.tangent(seen, x, y, x2, y2, radius, 1.0)
-        x, y, x2, y2 = wide[k + LEFT_X], wide[k + LEFT_Y], wide[k + LEFT_X2], wide[k + LEFT_Y2]
+        x, y, x2, y2 = (
+            wide[k + LEFT_X],
+            wide[k + LEFT_Y],
+            wide[k + LEFT_X2],
+            wide[k + LEFT_Y2],
+        )
         left = baked.tangent(seen, x, y, x2, y2, radius, -1.0)
         bearing, ahead = lanes.single[k + BEARING], wide[k + BEARING_0]
         wide[k + MIDDLE], wide[k + LOW], wide[k + HIGH] = baked.in_beams(
@@ -208,7 +256,10 @@ def climb(k, lidar, lanes):  # type: ignore[no-untyped-def]
     """Replaces the silhouettes of a body that two corners do not determine."""
     wide, whole, table = lanes.wide, lanes.whole, lidar.table
     seen = baked.seen_at(wide[k + DX], wide[k + DY], wide[k + COSINE], wide[k + SINE])
-    shape, cell = table.shapes[np.uintp(whole[k + KIND])], table.cells[np.uintp(whole[k + CELL])]
+    shape, cell = (
+        table.shapes[np.uintp(whole[k + KIND])],
+        table.cells[np.uintp(whole[k + CELL])],
+    )
     right = baked.silhouette(cell[2], whole[k + HULL], shape, table.hulls, seen, 1.0)
     left = baked.silhouette(cell[3], whole[k + HULL], shape, table.hulls, seen, -1.0)
     bearing, ahead = lanes.single[k + BEARING], wide[k + BEARING_0]
@@ -225,18 +276,37 @@ def aim(k, turn, count, shift, lanes):  # type: ignore[no-untyped-def]
     often mispredict a branch. Blocks beyond the last of `count` beams begin `BACK` earlier.
     """
     wide, whole, zero = lanes.wide, lanes.whole, np.int32(0)
-    middle, low, high = wide[k + MIDDLE] - turn, wide[k + LOW] - turn, wide[k + HIGH] - turn
+    middle, low, high = (
+        wide[k + MIDDLE] - turn,
+        wide[k + LOW] - turn,
+        wide[k + HIGH] - turn,
+    )
     begin, hits, point, share = baked.beams_between(middle, low, high, count, shift)
-    width = np.int32(max(np.int32(hits + BLOCK - 1) & np.int32(-BLOCK), np.int32(2 * BLOCK)))
+    width = np.int32(
+        max(np.int32(hits + BLOCK - 1) & np.int32(-BLOCK), np.int32(2 * BLOCK))
+    )
     back = np.int32(max(np.int32(begin + width - count), zero))
-    whole[k + HITS], whole[k + BACK], wide[k + AT] = hits, back, wide[k + SCAN] + (begin - back)
+    whole[k + HITS], whole[k + BACK], wide[k + AT] = (
+        hits,
+        back,
+        wide[k + SCAN] + (begin - back),
+    )
     one, two = baked.points_of(whole[k + START], whole[k + PLACE], point, shift, hits)
-    other, other2 = baked.points_of(whole[k + START2], whole[k + PLACE2], point, shift, hits)
+    other, other2 = baked.points_of(
+        whole[k + START2], whole[k + PLACE2], point, shift, hits
+    )
     whole[k + ONE], whole[k + TWO] = np.int32(one - back), np.int32(two - back)
-    whole[k + OTHER], whole[k + OTHER2] = np.int32(other - back), np.int32(other2 - back)
+    whole[k + OTHER], whole[k + OTHER2] = (
+        np.int32(other - back),
+        np.int32(other2 - back),
+    )
     first = np.int32(min(min(one, two), min(min(other, other2), begin)) - back)
-    blocks = np.int32(max(np.int32(hits + back + BLOCK - 1) >> np.int32(4), np.int32(2)))
-    whole[k + BLOCKS] = blocks if (first >= 0) & (hits > 0) else zero  # none at a table's begin
+    blocks = np.int32(
+        max(np.int32(hits + back + BLOCK - 1) >> np.int32(4), np.int32(2))
+    )
+    whole[k + BLOCKS] = (
+        blocks if (first >= 0) & (hits > 0) else zero
+    )  # none at a table's begin
     lanes.single[k + SHARE] = share
 
 
@@ -256,7 +326,10 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
     least, most = np.float32(lidar.range_min), np.float32(lidar.range_max)
     at, first = np.uintp(lanes.wide[k + AT]), np.int64(0 if blocks > 0 else back)
     one, two = np.uintp(whole[k + ONE] + first), np.uintp(whole[k + TWO] + first)
-    other, other2 = np.uintp(whole[k + OTHER] + first), np.uintp(whole[k + OTHER2] + first)
+    other, other2 = (
+        np.uintp(whole[k + OTHER] + first),
+        np.uintp(whole[k + OTHER2] + first),
+    )
     # Ranges are fused as whole numbers, in the same order: of floats LLVM masks the store.
     if blocks > 0:
         place = np.int32(-back)

@@ -26,9 +26,15 @@ from nics_drl_bridge.lidar.table import LidarTable
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
 NO_WALLS = np.zeros((0, 4))
-GREATEST_ERROR = 0.01  # `auto` looks up at distances where the ranges' RMSE is at most this [m]
-_MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}  # cache of `lookup_distances`
-WIDEST_BEAMS = 0.2  # `auto` scans beams farther apart exactly: rows of few points err [rad]
+GREATEST_ERROR = (
+    0.01  # `auto` looks up at distances where the ranges' RMSE is at most this [m]
+)
+_MEASURED: dict[
+    tuple[Any, ...], tuple[float, float]
+] = {}  # cache of `lookup_distances`
+WIDEST_BEAMS = (
+    0.2  # `auto` scans beams farther apart exactly: rows of few points err [rad]
+)
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,9 @@ class Scanner:
         if not table.has_rows:
             reason = f"has no rows to look up with the renderer {self.renderer!r}"
         elif not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
-            apart = f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
+            apart = (
+                f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
+            )
             reason = f"is for beams that are {apart}"
         elif reach < spec.range_max * (1.0 - 1e-9):
             reason = f"reaches {reach:g} m, not {spec.range_max:g} m"
@@ -73,11 +81,20 @@ class Scanner:
         spec, table = self.spec, self.table
         return LidarArrays(
             np.array(spec.mount),
-            beams_of(np.ascontiguousarray(spec.directions.T), spec.angle_min, spec.angle_increment,
-                  spec.full_circle),
-            spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
-            table.outlines.arguments, table.arrays, self.renderer == "exact",
-        )  # fmt: skip
+            beams_of(
+                np.ascontiguousarray(spec.directions.T),
+                spec.angle_min,
+                spec.angle_increment,
+                spec.full_circle,
+            ),
+            spec.range_min,
+            spec.range_max,
+            spec.sweep_time,
+            self._looked_up(),
+            table.outlines.arguments,
+            table.arrays,
+            self.renderer == "exact",
+        )
 
     @cached_property
     def _without_walls(self) -> Fixtures:
@@ -93,9 +110,14 @@ class Scanner:
                 farthest = float(table.grid[h, 0])
                 key = spec.model_dump_json(), table.shapes[h], table.density, farthest
                 if key not in _MEASURED:  # once per process
-                    ways = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
+                    ways = (
+                        replace(self, renderer=way, grid=None)
+                        for way in ("exact", "baked")
+                    )
                     exact, baked = (way.arguments for way in ways)
-                    found = lookup_distances(exact, baked, h, float(radii[h]), GREATEST_ERROR)
+                    found = lookup_distances(
+                        exact, baked, h, float(radii[h]), GREATEST_ERROR
+                    )
                     _MEASURED[key] = found
                 between[h] = _MEASURED[key]
         return np.asarray(np.square(between))
@@ -106,9 +128,12 @@ class Scanner:
         return place(poses, self.table.outlines.radii[index], index)
 
     def scan(
-        self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike = NO_WALLS,
+        self,
+        poses: ArrayLike,
+        bodies: ArrayLike,
+        walls: ArrayLike = NO_WALLS,
         out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:  # fmt: skip
+    ) -> NDArray[np.float32]:
         """Scans (N, B) [m], REP-117, from poses (N, 3) of robots, each in a separate world.
 
         The bodies (N, K, 7) are from `place`; walls (W, 4) x1, y1, x2, y2 [m] are the same in every
@@ -119,7 +144,9 @@ class Scanner:
         shape = (len(poses), self.spec.beams)
         out = np.empty(shape, np.float32) if out is None else out
         if out.shape != shape or out.dtype != np.float32:
-            raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
+            raise ConfigError(
+                f"out is {out.shape} {out.dtype}; it must be {shape} float32."
+            )
         if not out.flags.c_contiguous:
             out[:] = self.scan(poses, bodies, walls)
             return out
@@ -128,19 +155,35 @@ class Scanner:
         around = self._without_walls._replace(member=member, walls=walls, first=first)
         cells = body_cells(0, bodies.shape[1])
         scan_kernels.scan_worlds(
-            out[:, None], poses[:, None], worlds, bodies, -1, around, self.arguments, cells, lanes
+            out[:, None],
+            poses[:, None],
+            worlds,
+            bodies,
+            -1,
+            around,
+            self.arguments,
+            cells,
+            lanes,
         )
         return out
 
-    def _scene(self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike) -> tuple[Array, ...]:
+    def _scene(
+        self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike
+    ) -> tuple[Array, ...]:
         poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
         bodies = np.asarray(bodies, dtype=np.float64)
         if bodies.size == 0:
             bodies = np.zeros((len(poses), 0, BODY))
         elif bodies.ndim == 2:
             bodies = bodies[None]
-        walls = np.array(walls if np.size(walls) else NO_WALLS, np.float64, order="C", ndmin=2)
-        if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
+        walls = np.array(
+            walls if np.size(walls) else NO_WALLS, np.float64, order="C", ndmin=2
+        )
+        if poses.shape[1:] != (3,) or bodies.shape != (
+            len(poses),
+            bodies.shape[1],
+            BODY,
+        ):
             given = f"poses {poses.shape} and bodies {bodies.shape}"
             raise ConfigError(f"{given} must be (N, 3) and (N, K, {BODY}).")
         if walls.shape != (len(walls), 4):
@@ -148,14 +191,22 @@ class Scanner:
         index, known = bodies[..., SHAPE], len(self.table.shapes)
         if index.size and not (index.min() >= 0 and index.max() < known):
             reason = f"none of the {known} in the lidar table"  # the kernels would read beyond it
-            raise ModelError(f"a body's shape is {reason}; make bodies by `place` of its scanner.")
+            raise ModelError(
+                f"a body's shape is {reason}; make bodies by `place` of its scanner."
+            )
         return poses, bodies, walls
 
 
 def make_scanner(
-    spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto",
+    spec: LidarSpec,
+    shapes: Sequence[Shape],
+    renderer: Renderer = "auto",
     grid: GridMap | None = None,
-) -> Scanner:  # fmt: skip
+) -> Scanner:
     """Returns a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""
-    table = LidarTable.without_rows(spec, shapes) if renderer == "exact" else bake(spec, shapes)
+    table = (
+        LidarTable.without_rows(spec, shapes)
+        if renderer == "exact"
+        else bake(spec, shapes)
+    )
     return Scanner(spec, table, renderer, grid)

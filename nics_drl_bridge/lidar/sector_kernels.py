@@ -19,9 +19,13 @@ class SectorPlan(NamedTuple):
     """Assignment of the beams of one lidar to the sectors of one layout."""
 
     first: NDArray[np.int32]  # (S,) first beam of each sector
-    hits: NDArray[np.int32]  # (S,) number of its beams, which continue with beam 0 after the last
+    hits: NDArray[
+        np.int32
+    ]  # (S,) number of its beams, which continue with beam 0 after the last
     directions: NDArray[np.float64]  # (B, 2) of the beams in `base_link`
-    shift: NDArray[np.float64]  # (2,) of the lidar from the viewpoint [m]; zero: filled by beam
+    shift: NDArray[
+        np.float64
+    ]  # (2,) of the lidar from the viewpoint [m]; zero: filled by beam
     angle_min: float  # begin of sector 0 [rad]
     width: float  # of the sectors [rad]
     range_min: float  # of the lidar [m]
@@ -55,7 +59,9 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
     least = np.empty((rows, beams), np.int32)
     row = least[0]
     for b in range(beams):
-        row[b] = whole[b] if np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF else UNKNOWN
+        row[b] = (
+            whole[b] if np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF else UNKNOWN
+        )
     for k in range(rows - 1):
         step, last = 1 << k, beams - (2 << k) + 1
         one, two, row = least[k, :last], least[k, step : step + last], least[k + 1]
@@ -114,7 +120,9 @@ def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
     reach = min(max(float(r), 0.5 * plan.range_min), plan.range_max)
     x, y = plan.shift[0] + reach * direction[0], plan.shift[1] + reach * direction[1]
     angle = (math.atan2(y, x) - plan.angle_min) % TURN
-    s = int(angle / plan.width) if angle < TURN else 0  # a tiny negative angle is rounded to TURN
+    s = (
+        int(angle / plan.width) if angle < TURN else 0
+    )  # a tiny negative angle is rounded to TURN
     return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
 
 

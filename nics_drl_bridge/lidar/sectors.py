@@ -17,19 +17,32 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import Array, wrap_angle
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.shapes import LARGEST, Place
-from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader, check_angles
+from nics_drl_bridge.lidar.spec import (
+    FULL_CIRCLE_TOLERANCE,
+    LidarSpec,
+    ScanHeader,
+    check_angles,
+)
 
 Ranges = NDArray[np.float32]
-COARSEST_RAD = 0.21  # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
-BORDER_RAD = 1e-4  # A beam this near to a border counts in both: headers have angles in float32
-RANGE_TOLERANCE = 1e-5  # Share by which a lidar's range may be less than the layout's, by float32
+COARSEST_RAD = (
+    0.21  # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
+)
+BORDER_RAD = (
+    1e-4  # A beam this near to a border counts in both: headers have angles in float32
+)
+RANGE_TOLERANCE = (
+    1e-5  # Share by which a lidar's range may be less than the layout's, by float32
+)
 
 
 class ScanLayout(Schema):
     """The scan that a policy sees: the nearest return in each sector, seen from the viewpoint."""
 
     sectors: int = Field(ge=4, le=1440)  # S
-    angle_min: float = -np.pi  # begin of the first, counter-clockwise, in `base_link` [rad]
+    angle_min: float = (
+        -np.pi
+    )  # begin of the first, counter-clockwise, in `base_link` [rad]
     angle_max: float = np.pi  # end of the last sector [rad]
     range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns count as none [m]
     viewpoint: tuple[Place, Place] = (0.0, 0.0)  # x, y in `base_link` [m]
@@ -52,7 +65,9 @@ class ScanLayout(Schema):
 
 LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars cover
     "around": ScanLayout(sectors=72, range_max=3.0),
-    "front": ScanLayout(sectors=54, angle_min=-0.75 * np.pi, angle_max=0.75 * np.pi, range_max=3.0),
+    "front": ScanLayout(
+        sectors=54, angle_min=-0.75 * np.pi, angle_max=0.75 * np.pi, range_max=3.0
+    ),
 }
 
 
@@ -73,11 +88,17 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
         middle = 0.5 * (lidar.angle_min + lidar.angle_max)
         begin = lidar.angle_min + float(wrap_angle(middle + heading)) - middle
         span = lidar.angle_max - lidar.angle_min
-        fields = {"angle_min": begin, "angle_max": begin + span, "range_max": lidar.range_max}
+        fields = {
+            "angle_min": begin,
+            "angle_max": begin + span,
+            "range_max": lidar.range_max,
+        }
         given = {"sectors": int(given), "viewpoint": (x, y), **fields}
     if not isinstance(given, Mapping):
         known = ", ".join(map(repr, LAYOUTS))
-        raise ConfigError(f"{option}: must be a number of sectors, a mapping, or one of {known}.")
+        raise ConfigError(
+            f"{option}: must be a number of sectors, a mapping, or one of {known}."
+        )
     return validate(dict(given), ScanLayout, "task option scan")
 
 
@@ -96,9 +117,16 @@ def covers(lidar: LidarSpec, layout: str) -> bool:
 
 
 NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
-    np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2),
-    angle_min=0.0, width=0.0, range_min=0.0, range_max=0.0, closed=False,
-)  # fmt: skip
+    np.zeros(0, np.int32),
+    np.zeros(0, np.int32),
+    np.zeros((0, 2)),
+    np.zeros(2),
+    angle_min=0.0,
+    width=0.0,
+    range_min=0.0,
+    range_max=0.0,
+    closed=False,
+)
 
 
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
@@ -108,14 +136,22 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     _check(lidar, layout, angles)
     first, count = np.zeros((2, layout.sectors), np.int32)
     for s, middle in enumerate(layout.angles):
-        first[s], count[s] = _beams_of(wrap_angle(angles - middle), 0.5 * layout.width + BORDER_RAD)
+        first[s], count[s] = _beams_of(
+            wrap_angle(angles - middle), 0.5 * layout.width + BORDER_RAD
+        )
     left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
     closed = left_open <= max(COARSEST_RAD, lidar.angle_increment)
     return SectorPlan(
-        first, count, np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]), float(layout.angle_min),
-        float(layout.width), float(lidar.range_min), float(lidar.range_max), bool(closed),
-    )  # fmt: skip
+        first,
+        count,
+        np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]),
+        float(layout.angle_min),
+        float(layout.width),
+        float(lidar.range_min),
+        float(lidar.range_max),
+        bool(closed),
+    )
 
 
 def _beams_of(away: Array, half: float) -> tuple[int, int]:
@@ -135,23 +171,33 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     if apart > COARSEST_RAD:
         found, most = np.degrees([apart, COARSEST_RAD])
         reason = f"are {found:.3g} deg apart, a scan layout needs at most {most:.3g}"
-        raise ConfigError(f"the beams of the lidar {lidar.name!r} {reason}; use a finer lidar.")
+        raise ConfigError(
+            f"the beams of the lidar {lidar.name!r} {reason}; use a finer lidar."
+        )
     if lidar.range_max < layout.range_max * (1.0 - RANGE_TOLERANCE):
         needed = f"{layout.range_max:g} m; {_narrower(lidar, layout)}."
         seen = f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m"
         raise ConfigError(f"{seen}, the scan layout needs {needed}")
-    steps = max(layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart)))
+    steps = max(
+        layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart))
+    )
     wanted = np.linspace(layout.angle_min, layout.angle_max, steps + 1)
     ordered = np.sort(np.mod(angles, 2.0 * np.pi))
-    ordered = np.concatenate([ordered[-1:] - 2.0 * np.pi, ordered, ordered[:1] + 2.0 * np.pi])
+    ordered = np.concatenate(
+        [ordered[-1:] - 2.0 * np.pi, ordered, ordered[:1] + 2.0 * np.pi]
+    )
     place = np.mod(wanted, 2.0 * np.pi)
     after = np.searchsorted(ordered, place).clip(1, len(ordered) - 1)
     gap = np.minimum(place - ordered[after - 1], ordered[after] - place)
     if (gap > apart + BORDER_RAD).any():
         limits = np.degrees([angles[0], angles[-1], layout.angle_min, layout.angle_max])
         a, b, c, d = (f"{limit:.4g}" for limit in limits)
-        reason = f"looks from {a} to {b} deg in base_link, the scan layout needs {c} to {d}"
-        raise ConfigError(f"the lidar {lidar.name!r} {reason}; {_narrower(lidar, layout)}.")
+        reason = (
+            f"looks from {a} to {b} deg in base_link, the scan layout needs {c} to {d}"
+        )
+        raise ConfigError(
+            f"the lidar {lidar.name!r} {reason}; {_narrower(lidar, layout)}."
+        )
 
 
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:
@@ -172,7 +218,9 @@ class Reader:
         return values[..., ::-1] if self.backwards else values
 
 
-def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False) -> Reader:
+def reader_of(
+    header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
+) -> Reader:
     """Returns the reader for scans of B beams with the header of a LaserScan.
 
     A negative `angle_increment` means clockwise beams, and so does `upside_down`. `like` gives
@@ -197,9 +245,13 @@ def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool
     elif turn - FULL_CIRCLE_TOLERANCE < span < turn + 0.1 * step:
         span = turn - 2.0 * FULL_CIRCLE_TOLERANCE  # first and last beam coincide
     fields = like.model_dump() | {
-        "name": "scan", "beams": beams, "angle_min": begin, "angle_max": begin + span,
-        "range_min": header.range_min, "range_max": header.range_max,
-    }  # fmt: skip
+        "name": "scan",
+        "beams": beams,
+        "angle_min": begin,
+        "angle_max": begin + span,
+        "range_min": header.range_min,
+        "range_max": header.range_max,
+    }
     return Reader(validate(fields, LidarSpec, "LaserScan"), backwards)
 
 
@@ -212,7 +264,9 @@ def reader_beside(
     near = np.allclose(limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4)
     same = near and found.lidar.beams == like.beams
     turned = found.lidar.angles - like.angles if same else np.ones(1)
-    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, off by full turns
+    whole = (
+        2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))
+    )  # the same beams, off by full turns
     if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
         return Reader(like, found.backwards)
     return found

@@ -53,10 +53,14 @@ class Sensor(Schema, ABC):
     of a class that `add_sensor_kind` imported. A reading is S numbers, float32; NaN is unknown.
     """
 
-    message: ClassVar[str]  # type of its message, as sensor_msgs/msg/LaserScan, with a header
+    message: ClassVar[
+        str
+    ]  # type of its message, as sensor_msgs/msg/LaserScan, with a header
 
     kind: str
-    name: str = Field(pattern="^[a-z][a-z0-9_]*$")  # also its topic, below the robot's namespace
+    name: str = Field(
+        pattern="^[a-z][a-z0-9_]*$"
+    )  # also its topic, below the robot's namespace
 
     @property
     @abstractmethod
@@ -140,7 +144,9 @@ def sensor_of_data(given: Sensor | Mapping[str, Any]) -> Sensor:
         raise ConfigError(f"sensor kind {kind!r}: {CODE_IN_DATA}")
     found = extensions.load("sensors", kind)
     if not (isinstance(found, type) and issubclass(found, Sensor)):
-        raise ConfigError(f"sensor kind {kind!r}: is no subclass of lidar.sensor.Sensor.")
+        raise ConfigError(
+            f"sensor kind {kind!r}: is no subclass of lidar.sensor.Sensor."
+        )
     return validate(dict(given), found, f"sensor {given.get('name')!r}")
 
 
@@ -155,7 +161,9 @@ def load_sensor(file: Path) -> Sensor:
 
 def unread(sensors: Sequence[Sensor], *lead: int) -> dict[str, Readings]:
     """Returns unknown readings (*lead, S) by the sensors' names."""
-    return {each.name: np.full((*lead, each.size), np.nan, np.float32) for each in sensors}
+    return {
+        each.name: np.full((*lead, each.size), np.nan, np.float32) for each in sensors
+    }
 
 
 def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
@@ -164,7 +172,9 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
     for sensor in sensors:
         if sensor.name in names or sensor.frame in used:
             reason = "another has that name or frame already; choose others."
-            raise ConfigError(f"sensor {sensor.name!r} with frame {sensor.frame!r}: {reason}")
+            raise ConfigError(
+                f"sensor {sensor.name!r} with frame {sensor.frame!r}: {reason}"
+            )
         names.append(sensor.name)
         used.append(sensor.frame)
 
@@ -176,5 +186,9 @@ def _validated(given: Any) -> Sensor:
         raise ValueError(str(error)) from None
 
 
-_dumped = PlainSerializer(lambda sensor: sensor.model_dump(mode="json"), return_type=dict)
-AnySensor = Annotated[Sensor, PlainValidator(_validated), _dumped]  # a field of a schema
+_dumped = PlainSerializer(
+    lambda sensor: sensor.model_dump(mode="json"), return_type=dict
+)
+AnySensor = Annotated[
+    Sensor, PlainValidator(_validated), _dumped
+]  # a field of a schema

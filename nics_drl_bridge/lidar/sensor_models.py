@@ -19,8 +19,12 @@ NEAREST = 1e-3  # a surface nearer than this is as bright as one at this range [
 class IncidenceDropout(Schema):
     """Loses returns at oblique incidence, as from polished metal."""
 
-    kind: Literal["incidence_dropout"] = "incidence_dropout"  # which sensor model this is
-    greatest_incidence: float = Field(gt=0.0, lt=math.pi / 2.0)  # of the ray to the normal [rad]
+    kind: Literal["incidence_dropout"] = (
+        "incidence_dropout"  # which sensor model this is
+    )
+    greatest_incidence: float = Field(
+        gt=0.0, lt=math.pi / 2.0
+    )  # of the ray to the normal [rad]
 
     def __str__(self) -> str:
         """In a few words."""
@@ -44,27 +48,41 @@ class Intensity(Schema):
     """
 
     kind: Literal["intensity"] = "intensity"  # which sensor model this is
-    gain: float = Field(default=1.0, gt=0.0)  # white, at normal incidence, at 1 m [device's unit]
-    reflectivity: float = Field(default=0.5, gt=0.0)  # of walls, maps, shapes without their own
+    gain: float = Field(
+        default=1.0, gt=0.0
+    )  # white, at normal incidence, at 1 m [device's unit]
+    reflectivity: float = Field(
+        default=0.5, gt=0.0
+    )  # of walls, maps, shapes without their own
     exponent: float = Field(default=1.0, ge=0.0, le=100.0)  # of the cosine
-    threshold: float = Field(default=0.0, ge=0.0)  # weaker returns are lost [the device's unit]
+    threshold: float = Field(
+        default=0.0, ge=0.0
+    )  # weaker returns are lost [the device's unit]
 
     def __str__(self) -> str:
         """In a few words."""
         lost = f", below {self.threshold:g} nothing" if self.threshold else ""
-        return f"intensity {self.gain:g} at 1 m{lost}, reflectivity {self.reflectivity:g}"
+        return (
+            f"intensity {self.gain:g} at 1 m{lost}, reflectivity {self.reflectivity:g}"
+        )
 
-    def reflectance(self, cosine: ArrayLike, reflectivity: float | None) -> NDArray[np.float64]:
+    def reflectance(
+        self, cosine: ArrayLike, reflectivity: float | None
+    ) -> NDArray[np.float64]:
         """Returns the factor (P,) without the range: reflectivity times cos(incidence)^exponent."""
         white = self.reflectivity if reflectivity is None else reflectivity
-        return np.asarray(white * np.power(np.asarray(cosine, np.float64), self.exponent))
+        return np.asarray(
+            white * np.power(np.asarray(cosine, np.float64), self.exponent)
+        )
 
     def lost(
         self, ranges: Ranges, incidence: NDArray[np.float64], reflectivity: float | None
     ) -> NDArray[np.bool_]:
         """True for the points (P,) below the threshold, by angle to the surface's normal [rad]."""
         light = self.gain * self.reflectance(np.cos(incidence), reflectivity)
-        return np.asarray(light / np.square(np.maximum(ranges, NEAREST)) < self.threshold)
+        return np.asarray(
+            light / np.square(np.maximum(ranges, NEAREST)) < self.threshold
+        )
 
 
 def _one_intensity(models: "tuple[SensorModel, ...]") -> "tuple[SensorModel, ...]":
@@ -78,10 +96,14 @@ SensorModels = Annotated[tuple[SensorModel, ...], AfterValidator(_one_intensity)
 
 
 def returned(
-    models: Sequence[SensorModel], ranges: Ranges, incidence: NDArray[np.float64],
+    models: Sequence[SensorModel],
+    ranges: Ranges,
+    incidence: NDArray[np.float64],
     reflectivity: float | None,
-) -> Ranges:  # fmt: skip
+) -> Ranges:
     """Returns ranges (P,) with `inf` where any model loses the return; see `Intensity.lost`."""
     for model in models:
-        ranges = np.where(model.lost(ranges, incidence, reflectivity), np.float32(np.inf), ranges)
+        ranges = np.where(
+            model.lost(ranges, incidence, reflectivity), np.float32(np.inf), ranges
+        )
     return ranges

@@ -15,8 +15,13 @@ from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, Outline
 
 MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000  # in one group of obstacles
-SMALLEST, LARGEST = 1e-6, 1e4  # Extent of a shape [m]: less is invisible, more fits in no world
-SAME_PLACE = 1e-9  # corners within this distance, as a share of the shape's radius, coincide
+SMALLEST, LARGEST = (
+    1e-6,
+    1e4,
+)  # Extent of a shape [m]: less is invisible, more fits in no world
+SAME_PLACE = (
+    1e-9  # corners within this distance, as a share of the shape's radius, coincide
+)
 FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -66,7 +71,9 @@ class Rectangle(Outlined):
     @classmethod
     def _extended(cls, size: Any) -> Any:
         if isinstance(size, list | tuple) and any(part == 0.0 for part in size):
-            raise ValueError("size must be greater than 0; a wall without thickness is a segment")
+            raise ValueError(
+                "size must be greater than 0; a wall without thickness is a segment"
+            )
         return size
 
     @property
@@ -81,11 +88,15 @@ class Polygon(Outlined):
 
     kind: Literal["polygon"] = "polygon"  # which kind of shape this is
     # in the shape's own frame, in either orientation [m]
-    points: tuple[tuple[Place, Place], ...] = Field(min_length=3, max_length=MOST_CORNERS)
+    points: tuple[tuple[Place, Place], ...] = Field(
+        min_length=3, max_length=MOST_CORNERS
+    )
 
     @field_validator("points")
     @classmethod
-    def _distinct(cls, points: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    def _distinct(
+        cls, points: tuple[tuple[float, float], ...]
+    ) -> tuple[tuple[float, float], ...]:
         if len(set(points)) < 3:
             raise ValueError("a polygon needs at least 3 different corners")
         if np.ptp(points, axis=0).max() < SMALLEST:
@@ -105,7 +116,9 @@ class Segment(Outlined):
     """A straight wall without thickness."""
 
     kind: Literal["segment"] = "segment"  # which kind of shape this is
-    ends: tuple[tuple[Place, Place], tuple[Place, Place]]  # in the shape's own frame [m]
+    ends: tuple[
+        tuple[Place, Place], tuple[Place, Place]
+    ]  # in the shape's own frame [m]
 
     @model_validator(mode="after")
     def _extended(self) -> "Segment":
@@ -138,8 +151,13 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses
-    with np.errstate(invalid="ignore"):  # a body with an infinite heading is NaN, and not visible
-        bodies[..., COS], bodies[..., SIN] = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    with np.errstate(
+        invalid="ignore"
+    ):  # a body with an infinite heading is NaN, and not visible
+        bodies[..., COS], bodies[..., SIN] = (
+            np.cos(poses[..., 2]),
+            np.sin(poses[..., 2]),
+        )
     bodies[..., RADIUS], bodies[..., SHAPE] = radii, shapes
     return bodies
 
@@ -174,9 +192,13 @@ def rotational_order(outline: Array, hull: Array) -> int:
         if len(outline) % order or len(hull) % order:
             continue
         angle = 2.0 * np.pi / order
-        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        turn = np.array(
+            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        )
         if all(
-            np.abs(corners @ turn - np.roll(corners, -len(corners) // order, axis=0)).max()
+            np.abs(
+                corners @ turn - np.roll(corners, -len(corners) // order, axis=0)
+            ).max()
             < tolerance
             for corners in (outline, hull)
         ):
@@ -190,8 +212,12 @@ class Outlines:
 
     shapes: tuple[Shape, ...]  # H
     corners: Array  # (sum V, 2) of all outlines, one after the other [m]
-    corner: NDArray[np.int64]  # (H + 1,) first corner of each outline; a circle has none
-    hulls: Array  # (sum 2 V, 2) corners of all convex hulls [m]; a circle's is its centre
+    corner: NDArray[
+        np.int64
+    ]  # (H + 1,) first corner of each outline; a circle has none
+    hulls: (
+        Array  # (sum 2 V, 2) corners of all convex hulls [m]; a circle's is its centre
+    )
     hull: NDArray[np.int64]  # (H + 1,) first corner of each hull
     radii: Array  # (H,) [m]
     orders: NDArray[np.int64]  # (H,) rotational order
@@ -207,10 +233,13 @@ class Outlines:
         radii = np.array([shape.radius for shape in shapes], dtype=np.float64)
         return cls(
             tuple(shapes),
-            np.concatenate([nothing, *outlines]), np.cumsum([0, *map(len, outlines)]),
-            np.concatenate([nothing, *twice]), np.cumsum([0, *map(len, twice)]),
-            radii, np.array(orders, dtype=np.int64),
-        )  # fmt: skip
+            np.concatenate([nothing, *outlines]),
+            np.cumsum([0, *map(len, outlines)]),
+            np.concatenate([nothing, *twice]),
+            np.cumsum([0, *map(len, twice)]),
+            radii,
+            np.array(orders, dtype=np.int64),
+        )
 
     @property
     def arguments(self) -> OutlineArrays:
@@ -237,4 +266,8 @@ def describe(shape: Shape) -> str:
         words = f"segment of {np.hypot(*np.subtract(*shape.ends)):.3g} m"
     else:
         words = f"polygon of {len(shape.points)} corners, radius {shape.radius:.3g} m"
-    return words if shape.reflectivity is None else f"{words}, reflectivity {shape.reflectivity:g}"
+    return (
+        words
+        if shape.reflectivity is None
+        else f"{words}, reflectivity {shape.reflectivity:g}"
+    )

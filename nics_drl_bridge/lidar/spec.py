@@ -29,7 +29,9 @@ class ScanHeader(NamedTuple):
     angle_min: float  # of the first beam [rad]
     angle_max: float  # of the last beam, also for a full circle [rad]
     angle_increment: float  # between neighbouring beams [rad]
-    time_increment: float  # the same [s]; 0 if all are measured at once, negative if clockwise
+    time_increment: (
+        float  # the same [s]; 0 if all are measured at once, negative if clockwise
+    )
     scan_time: float  # between scans [s]
     range_min: float  # nearest return [m]
     range_max: float  # farthest return [m]
@@ -38,7 +40,9 @@ class ScanHeader(NamedTuple):
 def check_angles(angle_min: float, angle_max: float) -> None:
     """Raises ValueError unless the limits span at most a full circle within two turns."""
     if not 0.0 < angle_max - angle_min <= 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
-        raise ValueError("angle_max must exceed angle_min by at most a full circle, in radians")
+        raise ValueError(
+            "angle_max must exceed angle_min by at most a full circle, in radians"
+        )
     if max(-angle_min, angle_max) > 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
         raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
 
@@ -54,7 +58,9 @@ class LidarSpec(Schema):
     angle_min: float  # of the first beam, in the frame of the lidar [rad]
     angle_max: float  # of the last beam, or of the end of the circle [rad]
     range_min: float = Field(ge=0.0)  # nearer returns are reported as `-inf` [m]
-    range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns are reported as `inf` [m]
+    range_max: float = Field(
+        ge=1e-3, le=LARGEST
+    )  # farther returns are reported as `inf` [m]
     rate: float = Field(ge=1e-3, le=1e5)  # scans per second [Hz]
     mount: Mount = (0.0, 0.0, 0.0)  # of `laser` in `base_link`
     noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)  # of a range [m]
@@ -69,7 +75,9 @@ class LidarSpec(Schema):
             raise ValueError("range_min must be less than range_max")
         check_angles(self.angle_min, self.angle_max)
         if self.faults.quantisation > self.range_max - self.range_min:
-            raise ValueError("faults.quantisation must be less than range_max - range_min")
+            raise ValueError(
+                "faults.quantisation must be less than range_max - range_min"
+            )
         if self.no_return == "zero" and self.range_min == 0.0:
             raise ValueError("range_min must be greater than 0 where no_return is zero")
         return self
@@ -114,11 +122,14 @@ class LidarSpec(Schema):
     def header(self) -> ScanHeader:
         """The fields of a LaserScan except stamp, frame and ranges."""
         return ScanHeader(
-            angle_min=float(self.angles[0]), angle_max=float(self.angles[-1]),
-            angle_increment=self.angle_increment, scan_time=self.scan_time,
+            angle_min=float(self.angles[0]),
+            angle_max=float(self.angles[-1]),
+            angle_increment=self.angle_increment,
+            scan_time=self.scan_time,
             time_increment=self.beam_time * SKEW[self.faults.skew],
-            range_min=self.range_min, range_max=self.range_max,
-        )  # fmt: skip
+            range_min=self.range_min,
+            range_max=self.range_max,
+        )
 
     @property
     def fault_parameters(self) -> NDArray[np.float64]:
@@ -157,4 +168,6 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
 
 
 def _no_return(spec: LidarSpec) -> np.float32:
-    return np.float32({"zero": 0.0, "nan": np.nan, "range_max": spec.range_max}[spec.no_return])
+    return np.float32(
+        {"zero": 0.0, "nan": np.nan, "range_max": spec.range_max}[spec.no_return]
+    )

@@ -31,7 +31,9 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 FORMAT = "nics_drl_bridge/lidar_table/4"
 ABOUT_FILE, ARRAYS = "about.json", ("grid", "start", "cell", "rows")
 TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))  # and a manifest
-POINT_ANGLE = 0.01  # greatest default angle of points in a row, as `MOST_PHASES` allows [rad]
+POINT_ANGLE = (
+    0.01  # greatest default angle of points in a row, as `MOST_PHASES` allows [rad]
+)
 MOST_PHASES = 8
 MOST_WIDE = 0xFFFF  # greatest number of beams in a row
 
@@ -39,7 +41,9 @@ MOST_WIDE = 0xFFFF  # greatest number of beams in a row
 class Density(Schema):
     """Sampling density of a table; a shape with rotational symmetry is baked for one period."""
 
-    distances: int = Field(default=100, ge=3, le=10_000)  # from the shape's radius to out of range
+    distances: int = Field(
+        default=100, ge=3, le=10_000
+    )  # from the shape's radius to out of range
     rotations: int = Field(default=240, ge=1, le=100_000)  # in a full turn
     phases: Literal[1, 2, 4, 8] = 1  # points per beam, see `for_beams`
 
@@ -82,7 +86,9 @@ class LidarTable:
     shapes: tuple[Shape, ...]  # H
     density: Density
     beam_angle: float  # between the beams that it was baked for [rad]
-    grid: NDArray[np.float64]  # (H, 3) greatest distance [m], rotations in a period, first cell
+    grid: NDArray[
+        np.float64
+    ]  # (H, 3) greatest distance [m], rotations in a period, first cell
     start: NDArray[np.int32]  # (cells,) begin of each row in `rows`
     cell: NDArray[np.int16]  # (cells, 6) see above
     rows: NDArray[np.float32]  # (R,) ranges [m], padded by what one look-up can read
@@ -94,8 +100,14 @@ class LidarTable:
         shapes = tuple(dict.fromkeys(shapes))
         grid = np.ones((len(shapes), 3))
         grid[:, 0] = [spec.range_max + 2.0 * shape.radius for shape in shapes]
-        none = np.zeros(0, np.int32), np.zeros((0, 6), np.int16), np.zeros(0, np.float32)
-        return cls(shapes, Density(), spec.angle_increment, grid, *none, spec.sensor_model)
+        none = (
+            np.zeros(0, np.int32),
+            np.zeros((0, 6), np.int16),
+            np.zeros(0, np.float32),
+        )
+        return cls(
+            shapes, Density(), spec.angle_increment, grid, *none, spec.sensor_model
+        )
 
     @property
     def has_rows(self) -> bool:
@@ -123,7 +135,10 @@ class LidarTable:
         shapes["per_metre"] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
         shapes["rotations"] = np.where(circles, 0.0, rotations * parts)
         shapes["parts_per_rotation"] = 1.0 / rotations
-        shapes["first_cell"], shapes["cells_per_part"] = self.grid[:, 2], rotations * distances
+        shapes["first_cell"], shapes["cells_per_part"] = (
+            self.grid[:, 2],
+            rotations * distances,
+        )
         shapes["hull_end"] = outlines.hull[:-1] + corners
         shapes["corners_per_part"], shapes["corners"] = corners // parts, corners
         shapes["round_radius"] = np.where(circles, outlines.radii, 0.0)
@@ -132,7 +147,11 @@ class LidarTable:
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         cells = np.column_stack([self.start, pairs])
         missing = max(32 - padding(self.beam_angle), 0)  # at least two blocks are read
-        rows = np.append(self.rows, np.zeros(missing, np.float32)) if missing else self.rows
+        rows = (
+            np.append(self.rows, np.zeros(missing, np.float32))
+            if missing
+            else self.rows
+        )
         return TableArrays(shapes, distances, cells, rows, shift, outlines.hulls)
 
     @property
@@ -146,8 +165,17 @@ class LidarTable:
 
     @property
     def _about(self) -> str:
-        kept = {name: getattr(self, name) for name in TableAbout.model_fields if name != "format"}
-        return TableAbout(format=FORMAT, **kept).model_dump_json(indent=1, exclude_none=True) + "\n"
+        kept = {
+            name: getattr(self, name)
+            for name in TableAbout.model_fields
+            if name != "format"
+        }
+        return (
+            TableAbout(format=FORMAT, **kept).model_dump_json(
+                indent=1, exclude_none=True
+            )
+            + "\n"
+        )
 
     @cached_property
     def fingerprint(self) -> str:
@@ -179,9 +207,13 @@ class LidarTable:
         try:
             data = json.loads(read_text(path, MOST_BYTES))
         except (RecursionError, ValueError) as error:
-            raise ModelError(f"{path}: is no JSON ({error}); generate the model anew.") from None
+            raise ModelError(
+                f"{path}: is no JSON ({error}); generate the model anew."
+            ) from None
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise ModelError(f"{path}: its format is not {FORMAT!r}; generate the model anew.")
+            raise ModelError(
+                f"{path}: its format is not {FORMAT!r}; generate the model anew."
+            )
         parts: dict[str, Any] = dict(validate(data, TableAbout, str(path)))
         parts |= {name: _mapped(folder / f"{name}.npy") for name in ARRAYS}
         del parts["format"]
@@ -197,25 +229,39 @@ class LidarTable:
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
         types = [array.dtype for array in arrays if array.flags.c_contiguous]
         if types != [np.float64, np.int32, np.int16, np.float32]:
-            raise ValueError("an array has another type of number, or order of its axes")
+            raise ValueError(
+                "an array has another type of number, or order of its axes"
+            )
         if self.grid.shape != (len(self.shapes), 3) or not np.isfinite(self.grid).all():
             raise ValueError("the grid does not fit the shapes")
         counts = self.grid[:, 1] * self.density.distances
         cells = int(counts.sum())
-        if (counts < 1).any() or not np.array_equal(self.grid[:, 2], np.cumsum(counts) - counts):
+        if (counts < 1).any() or not np.array_equal(
+            self.grid[:, 2], np.cumsum(counts) - counts
+        ):
             raise ValueError("the grid does not fit the density")
         if (self.grid[:, 0] <= self.outlines.radii).any():
             raise ValueError("the grid has no extent")
-        if self.start.shape != (cells,) or self.cell.shape != (cells, 6) or self.rows.ndim != 1:
+        if (
+            self.start.shape != (cells,)
+            or self.cell.shape != (cells, 6)
+            or self.rows.ndim != 1
+        ):
             raise ValueError("the number of cells does not fit the grid")
         widths = self.widths * self.density.phases
         ends = self.start + widths
         last = len(self.rows) - padding(self.beam_angle)
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
             raise ValueError("a row lies outside of the table")
-        corners = np.repeat(np.diff(self.outlines.hull) // 2, counts.astype(np.int64))[:, None]
+        corners = np.repeat(np.diff(self.outlines.hull) // 2, counts.astype(np.int64))[
+            :, None
+        ]
         hint, other = self.cell[:, 2::2], self.cell[:, 3::2]
-        if (hint < 0).any() or (hint >= corners).any() or (np.abs(other) >= corners).any():
+        if (
+            (hint < 0).any()
+            or (hint >= corners).any()
+            or (np.abs(other) >= corners).any()
+        ):
             raise ValueError("a cell names a corner that its shape has not")
 
 
@@ -227,5 +273,7 @@ def _mapped(path: Path) -> NDArray[Any]:
         if not isinstance(array, np.memmap):
             raise TypeError("an archive of arrays")
     except Exception:  # noqa: BLE001 - a false header breaks numpy in any way
-        raise ModelError(f"{path}: is no array of numbers; generate the model anew.") from None
+        raise ModelError(
+            f"{path}: is no array of numbers; generate the model anew."
+        ) from None
     return np.asarray(array)

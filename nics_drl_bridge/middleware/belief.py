@@ -13,7 +13,10 @@ from nics_drl_bridge.middleware.turning import Gyro
 
 JITTER_S = 0.2  # Uncertainty of the unobserved time: transmission takes longer now and then [s]
 MARGIN = 1.2  # Factor by which odometry, through noise or slip, may exceed the greatest speed
-LEVELS, MOST_CORNERS = 3, 4096  # values tried per variable for the greatest speed; combinations
+LEVELS, MOST_CORNERS = (
+    3,
+    4096,
+)  # values tried per variable for the greatest speed; combinations
 
 
 class Belief(NamedTuple):
@@ -44,7 +47,9 @@ class Foreseen(NamedTuple):
     error: Array  # see `Belief`
     since: Anchor | None  # at the time of the prediction
     anchor: Anchor | None  # the same as of the predicted time
-    gains: tuple[tuple[Array, ...], tuple[Array, ...]] | None = None  # `kernels.gain`, `recall`
+    gains: tuple[tuple[Array, ...], tuple[Array, ...]] | None = (
+        None  # `kernels.gain`, `recall`
+    )
 
 
 def parted(covariance: Array) -> Array:
@@ -62,11 +67,15 @@ def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
         low, high = np.array(ranges).T
         tried = np.random.default_rng(0).uniform(low, high, (MOST_CORNERS, len(ranges)))
     else:
-        tried = np.array(list(product(*(np.linspace(*each, levels) for each in ranges))))
+        tried = np.array(
+            list(product(*(np.linspace(*each, levels) for each in ranges)))
+        )
     states = len(model.robot.state)
     tried[:, states:] = model.kinematics.in_effect(tried[:, states:])
     twist = model.kinematics.rates(tried)[:, :3]
-    return float(np.hypot(twist[:, 0], twist[:, 1]).max()), float(np.abs(twist[:, 2]).max())
+    return float(np.hypot(twist[:, 0], twist[:, 1]).max()), float(
+        np.abs(twist[:, 2]).max()
+    )
 
 
 class Unseen:
@@ -76,7 +85,9 @@ class Unseen:
     twist's, `news` (3 + S,) the variance of the state after possible news, see `Acceptance`.
     """
 
-    def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:
+    def __init__(
+        self, model: SimulatorModel, process: Array, noise: Array, news: Array
+    ) -> None:
         self._news = news
         self.fastest = greatest_twist(model)  # [m/s], [rad/s]
         # Variance (3,) that a pose by odometry gains in a second [m^2, m^2, rad^2]: it integrates
@@ -97,11 +108,15 @@ class Unseen:
         np.fill_diagonal(doubted, variance)
         return doubted
 
-    def bridged(self, anchor: Anchor, odom: Array, seconds: float) -> tuple[Array, Array] | None:
+    def bridged(
+        self, anchor: Anchor, odom: Array, seconds: float
+    ) -> tuple[Array, Array] | None:
         """Returns pose and covariance where odometry has `odom`; None if beyond reach."""
         moved = geometry.between(anchor.odom, odom)
         far, turned = self.reach(seconds)
-        if not (np.hypot(*moved[:2]) <= MARGIN * far and abs(moved[2]) <= MARGIN * turned):
+        if not (
+            np.hypot(*moved[:2]) <= MARGIN * far and abs(moved[2]) <= MARGIN * turned
+        ):
             return None
         pose = geometry.compose(anchor.mean[:3], moved)
         along = pose[:2] - anchor.mean[:2]

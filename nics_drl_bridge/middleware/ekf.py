@@ -11,7 +11,12 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Belief, Foreseen, Unseen, parted
 from nics_drl_bridge.middleware.kernels import Anchor, Log, MotionModel, log_of
-from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
+from nics_drl_bridge.middleware.measurement import (
+    Acceptance,
+    Judgement,
+    Kind,
+    Measurement,
+)
 from nics_drl_bridge.middleware.turning import (
     Turned,
     believable_variance,
@@ -29,7 +34,10 @@ LEAST_TWIST_STD = LEAST_POSE_STD = START_STD = 1e-3
 of the pose at a reset."""
 # Gates on the squared, normalised innovation: 99.9 % of chi-squared with 3 degrees of freedom.
 GATE = {Kind.TWIST: 16.27, Kind.POSE: 16.27}
-PATIENCE = {Kind.TWIST: 3, Kind.POSE: 5}  # consecutive outliers after which they are believed
+PATIENCE = {
+    Kind.TWIST: 3,
+    Kind.POSE: 5,
+}  # consecutive outliers after which they are believed
 # Factors of variances, after each outlier and after each measurement that fits well, and the
 # greatest: noise may be more than was told, and nearly all measurements would then be outliers.
 ROUGHER, SMOOTHER, ROUGHEST = 4.0, 0.93, 100.0
@@ -38,9 +46,18 @@ NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share
 STILL = np.zeros(3)
 REACHABLE = 2.0  # States and commands are cut at this many times their range
 FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
-ANYWHERE = (100.0, 100.0, np.pi)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
-STANDS, ABOUT_STANDS = 0.01, 0.05  # of a robot at rest: expected and measured speeds [m/s, rad/s]
-LONGEST_GAP_S = 10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
+ANYWHERE = (
+    100.0,
+    100.0,
+    np.pi,
+)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
+STANDS, ABOUT_STANDS = (
+    0.01,
+    0.05,
+)  # of a robot at rest: expected and measured speeds [m/s, rad/s]
+LONGEST_GAP_S = (
+    10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
+)
 
 
 class Estimator:
@@ -57,24 +74,36 @@ class Estimator:
         self._delay_ns = round(dt * delay * NS_PER_S)
         size = len(model.robot.state)
         reach = np.array([v.max - v.min for v in model.robot.state])
-        least = np.concatenate([np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach])
+        least = np.concatenate(
+            [np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach]
+        )
         self._process = np.diag(np.maximum(model.noise.drift(model.robot), least) ** 2)
         self._news = np.concatenate([np.zeros(3), NEWS * reach]) ** 2
-        low, high = np.array([(v.min, v.max) for v in model.robot.state]).reshape(-1, 2).T
+        low, high = (
+            np.array([(v.min, v.max) for v in model.robot.state]).reshape(-1, 2).T
+        )
         self._limits = _widened(low, high)
-        self._least, self._most = _widened(model.robot.command_low, model.robot.command_high)
+        self._least, self._most = _widened(
+            model.robot.command_low, model.robot.command_high
+        )
         linear, angular = (max(std, LEAST_TWIST_STD) for std in model.noise.odometry)
         self._noise = {
             Kind.TWIST: np.diag([linear, linear, angular]) ** 2,
             Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
         }
         # Measured drift is motion that the model misses, wheels do not; an assumed one may be slip.
-        missed = model.noise.drift(model.robot) ** 2 - model.noise.simulated_drift(model.robot) ** 2
+        missed = (
+            model.noise.drift(model.robot) ** 2
+            - model.noise.simulated_drift(model.robot) ** 2
+        )
         slip = np.diag(np.maximum(missed[:3], LEAST_SLIP**2))
         walk = self._noise[Kind.TWIST] * model.control_period
         self._wheels = kernels.Wheels(walk, slip, *self._limits)
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
-        self._observe_pose, self._suddenly = np.eye(3, 3 + size), np.eye(3 + size, size, -3)
+        self._observe_pose, self._suddenly = (
+            np.eye(3, 3 + size),
+            np.eye(3 + size, size, -3),
+        )
         self._filter = ExtendedKalmanFilter(3 + size, 3)
         self._anchor: Anchor | None = None
         self._foreseen: Foreseen | None = None  # of the present belief and commands
@@ -82,7 +111,10 @@ class Estimator:
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
         """Begins at a time [ns] and a pose (3,) in `map`, of a deviation [m, rad], at rest."""
-        mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
+        mean, deviation = (
+            np.zeros(self._filter.dim_x),
+            np.full(self._filter.dim_x, START_STD),
+        )
         mean[:3], deviation[:3] = pose, std
         spread, error = np.diag(deviation**2), self._suddenly
         self.belief = Belief(time_ns, mean, spread, (0, 0, 0), None, False, error)
@@ -91,19 +123,31 @@ class Estimator:
     def anchor(self, odom: Array, twist: Array = STILL) -> None:
         """Records the present pose (3,) in `odom` and body twist (3,)."""
         mean, covariance = self._filter.x, self._filter.P
-        self._anchor = Anchor(self.time_ns, odom, twist, mean, covariance, covariance[:, :3].copy())
+        self._anchor = Anchor(
+            self.time_ns, odom, twist, mean, covariance, covariance[:, :3].copy()
+        )
 
-    def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
+    def lose(
+        self, time_ns: int, seconds: float, continuous: bool, command: Array
+    ) -> None:
         """Continues from the last odometry, seconds ago, at a time [ns] to which the clock was set.
 
         The robot may be anywhere within reach, unless odometry is `continuous`: then the next one's
         pose bridges the motion. The command (C,) is in effect.
         """
-        anchor = self._anchor or Anchor(self.time_ns, STILL, STILL, self._filter.x, self._filter.P)
-        seconds = max(seconds, (self.time_ns - anchor.time_ns) / NS_PER_S)  # after an outlier
+        anchor = self._anchor or Anchor(
+            self.time_ns, STILL, STILL, self._filter.x, self._filter.P
+        )
+        seconds = max(
+            seconds, (self.time_ns - anchor.time_ns) / NS_PER_S
+        )  # after an outlier
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
-        since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
+        since = (
+            anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S))
+            if known
+            else None
+        )
         known_so = anchor.mean, covariance, (0, 0, 0), since, True, self._suddenly
         gyro = None if self._gyro is None else self._gyro.restarted()
         self.belief = Belief(time_ns, *known_so, self._roughness, self._missed, gyro)
@@ -139,7 +183,9 @@ class Estimator:
         """Time at which a command sent at `stamp_ns` takes effect [ns]."""
         return stamp_ns + self._delay_ns
 
-    def command(self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None) -> bool:
+    def command(
+        self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None
+    ) -> bool:
         """Adds a command (C,) sent at a time [ns]; False if there is one of that time.
 
         The estimate may be set back as far as `needed_ns`, by default not at all.
@@ -156,7 +202,9 @@ class Estimator:
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
         now, motion = self.time_ns, self._motion
-        mean, twist = kernels.look_ahead(self._filter.x, now, time_ns, motion, self._log)
+        mean, twist = kernels.look_ahead(
+            self._filter.x, now, time_ns, motion, self._log
+        )
         return mean[:3], twist
 
     def predict(self, time_ns: int) -> None:
@@ -167,7 +215,10 @@ class Estimator:
         if here is None or here.time_ns != time_ns or here.since is not self._anchor:
             here = self._foreseen = self._forecast(time_ns)
         self._lost = self._lost or time_ns - self.time_ns > self._motion.longest_ns
-        self.time_ns, self._filter.x, self._filter.P, self._error = *here[:3], here.error
+        self.time_ns, self._filter.x, self._filter.P, self._error = (
+            *here[:3],
+            here.error,
+        )
         self._anchor = here.anchor
 
     def foresee(self, time_ns: int) -> None:
@@ -194,16 +245,22 @@ class Estimator:
             anchor = anchor._replace(cross=transition @ anchor.cross)
         return Foreseen(time_ns, mean, covariance, expected, error, since, anchor)
 
-    def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
+    def update(
+        self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None
+    ) -> Judgement:
         """Corrects by a measured value (n,), with its standard deviations or the model's."""
         noise = None if std is None else np.diag(np.atleast_1d(std) ** 2.0)
-        return self.correct(Measurement(kind, np.atleast_1d(value).astype(np.float64), noise))
+        return self.correct(
+            Measurement(kind, np.atleast_1d(value).astype(np.float64), noise)
+        )
 
     def turn(self, time_ns: int, measurement: Measurement) -> Judgement:
         """Takes a yaw rate measured at a time; the next odometry turns by it, see `turning`."""
         variance = None if measurement.noise is None else float(measurement.noise[0, 0])
         rate, fastest = float(measurement.value[0]), self.unseen.fastest[1]
-        self._gyro, distance, used = take_rate(self._gyro, time_ns, rate, variance, fastest)
+        self._gyro, distance, used = take_rate(
+            self._gyro, time_ns, rate, variance, fastest
+        )
         outcome = Acceptance.USED if used else Acceptance.OUTLIER
         self._count(Kind.YAW_RATE, 0 if used else self._outliers[Kind.YAW_RATE] + 1)
         return Judgement(distance, outcome)
@@ -215,19 +272,28 @@ class Estimator:
         variance = believable_variance(measurement.turn_variance)
         known = float(self._noise[Kind.TWIST][2, 2]) if variance is None else variance
         turned = turn_odometry(
-            self._gyro, self._anchor.odom, measurement.odom, measurement.value, self.time_ns, known,
+            self._gyro,
+            self._anchor.odom,
+            measurement.odom,
+            measurement.value,
+            self.time_ns,
+            known,
             self._rests(measurement.value),
-        )  # fmt: skip
+        )
         noise = measurement.noise
         if turned.rate_variance > self._noise[Kind.TWIST][2, 2]:
             noise = np.array(self._noise[Kind.TWIST])
             noise[2, 2] = turned.rate_variance
-        return measurement._replace(value=turned.twist, odom=turned.odom, noise=noise), turned
+        return measurement._replace(
+            value=turned.twist, odom=turned.odom, noise=noise
+        ), turned
 
     def _rests(self, twist: Array) -> bool:
         """True if the robot is expected to stand, and odometry does not say otherwise."""
         expected, _ = self._expect(Kind.TWIST)
-        return bool((np.abs(expected) < STANDS).all() and (np.abs(twist) < ABOUT_STANDS).all())
+        return bool(
+            (np.abs(expected) < STANDS).all() and (np.abs(twist) < ABOUT_STANDS).all()
+        )
 
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at this time, after bridging unobserved motion."""
@@ -238,8 +304,13 @@ class Estimator:
         lost = self._lost
         if lost and odom is not None:
             self._lost = False
-            seconds = 0.0 if anchor is None else (self.time_ns - anchor.time_ns) / NS_PER_S
-            if anchor and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None:
+            seconds = (
+                0.0 if anchor is None else (self.time_ns - anchor.time_ns) / NS_PER_S
+            )
+            if (
+                anchor
+                and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None
+            ):
                 self._jump(*bridged)
                 self._foreseen = None
         verdict = self._correct(measurement, odom is not None and not lost)
@@ -272,7 +343,13 @@ class Estimator:
             return Judgement(distance, outcome)
         anchor, own, way = self._anchor, self._filter, None
         if follows and anchor is not None and anchor.cross is not None:
-            way = np.array(odom), np.array(value), self.time_ns, self._wheels_now, GATE[Kind.POSE]
+            way = (
+                np.array(odom),
+                np.array(value),
+                self.time_ns,
+                self._wheels_now,
+                GATE[Kind.POSE],
+            )
         if way and outcome is Acceptance.USED and given_noise is None:
             here = self._foreseen_here
             ready = here.gains if here is not None and here.anchor is anchor else None
@@ -288,10 +365,15 @@ class Estimator:
             kernels.settle(own.x, own.P, *self._limits)
             if way:
                 since: Any = self._anchor
-                done = np.zeros((own.dim_x, 3)), own.P  # nothing is left to correct but by the way
+                done = (
+                    np.zeros((own.dim_x, 3)),
+                    own.P,
+                )  # nothing is left to correct but by the way
                 kept = np.zeros((3, 3)), since.covariance, since.cross
                 own.x, own.P = kernels.follow(own.x, STILL, done, kept, since, *way)
-        if self._outliers[kind] and not (outcome is Acceptance.JUMP and kind is Kind.TWIST):
+        if self._outliers[kind] and not (
+            outcome is Acceptance.JUMP and kind is Kind.TWIST
+        ):
             self._count(kind, 0)
         self._foreseen = None
         if outcome is Acceptance.USED and not (scattered and distance > WELL):
@@ -335,7 +417,9 @@ class Estimator:
             spread, mean = self._filter.P, anchor.mean.copy()
             gain, covariance, cross = kernels.recall(anchor, derivative, spread, noise)
             mean[:3] += innovation @ gain
-            self._anchor = anchor._replace(mean=mean, covariance=covariance, cross=cross)
+            self._anchor = anchor._replace(
+                mean=mean, covariance=covariance, cross=cross
+            )
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
         if kind is Kind.POSE:
@@ -344,22 +428,35 @@ class Estimator:
             twist, derivative = here.expected
         else:
             now = self.time_ns
-            twist, derivative = kernels.expect(self._filter.x, now, self._motion, self._log)
+            twist, derivative = kernels.expect(
+                self._filter.x, now, self._motion, self._log
+            )
         return twist, derivative
 
     @property
     def _foreseen_here(self) -> Foreseen | None:
         foreseen = self._foreseen
-        return foreseen if foreseen is not None and foreseen.mean is self._filter.x else None
+        return (
+            foreseen
+            if foreseen is not None and foreseen.mean is self._filter.x
+            else None
+        )
 
     def _surprise(
-        self, kind: Kind, innovation: Array, derivative: Array, noise: Array, scattered: bool
+        self,
+        kind: Kind,
+        innovation: Array,
+        derivative: Array,
+        noise: Array,
+        scattered: bool,
     ) -> Acceptance:
         """Decides on a measurement beyond its gate; that of a stuck or pushed robot is news."""
         if not (np.abs(innovation) < FARTHEST).all():
             return Acceptance.OUTLIER
         most = noise * (ROUGHEST / self._roughness[kind])
-        far = kernels.distance(innovation, derivative, self._filter.P, most) > GATE[kind]
+        far = (
+            kernels.distance(innovation, derivative, self._filter.P, most) > GATE[kind]
+        )
         noisy = scattered and not far  # neither off in one way, nor a glitch
         believed = self._outliers[kind] + 1 >= PATIENCE[kind] and not noisy
         if kind is Kind.TWIST:

@@ -14,9 +14,13 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot import kernels as robot
 
-RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
+RUNAWAY = (
+    1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
+)
 SHORT_S = 0.25  # longest time in which the way is that of the twists at its ends
-LEAST_PIVOT = 1e-12  # Lower bound on a variance given the variables before, as a share of its own
+LEAST_PIVOT = (
+    1e-12  # Lower bound on a variance given the variables before, as a share of its own
+)
 LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
 
 
@@ -107,8 +111,12 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
         step[1, 2] = dt * (c * dq[0] - s * dq[1])
         for i in range(size):
             turn = dt / 2.0 * jacobian[2, i]
-            step[0, 3 + i] = dt * (c * jacobian[0, i] - s * jacobian[1, i]) + step[0, 2] * turn
-            step[1, 3 + i] = dt * (s * jacobian[0, i] + c * jacobian[1, i]) + step[1, 2] * turn
+            step[0, 3 + i] = (
+                dt * (c * jacobian[0, i] - s * jacobian[1, i]) + step[0, 2] * turn
+            )
+            step[1, 3 + i] = (
+                dt * (s * jacobian[0, i] + c * jacobian[1, i]) + step[1, 2] * turn
+            )
             step[2, 3 + i] = dt * jacobian[2, i]
             for d in range(size):  # a limited rate does not depend on the state
                 free = motion.terms.fall[d] <= dq[3 + d] <= motion.terms.rise[d]
@@ -152,7 +160,10 @@ def logged(log, effective_ns, command, low, high, needed_ns):  # type: ignore[no
     for i in range(size):
         k = first + i
         if k == place:
-            times[i], values[i] = effective_ns, np.minimum(np.maximum(command, low), high)
+            times[i], values[i] = (
+                effective_ns,
+                np.minimum(np.maximum(command, low), high),
+            )
         else:
             k -= 1 if k > place else 0
             times[i], values[i] = effective[k], commands[k]
@@ -235,9 +246,18 @@ def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignor
     derivative = unmoved(width, 0.0)
     carry(moved, derivative, begin, end, motion, log)
     transition, error = derivative[:, :width].copy(), derivative[:, width:].copy()
-    spread = transition @ covariance @ transition.T + error @ (process[3:, 3:] / time) @ error.T
+    spread = (
+        transition @ covariance @ transition.T
+        + error @ (process[3:, 3:] / time) @ error.T
+    )
     spread[:3, :3] += process[:3, :3] * time
-    return moved, (spread + spread.T) * 0.5, expect(moved, end, motion, log), error, transition
+    return (
+        moved,
+        (spread + spread.T) * 0.5,
+        expect(moved, end, motion, log),
+        error,
+        transition,
+    )
 
 
 @kernel(allocates=True)
@@ -273,7 +293,10 @@ def recall(anchor, derivative, covariance, noise):  # type: ignore[no-untyped-de
     """
     seen = derivative @ anchor.cross
     gain = np.linalg.solve(derivative @ covariance @ derivative.T + noise, seen)
-    less, spread = anchor.cross - covariance @ (derivative.T @ gain), anchor.covariance.copy()
+    less, spread = (
+        anchor.cross - covariance @ (derivative.T @ gain),
+        anchor.covariance.copy(),
+    )
     spread[:3, :3] -= seen.T @ gain
     return gain.copy(), spread, less
 
@@ -281,7 +304,7 @@ def recall(anchor, derivative, covariance, noise):  # type: ignore[no-untyped-de
 @kernel(allocates=True)
 def retrace(  # type: ignore[no-untyped-def]
     mean, covariance, anchor, odom, twist, now, wheels, gate
-):  # fmt: skip
+):
     """Corrects by the way from the `Anchor` to odometry's pose and twist (3,), if that is likely.
 
     One that is unlikely, but that of the twists at its ends, replaces what was predicted. Returns
@@ -290,18 +313,30 @@ def retrace(  # type: ignore[no-untyped-def]
     seconds, then, size = (now - anchor.time_ns) / NS_PER_S, anchor.mean, mean.shape[0]
     c, s = math.cos(anchor.odom[2]), math.sin(anchor.odom[2])
     x, y = odom[0] - anchor.odom[0], odom[1] - anchor.odom[1]
-    along, aside, turned = c * x + s * y, c * y - s * x, robot.wrap(odom[2] - anchor.odom[2])
+    along, aside, turned = (
+        c * x + s * y,
+        c * y - s * x,
+        robot.wrap(odom[2] - anchor.odom[2]),
+    )
     c, s = math.cos(then[2]), math.sin(then[2])
     x, y = mean[0] - then[0], mean[1] - then[1]
     ahead, before = c * x + s * y, c * y - s * x
     here, there = np.zeros((3, size)), np.zeros((3, 3))
     here[0, 0], here[0, 1], here[1, 0], here[1, 1], here[2, 2] = c, s, -s, c, 1.0
-    there[0, 0], there[0, 1], there[1, 0], there[1, 1], there[2, 2] = -c, -s, s, -c, -1.0
+    there[0, 0], there[0, 1], there[1, 0], there[1, 1], there[2, 2] = (
+        -c,
+        -s,
+        s,
+        -c,
+        -1.0,
+    )
     there[0, 2], there[1, 2] = before, -ahead
     shared = covariance @ here.T + anchor.cross @ there.T
     past = anchor.cross.T @ here.T + anchor.covariance[:3, :3].copy() @ there.T
     total = here @ shared + there @ past + wheels.walk * seconds
-    innovation = np.array([along - ahead, aside - before, robot.wrap(turned - mean[2] + then[2])])
+    innovation = np.array(
+        [along - ahead, aside - before, robot.wrap(turned - mean[2] + then[2])]
+    )
     # Between two twists the robot may have had either.
     slack = np.diag((0.5 * seconds * (twist - anchor.twist)) ** 2)
     if innovation @ np.linalg.solve(total + slack, innovation) <= gate:
@@ -309,15 +344,22 @@ def retrace(  # type: ignore[no-untyped-def]
         less, moved = covariance - shared @ gain, mean + innovation @ gain
         less = (less + less.T) * 0.5
     else:
-        arc = np.array([along + 0.5 * turned * aside, aside - 0.5 * turned * along, turned])
+        arc = np.array(
+            [along + 0.5 * turned * aside, aside - 0.5 * turned * along, turned]
+        )
         off = arc - 0.5 * seconds * (twist + anchor.twist)
         spread = wheels.walk * seconds + 0.25 * slack
-        spread += np.diag((0.25 * turned * np.array([aside, along, 0.0])) ** 2)  # where it turned
+        spread += np.diag(
+            (0.25 * turned * np.array([aside, along, 0.0])) ** 2
+        )  # where it turned
         if seconds > SHORT_S or not off @ np.linalg.solve(spread, off) <= gate:
             return mean, covariance
         # The way is that of its twists: what was predicted is wrong.
         moved, less, turning = mean.copy(), covariance.copy(), np.eye(3)
-        moved[0], moved[1] = then[0] + c * along - s * aside, then[1] + s * along + c * aside
+        moved[0], moved[1] = (
+            then[0] + c * along - s * aside,
+            then[1] + s * along + c * aside,
+        )
         moved[2], less[:3, 3:], less[3:, :3] = then[2] + turned, 0.0, 0.0
         turning[0, 2], turning[1, 2] = then[1] - moved[1], moved[0] - then[0]
         spread = anchor.covariance[:3, :3].copy()
@@ -330,13 +372,15 @@ def retrace(  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def follow(  # type: ignore[no-untyped-def]
     mean, innovation, update, recall, anchor, odom, twist, now, wheels, gate
-):  # fmt: skip
+):
     """Corrects by an innovation (3,) of a twist, by `gain` and `recall`, and then by `retrace`."""
     weight, covariance = update[0], update[1].copy()
     here, then = mean + weight @ innovation, anchor.mean.copy()
     settle(here, covariance, wheels.low, wheels.high)
     then[:3] += innovation @ recall[0]
-    since = Anchor(anchor.time_ns, anchor.odom, anchor.twist, then, recall[1], recall[2])
+    since = Anchor(
+        anchor.time_ns, anchor.odom, anchor.twist, then, recall[1], recall[2]
+    )
     return retrace(here, covariance, since, odom, twist, now, wheels, gate)
 
 

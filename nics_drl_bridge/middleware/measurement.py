@@ -31,8 +31,12 @@ class Measurement(NamedTuple):
     kind: Kind
     value: Array
     noise: Array | None = None  # covariance of the value; None for the model's
-    odom: Array | None = None  # (3,) pose that came with a twist: how far the robot came
-    turn_variance: float | None = None  # of a twist's yaw rate, as told; None for the model's
+    odom: Array | None = (
+        None  # (3,) pose that came with a twist: how far the robot came
+    )
+    turn_variance: float | None = (
+        None  # of a twist's yaw rate, as told; None for the model's
+    )
 
 
 class Acceptance(IntEnum):
@@ -51,7 +55,9 @@ class Judgement(NamedTuple):
     outcome: Acceptance
 
 
-def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:
+def checked_covariance(
+    covariance: ArrayLike | None, size: int, least_std: float
+) -> Array | None:
     """Returns a covariance that the filter can use, of at least `least_std` in any direction.
 
     None if it is unknown (or zeros). Raises ValueError if it is no covariance (size, size).
@@ -79,7 +85,9 @@ class TopicHealth:
     received: int
     rate_hz: float
     age_s: float
-    innovation: float = float("nan")  # distance of the newest `Judgement`; NaN if none corrects
+    innovation: float = float(
+        "nan"
+    )  # distance of the newest `Judgement`; NaN if none corrects
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,10 @@ class Health:
     """Health of all topics of a robot that have data."""
 
     topics: dict[str, TopicHealth] = field(default_factory=dict)
-    rejected: dict[str, int] = field(default_factory=dict)  # by reasons that begin with the topic
-    noticed: dict[str, int] = field(default_factory=dict)  # surprised but used (`odom: news`)
+    rejected: dict[str, int] = field(
+        default_factory=dict
+    )  # by reasons that begin with the topic
+    noticed: dict[str, int] = field(
+        default_factory=dict
+    )  # surprised but used (`odom: news`)
     replayed: int = 0  # late ones, inserted at their time

@@ -14,8 +14,19 @@ from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.middleware import measurement as measured
 from nics_drl_bridge.middleware import timeline
 from nics_drl_bridge.middleware.belief import parted
-from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
-from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN, Kind, Measurement
+from nics_drl_bridge.middleware.ekf import (
+    LEAST_POSE_STD,
+    LEAST_TWIST_STD,
+    START_STD,
+    Estimator,
+)
+from nics_drl_bridge.middleware.measurement import (
+    CMD_VEL,
+    ODOM,
+    SCAN,
+    Kind,
+    Measurement,
+)
 from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
 
 NOT_FINITE = "NaN or inf"
@@ -46,7 +57,9 @@ class TopicCache:
         held = self.newest.get(topic)
         if held is not None and stamp_ns <= held.stamp_ns:
             late = stamp_ns < held.stamp_ns
-            return self.reject(f"{topic}: out of order" if late else f"{topic}: duplicate")
+            return self.reject(
+                f"{topic}: out of order" if late else f"{topic}: duplicate"
+            )
         self.take(topic, stamp_ns, arrival_ns, value)
         return True
 
@@ -54,7 +67,9 @@ class TopicCache:
         """Counts a datum, and stores it if it is the newest: late data may be useful, too."""
         held = self.newest.get(topic)
         if held is None or stamp_ns > held.stamp_ns:
-            self.newest[topic] = Datum(stamp_ns, arrival_ns, self.received[topic], value)
+            self.newest[topic] = Datum(
+                stamp_ns, arrival_ns, self.received[topic], value
+            )
         self.received[topic] += 1
         self.arrivals.setdefault(topic, deque(maxlen=RATE_OVER)).append(arrival_ns)
 
@@ -113,8 +128,12 @@ class Middleware:
         belief = self.estimator.belief
         mean, spread = belief.mean.copy(), parted(belief.covariance)
         mean[:3], spread[:3, :3] = pose, covariance
-        anchor = belief.anchor and belief.anchor._replace(mean=mean, covariance=spread, cross=None)
-        self.estimator.belief = belief._replace(mean=mean, covariance=spread, anchor=anchor)
+        anchor = belief.anchor and belief.anchor._replace(
+            mean=mean, covariance=spread, cross=None
+        )
+        self.estimator.belief = belief._replace(
+            mean=mean, covariance=spread, anchor=anchor
+        )
         self._timeline.reset()
 
     def _begin(self, time_ns: int) -> None:
@@ -164,7 +183,12 @@ class Middleware:
         return self._keep(name, stamp_ns, arrival_ns, reading, size)
 
     def _keep(
-        self, topic: str, stamp_ns: int, arrival_ns: int, values: NDArray[np.float32], size: int
+        self,
+        topic: str,
+        stamp_ns: int,
+        arrival_ns: int,
+        values: NDArray[np.float32],
+        size: int,
     ) -> bool:
         fault = self._stamps.fault(stamp_ns, arrival_ns)
         if values.shape != (size,):
@@ -174,9 +198,13 @@ class Middleware:
         return self.cache.put(topic, stamp_ns, arrival_ns, values)
 
     def odometry(
-        self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike,
+        self,
+        stamp_ns: int,
+        arrival_ns: int,
+        pose: ArrayLike,
+        twist: ArrayLike,
         turn_variance: float | None = None,
-    ) -> bool:  # fmt: skip
+    ) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
 
         The twist corrects the estimate, and so does the way between two poses; the pose, which
@@ -201,14 +229,22 @@ class Middleware:
         self._trail.use(odometry)
         return True
 
-    def _measure_odometry(self, odometry: ReportedPose, turn_variance: float | None) -> bool:
+    def _measure_odometry(
+        self, odometry: ReportedPose, turn_variance: float | None
+    ) -> bool:
         """Measures an odometry; True if accepted. Continues from it if the clock was set."""
         stamp_ns, arrival_ns, pose, twist = odometry
-        measurement = Measurement(Kind.TWIST, twist, odom=pose, turn_variance=turn_variance)
+        measurement = Measurement(
+            Kind.TWIST, twist, odom=pose, turn_variance=turn_variance
+        )
         reason = self._measure(stamp_ns, arrival_ns, measurement, (pose, twist))
         if not reason:
             self._trail.use(odometry)
-        elif reason in (self._stamps.from_the_future, timeline.TOO_OLD, timeline.BEFORE_START):
+        elif reason in (
+            self._stamps.from_the_future,
+            timeline.TOO_OLD,
+            timeline.BEFORE_START,
+        ):
             if self._stamps.refuse():
                 self._follow_clock(odometry)
             else:
@@ -216,23 +252,38 @@ class Middleware:
         return not reason
 
     def pose(
-        self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, covariance: ArrayLike | None = None
+        self,
+        stamp_ns: int,
+        arrival_ns: int,
+        pose: ArrayLike,
+        covariance: ArrayLike | None = None,
     ) -> bool:
         """Takes a pose (3,) in `map`, by default with the model's covariance; True if used."""
         return self._optional(Kind.POSE, stamp_ns, arrival_ns, pose, covariance)
 
     def imu(
-        self, stamp_ns: int, arrival_ns: int, yaw_rate: float, variance: float | None = None
+        self,
+        stamp_ns: int,
+        arrival_ns: int,
+        yaw_rate: float,
+        variance: float | None = None,
     ) -> bool:
         """Takes a yaw rate [rad/s], by default with a cheap gyro's variance; True if used.
 
         Odometry then turns by it, see `turning`.
         """
         covariance = None if variance is None else [[variance]]
-        return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance)
+        return self._optional(
+            Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance
+        )
 
     def _optional(
-        self, kind: Kind, stamp_ns: int, arrival_ns: int, given: ArrayLike, about: ArrayLike | None
+        self,
+        kind: Kind,
+        stamp_ns: int,
+        arrival_ns: int,
+        given: ArrayLike,
+        about: ArrayLike | None,
     ) -> bool:
         value = np.array(given, dtype=np.float64)
         if not np.isfinite(value).all():
@@ -241,9 +292,13 @@ class Middleware:
             noise = measured.checked_covariance(about, len(value), LEAST_STD[kind])
         except ValueError as error:
             return self.cache.reject(f"{kind.topic}: {error}")
-        return not self._measure(stamp_ns, arrival_ns, Measurement(kind, value, noise), value)
+        return not self._measure(
+            stamp_ns, arrival_ns, Measurement(kind, value, noise), value
+        )
 
-    def _measure(self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any) -> str:
+    def _measure(
+        self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any
+    ) -> str:
         """Takes a measurement; returns the reason if it cannot be used, or an empty string."""
         topic = measurement.kind.topic
         fault = self._stamps.fault(stamp_ns, arrival_ns)
@@ -257,9 +312,14 @@ class Middleware:
 
     def _follow_clock(self, odometry: ReportedPose) -> None:
         """Continues from an odometry to whose stamp the clock was set, by the motion it shows."""
-        seconds, continuous = self._trail.seconds(odometry), self._trail.continuous(odometry)
+        seconds, continuous = (
+            self._trail.seconds(odometry),
+            self._trail.continuous(odometry),
+        )
         self.estimator.lose(odometry.stamp_ns, seconds, continuous, self._commanded)
-        self.estimator.correct(Measurement(Kind.TWIST, odometry.twist, odom=odometry.pose))
+        self.estimator.correct(
+            Measurement(Kind.TWIST, odometry.twist, odom=odometry.pose)
+        )
         self._begin(odometry.stamp_ns)
         self._trail.reset()
         self._trail.use(odometry)
@@ -274,7 +334,9 @@ class Middleware:
     @property
     def newest_ns(self) -> int | None:
         """Stamp of the newest datum of all topics [ns]; None if there is none."""
-        return max((datum.stamp_ns for datum in self.cache.newest.values()), default=None)
+        return max(
+            (datum.stamp_ns for datum in self.cache.newest.values()), default=None
+        )
 
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
@@ -283,11 +345,16 @@ class Middleware:
         sensed |= {name: newest[name].value for name in sensed if name in newest}
         oldest_s = max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0)
         return RobotView(
-            *self.estimator.at(now_ns), sensed=sensed, sensed_age_s=oldest_s,
-            ranges=np.full(self._beams, np.nan, np.float32) if scan is None else scan.value,
+            *self.estimator.at(now_ns),
+            sensed=sensed,
+            sensed_age_s=oldest_s,
+            ranges=np.full(self._beams, np.nan, np.float32)
+            if scan is None
+            else scan.value,
             stamp_s=(now_ns if newest_ns is None else newest_ns) * S_PER_NS,
-            scan_age_s=self.cache.age_s(SCAN, now_ns), odom_age_s=self.cache.age_s(ODOM, now_ns),
-        )  # fmt: skip
+            scan_age_s=self.cache.age_s(SCAN, now_ns),
+            odom_age_s=self.cache.age_s(ODOM, now_ns),
+        )
 
     def health(self, arrival_ns: int) -> measured.Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""

@@ -32,10 +32,17 @@ from nics_drl_bridge.recording.messages import (
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
-    SCAN: (SCAN_TYPE,), ODOM: (topic_roles.ODOMETRY,), CMD_VEL: topic_roles.TYPES["cmd_vel"],
-    POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE), IMU: (topic_roles.IMU,),
-}  # fmt: skip
-ALWAYS = (SCAN, ODOM, CMD_VEL)  # roles used if the bag has them; the others only on request
+    SCAN: (SCAN_TYPE,),
+    ODOM: (topic_roles.ODOMETRY,),
+    CMD_VEL: topic_roles.TYPES["cmd_vel"],
+    POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE),
+    IMU: (topic_roles.IMU,),
+}
+ALWAYS = (
+    SCAN,
+    ODOM,
+    CMD_VEL,
+)  # roles used if the bag has them; the others only on request
 APART_S = 1.0  # Greatest difference between stamps of one clock at the same time of receipt [s]
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
@@ -54,10 +61,14 @@ class EstimatedDrive:
     def digest(self) -> str:
         """SHA-256 of all numbers, to compare two runs bit for bit."""
         arrays = (self.stamp_ns, self.pose, self.twist, self.covariance)
-        return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
+        return sha256(
+            b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+        )
 
 
-def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> EstimatedDrive:
+def estimate(
+    path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
+) -> EstimatedDrive:
     """Runs a bag through the middleware, with `topics` by role, see `chosen`.
 
     The estimate is identical on every machine with the same versions. Raises RecordingError if the
@@ -69,22 +80,32 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
     for role, message in in_order(messages):
         if playback.take(role, message) and role == ODOM:
             stamp_ns = max(stamp(message.content), middleware.estimator.time_ns)
-            view, covariance = middleware.view(stamp_ns), middleware.estimator.covariance
+            view, covariance = (
+                middleware.view(stamp_ns),
+                middleware.estimator.covariance,
+            )
             rows.append((stamp_ns, view.pose, view.twist, covariance[:3, :3]))
     if not rows:
-        raise RecordingError("no odometry of the bag could be used; see `nics bag info`.")
+        raise RecordingError(
+            "no odometry of the bag could be used; see `nics bag info`."
+        )
     stamps, poses, twists, covariances = zip(*rows, strict=True)
     return EstimatedDrive(
-        np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
-        np.array(covariances), dict(middleware.cache.rejected),
-    )  # fmt: skip
+        np.array(stamps, dtype=np.int64),
+        np.array(poses),
+        np.array(twists),
+        np.array(covariances),
+        dict(middleware.cache.rejected),
+    )
 
 
 def with_gyro(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
     """Returns topics by role with that of a gyro, if a bag has a usual one and none is named."""
     if IMU in topics:
         named = topics[IMU].strip("/") != topic_roles.NONE
-        return topics if named else {role: t for role, t in topics.items() if role != IMU}
+        return (
+            topics if named else {role: t for role, t in topics.items() if role != IMU}
+        )
     with opened(path) as bag:
         for name in (f"/{name}" for name in topic_roles.IMU_NAMES):
             if bag.types.get(name) == topic_roles.IMU and name not in bag.empty:
@@ -112,20 +133,28 @@ def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
     roles = {}
     for role, kinds in TYPES.items():
         topic = topics.get(role) or (f"/{role}" if f"/{role}" in bag.types else "")
-        if role not in topics and (role not in ALWAYS or not topic or topic in bag.empty):
+        if role not in topics and (
+            role not in ALWAYS or not topic or topic in bag.empty
+        ):
             continue
         if topic not in bag.types:
             hint = nearest(topic, bag.types)
-            raise RecordingError(f"{bag.place}: has no topic {topic!r} ({role}); {hint}")
+            raise RecordingError(
+                f"{bag.place}: has no topic {topic!r} ({role}); {hint}"
+            )
         if bag.types[topic] not in kinds or topic in bag.empty:
             is_now = "empty" if topic in bag.empty else f"of type {bag.types[topic]}"
             needed = f"{role} needs messages of {' or '.join(kinds)}."
-            raise RecordingError(f"{bag.place}: the topic {topic!r} is {is_now}; {needed}")
+            raise RecordingError(
+                f"{bag.place}: the topic {topic!r} is {is_now}; {needed}"
+            )
         roles[role] = topic
     if ODOM not in roles:
         fix = "say which topic it is, as in --topic odom=/wheel_odom"
         known = ", ".join(sorted(bag.types))
-        raise RecordingError(f"{bag.place}: has no odometry; {fix}; its topics are {known}.")
+        raise RecordingError(
+            f"{bag.place}: has no odometry; {fix}; its topics are {known}."
+        )
     return roles
 
 
@@ -142,9 +171,13 @@ def _check_clocks(
             if role == CMD_VEL:
                 continue
             fix = "have the driver stamp them, the middleware orders data by their stamps."
-            raise RecordingError(f"{place}: topic {roles[role]!r} is not stamped; {fix}")
+            raise RecordingError(
+                f"{place}: topic {roles[role]!r} is not stamped; {fix}"
+            )
         clock = stamps[ODOM]
-        there = clock[0, 1] + np.interp(times[:, 0], clock[:, 0], clock[:, 1] - clock[0, 1])
+        there = clock[0, 1] + np.interp(
+            times[:, 0], clock[:, 0], clock[:, 1] - clock[0, 1]
+        )
         apart = float(np.median(times[:, 1] - there)) * 1e-9
         if abs(apart) > APART_S:
             raise RecordingError(
@@ -160,7 +193,9 @@ class Playback:
     With `posed`, a pose sensor gives the start; with `any_lidar`, the first scan fixes the `lidar`.
     """
 
-    def __init__(self, model: SimulatorModel, posed: bool, any_lidar: bool = False) -> None:
+    def __init__(
+        self, model: SimulatorModel, posed: bool, any_lidar: bool = False
+    ) -> None:
         self._model, self._posed, self._any_lidar = model, posed, any_lidar
         self.middleware, self.lidar = Middleware(model), model.lidar
         self._reader: Reader | None = None
@@ -170,9 +205,12 @@ class Playback:
     def take(self, role: str, message: Message) -> bool:
         """Feeds a message; True if it was used and is the newest of its topic."""
         takes = {
-            SCAN: self._scan, ODOM: self._odometry, CMD_VEL: self._command,
-            POSE: self._pose, IMU: self._imu,
-        }  # fmt: skip
+            SCAN: self._scan,
+            ODOM: self._odometry,
+            CMD_VEL: self._command,
+            POSE: self._pose,
+            IMU: self._imu,
+        }
         if not takes[role](message.receive_ns, message.content):
             return False
         newest = self.middleware.cache.newest.get(role)
@@ -181,7 +219,9 @@ class Playback:
     def _scan(self, arrival_ns: int, message: Any) -> bool:
         values = np.asarray(message.ranges, np.float32)
         if self._any_lidar and self._reader is None:
-            header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
+            header = ScanHeader(
+                *(float(getattr(message, name)) for name in ScanHeader._fields)
+            )
             self._reader = reader_beside(header, len(message.ranges), self._model.lidar)
             self.lidar = self._reader.lidar
             self.middleware.expect_beams(self.lidar.beams)
@@ -195,7 +235,9 @@ class Playback:
     def _odometry(self, arrival_ns: int, message: Any) -> bool:
         stamp_ns, pose = stamp(message), np.array(whole_pose(message))
         if not self._started and np.isfinite(pose).all():
-            self.middleware.reset(stamp_ns, pose, ANYWHERE if self._posed else START_STD)
+            self.middleware.reset(
+                stamp_ns, pose, ANYWHERE if self._posed else START_STD
+            )
             self._started = True
         twist, variance = np.array(twist_row(message)), turn_variance(message)
         return self.middleware.odometry(stamp_ns, arrival_ns, pose, twist, variance)
@@ -210,7 +252,9 @@ class Playback:
         covariance = getattr(message.pose, "covariance", None)
         if covariance is not None:
             covariance = np.reshape(covariance, (6, 6))[np.ix_([0, 1, 5], [0, 1, 5])]
-        return self.middleware.pose(stamp(message), arrival_ns, whole_pose(message), covariance)
+        return self.middleware.pose(
+            stamp(message), arrival_ns, whole_pose(message), covariance
+        )
 
     def _imu(self, arrival_ns: int, message: Any) -> bool:
         if (measured := self._gyro.read(message)) is None:
@@ -221,7 +265,9 @@ class Playback:
 def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:
     """Yields all messages with their roles, in the order of receipt."""
     every = [(role, message) for role in sorted(messages) for message in messages[role]]
-    yield from sorted(every, key=lambda each: each[1].receive_ns)  # which keeps equals in order
+    yield from sorted(
+        every, key=lambda each: each[1].receive_ns
+    )  # which keeps equals in order
 
 
 def write_estimate(made: EstimatedDrive, path: str | Path) -> None:
@@ -229,9 +275,12 @@ def write_estimate(made: EstimatedDrive, path: str | Path) -> None:
     if Path(path).suffix == ".npz":
         buffer = io.BytesIO()
         np.savez_compressed(
-            buffer, stamp_ns=made.stamp_ns, pose=made.pose, twist=made.twist,
+            buffer,
+            stamp_ns=made.stamp_ns,
+            pose=made.pose,
+            twist=made.twist,
             covariance=made.covariance,
-        )  # fmt: skip
+        )
         write_bytes(path, buffer.getvalue())
         return
     lines = [",".join(("stamp_ns", *COLUMNS))]

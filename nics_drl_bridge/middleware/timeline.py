@@ -14,21 +14,38 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.belief import JITTER_S, Belief
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
+from nics_drl_bridge.middleware.measurement import (
+    Acceptance,
+    Judgement,
+    Kind,
+    Measurement,
+)
 
 HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
 DUPLICATE = "duplicate"
-FUTURE_NS = NS_PER_S  # By which a stamp may be early [ns], or two control periods if longer
-CLOCK_JUMP = 10  # Odometries rejected in a row for their stamps that show that a clock was set
-NEAR_NS = HISTORY_NS + 2 * NS_PER_S  # Stamps farther back [ns] are all rejected, see `Stamps`
-CONTRADICTED_NS = 200_000_000  # A smaller error of a stamp [ns] may be a longer transmission
-IN_STEP = 5  # Odometries in a row in step with their stamps, before arrivals measure time
+FUTURE_NS = (
+    NS_PER_S  # By which a stamp may be early [ns], or two control periods if longer
+)
+CLOCK_JUMP = (
+    10  # Odometries rejected in a row for their stamps that show that a clock was set
+)
+NEAR_NS = (
+    HISTORY_NS + 2 * NS_PER_S
+)  # Stamps farther back [ns] are all rejected, see `Stamps`
+CONTRADICTED_NS = (
+    200_000_000  # A smaller error of a stamp [ns] may be a longer transmission
+)
+IN_STEP = (
+    5  # Odometries in a row in step with their stamps, before arrivals measure time
+)
 # Between odometry's pose and twist: greatest standard deviations, and always allowed [m, rad].
 SIGMA, LEAST = 6.0, 0.01
 STILL = 0.02  # Slower motion [m/s, rad/s] gives no information about time
-Moment = tuple[int, int]  # Stamp [ns] and kind: the order of measurements, however they arrive
+Moment = tuple[
+    int, int
+]  # Stamp [ns] and kind: the order of measurements, however they arrive
 
 
 @dataclass(slots=True)
@@ -85,7 +102,9 @@ class Timeline:
         elif self._entries[place].moment == moment:
             return DUPLICATE
         else:
-            self._entries.insert(place, _Entry(moment, self._entries[0].belief, measurement))
+            self._entries.insert(
+                place, _Entry(moment, self._entries[0].belief, measurement)
+            )
             self._rerun(place)
         return ""
 
@@ -99,7 +118,9 @@ class Timeline:
         if not self._estimator.command(stamp_ns, command, self._entries[0].moment[0]):
             return DUPLICATE
         if effective_ns < self.newest_ns:
-            self._rerun(bisect_right(self._entries, effective_ns, key=lambda e: e.moment[0]))
+            self._rerun(
+                bisect_right(self._entries, effective_ns, key=lambda e: e.moment[0])
+            )
         return ""
 
     def _run(self, moment: Moment, measurement: Measurement) -> _Entry:
@@ -133,7 +154,9 @@ class Stamps:
 
     def __init__(self, period_ns: int = 0) -> None:
         self._tolerance_ns = max(FUTURE_NS, 2 * period_ns)
-        self.from_the_future = f"more than {self._tolerance_ns * 1e-9:g} s in the future"
+        self.from_the_future = (
+            f"more than {self._tolerance_ns * 1e-9:g} s in the future"
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -151,7 +174,9 @@ class Stamps:
         if arrival_ns is None or self._stamp_ns is None:
             return ""
         latest_ns = self._stamp_ns + self._tolerance_ns
-        if stamp_ns <= latest_ns or stamp_ns <= latest_ns + (arrival_ns - self._arrival_ns):
+        if stamp_ns <= latest_ns or stamp_ns <= latest_ns + (
+            arrival_ns - self._arrival_ns
+        ):
             return ""
         return self.from_the_future
 
@@ -208,8 +233,14 @@ class Trail:
         if len(self._recent) <= IN_STEP:
             return False
         last = self._recent[-1]
-        passed, waited = odometry.stamp_ns - last.stamp_ns, odometry.arrival_ns - last.arrival_ns
-        if abs(passed - waited) < CONTRADICTED_NS or not -NEAR_NS <= passed - waited <= FUTURE_NS:
+        passed, waited = (
+            odometry.stamp_ns - last.stamp_ns,
+            odometry.arrival_ns - last.arrival_ns,
+        )
+        if (
+            abs(passed - waited) < CONTRADICTED_NS
+            or not -NEAR_NS <= passed - waited <= FUTURE_NS
+        ):
             return False
         if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
             return False
@@ -224,8 +255,13 @@ class Trail:
         )
 
     def _in_step(self, before: ReportedPose, after: ReportedPose) -> bool:
-        passed, waited = after.stamp_ns - before.stamp_ns, after.arrival_ns - before.arrival_ns
-        return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NS_PER_S)
+        passed, waited = (
+            after.stamp_ns - before.stamp_ns,
+            after.arrival_ns - before.arrival_ns,
+        )
+        return 2 * abs(waited - passed) <= passed and self._fits(
+            before, after, passed / NS_PER_S
+        )
 
     def seconds(self, now: ReportedPose) -> float:
         """Time since the last used odometry, by its arrival and by the stamps since [s]."""
@@ -254,11 +290,18 @@ class Trail:
         )
 
     def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
-        mean, change = (before.twist + after.twist) / 2.0, np.abs(after.twist - before.twist)
+        mean, change = (
+            (before.twist + after.twist) / 2.0,
+            np.abs(after.twist - before.twist),
+        )
         moved = geometry.between(before.pose, after.pose)
         off = np.abs(geometry.between(geometry.exp(mean * seconds), moved))
         span = abs(seconds)
-        return bool((off <= LEAST + SIGMA * np.sqrt(self._walk * span) + change * span / 2.0).all())
+        return bool(
+            (
+                off <= LEAST + SIGMA * np.sqrt(self._walk * span) + change * span / 2.0
+            ).all()
+        )
 
 
 def _seconds(before: ReportedPose, after: ReportedPose, standing: float) -> float:
@@ -266,4 +309,6 @@ def _seconds(before: ReportedPose, after: ReportedPose, standing: float) -> floa
     mean = (before.twist + after.twist) / 2.0
     if not (np.abs(mean) > STILL).any():
         return standing
-    return float(geometry.log(geometry.between(before.pose, after.pose)) @ mean / (mean @ mean))
+    return float(
+        geometry.log(geometry.between(before.pose, after.pose)) @ mean / (mean @ mean)
+    )

@@ -21,11 +21,15 @@ LEAST_STD = 1e-4  # lower bound on that [rad/s]
 GREATEST_VARIANCE = 1.0  # a greater one says that the rate is not known [rad^2/s^2]
 BIAS_STD = 0.1  # of a gyro that was never at rest [rad/s]
 BIAS_WALK = 1e-4  # random walk of a bias [rad/s / sqrt(s)]
-LEAST_BIAS_STD = 3e-4  # by which the rate of standing wheels may differ from the bias [rad/s]
+LEAST_BIAS_STD = (
+    3e-4  # by which the rate of standing wheels may differ from the bias [rad/s]
+)
 CLAIM = 25.0  # factor by which a variance may differ from what is seen, and is believed
 FEWEST_SEEN = 30  # yaw rates that show their noise
 SMOOTHING = 0.05  # weight of a new yaw rate in that
-LONGEST_GAP_NS = 250_000_000  # between two yaw rates; beyond, the wheels turn the robot [ns]
+LONGEST_GAP_NS = (
+    250_000_000  # between two yaw rates; beyond, the wheels turn the robot [ns]
+)
 FROZEN = 25  # equal yaw rates in a row of a gyro that is stuck,
 CHANGED_RADPS = 0.1  # if the wheels turn the robot so much faster or slower since
 GREATEST_CHANGE = 40.0  # angular acceleration that no robot exceeds [rad/s^2]
@@ -40,12 +44,19 @@ LEAST_SLIP = 0.05
 SLIP_KNOWN = 1e-3  # square of turns [rad^2] that weighs as much as that assumption
 MEMORY_S = 30.0
 TURN_TO_TELL = 0.5  # rad by the wheels, before gyro and wheels are compared
-SLOPES = (-0.3, 3.0)  # of the gyro's turns to the wheels'; beyond, its axis or unit is wrong
+SLOPES = (
+    -0.3,
+    3.0,
+)  # of the gyro's turns to the wheels'; beyond, its axis or unit is wrong
 LEAST_CONTRADICTION = 0.005  # rad, between two odometries
 TURNING_RADPS = 0.1  # slower turns of the wheels do not show their slip
-SCATTER_KNOWN_S = 5.0  # of driving and standing, from which on the wheels' scatter is known
+SCATTER_KNOWN_S = (
+    5.0  # of driving and standing, from which on the wheels' scatter is known
+)
 WHEELS_BIAS = 0.004  # constant error of rolling wheels [rad/s]
-WRONG_FOR_S = 3.0  # other errors of rolling wheels last so long: they are no independent news
+WRONG_FOR_S = (
+    3.0  # other errors of rolling wheels last so long: they are no independent news
+)
 ABOUT_RADPS = 0.005  # yaw rate of a robot that about stands, over a second
 STANDING = 4.0  # standard deviations from the bias within which the robot stands, too
 
@@ -73,14 +84,18 @@ class Gyro(NamedTuple):
     product: float = 0.0
     difference_square: float = 0.0
     wheels_turned: float = 0.0  # sum of the sizes [rad]
-    scatter: float = 0.0  # mean square difference of both rates while going straight [rad^2/s^2]
+    scatter: float = (
+        0.0  # mean square difference of both rates while going straight [rad^2/s^2]
+    )
     compared_s: float = 0.0
     # Of the newest odometry that was used; None before.
     odom: Array | None = None  # (3,) its pose, as it was received
     odom_ns: int = 0
     odom_total: float = 0.0  # integral of all rates until then [rad]
     wheels_rate: float = 0.0  # yaw rate of its twist [rad/s]
-    wheels_rate_when_equal: float = 0.0  # the same before the gyro was `FROZEN` times equal
+    wheels_rate_when_equal: float = (
+        0.0  # the same before the gyro was `FROZEN` times equal
+    )
 
     @property
     def variance(self) -> float:
@@ -136,8 +151,12 @@ class Turned(NamedTuple):
     odom: Array  # (3,) pose on a path of the same displacements
     twist: Array  # (3,)
     gyro: Gyro
-    heading_variance: float = 0.0  # gained by the heading, beside what the filter adds [rad^2]
-    rate_variance: float = 0.0  # of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
+    heading_variance: float = (
+        0.0  # gained by the heading, beside what the filter adds [rad^2]
+    )
+    rate_variance: float = (
+        0.0  # of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
+    )
 
 
 def believable_variance(variance: float | None) -> float | None:
@@ -148,7 +167,11 @@ def believable_variance(variance: float | None) -> float | None:
 
 
 def take_rate(
-    gyro: Gyro | None, stamp_ns: int, rate: float, variance: float | None, fastest: float
+    gyro: Gyro | None,
+    stamp_ns: int,
+    rate: float,
+    variance: float | None,
+    fastest: float,
 ) -> tuple[Gyro | None, float, bool]:
     """Takes a yaw rate [rad/s] of a robot that turns at most so fast [rad/s].
 
@@ -163,14 +186,26 @@ def take_rate(
         return Gyro(stamp_ns, rate, 0.0, stamp_ns, 0.0, noise), 0.0, True
     distance = _distance(gyro, rate)
     passed_s = (stamp_ns - gyro.stamp_ns) / NS_PER_S
-    gap = gyro.since_ns > gyro.stamp_ns or not 0 < stamp_ns - gyro.stamp_ns <= LONGEST_GAP_NS
+    gap = (
+        gyro.since_ns > gyro.stamp_ns
+        or not 0 < stamp_ns - gyro.stamp_ns <= LONGEST_GAP_NS
+    )
     if gap:
         fresh = gyro._replace(
-            stamp_ns=stamp_ns, rate=rate, since_ns=stamp_ns, change=0.0, equal=0, refused=0
+            stamp_ns=stamp_ns,
+            rate=rate,
+            since_ns=stamp_ns,
+            change=0.0,
+            equal=0,
+            refused=0,
         )
         return fresh, distance, True
     change = rate - gyro.rate
-    allowed = ALWAYS_ALLOWED + GREATEST_CHANGE * passed_s + STANDING * math.sqrt(gyro.variance)
+    allowed = (
+        ALWAYS_ALLOWED
+        + GREATEST_CHANGE * passed_s
+        + STANDING * math.sqrt(gyro.variance)
+    )
     if abs(change) > allowed and gyro.refused + 1 < PATIENCE:
         return _refuse(gyro), distance, False
     square = (change - gyro.change) ** 2 / 6.0  # of a second difference of white noise
@@ -179,7 +214,9 @@ def take_rate(
         stamp_ns=stamp_ns,
         rate=rate,
         total=gyro.total + 0.5 * (gyro.rate + rate) * passed_s,
-        period_s=passed_s if gyro.period_s == 0.0 else 0.9 * gyro.period_s + 0.1 * passed_s,
+        period_s=passed_s
+        if gyro.period_s == 0.0
+        else 0.9 * gyro.period_s + 0.1 * passed_s,
         noise=noise,
         seen=gyro.seen + smoothing * (square - gyro.seen),
         seen_count=gyro.seen_count + 1,
@@ -202,9 +239,14 @@ def _distance(gyro: Gyro, rate: float) -> float:
 
 
 def turn_odometry(
-    gyro: Gyro, before: Array, odom: Array, twist: Array, now_ns: int, rate_variance: float,
+    gyro: Gyro,
+    before: Array,
+    odom: Array,
+    twist: Array,
+    now_ns: int,
+    rate_variance: float,
     resting: bool = False,
-) -> Turned:  # fmt: skip
+) -> Turned:
     """Fuses the turn of an odometry, pose (3,) and twist (3,), with the gyro's since the last one.
 
     `before` (3,) is the pose that was returned for the last one; `rate_variance` that of the yaw
@@ -214,9 +256,11 @@ def turn_odometry(
     last = before if gyro.odom is None else gyro.odom
     step = geometry.log(geometry.between(last, odom))
     here = gyro._replace(
-        odom=np.array(odom), odom_ns=now_ns, odom_total=gyro.total_at(now_ns),
+        odom=np.array(odom),
+        odom_ns=now_ns,
+        odom_total=gyro.total_at(now_ns),
         wheels_rate=float(twist[2]),
-    )  # fmt: skip
+    )
     seconds = (now_ns - gyro.odom_ns) / NS_PER_S
     if not _covers(gyro, now_ns) or seconds <= 0.0:
         moved = geometry.compose(before, geometry.exp(step))
@@ -227,7 +271,9 @@ def turn_odometry(
     here = _compare(here, by_gyro - gyro.bias * seconds, by_wheels, seconds)
     noise = gyro.variance * max(gyro.period_s, 1e-3) * seconds
     spread = noise + gyro.bias_variance * seconds**2
-    doubted = not still and here.contradicts(by_gyro - gyro.bias * seconds, by_wheels, spread)
+    doubted = not still and here.contradicts(
+        by_gyro - gyro.bias * seconds, by_wheels, spread
+    )
     if here.equal < FROZEN:
         here = here._replace(wheels_rate_when_equal=here.wheels_rate)
     stuck = abs(here.wheels_rate - here.wheels_rate_when_equal) > CHANGED_RADPS
@@ -291,7 +337,9 @@ def _learn_bias_at_rest(
     """Corrects the bias by how the gyro turned while the robot stood, to the tick or about so."""
     per_second = LEAST_BIAS_STD**2 if still else ABOUT_RADPS**2 / seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    return _with_bias(gyro, by_gyro / seconds, variance, noise / seconds**2 + per_second)
+    return _with_bias(
+        gyro, by_gyro / seconds, variance, noise / seconds**2 + per_second
+    )
 
 
 def _learn_bias(
@@ -310,7 +358,9 @@ def _with_bias(gyro: Gyro, seen: float, variance: float, measured: float) -> Gyr
     """Corrects a bias by one that was seen, with a variance of `measured`."""
     apart, spread = seen - gyro.bias, variance + measured
     if apart**2 > STANDING**2 * spread:
-        return gyro._replace(bias_variance=variance)  # it was pushed, or its wheels spin
+        return gyro._replace(
+            bias_variance=variance
+        )  # it was pushed, or its wheels spin
     gain = variance / spread
     return gyro._replace(
         bias=gyro.bias + gain * apart,

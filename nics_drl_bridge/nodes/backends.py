@@ -17,7 +17,14 @@ from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, BackendFacts, RobotView, Start
+from nics_drl_bridge.interface import (
+    NS_PER_S,
+    S_PER_NS,
+    Array,
+    BackendFacts,
+    RobotView,
+    Start,
+)
 from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
@@ -49,7 +56,10 @@ class _Mailbox:
     # The caller is woken once, when all its topics are there: each wake-up costs a good part of a
     # step. The executor's thread gives awaited odometry to `work` while the scan is in transit.
     def __init__(
-        self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None], slack_ns: int
+        self,
+        topics: tuple[str, ...],
+        work: Callable[[int, int, bytes], None],
+        slack_ns: int,
     ) -> None:
         self._slack_ns = slack_ns  # data may be so much older than what is awaited
         self._mail, self._work = dict.fromkeys(topics, _Mail()), work
@@ -65,7 +75,9 @@ class _Mailbox:
                 self._work_in()
             except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
                 self._failure = error
-            if self._awaited_ns >= 0 and (self._failure or not self._late(self._awaited_ns)):
+            if self._awaited_ns >= 0 and (
+                self._failure or not self._late(self._awaited_ns)
+            ):
                 if self._awaiting.locked():
                     self._awaiting.release()
                 return HANDED_OVER
@@ -112,11 +124,15 @@ class _Mailbox:
             if (late := self._late(stamp_ns)) is not None:
                 mail = self._mail[late]
                 age_s = (time.monotonic_ns() - mail.arrival_ns) * S_PER_NS
-                raise StaleDataError(late, age_s if mail.content else math.inf, timeout_s)
+                raise StaleDataError(
+                    late, age_s if mail.content else math.inf, timeout_s
+                )
             return dict(self._mail)
 
 
-def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, message: bytes) -> None:
+def _take_odometry(
+    middleware: Middleware, stamp_ns: int, arrival_ns: int, message: bytes
+) -> None:
     middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
 
 
@@ -132,11 +148,18 @@ class DdsBackend:
     """
 
     def __init__(
-        self, model: SimulatorModel, world: AnyWorld, namespace: str = "",
-        simulator: str = "simulator_node", timeout_s: float = 30.0, truth: bool = False,
-        domain_id: int | None = None, randomisation: Randomisation | None = None,
-        stamped: bool | None = None, standard: Mapping[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        namespace: str = "",
+        simulator: str = "simulator_node",
+        timeout_s: float = 30.0,
+        truth: bool = False,
+        domain_id: int | None = None,
+        randomisation: Randomisation | None = None,
+        stamped: bool | None = None,
+        standard: Mapping[str, Any] | None = None,
+    ) -> None:
         self._robot, self._lidar = model.robot, model.lidar
         self._robot.require_cmd_vel()
         self._sensors = {sensor.name: sensor for sensor in model.sensors}
@@ -147,7 +170,9 @@ class DdsBackend:
         # No reference to the backend, which may be garbage.
         take = partial(_take_odometry, self._middleware)
         options = validate(dict(standard or {}), client.StandardOptions, "standard")
-        by_standard = simulator == STANDARD.name  # whose steps may be of a rounded length
+        by_standard = (
+            simulator == STANDARD.name
+        )  # whose steps may be of a rounded length
         self._grain_ns = round(client.TOLERANCE * self._period_ns) if by_standard else 0
         self._slack_ns = max(round(options.slack_s * NS_PER_S), self._grain_ns)
         self._now_ns, self._mail = 0, _Mailbox(self._topics, take, self._slack_ns)
@@ -161,22 +186,36 @@ class DdsBackend:
                 kind = LaserScan if topic == SCAN else Odometry
                 if topic in self._sensors:
                     kind = sensor_type(self._sensors[topic])
-                put = lambda message, mail=self._mail, topic=topic: mail.put(topic, message)  # noqa: E731
-                self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
-            self._episodes = self._services(model, world, simulator, options, randomisation)
+                put = lambda message, mail=self._mail, topic=topic: mail.put(
+                    topic, message
+                )  # noqa: E731
+                self._link.node.create_subscription(
+                    kind, topic, put, qos.SENSOR, raw=True
+                )
+            self._episodes = self._services(
+                model, world, simulator, options, randomisation
+            )
             self._link.begin()
-            self._link.wait_for_peers(self._topics, self._episodes.clients, timeout_s, ADVICE)
+            self._link.wait_for_peers(
+                self._topics, self._episodes.clients, timeout_s, ADVICE
+            )
             self._episodes.open(timeout_s)
         except BaseException:
             self.close()
             raise
 
     def _services(
-        self, model: SimulatorModel, world: AnyWorld, simulator: str,
-        options: client.StandardOptions, randomisation: Randomisation | None,
-    ) -> EpisodeServices | client.StandardEpisodes:  # fmt: skip
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        simulator: str,
+        options: client.StandardOptions,
+        randomisation: Randomisation | None,
+    ) -> EpisodeServices | client.StandardEpisodes:
         if simulator == STANDARD.name:
-            return client.StandardEpisodes(self._link, model, world, options, self._mail)
+            return client.StandardEpisodes(
+                self._link, model, world, options, self._mail
+            )
         return EpisodeServices(self._link, simulator, model, world, randomisation)
 
     @halts_on_error
@@ -232,8 +271,12 @@ class DdsBackend:
         mail = self._await(self._now_ns)
         self._check_stamps()
         off_ns = self._mail.stamp_ns(ODOM) - self._now_ns
-        now = self._now_ns = self._now_ns + (off_ns if abs(off_ns) <= self._grain_ns else 0)
-        ranges = from_device(_read(SCAN, wire.ranges_of, mail[SCAN].content), self._lidar)
+        now = self._now_ns = self._now_ns + (
+            off_ns if abs(off_ns) <= self._grain_ns else 0
+        )
+        ranges = from_device(
+            _read(SCAN, wire.ranges_of, mail[SCAN].content), self._lidar
+        )
         self._middleware.scan(now, mail[SCAN].arrival_ns, ranges)
         for name, sensor in self._sensors.items():
             reading = _read(name, partial(sensor_from_ros, sensor), mail[name].content)
@@ -252,7 +295,9 @@ class DdsBackend:
                 return self._mail.wait(stamp_ns, min(AGAIN_S, left_s))
             except StaleDataError as error:
                 if left_s <= AGAIN_S:
-                    raise StaleDataError(error.topic, error.age_s, self.timeout_s) from None
+                    raise StaleDataError(
+                        error.topic, error.age_s, self.timeout_s
+                    ) from None
                 self._episodes.repeat()
 
     def facts(self) -> BackendFacts:
@@ -280,16 +325,24 @@ class FleetBackend:
     """M robots (M, ...) in lock-step with one simulator node; BackendError if one is missing."""
 
     def __init__(
-        self, model: SimulatorModel, world: AnyWorld, namespaces: Sequence[str],
-        simulator: str = "/simulator_node", **options: Any,
-    ) -> None:  # fmt: skip
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        namespaces: Sequence[str],
+        simulator: str = "/simulator_node",
+        **options: Any,
+    ) -> None:
         if len(set(namespaces)) < max(2, len(namespaces)):
             given = f"namespaces {list(namespaces)!r}"
-            raise ConfigError(f"backend_options: {given} must be of at least two different robots.")
+            raise ConfigError(
+                f"backend_options: {given} must be of at least two different robots."
+            )
         self._robots: list[DdsBackend] = []
         try:
             for namespace in namespaces:
-                self._robots.append(DdsBackend(model, world, namespace, simulator, **options))
+                self._robots.append(
+                    DdsBackend(model, world, namespace, simulator, **options)
+                )
         except BaseException:
             self.close()
             raise
@@ -330,7 +383,9 @@ def together(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Merges the facts of M robots: equal values stay as they are, others become (M, ...)."""
     values = {name: [each[name] for each in facts] for name in facts[0]}
     return {
-        name: every[0] if all(np.array_equal(every[0], one) for one in every) else np.stack(every)
+        name: every[0]
+        if all(np.array_equal(every[0], one) for one in every)
+        else np.stack(every)
         for name, every in values.items()
     }
 
@@ -339,16 +394,23 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 
 
 def dds_backend(
-    model: SimulatorModel, world: AnyWorld, mode: str = "lockstep", robots: int = 1,
-    estimator: bool = True, randomisation: str | Randomisation | None = None, **options: Any,
-) -> interface.Backend:  # fmt: skip
+    model: SimulatorModel,
+    world: AnyWorld,
+    mode: str = "lockstep",
+    robots: int = 1,
+    estimator: bool = True,
+    randomisation: str | Randomisation | None = None,
+    **options: Any,
+) -> interface.Backend:
     """Returns the backend for the options; ConfigError if they do not go together, BackendError."""
     if not estimator:
         raise ConfigError("backend 'dds' always estimates; leave out `estimator`.")
     if randomisation is not None:
         if mode != "lockstep" or robots > 1:
             needed = "one robot in mode 'lockstep' alone can be randomised"
-            raise ConfigError(f"backend 'dds': {needed}, not {robots} in mode {mode!r}.")
+            raise ConfigError(
+                f"backend 'dds': {needed}, not {robots} in mode {mode!r}."
+            )
         if not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
         options["randomisation"] = randomisation
@@ -356,14 +418,20 @@ def dds_backend(
         randomisation is not None or mode != "lockstep" or robots > 1
     ):
         needed = "one robot in mode 'lockstep', without randomisation"
-        raise ConfigError(f"simulator {STANDARD.name!r}: drives {needed}; leave out the rest.")
+        raise ConfigError(
+            f"simulator {STANDARD.name!r}: drives {needed}; leave out the rest."
+        )
     if mode not in MODES:
-        raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
+        raise ConfigError(
+            f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}"
+        )
     if robots > 1:
         names = options.pop("namespaces", default_namespaces(robots))
         if mode != "lockstep" or len(names) != robots:
             needed = f"in mode 'lockstep' alone, with {robots} namespaces"
-            given = f"a team of {robots} robots is driven {needed}, not in {mode!r} with"
+            given = (
+                f"a team of {robots} robots is driven {needed}, not in {mode!r} with"
+            )
             raise ConfigError(f"backend_options: {given} {list(names)!r}.")
         return FleetBackend(model, world, names, **options)
     made: interface.Backend = MODES[mode](model, world, **options)

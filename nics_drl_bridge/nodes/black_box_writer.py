@@ -59,7 +59,9 @@ class Ring:
         """Begins a segment with a state at a time [s], and drops segments that are too old."""
         self._segments.append(Segment(now))
         self._segments[-1].add(state)
-        while len(self._segments) > 1 and self._segments[1].begin_s <= now - self._kept_s:
+        while (
+            len(self._segments) > 1 and self._segments[1].begin_s <= now - self._kept_s
+        ):
             self._segments.popleft()
 
     def add(self, entry: bytes) -> None:
@@ -83,12 +85,18 @@ class Disk:
     """Writes files one after the other, in a thread, which alone waits for the disk."""
 
     def __init__(
-        self, answer: Callable[[str, str], None], write: Callable[..., None] = write_parts
+        self,
+        answer: Callable[[str, str], None],
+        write: Callable[..., None] = write_parts,
     ) -> None:
         self._answer = answer
         self._write = write
-        self._orders: SimpleQueue[tuple[str, Sequence[str], list[bytes]] | None] = SimpleQueue()
-        self._room = threading.Semaphore(MOST_AT_WORK)  # for files that are not written yet
+        self._orders: SimpleQueue[tuple[str, Sequence[str], list[bytes]] | None] = (
+            SimpleQueue()
+        )
+        self._room = threading.Semaphore(
+            MOST_AT_WORK
+        )  # for files that are not written yet
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -135,7 +143,9 @@ class Disk:
 def prune(folder: Path, own: Sequence[str]) -> None:
     """Removes the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
     place = {name: i for i, name in enumerate(own, 1)}
-    files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
+    files = sorted(
+        folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name)
+    )
     for old in files[:-FILES_KEPT]:
         old.unlink(missing_ok=True)
 
@@ -171,7 +181,9 @@ def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
 
 def main() -> None:
     """Serves the gate until it ends; SIGTERM lets it give up the files that are not written yet."""
-    with contextlib.suppress(OSError):  # the gate's real-time priority is not for its files
+    with contextlib.suppress(
+        OSError
+    ):  # the gate's real-time priority is not for its files
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(NICENESS)
     disk = Disk(answer)

@@ -24,13 +24,31 @@ from nics_drl_bridge.gate import inputs, scan_motion, shield
 from nics_drl_bridge.gate.black_box import Entry
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
-from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin, replace
-from nics_drl_bridge.gate.stopping import doubtful, gate_config, require_possible, shield_config
+from nics_drl_bridge.gate.state import (
+    Decision,
+    GateConfig,
+    ShieldConfig,
+    begin,
+    replace,
+)
+from nics_drl_bridge.gate.stopping import (
+    doubtful,
+    gate_config,
+    require_possible,
+    shield_config,
+)
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.nodes import command_types, device_parameters, parameters, qos, runner, wire
+from nics_drl_bridge.nodes import (
+    command_types,
+    device_parameters,
+    parameters,
+    qos,
+    runner,
+    wire,
+)
 from nics_drl_bridge.nodes.conversions import PLANAR, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.e_stop_queue import EStopQueue
 from nics_drl_bridge.nodes.gate_log import GateLog
@@ -43,8 +61,12 @@ FOREIGN_SETTINGS = {
     command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
     command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
 }
-STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
-SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
+STALE_S = (
+    0.05  # a motion that was decided on longer ago than this is decided on again [s]
+)
+SCAN_PERIODS = (
+    1.75  # for a slow lidar, default age limit of a command's scan, in its periods
+)
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
@@ -60,9 +82,12 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     file = str(runner.declare_row(node, parameters.LIMITS))
     limits = load_limits(file, model.robot) if file else None
     config = gate_config(
-        model, limits, _declare_shield(node, model, limits, file),
-        simulated=bool(node.get_parameter(SIM_TIME).value), **_declare_rules(node, model),
-    )  # fmt: skip
+        model,
+        limits,
+        _declare_shield(node, model, limits, file),
+        simulated=bool(node.get_parameter(SIM_TIME).value),
+        **_declare_rules(node, model),
+    )
     node.add_on_set_parameters_callback(partial(_keep_clock, config.simulated))
     require_possible(config)
     if doubt := doubtful(config, model.control_period):
@@ -75,14 +100,18 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
     for parameter in parameters:
         if parameter.name == SIM_TIME and parameter.value != simulated:
             fix = f"start it anew with `-p {SIM_TIME}:={str(not simulated).lower()}`."
-            reason = f"parameter {SIM_TIME!r} can't be changed while the gate runs; {fix}"
+            reason = (
+                f"parameter {SIM_TIME!r} can't be changed while the gate runs; {fix}"
+            )
             return SetParametersResult(successful=False, reason=reason)
     return SetParametersResult(successful=True)
 
 
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
-    rules: dict[str, Any] = {"odom_rate_declared": "odom_rate" in runner.given_values(node)}
+    rules: dict[str, Any] = {
+        "odom_rate_declared": "odom_rate" in runner.given_values(node)
+    }
     for row in parameters.gate_rules(1.0 / model.control_period, scan_age):
         field = f"{row.name}_s" if row.name in parameters.RULES_IN_SECONDS else row.name
         rules[field] = runner.declare_row(node, row)
@@ -94,7 +123,9 @@ def declare_black_box(node: Node) -> Path:
     given = str(runner.declare_row(node, parameters.BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
-    return (Path(given) if given else home / "black_box") / str(node.get_namespace()).strip("/")
+    return (Path(given) if given else home / "black_box") / str(
+        node.get_namespace()
+    ).strip("/")
 
 
 def _declare_shield(
@@ -103,7 +134,10 @@ def _declare_shield(
     on = runner.declare_row(node, parameters.SHIELD)
     values = {}
     for row in parameters.SHIELD_NUMBERS:
-        value, name = float(runner.declare_row(node, row)), row.name.removeprefix("shield_")
+        value, name = (
+            float(runner.declare_row(node, row)),
+            row.name.removeprefix("shield_"),
+        )
         if not math.isnan(value):
             values[name] = value
     if not on:
@@ -137,13 +171,17 @@ def odometry(content: bytes) -> inputs.Odometry:
 def estimate(content: bytes) -> inputs.Estimate:
     """Reads a serialised Odometry of an estimator."""
     pose, twist = wire.odometry_of(content)
-    covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(6, 6)
+    covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
+        6, 6
+    )
     return inputs.Estimate(twist, pose, covariance[PLANAR].astype(np.float64))
 
 
 def command(content: bytes) -> inputs.Command:
     """Reads a serialised TwistStamped."""
-    return inputs.Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
+    return inputs.Command(
+        wire.stamp_of(content), np.array(wire.stamped_twist_of(content))
+    )
 
 
 def foreign_command(
@@ -158,7 +196,9 @@ def foreign_command(
     if kind == TWIST:
         return inputs.Command(newest.stamp_ns, np.array(wire.twist_of(content)))
     if 0 < wire.stamp_of(content) < oldest_ns:
-        raise ValueError("its stamp is older than command_age; is use_sim_time the same at both?")
+        raise ValueError(
+            "its stamp is older than command_age; is use_sim_time the same at both?"
+        )
     return replace(command(content), stamp_ns=newest.stamp_ns)
 
 
@@ -174,7 +214,9 @@ def take_priority(priority: int) -> str:
     try:
         for thread in ("0", *os.listdir("/proc/self/task")):
             with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
+                os.sched_setscheduler(
+                    int(thread), os.SCHED_FIFO, os.sched_param(priority)
+                )
     except (OSError, AttributeError) as error:  # the latter on systems without it
         reason = str(getattr(error, "strerror", None) or "it has none").lower()
         return REFUSED.format(priority=priority, error=reason)
@@ -190,7 +232,9 @@ class CommandGate(qos.QosWatch):
         self._lidar, self._config = model.lidar, declare_gate(self, model)
         self._sensors = model.sensors
         self._state = begin(self._config)
-        self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
+        self._log = GateLog(
+            self._config, declare_black_box(self), model.robot.name, logger
+        )
         if not self._config.e_stop_required:
             risk = "an e_stop that was never heard does not stop the robot. That is for simulations"
             logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
@@ -200,7 +244,9 @@ class CommandGate(qos.QosWatch):
         self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
-        if fault := parameters.frame_fault(self._parameters.values(), parameters.ROBOT_FRAME.name):
+        if fault := parameters.frame_fault(
+            self._parameters.values(), parameters.ROBOT_FRAME.name
+        ):
             raise ConfigError(fault)
         kind = TwistStamped if self._stamped else Twist
         self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
@@ -243,7 +289,9 @@ class CommandGate(qos.QosWatch):
         runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
         runner.serve(self, "~/e_stop", self._press)
 
-    def _take(self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes) -> None:
+    def _take(
+        self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes
+    ) -> None:
         try:
             given = read(content)
         except wire.UNREADABLE as error:  # of a middleware with another encoding
@@ -252,7 +300,10 @@ class CommandGate(qos.QosWatch):
             self._decide(given)
 
     def _take_command(
-        self, read: Callable[[bytes], inputs.Command], content: bytes, info: Mapping[str, Any]
+        self,
+        read: Callable[[bytes], inputs.Command],
+        content: bytes,
+        info: Mapping[str, Any],
     ) -> None:
         source = self._sources.name_of(info)
         publishers = self._sources.publishers
@@ -272,7 +323,9 @@ class CommandGate(qos.QosWatch):
                 messages.append(e_stop(each))
             except wire.UNREADABLE as error:
                 self._log.refuse(f"e_stop: {error}")
-                self._decide(inputs.Press("a message could not be read, and may be a press"))
+                self._decide(
+                    inputs.Press("a message could not be read, and may be a press")
+                )
         if any(message.pressed for message in messages):
             self._decide(inputs.EStop(True))
         if messages:

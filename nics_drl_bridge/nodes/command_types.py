@@ -38,7 +38,9 @@ def deaf_subscribers(node: Node, topic: str, stamped: bool) -> str:
     kinds = sorted({end.topic_type for end in ends} - {name_of(stamped)})
     if not kinds:
         return ""
-    names = sorted({qos.owner(end) or "somebody" for end in ends if end.topic_type in kinds})
+    names = sorted(
+        {qos.owner(end) or "somebody" for end in ends if end.topic_type in kinds}
+    )
     return f"{', '.join(names)} expects {' and '.join(kinds)} there, not {name_of(stamped)}"
 
 
@@ -48,7 +50,9 @@ class TypeWatch:
     `settings` are those that select a type, by the type.
     """
 
-    def __init__(self, node: Node, topic: str, settings: Mapping[str, str] = SETTINGS) -> None:
+    def __init__(
+        self, node: Node, topic: str, settings: Mapping[str, str] = SETTINGS
+    ) -> None:
         self._node = node
         self._topic = node.resolve_topic_name(topic)
         self._settings = settings
@@ -77,7 +81,9 @@ class CommandListener:
     is heard stays, and a warning names who publishes the other.
     """
 
-    def __init__(self, node: Node, topic: str, stamped: bool, take: Callable[[Any], None]) -> None:
+    def __init__(
+        self, node: Node, topic: str, stamped: bool, take: Callable[[Any], None]
+    ) -> None:
         self._node = node
         self._topic = topic
         self._take = take
@@ -96,10 +102,14 @@ class CommandListener:
     def look(self) -> None:
         """Follows the type that is published now."""
         if self._subscription is None:
-            with contextlib.suppress(RuntimeError):  # the old one is not gone yet: at the next look
+            with contextlib.suppress(
+                RuntimeError
+            ):  # the old one is not gone yet: at the next look
                 self._subscribe()
             return
-        ends = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(self._topic))
+        ends = self._node.get_publishers_info_by_topic(
+            self._node.resolve_topic_name(self._topic)
+        )
         published = {end.topic_type for end in ends}
         others = sorted((published & KINDS.keys()) - {self.kind})
         if self.kind in published or not others:
@@ -107,7 +117,9 @@ class CommandListener:
             return
         expected = self.kind
         self.kind = others[0]
-        names = {qos.owner(end) or "somebody" for end in ends if end.topic_type == self.kind}
+        names = {
+            qos.owner(end) or "somebody" for end in ends if end.topic_type == self.kind
+        }
         self._node.get_logger().warning(
             f"{self._node.resolve_topic_name(self._topic)}: {', '.join(sorted(names))} publishes "
             f"{self.kind}, not {expected}, and is heard from now on; to hear its first commands "

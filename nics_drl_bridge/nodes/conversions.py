@@ -28,10 +28,16 @@ from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import RobotSpec
 
-PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and heading in the 6 x 6 covariance of a message
+PLANAR = np.ix_(
+    [0, 1, 5], [0, 1, 5]
+)  # x, y and heading in the 6 x 6 covariance of a message
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
-UNUSED_VARIANCE = 1e6  # variance of z, roll and pitch, which a planar robot does not measure
-FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")  # type, in a `.msg` file
+UNUSED_VARIANCE = (
+    1e6  # variance of z, roll and pitch, which a planar robot does not measure
+)
+FIELD = re.compile(
+    r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)"
+)  # type, in a `.msg` file
 
 
 def stamp_to_ros(time_ns: int) -> Time:
@@ -61,13 +67,17 @@ def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion
         return heading_to_ros(heading)
     half = (heading - heading_of(x, y, z, w)) / 2.0
     s, c = math.sin(half), math.cos(half)
-    return geometry.Quaternion(x=c * x - s * y, y=c * y + s * x, z=c * z + s * w, w=c * w - s * z)
+    return geometry.Quaternion(
+        x=c * x - s * y, y=c * y + s * x, z=c * z + s * w, w=c * w - s * z
+    )
 
 
 def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
     """Returns linear.x, linear.y, angular.z (3,) as a Twist."""
     message = geometry.Twist()
-    message.linear.x, message.linear.y, message.angular.z = np.asarray(twist, np.float64).tolist()
+    message.linear.x, message.linear.y, message.angular.z = np.asarray(
+        twist, np.float64
+    ).tolist()
     return message
 
 
@@ -83,7 +93,9 @@ def twist_from_ros(message: geometry.Twist | geometry.TwistStamped) -> Array:
     return np.array(messages.command_row(message))
 
 
-def scan_to_ros(spec: LidarSpec, ranges: NDArray[np.float32], now_ns: int, frame: str) -> LaserScan:
+def scan_to_ros(
+    spec: LidarSpec, ranges: NDArray[np.float32], now_ns: int, frame: str
+) -> LaserScan:
     """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec."""
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(now_ns), frame
@@ -93,16 +105,23 @@ def scan_to_ros(spec: LidarSpec, ranges: NDArray[np.float32], now_ns: int, frame
     return message
 
 
-def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = False) -> Reader:
+def reader_from_ros(
+    message: LaserScan, like: LidarSpec, upside_down: bool = False
+) -> Reader:
     """Returns the reader of the lidar that a header describes. Raises ConfigError."""
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
     return reader_beside(header, len(message.ranges), like, upside_down)
 
 
 def odometry_to_ros(
-    pose: ArrayLike, twist: ArrayLike, time_ns: int, frames: Sequence[str],
-    variance: tuple[float, float, float, float],  # of position, heading, linear, angular [SI]
-) -> Odometry:  # fmt: skip
+    pose: ArrayLike,
+    twist: ArrayLike,
+    time_ns: int,
+    frames: Sequence[str],
+    variance: tuple[
+        float, float, float, float
+    ],  # of position, heading, linear, angular [SI]
+) -> Odometry:
     """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = Odometry(child_frame_id=frames[1])
@@ -110,7 +129,10 @@ def odometry_to_ros(
     message.pose.pose.position.x, message.pose.pose.position.y = x, y
     message.pose.pose.orientation = heading_to_ros(heading)
     message.twist.twist = twist_to_ros(twist)
-    for part, linear, angular in ((message.pose, *variance[:2]), (message.twist, *variance[2:])):
+    for part, linear, angular in (
+        (message.pose, *variance[:2]),
+        (message.twist, *variance[2:]),
+    ):
         part.covariance = covariance_to_ros(np.diag([linear, linear, angular]))
     return message
 
@@ -141,7 +163,9 @@ def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) ->
     frame, pose = message.header.frame_id.strip("/"), pose_from_ros(message)[0]
     if frame not in ("", map_frame):
         fix = f"give it in {map_frame!r}, as RViz does if that is its fixed frame."
-        raise ConfigError(f"{INITIAL_POSE}: a pose in the frame {frame!r} is refused; {fix}")
+        raise ConfigError(
+            f"{INITIAL_POSE}: a pose in the frame {frame!r} is refused; {fix}"
+        )
     if not np.isfinite(pose).all():
         fix = "give finite numbers and a quaternion of unit length."
         raise ConfigError(f"{INITIAL_POSE}: a pose that is none is refused; {fix}")
@@ -173,19 +197,29 @@ def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
 def map_from_ros(message: OccupancyGrid) -> GridMap:
     """Returns the map of an OccupancyGrid. Raises ConfigError if sizes do not fit."""
     info, cells = message.info, np.array(message.data, np.int8)
-    if cells.size != info.height * info.width or not cells.size or not info.resolution > 0.0:
+    if (
+        cells.size != info.height * info.width
+        or not cells.size
+        or not info.resolution > 0.0
+    ):
         size = f"{info.height} x {info.width} of {info.resolution:g} m"
-        raise ConfigError(f"map: {cells.size} cells are no {size}; look at who publishes it.")
+        raise ConfigError(
+            f"map: {cells.size} cells are no {size}; look at who publishes it."
+        )
     place, turn = info.origin.position, info.origin.orientation
     origin = place.x, place.y, heading_of(turn.x, turn.y, turn.z, turn.w)
-    return GridMap(cells.reshape(info.height, info.width), float(info.resolution), origin)
+    return GridMap(
+        cells.reshape(info.height, info.width), float(info.resolution), origin
+    )
 
 
 def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:
     """Returns a state (S,) as a JointState: angles and lengths as positions, all else as rates."""
     message = JointState()
     message.header.stamp = stamp_to_ros(time_ns)
-    for variable, value in zip(spec.state, np.asarray(state, dtype=np.float64), strict=True):
+    for variable, value in zip(
+        spec.state, np.asarray(state, dtype=np.float64), strict=True
+    ):
         still = variable.unit in messages.POSITION_UNITS
         message.name.append(variable.name)
         message.position.append(float(value) if still else 0.0)
@@ -198,7 +232,9 @@ def message_type(kind: str) -> Any | None:
 
     Types come from other programs on the network: only a package that has messages is imported.
     """
-    named = re.fullmatch(r"([A-Za-z]\w*)/(msg|srv|action)/([A-Za-z]\w*)", kind, re.ASCII)
+    named = re.fullmatch(
+        r"([A-Za-z]\w*)/(msg|srv|action)/([A-Za-z]\w*)", kind, re.ASCII
+    )
     if named is None:
         return None
     package, interface, name = named.groups()
@@ -222,11 +258,15 @@ def sensor_type(sensor: Sensor) -> Any:
     kind = message_type(sensor.message)
     if kind is None:
         missing = f"the message {sensor.message} is not installed; install its package"
-        raise ConfigError(f"sensor {sensor.name!r}: {missing} with your ROS 2 distribution.")
+        raise ConfigError(
+            f"sensor {sensor.name!r}: {missing} with your ROS 2 distribution."
+        )
     return kind
 
 
-def sensor_to_ros(sensor: Sensor, reading: NDArray[np.float32], time_ns: int, frame: str) -> Any:
+def sensor_to_ros(
+    sensor: Sensor, reading: NDArray[np.float32], time_ns: int, frame: str
+) -> Any:
     """Returns a reading (S,) of a further sensor as its message."""
     message = sensor_type(sensor)()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
@@ -256,7 +296,9 @@ def message_texts(kind: str) -> dict[str, str]:
         for name in filter(None, map(FIELD.match, texts[each].splitlines())):
             package, _, inner = name[1].rpartition("/")
             if package or inner[0].isupper():
-                waiting.append(f"{package.split('/')[0] or each.split('/')[0]}/msg/{inner}")
+                waiting.append(
+                    f"{package.split('/')[0] or each.split('/')[0]}/msg/{inner}"
+                )
     return texts
 
 
@@ -265,7 +307,11 @@ def _message_file(kind: str) -> Path | None:
 
     package, _, name = kind.split("/")
     prefixes = [sys.prefix]
-    with contextlib.suppress(OSError):  # if ROS 2 comes from wheels, the variable is not set
+    with contextlib.suppress(
+        OSError
+    ):  # if ROS 2 comes from wheels, the variable is not set
         prefixes = [*get_search_paths(), sys.prefix]
-    files = (Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes)
+    files = (
+        Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes
+    )
     return next((file for file in files if file.is_file()), None)

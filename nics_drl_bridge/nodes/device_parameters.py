@@ -24,8 +24,12 @@ LOCKSTEP = "lockstep"
 START, GIVEN = "episode_start", "episode_start_given"
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-SLACK = 0.1  # a step may be early by this share of it, because timers are no more precise
-PATIENCE_NS = NS_PER_S // 2  # steps missed for longer than this are not made up for [ns]
+SLACK = (
+    0.1  # a step may be early by this share of it, because timers are no more precise
+)
+PATIENCE_NS = (
+    NS_PER_S // 2
+)  # steps missed for longer than this are not made up for [ns]
 
 
 class DeviceTiming(NamedTuple):
@@ -36,7 +40,9 @@ class DeviceTiming(NamedTuple):
     step_ns: int  # of the world
     odom_ns: int  # between two odometries
     scan_ns: int  # between two scans
-    scan_late_ns: tuple[int, int]  # least delay to publication, and greatest additional one
+    scan_late_ns: tuple[
+        int, int
+    ]  # least delay to publication, and greatest additional one
     odom_late_ns: tuple[int, int]
 
     @property
@@ -60,7 +66,9 @@ def declare_device(node: Node, laser_frame: str) -> None:
     """Declares, and checks, all but the parameters of one kind of simulator. ConfigError."""
     # First, so that it also checks the values that the node is started with.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
-    fleet = ParameterDescriptor(description=ROBOTS.about, read_only=True, dynamic_typing=True)
+    fleet = ParameterDescriptor(
+        description=ROBOTS.about, read_only=True, dynamic_typing=True
+    )
     node.declare_parameter(ROBOTS.name, ROBOTS.default, fleet)
     for row in device(laser_frame):
         if row.name == GIVEN:
@@ -91,45 +99,73 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     odom = 1.0 / rate if rate else model.control_period
     scan = 1.0 / (number(node, "scan_rate") or model.lidar.rate)
     step = common_step(dt, (odom, scan)) * dt
-    step_ns, odom_ns, scan_ns = (round(seconds * NS_PER_S) for seconds in (step, odom, scan))
+    step_ns, odom_ns, scan_ns = (
+        round(seconds * NS_PER_S) for seconds in (step, odom, scan)
+    )
     late = []
     for topic in ("scan", "odom"):
         own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
         least, jitter = number(node, f"{topic}_latency"), number(node, "latency_jitter")
-        chosen = least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter
+        chosen = (
+            least if least >= 0.0 else own.least,
+            jitter if jitter >= 0.0 else own.jitter,
+        )
         late.append((round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)))
     return DeviceTiming(mode, number(node, "rate"), step_ns, odom_ns, scan_ns, *late)
 
 
-def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> SimulatorModel:
+def timed_model(
+    node: Node, model: SimulatorModel, time: DeviceTiming
+) -> SimulatorModel:
     """Returns the model with the step of the world and the requested latency."""
     if time.lockstep:
         return model
     if (latency := number(node, "command_latency")) >= 0.0:
-        model = replace(model, calibration=replace(model.calibration, command_latency_s=latency))
+        model = replace(
+            model, calibration=replace(model.calibration, command_latency_s=latency)
+        )
     dt = model.timing[0]
     steps = round(time.step_ns / NS_PER_S / dt)
-    return model if steps == model.timing[1] else replace(model, control_period=steps * dt)
+    return (
+        model if steps == model.timing[1] else replace(model, control_period=steps * dt)
+    )
 
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     """Returns a parameter that must be one of some words. Raises ConfigError with the nearest."""
     value = str(node.get_parameter(name).value)
     if value not in valid:
-        raise ConfigError(f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}")
+        raise ConfigError(
+            f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}"
+        )
     return value
 
 
 def namespaces(node: Node) -> tuple[str, ...]:
     """Returns each robot's namespace, below the node's own and empty for one. ConfigError."""
     value: Any = node.get_parameter("robots").value
-    if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= GREATEST_FLEET:
+    if (
+        isinstance(value, int)
+        and not isinstance(value, bool)
+        and 1 <= value <= GREATEST_FLEET
+    ):
         return ("",) if value == 1 else default_namespaces(value)
-    names = tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else ()
+    names = (
+        tuple(value)
+        if isinstance(value, Sequence) and not isinstance(value, str)
+        else ()
+    )
     valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
-    if not names or not valid or len(set(names)) < len(names) or len(names) > GREATEST_FLEET:
+    if (
+        not names
+        or not valid
+        or len(set(names)) < len(names)
+        or len(names) > GREATEST_FLEET
+    ):
         fix = f"give a count from 1 to {GREATEST_FLEET}, or a list of different namespaces"
-        raise ConfigError(f"parameter 'robots' is {value!r}; {fix}, as in [robot1, robot2].")
+        raise ConfigError(
+            f"parameter 'robots' is {value!r}; {fix}, as in [robot1, robot2]."
+        )
     return names
 
 
@@ -140,8 +176,12 @@ def default_namespaces(robots: int) -> tuple[str, ...]:
 
 def frames(node: Node, namespace: str) -> Frames:
     """Returns the frames of a robot; those of a fleet begin with its namespace, except the map."""
-    prefix = str(node.get_parameter("frame_prefix").value) + (f"{namespace}/" if namespace else "")
-    world, *own = (str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields[:-1])
+    prefix = str(node.get_parameter("frame_prefix").value) + (
+        f"{namespace}/" if namespace else ""
+    )
+    world, *own = (
+        str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields[:-1]
+    )
     odom, base, laser, footprint = (name and prefix + name for name in own)
     return Frames(world, odom, base, laser, footprint, prefix)
 
@@ -153,13 +193,20 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers: x, y, heading; of each robot."
-            elif node.has_parameter(GIVEN) and values.size != (needed := 3 * len(namespaces(node))):
+            elif node.has_parameter(GIVEN) and values.size != (
+                needed := 3 * len(namespaces(node))
+            ):
                 reason = f"episode_start has {values.size} numbers; give {needed}, 3 of each robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
     names = {parameter.name for parameter in parameters}
     # A start that is set alone holds; when they are declared, it comes first.
-    if not reason and START in names and GIVEN not in names and node.has_parameter(GIVEN):
+    if (
+        not reason
+        and START in names
+        and GIVEN not in names
+        and node.has_parameter(GIVEN)
+    ):
         node.set_parameters([Parameter(GIVEN, value=True)])
     return SetParametersResult(successful=not reason, reason=reason)
 
@@ -168,7 +215,10 @@ class TopicPace:
     """Decides when a topic is due, so that its mean rate is the requested one with any step."""
 
     def __init__(self, period_ns: int, step_ns: int) -> None:
-        self._period_ns, self._slack_ns = period_ns, step_ns // 2 if period_ns > step_ns else 0
+        self._period_ns, self._slack_ns = (
+            period_ns,
+            step_ns // 2 if period_ns > step_ns else 0,
+        )
         self._next_ns = 0
 
     def begin(self, now_ns: int) -> None:
@@ -210,4 +260,6 @@ class RealTime:
 
     def lost(self, steady_ns: int, now_ns: int) -> bool:
         """True if the world is too far behind to catch up with real time."""
-        return self.time_at(steady_ns) - now_ns - self._step_ns > PATIENCE_NS * self._rate
+        return (
+            self.time_at(steady_ns) - now_ns - self._step_ns > PATIENCE_NS * self._rate
+        )

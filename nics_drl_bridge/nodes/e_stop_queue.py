@@ -16,7 +16,9 @@ class EStopQueue:
     """Measures the rate of `e_stop`, and judges each sleep of the gate by it."""
 
     def __init__(self) -> None:
-        self._heard: deque[tuple[float, int]] = deque()  # times [s], and messages read at each
+        self._heard: deque[tuple[float, int]] = (
+            deque()
+        )  # times [s], and messages read at each
         self._ticked_s: float | None = None  # last tick of the gate
         self._ever_heard = False
 

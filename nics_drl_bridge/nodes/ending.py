@@ -34,7 +34,9 @@ ENDING = (
 """Signals that end a process unless it handles them, but SIGKILL, those of a fault in the process
 itself, and those that Python ignores, as SIGPIPE."""
 OUTPUT_S = 1.0  # for which the last lines may take to be written
-_leave: int | None = None  # address of the handler; None in a process that is more than one node
+_leave: int | None = (
+    None  # address of the handler; None in a process that is more than one node
+)
 _within = False  # `at_once`
 
 

@@ -10,7 +10,11 @@ from functools import partial
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
+from rclpy.executors import (
+    ExternalShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -19,12 +23,17 @@ from rclpy.waitable import NumberOfEntities
 from nics_drl_bridge.interface import NS_PER_S
 
 InvalidHandle = rclpy_implementation.InvalidHandle
-PARTS_MISSING = (AttributeError, TypeError)  # raised if rclpy differs from what is known here
+PARTS_MISSING = (
+    AttributeError,
+    TypeError,
+)  # raised if rclpy differs from what is known here
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
 """Returned by a callback that has woken another thread of this process. The executor then keeps out
 of that thread's way for a part of the time since it last did so, at most for LONGEST_REST_S."""
-MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread has other work, too
+MOST_AT_ONCE = (
+    32  # a timer without a period is always ready, and the thread has other work, too
+)
 
 
 class StandingExecutor(SingleThreadedExecutor):
@@ -52,12 +61,19 @@ class StandingExecutor(SingleThreadedExecutor):
         due, asked = list[Any](), list[Callable[[], object]]()
         left = False
         try:
-            if self._entities is not None and self.context.ok():  # a callback may have shut it down
+            if (
+                self._entities is not None and self.context.ok()
+            ):  # a callback may have shut it down
                 asked = self._entities.asked()
                 woken, others = self._entities.others_ready(self._guard)
-                self._changed |= woken or others  # adding an entity to a node wakes the executor
+                self._changed |= (
+                    woken or others
+                )  # adding an entity to a node wakes the executor
                 # So does rclpy itself, after each callback; then there is nothing to handle.
-                due, left = self._entities.due(), others or (woken and bool(self._tasks))
+                due, left = (
+                    self._entities.due(),
+                    others or (woken and bool(self._tasks)),
+                )
         except PARTS_MISSING as error:
             self._fall_back(error)
         if asked:  # a message that was sent before a request is handled before it, too
@@ -75,7 +91,9 @@ class StandingExecutor(SingleThreadedExecutor):
         try:
             entities = self._gathered()
             entities.wait(-1 if timeout_sec is None else int(timeout_sec * NS_PER_S))
-        except RuntimeError:  # of the library: another thread may have shut down the context
+        except (
+            RuntimeError
+        ):  # of the library: another thread may have shut down the context
             if self.context.ok():
                 raise
         if not self.context.ok():
@@ -83,7 +101,9 @@ class StandingExecutor(SingleThreadedExecutor):
         return entities.taken()
 
     def _come(self) -> list[Received]:
-        if self._entities is None or not self.context.ok():  # a callback may have ended it
+        if (
+            self._entities is None or not self.context.ok()
+        ):  # a callback may have ended it
             return []
         return self._entities.come()
 
@@ -96,7 +116,9 @@ class StandingExecutor(SingleThreadedExecutor):
             time.sleep(min(REST * (self._handed_over_s - before_s), LONGEST_REST_S))
 
     def _tick(self, timer: Any) -> None:
-        if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
+        if not self.context.ok() or not any(
+            timer in node.timers for node in self.get_nodes()
+        ):
             return
         try:
             if not timer.handle.is_timer_ready():
@@ -110,7 +132,9 @@ class StandingExecutor(SingleThreadedExecutor):
     def _fall_back(self, error: Exception) -> None:
         self.stands = False
         self._release()
-        get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
+        get_logger("executor").warning(
+            f"this rclpy needs its own, slower executor ({error})"
+        )
 
     def _handle_others(self) -> None:
         with contextlib.suppress(TimeoutException):
@@ -142,14 +166,22 @@ class StandingExecutor(SingleThreadedExecutor):
 
 
 class _Entities:
-    def __init__(self, nodes: Sequence[Node], guards: Sequence[Any], context: Context) -> None:
+    def __init__(
+        self, nodes: Sequence[Node], guards: Sequence[Any], context: Context
+    ) -> None:
         self.all = _entities_of(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
         # A subscription's callback takes the message, or also its info.
-        self._subscriptions = [(s, 1 if _takes(s.callback, None) else 2) for s in subscriptions]
+        self._subscriptions = [
+            (s, 1 if _takes(s.callback, None) else 2) for s in subscriptions
+        ]
         self._clients = {one.handle.pointer: one for one in clients}
         self._services, self._timers = (
-            {e.handle.pointer: e for e in each if not inspect.iscoroutinefunction(e.callback)}
+            {
+                e.handle.pointer: e
+                for e in each
+                if not inspect.iscoroutinefunction(e.callback)
+            }
             for each in (services, [one for one in timers if _takes(one.callback)])
         )
         self._own = {*self._timers, *self._services, *self._clients}
@@ -162,9 +194,14 @@ class _Entities:
         for waitable in self._waitables:
             room += waitable.get_num_entities()
         self._wait_set = rclpy_implementation.WaitSet(
-            room.num_subscriptions, room.num_guard_conditions, room.num_timers,
-            room.num_clients, room.num_services, room.num_events, context.handle,
-        )  # fmt: skip
+            room.num_subscriptions,
+            room.num_guard_conditions,
+            room.num_timers,
+            room.num_clients,
+            room.num_services,
+            room.num_events,
+            context.handle,
+        )
         names = ("subscription", "guard_condition", "timer", "client", "service")
         self._adding = [
             (getattr(self._wait_set, f"add_{name}"), one.handle)
@@ -192,13 +229,19 @@ class _Entities:
         """Takes requests to services and answers to clients; returns how each is handled."""
         ready, found = self._wait_set.get_ready_entities, list[Callable[[], object]]()
         for service in _known(self._services, ready("service")):
-            request, header = service.handle.service_take_request(service.srv_type.Request)
+            request, header = service.handle.service_take_request(
+                service.srv_type.Request
+            )
             if header is not None:
                 found.append(partial(_serve, service, request, header))
         for client in _known(self._clients, ready("client")):
             header, response = client.handle.take_response(client.srv_type.Response)
             if header is not None:
-                found.append(partial(_answer, client, header.request_id.sequence_number, response))
+                found.append(
+                    partial(
+                        _answer, client, header.request_id.sequence_number, response
+                    )
+                )
         return found
 
     def due(self) -> list[Any]:
@@ -209,14 +252,20 @@ class _Entities:
         triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
             if guard.handle.pointer in triggered:
-                guard._executor_triggered = True  # waiting has reset it; set again for rclpy
+                guard._executor_triggered = (
+                    True  # waiting has reset it; set again for rclpy
+                )
         woken = own is not None and own.handle.pointer in triggered
         if woken:
             triggered.remove(own.handle.pointer)
         others = bool(triggered) or any(
-            one not in self._own for kind in ("client", "service", "timer") for one in ready(kind)
+            one not in self._own
+            for kind in ("client", "service", "timer")
+            for one in ready(kind)
         )
-        return woken, others or any(each.is_ready(self._wait_set) for each in self._waitables)
+        return woken, others or any(
+            each.is_ready(self._wait_set) for each in self._waitables
+        )
 
 
 def _known(entities: Mapping[int, Any], pointers: Iterable[int]) -> list[Any]:
@@ -224,7 +273,9 @@ def _known(entities: Mapping[int, Any], pointers: Iterable[int]) -> list[Any]:
 
 
 def _serve(service: Any, request: Any, header: Any) -> None:
-    service.send_response(service.callback(request, service.srv_type.Response()), header)
+    service.send_response(
+        service.callback(request, service.srv_type.Response()), header
+    )
 
 
 def _answer(client: Any, number: int, response: Any) -> None:
@@ -236,7 +287,9 @@ def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
     received = []
     for subscription, arguments in subscriptions:
         try:
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            taken = subscription.handle.take_message(
+                subscription.msg_type, subscription.raw
+            )
         except InvalidHandle:  # a callback has destroyed it
             continue
         if taken is not None:
@@ -254,4 +307,6 @@ def _takes(callback: Any, *arguments: Any) -> bool:
 
 def _entities_of(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:
     kinds = ("subscriptions", "guards", "timers", "clients", "services", "waitables")
-    return tuple(tuple(one for node in nodes for one in getattr(node, kind)) for kind in kinds)
+    return tuple(
+        tuple(one for node in nodes for one in getattr(node, kind)) for kind in kinds
+    )

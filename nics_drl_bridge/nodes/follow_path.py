@@ -24,12 +24,20 @@ from nics_drl_bridge.nodes.device_parameters import number
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.policy.follow import GoalChecker, Place, PlannedPath, ProgressChecker
+from nics_drl_bridge.policy.follow import (
+    GoalChecker,
+    Place,
+    PlannedPath,
+    ProgressChecker,
+)
 from nics_drl_bridge.policy.route import route
 from nics_drl_bridge.recording.messages import pose_row
 
 FOLLOW, NAVIGATE = "follow_path", "navigate_to_pose"
-KINDS = {FOLLOW: "nav2_msgs/action/FollowPath", NAVIGATE: "nav2_msgs/action/NavigateToPose"}
+KINDS = {
+    FOLLOW: "nav2_msgs/action/FollowPath",
+    NAVIGATE: "nav2_msgs/action/NavigateToPose",
+}
 SUCCEED, ABORT, CANCELED = "succeed", "abort", "canceled"
 SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
 LOOK_S = 2.0  # time between two looks for another server of `navigate_to_pose` [s]
@@ -60,16 +68,23 @@ class HeldActionServer(ActionServer):
     """
 
     def __init__(
-        self, node: Node, kind: Any, name: str, open_: Callable[[], bool],
+        self,
+        node: Node,
+        kind: Any,
+        name: str,
+        open_: Callable[[], bool],
         begin: Callable[[Any], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._begin = begin
         accept, reject = GoalResponse.ACCEPT, GoalResponse.REJECT
         super().__init__(
-            node, kind, name, lambda _: None,
+            node,
+            kind,
+            name,
+            lambda _: None,
             goal_callback=lambda _: accept if open_() else reject,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
-        )  # fmt: skip
+        )
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
         """Holds an accepted goal, which counts as executing from now on; see rclpy."""
@@ -117,10 +132,21 @@ class PathActions:
     """
 
     def __init__(
-        self, node: Node, topics: RobotTopics, frames: GoalFrames, model: SimulatorModel,
-        parameters: ControllerParameters, drive: Callable[[Array], Wish], anew: Callable[[], None],
-    ) -> None:  # fmt: skip
-        self._node, self._topics, self._frames, self._robot = node, topics, frames, model.robot
+        self,
+        node: Node,
+        topics: RobotTopics,
+        frames: GoalFrames,
+        model: SimulatorModel,
+        parameters: ControllerParameters,
+        drive: Callable[[Array], Wish],
+        anew: Callable[[], None],
+    ) -> None:
+        self._node, self._topics, self._frames, self._robot = (
+            node,
+            topics,
+            frames,
+            model.robot,
+        )
         self._parameters, self._drive, self._anew = parameters, drive, anew
         self._run: Run | None = None
         self._map: tuple[str, GridMap] | None = None  # and its frame
@@ -128,7 +154,9 @@ class PathActions:
         self._period_s = model.control_period
         self._undo: list[Callable[[], Any]] = []
         self._servers: dict[str, HeldActionServer] = {}
-        self._kinds = {name: conversions.message_type(kind) for name, kind in KINDS.items()}
+        self._kinds = {
+            name: conversions.message_type(kind) for name, kind in KINDS.items()
+        }
         if None in self._kinds.values():
             why = "the package nav2_msgs is not installed, so that its actions are not served"
             node.get_logger().info(f"{why}; install it with your ROS 2 distribution.")
@@ -140,9 +168,13 @@ class PathActions:
             self._undo.append(lambda: node.destroy_timer(timer))
         self._listen(OccupancyGrid, "map", self._take_map, qos.LATCHED)
         topic = str(node.get_parameter("speed_limit_topic").value)
-        self._listen(conversions.message_type(SPEED_LIMIT), topic, self._take_limit, qos.COMMAND)
+        self._listen(
+            conversions.message_type(SPEED_LIMIT), topic, self._take_limit, qos.COMMAND
+        )
 
-    def _listen(self, kind: Any, topic: str, take: Callable[[Any], None], quality: Any) -> None:
+    def _listen(
+        self, kind: Any, topic: str, take: Callable[[Any], None], quality: Any
+    ) -> None:
         heard = self._node.create_subscription(kind, topic, take, quality)
         self._undo.append(lambda: self._node.destroy_subscription(heard))
 
@@ -184,7 +216,9 @@ class PathActions:
         return False
 
     def _look(self) -> None:
-        own = NAVIGATE in self._servers and (self._run is None or self._run.goal.name == FOLLOW)
+        own = NAVIGATE in self._servers and (
+            self._run is None or self._run.goal.name == FOLLOW
+        )
         if own and self.led:
             told = f"another node serves {NAVIGATE}, so this one does not any more"
             self._node.get_logger().info(told)
@@ -201,7 +235,9 @@ class PathActions:
     def _take_limit(self, message: Any) -> None:
         limit = float(message.speed_limit)
         if not (math.isfinite(limit) and limit >= 0.0):
-            self._node.get_logger().error(f"speed limit {limit:g}: must be 0, for none, or more.")
+            self._node.get_logger().error(
+                f"speed limit {limit:g}: must be 0, for none, or more."
+            )
             return
         if message.percentage:
             limit *= 0.01 * float(self._robot.in_fields(self._robot.command_high)[0])
@@ -214,7 +250,9 @@ class PathActions:
         try:
             run = self._run = begin(goal)
             if before is not None and before.frame == run.frame:
-                run.valid_s = before.valid_s  # a way that is planned again is no way got on
+                run.valid_s = (
+                    before.valid_s
+                )  # a way that is planned again is no way got on
                 if before.progress.check == run.progress.check:
                     run.progress = before.progress
             if before is None or not np.array_equal(before.path.end, run.path.end):
@@ -222,12 +260,16 @@ class PathActions:
         except Refusal as refusal:
             self._end(goal, ABORT, refusal.code, str(refusal))
         if before is not None:
-            self._end(before.goal, ABORT, "UNKNOWN", "a newer goal has taken its place.")
+            self._end(
+                before.goal, ABORT, "UNKNOWN", "a newer goal has taken its place."
+            )
 
     def _follow(self, goal: Goal) -> Run:
         asked, names = goal.handle.request, []
         for what, those in self._parameters.names.items():
-            name, wrong = chosen(what.replace("_", " "), getattr(asked, f"{what}_id", ""), those)
+            name, wrong = chosen(
+                what.replace("_", " "), getattr(asked, f"{what}_id", ""), those
+            )
             if wrong:  # the code of Nav2's own server
                 code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
                 raise Refusal(code, f"{FOLLOW}: {wrong}")
@@ -241,7 +283,9 @@ class PathActions:
         asked = goal.handle.request
         if asked.behavior_tree:
             fix = "leave it empty, or let Nav2 serve the action"
-            reason = f"there are no behaviour trees here, as {asked.behavior_tree!r}; {fix}."
+            reason = (
+                f"there are no behaviour trees here, as {asked.behavior_tree!r}; {fix}."
+            )
             raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
         end = np.array([pose_row(asked.pose)])
         frame, end = self._placed(goal, asked.pose.header.frame_id, end)
@@ -250,14 +294,19 @@ class PathActions:
             way = self._way(frame, self._robot_in(NAVIGATE, frame), end[0])
         except ConfigError as error:
             raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
-        checks = [self._parameters.names[f"{what}_checker"][0] for what in ("goal", "progress")]
+        checks = [
+            self._parameters.names[f"{what}_checker"][0]
+            for what in ("goal", "progress")
+        ]
         return self._begin(goal, frame, way, checks)
 
     def _way(self, frame: str, robot: Array, end: Array) -> Array:
         """Returns the way (P, 3) on the map, if there is one; else straight."""
         points = np.stack([robot[:2], end[:2]])
         if self._map is not None and frame in ("", self._map[0]):
-            points = route(self._map[1], points[0], points[1], self._robot.footprint_radius)
+            points = route(
+                self._map[1], points[0], points[1], self._robot.footprint_radius
+            )
         return np.column_stack([points, np.full(len(points), end[2])])
 
     def _placed(self, goal: Goal, frame: str, poses: Array) -> tuple[str, Array]:
@@ -270,17 +319,24 @@ class PathActions:
         robot = self._frames.robot_in(frame)
         if robot is None:
             fix = "give the goal again when odometry and pose have come"
-            raise Refusal("TF_ERROR", f"{name}: the robot's place is not known yet; {fix}.")
+            raise Refusal(
+                "TF_ERROR", f"{name}: the robot's place is not known yet; {fix}."
+            )
         return robot
 
-    def _begin(self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]) -> Run:
+    def _begin(
+        self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]
+    ) -> Run:
         self._planned(goal, poses)
         frame, poses = self._placed(goal, frame, poses)
         path = self._planned(goal, poses)
         self._robot_in(goal.name, frame)
         self._require_on_map(goal, frame, poses)
         arrival, progress = self._parameters.checks(*checks)
-        checkers = GoalChecker(arrival, not self._robot.steers), ProgressChecker(progress)
+        checkers = (
+            GoalChecker(arrival, not self._robot.steers),
+            ProgressChecker(progress),
+        )
         now_s = time.monotonic()
         return Run(goal, frame, path, *checkers, now_s, now_s)
 
@@ -321,9 +377,11 @@ class PathActions:
         longest = max(longest, PATIENT_PERIODS * self._period_s)
         newest, now_ns = self._topics.middleware.cache.newest, self._topics.now_ns()
         silent = [
-            topic for topic in (SCAN, ODOM)
-            if topic not in newest or (now_ns - newest[topic].arrival_ns) * S_PER_NS > longest
-        ]  # fmt: skip
+            topic
+            for topic in (SCAN, ODOM)
+            if topic not in newest
+            or (now_ns - newest[topic].arrival_ns) * S_PER_NS > longest
+        ]
         if silent and time.monotonic() - run.valid_s > longest:
             self._run = None
             told = f"nothing on {' and '.join(silent)} for {longest:g} s."
@@ -352,15 +410,23 @@ class PathActions:
             return np.zeros(3)
         now_s = self._topics.newest_ns * S_PER_NS
         if run.progress.stuck(now_s, robot):
-            raise Refusal("FAILED_TO_MAKE_PROGRESS", "the robot has not got on for too long.")
+            raise Refusal(
+                "FAILED_TO_MAKE_PROGRESS", "the robot has not got on for too long."
+            )
         estimate = self._topics.view()
-        ahead = geometry.compose(estimate.pose, geometry.between(robot, [*place.ahead, 0.0]))
+        ahead = geometry.compose(
+            estimate.pose, geometry.between(robot, [*place.ahead, 0.0])
+        )
         drive = self._drive(ahead[:2])
         if drive.touched:
             patience = number(self._node, "failure_tolerance")
-            if 0.0 <= patience < time.monotonic() - run.valid_s:  # it has waited for long enough
+            if (
+                0.0 <= patience < time.monotonic() - run.valid_s
+            ):  # it has waited for long enough
                 code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
-                raise Refusal(code, "the robot touches something, so that no command is valid.")
+                raise Refusal(
+                    code, "the robot touches something, so that no command is valid."
+                )
         else:
             run.valid_s = time.monotonic()
         twist: Array = np.zeros(3) if drive.touched else drive.twist
@@ -380,16 +446,24 @@ class PathActions:
         pose = conversions.pose_to_ros(robot, self._topics.newest_ns, run.frame)
         times = time.monotonic() - run.started_s, place.remaining / max(speed, SLOWEST)
         told = {
-            "distance_to_goal": place.distance, "speed": speed, "robot_pose": pose,
-            "position_tracking_error": place.left, "heading_tracking_error": place.turned,
-            "current_path_index": place.nearest, "remaining_path_length": place.remaining,
-            "current_pose": pose, "distance_remaining": place.remaining, "header": pose.header,
+            "distance_to_goal": place.distance,
+            "speed": speed,
+            "robot_pose": pose,
+            "position_tracking_error": place.left,
+            "heading_tracking_error": place.turned,
+            "current_path_index": place.nearest,
+            "remaining_path_length": place.remaining,
+            "current_pose": pose,
+            "distance_remaining": place.remaining,
+            "header": pose.header,
             "navigation_time": duration_to_ros(times[0]),
             "estimated_time_remaining": duration_to_ros(times[1]),
-        }  # fmt: skip
+        }
         feedback = run.goal.kind.Feedback()
         for part in (feedback, getattr(feedback, "tracking_feedback", None)):
-            for name in told.keys() & getattr(part, "get_fields_and_field_types", dict)().keys():
+            for name in (
+                told.keys() & getattr(part, "get_fields_and_field_types", dict)().keys()
+            ):
                 setattr(part, name, told[name])
         run.goal.handle.publish_feedback(feedback)
 
@@ -405,7 +479,9 @@ class PathActions:
         if end == ABORT:
             self._node.get_logger().warning(f"goal aborted: {sentence}")
         else:
-            self._node.get_logger().info("goal reached" if end == SUCCEED else "goal cancelled")
+            self._node.get_logger().info(
+                "goal reached" if end == SUCCEED else "goal cancelled"
+            )
         goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
 
 
@@ -419,7 +495,9 @@ def result_of(kind: Any, code: str, sentence: str = "") -> Any:
     """Returns an action's result; distributions differ in what it tells: nothing, code, or both."""
     result = kind.Result()
     if hasattr(result, "error_code"):
-        result.error_code = getattr(kind.Result, code, getattr(kind.Result, "UNKNOWN", 0))
+        result.error_code = getattr(
+            kind.Result, code, getattr(kind.Result, "UNKNOWN", 0)
+        )
     if hasattr(result, "error_msg"):
         result.error_msg = sentence
     return result

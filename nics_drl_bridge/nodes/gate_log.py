@@ -16,16 +16,26 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from nics_drl_bridge.gate.black_box import Entry, entry_line, head_line
 from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
-from nics_drl_bridge.nodes.black_box_writer import ENTRY, FILES_KEPT, PATIENCE_S, STATE, WRITE
+from nics_drl_bridge.nodes.black_box_writer import (
+    ENTRY,
+    FILES_KEPT,
+    PATIENCE_S,
+    STATE,
+    WRITE,
+)
 from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
 LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
-LONGEST_LINE_S = 64.0  # the same for a kind that does not cease: each time it is doubled [s]
+LONGEST_LINE_S = (
+    64.0  # the same for a kind that does not cease: each time it is doubled [s]
+)
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
 GRACE_S = 0.5  # in which the writer may clean up what it gives up [s]
 POLL_S = 0.005
-OVERDUE_S = PATIENCE_S + 5.0  # after which a file that is not answered counts as not written [s]
+OVERDUE_S = (
+    PATIENCE_S + 5.0
+)  # after which a file that is not answered counts as not written [s]
 RESTART_S = 5.0  # shortest time between two starts of the writer [s]
 STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states
@@ -37,21 +47,29 @@ PIPE_BYTES = 2**20  # most that Linux gives a user's process
 class GateLog:
     """Counts all, logs without flooding, writes the first stop of each rule in a burst of stops."""
 
-    def __init__(self, config: GateConfig, folder: Path, robot: str, logger: RcutilsLogger) -> None:
+    def __init__(
+        self, config: GateConfig, folder: Path, robot: str, logger: RcutilsLogger
+    ) -> None:
         self.counters: Counter[str] = Counter()
         self._config = config
         self._logger = logger
         self._folder, self._hardware = folder, robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
-        self._rule: str | None = None  # that stops the robot; "" while commands pass, None at first
-        self._burst: set[str] = set()  # with a written stop since commands last passed for long
+        self._rule: str | None = (
+            None  # that stops the robot; "" while commands pass, None at first
+        )
+        self._burst: set[str] = (
+            set()
+        )  # with a written stop since commands last passed for long
         # Of each kind: time of the last line, and least time until the next [s].
         self._said: dict[str, tuple[float, float]] = {}
         self._kept: Counter[str] = Counter()  # events of a kind since then
         self._owed = False
         self._writer = BoxWriter()
-        self._state_s = float("-inf")  # time of the last state that the writer was sent [s]
+        self._state_s = float(
+            "-inf"
+        )  # time of the last state that the writer was sent [s]
         self._entries = 0  # that it was sent since
         self._names: list[str] = []
 
@@ -68,8 +86,12 @@ class GateLog:
         if rule != self._rule:
             self._changed(rule)
         self._cause = cause
-        lasts = entry.now - self._since >= LINE_S  # what does not alternate is told in any case
-        if self._owed and (more := self._due(rule, lasts)) is not None:  # else it is told later
+        lasts = (
+            entry.now - self._since >= LINE_S
+        )  # what does not alternate is told in any case
+        if (
+            self._owed and (more := self._due(rule, lasts)) is not None
+        ):  # else it is told later
             self._owed = False
             if cause is None:
                 self._logger.info(f"commands pass{more}")
@@ -81,7 +103,11 @@ class GateLog:
     def _record(self, entry: Entry) -> None:
         """Sends an entry to the writer, and now and then the state from which it follows."""
         passed = entry.now - self._state_s
-        if self._writer.needs_state or passed >= STATE_S or self._entries >= MOST_ENTRIES:
+        if (
+            self._writer.needs_state
+            or passed >= STATE_S
+            or self._entries >= MOST_ENTRIES
+        ):
             self._writer.state(entry.now, head_line(self._config, entry.before))
             self._state_s = entry.now
             self._entries = 0
@@ -110,7 +136,10 @@ class GateLog:
         if not certainly and self._now - said < wait_s:
             return None
         kept = self._kept.pop(kind, 1) - 1
-        self._said[kind] = self._now, min(2.0 * wait_s, LONGEST_LINE_S) if kept else LINE_S
+        self._said[kind] = (
+            self._now,
+            min(2.0 * wait_s, LONGEST_LINE_S) if kept else LINE_S,
+        )
         return f" ({kept} more since the last such line)" if kept else ""
 
     def _changed(self, rule: str) -> None:
@@ -127,7 +156,9 @@ class GateLog:
             self._write(rule)
 
     def _write(self, rule: str) -> None:
-        name = f"{time.strftime('%Y%m%d_%H%M%S')}_{self.counters.total():06d}_{rule}.jsonl"
+        name = (
+            f"{time.strftime('%Y%m%d_%H%M%S')}_{self.counters.total():06d}_{rule}.jsonl"
+        )
         self._names = [*self._names[1 - FILES_KEPT :], name]
         self._writer.write(self._folder / name, self._names)
 
@@ -139,7 +170,10 @@ class GateLog:
         """Returns the finding for `/diagnostics`."""
         for failure in self._writer.failures():
             self._failed(failure)
-        facts: dict[str, object] = {"armed": state.armed, "latched": state.latched is not None}
+        facts: dict[str, object] = {
+            "armed": state.armed,
+            "latched": state.latched is not None,
+        }
         facts |= dict(sorted(self.counters.items()))
         message = self._cause.line if self._cause else "commands pass"
         return Condition(message, self._cause is not None, facts, self._hardware)
@@ -159,7 +193,9 @@ class BoxWriter:
     def __init__(self) -> None:
         self.needs_state = True  # before the next entry
         self._backlog = bytearray()  # that the pipe has not taken yet
-        self._orders: dict[str, float] = {}  # times [s] of files that are not answered yet, by path
+        self._orders: dict[
+            str, float
+        ] = {}  # times [s] of files that are not answered yet, by path
         self._answers = b""  # the beginning of a line
         self._failed: list[str] = []
         self._entrance = self._exit = -1  # our ends of its pipes
@@ -204,7 +240,9 @@ class BoxWriter:
             self._process.terminate()
             self._finish(GRACE_S)
         reason = f"its writer ended with {self._process.poll()}"
-        if self._process.poll() is None:  # blocked by the disk; it ends when that releases it
+        if (
+            self._process.poll() is None
+        ):  # blocked by the disk; it ends when that releases it
             self._process.kill()
             reason = "the disk does not answer"
         self._hear()

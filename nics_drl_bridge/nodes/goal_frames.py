@@ -23,7 +23,9 @@ class GoalFrames:
 
     def __init__(self, node: Node, topics: RobotTopics) -> None:
         self._node, self._topics = node, topics
-        self._mounted: dict[str, tuple[str, Array]] = {}  # frame: its parent, and its pose there
+        self._mounted: dict[
+            str, tuple[str, Array]
+        ] = {}  # frame: its parent, and its pose there
         self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
         self._transforms = conversions.message_type("tf2_msgs/msg/TFMessage")
         self._heard = []
@@ -32,7 +34,9 @@ class GoalFrames:
                 ("/tf_static", self._take, qos.LATCHED),
                 ("/tf", self._follow, qos.TRANSFORMS),
             ):
-                self._heard.append(node.create_subscription(self._transforms, topic, take, quality))
+                self._heard.append(
+                    node.create_subscription(self._transforms, topic, take, quality)
+                )
 
     def close(self) -> None:
         """Ends the subscriptions."""
@@ -72,13 +76,19 @@ class GoalFrames:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:
             raise ConfigError(f"goal_pose: {error}") from None
-        if frame == self._map:  # of a localiser, if there is one; else that of the estimate
+        if (
+            frame == self._map
+        ):  # of a localiser, if there is one; else that of the estimate
             robot = None if self._odom is None else self.robot_in(self._map)
             if robot is None:
                 return place[:2]
         elif (robot := self._topics.in_odom()) is None:
-            raise ConfigError("goal_pose: its place is unknown before odometry comes; wait for it.")
-        there: Array = geometry.compose(self._topics.view().pose, geometry.between(robot, place))
+            raise ConfigError(
+                "goal_pose: its place is unknown before odometry comes; wait for it."
+            )
+        there: Array = geometry.compose(
+            self._topics.view().pose, geometry.between(robot, place)
+        )
         return there[:2]
 
     def fixed(self, frame: str, places: Array) -> tuple[str, Array]:
@@ -98,13 +108,19 @@ class GoalFrames:
                 if reported is None or not self._topics.located:
                     why = f"a goal in the frame {asked!r} is refused"
                     why = f"{why}, as the robot's place is not known yet"
-                    raise ConfigError(f"{why}; give it again when odometry and pose have come.")
-                return odom, places if frame == odom else geometry.compose(reported, places)
+                    raise ConfigError(
+                        f"{why}; give it again when odometry and pose have come."
+                    )
+                return odom, places if frame == odom else geometry.compose(
+                    reported, places
+                )
             if frame not in self._mounted:
                 break
             frame, mount = self._mounted[frame]
             places = geometry.compose(mount, places)
-        names = ", ".join(repr(each) for each in sorted({self._map, odom, *bases} - {""}))
+        names = ", ".join(
+            repr(each) for each in sorted({self._map, odom, *bases} - {""})
+        )
         heard = "one that /tf_static joins to them"
         if self._transforms is None:
             heard = "install tf2_msgs for those that /tf_static joins to them"

@@ -15,7 +15,13 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from launch import LaunchDescription
-from nics_drl_bridge.config import PACKAGE, find_config, parse_yaml, read_text, share_folder
+from nics_drl_bridge.config import (
+    PACKAGE,
+    find_config,
+    parse_yaml,
+    read_text,
+    share_folder,
+)
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, MODEL, STAMPED
 
@@ -23,12 +29,24 @@ STATE_PUBLISHER = "robot_state_publisher"
 SHIPPED_LASER = "laser"  # frame of the lidar in the URDFs of the shipped robots
 TRANSFORMS = ("/tf", "/tf_static")
 # RViz names topics absolutely; here they are those of the robot's namespace.
-SHOWN = ("scan", "odom", "odometry/filtered", "ground_truth", "goal_pose", "robot_description")
+SHOWN = (
+    "scan",
+    "odom",
+    "odometry/filtered",
+    "ground_truth",
+    "goal_pose",
+    "robot_description",
+)
 
 FLAGS = (
-    "autostart", "e_stop_required", "rviz", "stamped", "use_robot_state_pub", "use_rviz",
+    "autostart",
+    "e_stop_required",
+    "rviz",
+    "stamped",
+    "use_robot_state_pub",
+    "use_rviz",
     "use_sim_time",
-)  # fmt: skip
+)
 Values = dict[str, str]  # of the launch arguments
 Start = Callable[["Setup"], Iterator[Any]]
 
@@ -45,8 +63,12 @@ class Setup:
     """The request that launch arguments and the file of parameters make together."""
 
     def __init__(self, values: Values) -> None:
-        self.values = values | {name: flag_of(name, values.get(name, "")) for name in FLAGS}
-        self._file = parse_yaml(read_text(file), file) if (file := self["params_file"]) else {}
+        self.values = values | {
+            name: flag_of(name, values.get(name, "")) for name in FLAGS
+        }
+        self._file = (
+            parse_yaml(read_text(file), file) if (file := self["params_file"]) else {}
+        )
         self.model = self["model"] or str(self._of_file("model", "") or MODEL.default)
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
         self._opened: Any = None if shipped.is_file() else opened(self.model)
@@ -55,7 +77,9 @@ class Setup:
         space = self["namespace"].strip("/")
         given = self["robots"] or self._of_file("robots", self.simulator)
         self.fleet = names_of(given) if given and "robots" in values else ()
-        self.robots = [Robot(f"{space}/{n}".strip("/"), f"{n}/", space) for n in self.fleet]
+        self.robots = [
+            Robot(f"{space}/{n}".strip("/"), f"{n}/", space) for n in self.fleet
+        ]
         self.robots = self.robots or [Robot(space, "", space)]
 
     def __getitem__(self, name: str) -> str:
@@ -66,7 +90,9 @@ class Setup:
         """Returns what the file of parameters says of one, for a node in any namespace."""
         found = None
         for key in ("/**", f"/**/{node}", node, f"/{node}") if node else ("/**",):
-            found = (self._file.get(key) or {}).get("ros__parameters", {}).get(name, found)
+            found = (
+                (self._file.get(key) or {}).get("ros__parameters", {}).get(name, found)
+            )
         return found
 
     def limits(self) -> str:
@@ -74,7 +100,11 @@ class Setup:
         if self["limits"] or not self["model"]:
             return self["limits"]
         robot = self.model if self._opened is None else self._opened.robot.name
-        return robot if (share_folder() / "config" / "limits" / f"{robot}.yaml").is_file() else ""
+        return (
+            robot
+            if (share_folder() / "config" / "limits" / f"{robot}.yaml").is_file()
+            else ""
+        )
 
     def frame(self, node: str, robot: Robot) -> Any:
         """Returns the frame of a robot of a fleet; empty for one robot, whose file names it."""
@@ -92,12 +122,20 @@ class Setup:
 
         model = opened(self.model) if self._opened is None else self._opened
         further = {sensor.frame: sensor.mount for sensor in model.sensors}
-        return urdf_of(model.robot, model.lidar.mount, laser or model.lidar.frame, base, further)
+        return urdf_of(
+            model.robot, model.lidar.mount, laser or model.lidar.frame, base, further
+        )
 
     def node(
-        self, package: str, name: str, robot: Robot, parameters: dict[str, Any],
-        words: Sequence[str] = (), remapped: Sequence[tuple[str, str]] = (), **more: Any,
-    ) -> Node:  # fmt: skip
+        self,
+        package: str,
+        name: str,
+        robot: Robot,
+        parameters: dict[str, Any],
+        words: Sequence[str] = (),
+        remapped: Sequence[tuple[str, str]] = (),
+        **more: Any,
+    ) -> Node:
         """Returns a node with the parameters that are given, of ours over those of the file."""
         # As in Nav2, transforms stay in a namespace; those of a fleet, and its map, in that of all.
         own = robot.transforms == robot.namespace
@@ -106,11 +144,16 @@ class Setup:
         remapped = [*((each, f"{place}{each.strip('/')}") for each in moved), *remapped]
         files = [self["params_file"]] if package == PACKAGE else []
         return Node(
-            package=package, executable=name, name=name, namespace=robot.namespace,
+            package=package,
+            executable=name,
+            name=name,
+            namespace=robot.namespace,
             parameters=[*files, {k: v for k, v in parameters.items() if v is not None}],
-            remappings=remapped, arguments=[*words, "--ros-args", "--log-level", self["log_level"]],
-            output="screen", **more,
-        )  # fmt: skip
+            remappings=remapped,
+            arguments=[*words, "--ros-args", "--log-level", self["log_level"]],
+            output="screen",
+            **more,
+        )
 
 
 def opened(model: str) -> Any:
@@ -122,7 +165,9 @@ def opened(model: str) -> Any:
 
 def value(given: str, kind: Any = str) -> Any:
     """Returns a parameter of a type, whatever its text looks like; None if it was left empty."""
-    return ParameterValue(TextSubstitution(text=given), value_type=kind) if given else None
+    return (
+        ParameterValue(TextSubstitution(text=given), value_type=kind) if given else None
+    )
 
 
 def flag_of(name: str, given: str) -> str:
@@ -136,7 +181,11 @@ def flag_of(name: str, given: str) -> str:
 def names_of(robots: Any) -> tuple[str, ...]:
     """Returns the namespaces of a fleet by a count or their list; none for one robot."""
     if not isinstance(robots, str):
-        words = [str(each) for each in robots] if isinstance(robots, list) else [str(robots)]
+        words = (
+            [str(each) for each in robots]
+            if isinstance(robots, list)
+            else [str(robots)]
+        )
     else:
         words = re.findall(r"[^\s,\[\]'\"]+", robots)
     if len(words) == 1 and words[0].isdecimal():
@@ -145,7 +194,9 @@ def names_of(robots: Any) -> tuple[str, ...]:
             raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
         return tuple(f"robot{k + 1}" for k in range(count)) if count > 1 else ()
     if twice := {word for word in words if words.count(word) > 1}:
-        raise ConfigError(f"launch argument 'robots' names {min(twice)!r} twice; name each once.")
+        raise ConfigError(
+            f"launch argument 'robots' names {min(twice)!r} twice; name each once."
+        )
     return tuple(words)
 
 
@@ -157,7 +208,9 @@ def numbers_of(start: str) -> list[float] | None:
     except ValueError:
         found = [0.0]
     if len(found) % 3:
-        fix = "give x, y, heading [m, rad] of each robot, as in start:='[1.0, 0.0, 1.57]'"
+        fix = (
+            "give x, y, heading [m, rad] of each robot, as in start:='[1.0, 0.0, 1.57]'"
+        )
         raise ConfigError(f"launch argument 'start' is {start!r}; {fix}.")
     return found or None
 
@@ -169,9 +222,12 @@ def simulator(setup: Setup) -> Iterator[Any]:
     if setup.fleet:
         robots = value(str(list(setup.fleet)), list[str])
     given = {
-        "model": value(setup["model"]), "world": value(setup["world"]), "robots": robots,
-        "episode_start": numbers_of(setup["start"]), STAMPED: value(setup["stamped"], bool),
-    }  # fmt: skip
+        "model": value(setup["model"]),
+        "world": value(setup["world"]),
+        "robots": robots,
+        "episode_start": numbers_of(setup["start"]),
+        STAMPED: value(setup["stamped"], bool),
+    }
     yield setup.node(PACKAGE, setup.simulator, Robot(space, "", space), given)
 
 
@@ -179,7 +235,10 @@ def bridge(setup: Setup) -> Iterator[Any]:
     """Starts gate, middleware and policy of each robot."""
     shared = {"model": value(setup["model"]), STAMPED: value(setup["stamped"], bool)}
     shared["use_sim_time"] = value(setup["use_sim_time"], bool)
-    managed = shared | {"autostart": value(setup["autostart"], bool), IMU: value(setup[IMU])}
+    managed = shared | {
+        "autostart": value(setup["autostart"], bool),
+        IMU: value(setup[IMU]),
+    }
     required = value(setup["e_stop_required"] or "true", bool)
     gate = shared | {"e_stop_required": required, "limits": value(setup.limits())}
     named = {name: value(setup[name]) for name in ("policy", "fallback")}
@@ -200,14 +259,22 @@ def description(setup: Setup) -> Iterator[Any]:
             "robot_description": value(setup.description()),
             "frame_prefix": value(robot.frames),
         }
-        yield setup.node(STATE_PUBLISHER, STATE_PUBLISHER, robot, given, condition=wanted)
-    topics = [("/map", f"/{setup.robots[0].transforms}/map".replace("//", "/"))]  # of all robots
+        yield setup.node(
+            STATE_PUBLISHER, STATE_PUBLISHER, robot, given, condition=wanted
+        )
+    topics = [
+        ("/map", f"/{setup.robots[0].transforms}/map".replace("//", "/"))
+    ]  # of all robots
     topics += [(f"/{topic}", topic) for topic in SHOWN]
     words, wanted = ("-d", setup["rviz_config"]), IfCondition(setup["rviz"] or "false")
-    yield setup.node("rviz2", "rviz2", setup.robots[0], timed, words, topics, condition=wanted)
+    yield setup.node(
+        "rviz2", "rviz2", setup.robots[0], timed, words, topics, condition=wanted
+    )
 
 
-def launched(starts: Sequence[Start], arguments: Sequence[DeclareLaunchArgument]) -> Any:
+def launched(
+    starts: Sequence[Start], arguments: Sequence[DeclareLaunchArgument]
+) -> Any:
     """Returns a launch description of these arguments, which then starts what they request."""
 
     def start(context: Any) -> list[Any]:
@@ -222,7 +289,8 @@ def whole_simulation(robots: str = "") -> Any:
     """Returns the launch description of a simulator, the bridges of its robots, and RViz."""
     arguments = [*common("true"), *of_nodes(), *of_simulator(robots), *of_bridge()]
     return launched(
-        [simulator, bridge, description], [*arguments, e_stop_required("false"), *of_description()]
+        [simulator, bridge, description],
+        [*arguments, e_stop_required("false"), *of_description()],
     )
 
 
@@ -234,7 +302,9 @@ def argument(name: str, default: Any, about: str, **more: Any) -> DeclareLaunchA
 def common(use_sim_time: str) -> list[Any]:
     """Returns the arguments of every launch file."""
     return [
-        argument("model", "", "Shipped robot, or folder of a model; empty: of params_file"),
+        argument(
+            "model", "", "Shipped robot, or folder of a model; empty: of params_file"
+        ),
         argument("namespace", "", "Of the robot, or of the fleet"),
         argument("use_sim_time", use_sim_time, "Use /clock"),
         argument("log_level", "info", "Of all nodes"),
@@ -246,13 +316,20 @@ def of_nodes() -> list[Any]:
     file = str(find_config("bridge", "nodes"))
     return [
         argument("params_file", file, "Parameters of all nodes"),
-        argument("stamped", "", "cmd_vel is a TwistStamped; empty: of params_file, or as usual"),
+        argument(
+            "stamped",
+            "",
+            "cmd_vel is a TwistStamped; empty: of params_file, or as usual",
+        ),
     ]
 
 
 def of_simulator(robots: str = "") -> list[Any]:
     """Returns the arguments of a simulator."""
-    kinds, start = ["simulator", "mujoco"], "x, y, heading [m, rad] of each robot; empty: drawn"
+    kinds, start = (
+        ["simulator", "mujoco"],
+        "x, y, heading [m, rad] of each robot; empty: drawn",
+    )
     return [
         argument("simulator", kinds[0], "The fast simulator, or MuJoCo", choices=kinds),
         argument("world", "", "Shipped world, or a YAML file; empty: of params_file"),
@@ -264,17 +341,27 @@ def of_simulator(robots: str = "") -> list[Any]:
 def of_bridge() -> list[Any]:
     """Returns the arguments of gate, middleware and policy, but for the emergency stop."""
     return [
-        argument("policy", "", "Policy file, or a policy by name; empty: of params_file"),
+        argument(
+            "policy", "", "Policy file, or a policy by name; empty: of params_file"
+        ),
         argument("fallback", "", "Planner behind the policy; empty: of params_file"),
-        argument("limits", "", "Of the gate; empty: of the model, if given, or of params_file"),
-        argument("autostart", "true", "Managed nodes configure and activate themselves"),
+        argument(
+            "limits",
+            "",
+            "Of the gate; empty: of the model, if given, or of params_file",
+        ),
+        argument(
+            "autostart", "true", "Managed nodes configure and activate themselves"
+        ),
         argument(IMU, "", "Topic of the gyro, auto or none; empty: of params_file"),
     ]
 
 
 def e_stop_required(default: str) -> Any:
     """Returns the argument for the emergency stop."""
-    return argument("e_stop_required", default, "An e_stop that was never heard counts as pressed")
+    return argument(
+        "e_stop_required", default, "An e_stop that was never heard counts as pressed"
+    )
 
 
 def of_description() -> list[Any]:

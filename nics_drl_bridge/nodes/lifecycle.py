@@ -33,7 +33,10 @@ class ManagedNode(QosWatch, LifecycleNode):
         if fault := frame_fault(self._parameters.values()):
             raise ConfigError(fault)
         self._autostart = bool(values[0])
-        self.state, self._starting = UNCONFIGURED, False  # `state`: the last primary one
+        self.state, self._starting = (
+            UNCONFIGURED,
+            False,
+        )  # `state`: the last primary one
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)
 
@@ -57,12 +60,16 @@ class ManagedNode(QosWatch, LifecycleNode):
     def start(self) -> None:
         """Configures and activates the node, if `autostart` is set. Raises BridgeError."""
         if not self._autostart:
-            self.get_logger().info("unconfigured: waits for `ros2 lifecycle set` (autostart false)")
+            self.get_logger().info(
+                "unconfigured: waits for `ros2 lifecycle set` (autostart false)"
+            )
             return
         self._starting = True
         for trigger in (self.trigger_configure, self.trigger_activate):
             if trigger() != SUCCESS:
-                raise self._failure or BridgeError(f"{self.get_name()} could not be started.")
+                raise self._failure or BridgeError(
+                    f"{self.get_name()} could not be started."
+                )
         self._starting = False
 
     def stop(self) -> None:
@@ -114,7 +121,9 @@ class ManagedNode(QosWatch, LifecycleNode):
         self._failure = failure
         return done
 
-    def _attempt(self, do: Callable[[], None], reached: str) -> TransitionCallbackReturn:
+    def _attempt(
+        self, do: Callable[[], None], reached: str
+    ) -> TransitionCallbackReturn:
         """Does the work of a transition; rclpy itself would not report why one failed."""
         self._failure = None
         try:

@@ -44,7 +44,9 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 SPIN_S, POLL_S = 0.2, 0.002
 NO_RANDOMISATION = "none"
-LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
+LOST_S = (
+    1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
+)
 
 
 def _exit_at_signals() -> None:
@@ -58,10 +60,15 @@ class Link:
     """A node in its own context and thread, whose end or silence leaves a zero command behind."""
 
     def __init__(
-        self, namespace: str = "", domain_id: int | None = None, command_topic: str = "cmd_vel",
-        stamped: bool | None = None, parameters: Mapping[str, Any] | None = None,
-        command_timeout_s: float = math.inf, patience_s: float = 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        namespace: str = "",
+        domain_id: int | None = None,
+        command_topic: str = "cmd_vel",
+        stamped: bool | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        command_timeout_s: float = math.inf,
+        patience_s: float = 0.0,
+    ) -> None:
         namespace = namespace_of(namespace)
         if threading.current_thread() is threading.main_thread():
             _exit_at_signals()
@@ -70,19 +77,28 @@ class Link:
         # Also of a link that is never begun, or whose owner can't be made.
         self._closing = weakref.finalize(self, _shut_down, self._resources)
         try:
-            overrides = [Parameter(name, value=it) for name, it in (parameters or {}).items()]
+            overrides = [
+                Parameter(name, value=it) for name, it in (parameters or {}).items()
+            ]
             self.node = qos.QosWatch(
-                "bridge_env", namespace=namespace, context=self._context,
-                start_parameter_services=False, parameter_overrides=overrides,
-            )  # fmt: skip
+                "bridge_env",
+                namespace=namespace,
+                context=self._context,
+                start_parameter_services=False,
+                parameter_overrides=overrides,
+            )
             self._resources.node = self.node
             self._began_s = time.monotonic()
             if stamped is None:
                 stamped = self.hears_stamped(command_topic, patience_s)
-            self.frame = ""  # of the robot, in which commands are; unknown until it is set
+            self.frame = (
+                ""  # of the robot, in which commands are; unknown until it is set
+            )
             self.stamped = stamped
             self._kind: Any = TwistStamped if stamped else Twist
-            self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
+            self.commands = self.node.create_publisher(
+                self._kind, command_topic, qos.COMMAND
+            )
             self._topic = self.commands.topic_name
             self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
             self._resources.timeout = self._timeout
@@ -102,7 +118,9 @@ class Link:
         """Starts the executor's thread; call it once all subscriptions exist."""
         gc.collect()  # now, as the next one may take a tenth of a second while the robot moves
         given = (self._context, self.node, self._timeout)
-        thread = threading.Thread(target=_spin, args=given, daemon=True, name="dds_backend")
+        thread = threading.Thread(
+            target=_spin, args=given, daemon=True, name="dds_backend"
+        )
         thread.start()
         self._resources.thread = thread
 
@@ -142,7 +160,9 @@ class Link:
         future = client.call_async(request)
         if not holds(future.done, deadline - time.monotonic(), POLL_S):
             client.remove_pending_request(future)
-            reason = f"no answer within {timeout_s:g} s; look at the simulator node's log."
+            reason = (
+                f"no answer within {timeout_s:g} s; look at the simulator node's log."
+            )
             raise BackendError(f"service {client.srv_name}: {reason}")
         return future.result()
 
@@ -160,10 +180,16 @@ class Link:
         names = sorted(name for end in ends if (name := qos.owner(end)) is not None)
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
-        raise BackendError(f"{', '.join(names) or 'somebody'} publishes {topic} too; stop it.")
+        raise BackendError(
+            f"{', '.join(names) or 'somebody'} publishes {topic} too; stop it."
+        )
 
     def wait_for_peers(
-        self, topics: Sequence[str], clients: Sequence[Any], patience_s: float, advice: str
+        self,
+        topics: Sequence[str],
+        clients: Sequence[Any],
+        patience_s: float,
+        advice: str,
     ) -> None:
         """Waits until all peers are matched. Raises BackendError with what is missing."""
         node, commands = self.node, self.commands
@@ -177,12 +203,16 @@ class Link:
         deadline = self._began_s + patience_s
         left_s = deadline - time.monotonic()
         if not holds(lambda: all(there() for there in needed.values()), left_s, POLL_S):
-            missing = ", no ".join(name for name, there in needed.items() if not there())
+            missing = ", no ".join(
+                name for name, there in needed.items() if not there()
+            )
             deaf = deaf_subscribers(node, self._topic, self.stamped)
             if deaf and not commands.get_subscription_count():
                 fix = f"set `stamped` to {not self.stamped}, or leave it out."
                 raise BackendError(f"topic {self._topic}: {deaf}; {fix}")
-            raise BackendError(f"after {patience_s:g} s there is still no {missing}; {advice}")
+            raise BackendError(
+                f"after {patience_s:g} s there is still no {missing}; {advice}"
+            )
         # A publisher that was killed stays in the graph for a while.
         holds(lambda: not self.others_command(), deadline - time.monotonic(), POLL_S)
         self.check_alone()
@@ -260,7 +290,9 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
 
 
 def _shut_down(opened: Resources) -> None:
-    with uninterrupted():  # else Python may exit with a thread inside the middleware's library
+    with (
+        uninterrupted()
+    ):  # else Python may exit with a thread inside the middleware's library
         if opened.thread is None:  # it never began, so that nothing was commanded
             if opened.node is not None:
                 opened.node.destroy_node()
@@ -306,19 +338,30 @@ def identity(
 ) -> dict[str, str]:
     """Returns the fingerprints of what a simulator simulates; by `none` of no randomisation."""
     drawn = NO_RANDOMISATION if randomisation is None else randomisation.fingerprint
-    return {"model": model.fingerprint, "world": world.fingerprint, "randomisation": drawn}
+    return {
+        "model": model.fingerprint,
+        "world": world.fingerprint,
+        "randomisation": drawn,
+    }
 
 
 class EpisodeServices:
     """The services of a simulator node that begin an episode of a model in a world."""
 
     def __init__(
-        self, link: Link, simulator: str, model: SimulatorModel, world: AnyWorld,
+        self,
+        link: Link,
+        simulator: str,
+        model: SimulatorModel,
+        world: AnyWorld,
         randomisation: Randomisation | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._link = link
         self._identity = identity(model, world, randomisation)
-        client, setting = link.node.create_client, f"{simulator}/set_parameters_atomically"
+        client, setting = (
+            link.node.create_client,
+            f"{simulator}/set_parameters_atomically",
+        )
         self._parameters = client(SetParametersAtomically, setting)
         self._reset = client(Trigger, f"{simulator}/reset")
         self._repeat = client(Trigger, f"{simulator}/repeat")
@@ -345,13 +388,22 @@ class EpisodeServices:
                 return
             self._repeat.remove_pending_request(asked)
         if self._repeat.service_is_ready():
-            self._repeating, self._asked_s = self._repeat.call_async(Trigger.Request()), now
+            self._repeating, self._asked_s = (
+                self._repeat.call_async(Trigger.Request()),
+                now,
+            )
 
     def begin(self, start: Start, timeout_s: float) -> int:
         """Begins an episode; returns the stamp of its first data [ns]. Raises BridgeError."""
         seed, pose = int(start.seed), start.pose.ravel().tolist()
-        chosen = {"episode_seed": seed, "episode_start": pose, "episode_start_given": True}
-        given = [Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()]
+        chosen = {
+            "episode_seed": seed,
+            "episode_start": pose,
+            "episode_start_given": True,
+        }
+        given = [
+            Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()
+        ]
         request = SetParametersAtomically.Request(parameters=given)
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:

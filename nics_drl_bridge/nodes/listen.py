@@ -22,7 +22,9 @@ from nics_drl_bridge.report.doctor_facts import (
 
 NAME = "nics_doctor"
 SPIN_S, LOOK_S, DISCOVERY_S = 0.1, 0.5, 10.0
-ANY_PUBLISHER = profile_of(Offer(100, reliable=False))  # matches any offer, so hears every topic
+ANY_PUBLISHER = profile_of(
+    Offer(100, reliable=False)
+)  # matches any offer, so hears every topic
 
 
 def listen(
@@ -56,12 +58,21 @@ def listen(
 def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
     for topic, kinds in node.get_topic_names_and_types():
         offers = node.get_publishers_info_by_topic(topic)
-        asks = [i for i in node.get_subscriptions_info_by_topic(topic) if i.node_name != NAME]
+        asks = [
+            i
+            for i in node.get_subscriptions_info_by_topic(topic)
+            if i.node_name != NAME
+        ]
         told = {info.topic_type for info in offers} or set(kinds)
-        both = (tuple(offer_of(info.qos_profile) for info in some) for some in (offers, asks))
+        both = (
+            tuple(offer_of(info.qos_profile) for info in some)
+            for some in (offers, asks)
+        )
         facts.topics[topic] = Endpoints(tuple(sorted(told)), *both)
     if GYRO in facts.names and GYRO not in subscribed:
-        types = {topic: ends.types for topic, ends in facts.topics.items() if ends.offers}
+        types = {
+            topic: ends.types for topic, ends in facts.topics.items() if ends.offers
+        }
         facts.names[GYRO] = name_of_gyro(facts.names, imu, types)
     for role, topic in facts.names.items():
         there = facts.topics.get(topic, Endpoints(()))

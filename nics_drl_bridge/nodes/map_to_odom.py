@@ -19,7 +19,9 @@ QUIET_S = 2.0  # so long after another's transform, ours is published again
 KEPT = 100  # own transforms that are known again when they are heard
 
 
-def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Any) -> TransformStamped:
+def transform_to_ros(
+    parent: str, child: str, pose: ArrayLike, stamp: Any
+) -> TransformStamped:
     """Returns a pose (3,) of a child frame in its parent as a transform."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = TransformStamped(child_frame_id=child)
@@ -52,7 +54,9 @@ class MapToOdom:
         self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._kind is None:
             told = "the package tf2_msgs is not installed, so that map -> odom is not published"
-            node.get_logger().warning(f"{told}; install it with your ROS 2 distribution.")
+            node.get_logger().warning(
+                f"{told}; install it with your ROS 2 distribution."
+            )
             return
         self._publisher = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
         given = self._kind, "/tf", self._take, qos.TRANSFORMS
@@ -67,9 +71,15 @@ class MapToOdom:
     def publish(self, odom: Array, stamp_ns: int, frames: tuple[str, str]) -> None:
         """Publishes the pose (3,) of odom in map at a time [ns], with the frames of both."""
         self._frames = frames
-        if self._kind is None or time.monotonic() - self._heard_s < QUIET_S or not all(frames):
+        if (
+            self._kind is None
+            or time.monotonic() - self._heard_s < QUIET_S
+            or not all(frames)
+        ):
             return
-        one = transform_to_ros(*frames, odom, conversions.stamp_to_ros(stamp_ns + self._ahead_ns))
+        one = transform_to_ros(
+            *frames, odom, conversions.stamp_to_ros(stamp_ns + self._ahead_ns)
+        )
         self._own.append(one)
         self._publisher.publish(self._kind(transforms=[one]))
 

@@ -36,7 +36,9 @@ class MiddlewareNode(ManagedNode):
         self._hardware = model.robot.name
         rehearse(model)
         topic = "odometry/filtered"
-        self._filtered = self.create_lifecycle_publisher(Odometry, topic, qos.SENSOR_RELIABLE)
+        self._filtered = self.create_lifecycle_publisher(
+            Odometry, topic, qos.SENSOR_RELIABLE
+        )
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)
         self._topics.hear_initial_pose()
@@ -50,16 +52,31 @@ class MiddlewareNode(ManagedNode):
         if self.state != ACTIVE:
             return
         estimator = self._topics.middleware.estimator
-        stamp_ns = max(stamp_ns, estimator.time_ns)  # a pose or a yaw rate may have been newer
+        stamp_ns = max(
+            stamp_ns, estimator.time_ns
+        )  # a pose or a yaw rate may have been newer
         view = self._topics.middleware.view(stamp_ns)
-        frames = [str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")]
-        message = conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, (0.0,) * 4)
-        message.pose.covariance = conversions.covariance_to_ros(estimator.covariance[:3, :3])
-        message.twist.covariance = conversions.covariance_to_ros(estimator.twist_covariance)
+        frames = [
+            str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")
+        ]
+        message = conversions.odometry_to_ros(
+            view.pose, view.twist, stamp_ns, frames, (0.0,) * 4
+        )
+        message.pose.covariance = conversions.covariance_to_ros(
+            estimator.covariance[:3, :3]
+        )
+        message.twist.covariance = conversions.covariance_to_ros(
+            estimator.twist_covariance
+        )
         self._filtered.publish(message)
-        if self._map_to_odom is not None and (reported := self._topics.in_odom()) is not None:
+        if (
+            self._map_to_odom is not None
+            and (reported := self._topics.in_odom()) is not None
+        ):
             home = odom_in_map(self._topics.view().pose, reported)
-            self._map_to_odom.publish(home, stamp_ns, (frames[0], self._topics.frames[0]))
+            self._map_to_odom.publish(
+                home, stamp_ns, (frames[0], self._topics.frames[0])
+            )
 
     def _reset(self) -> tuple[bool, str]:
         if self.state == UNCONFIGURED:
@@ -92,17 +109,27 @@ def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) 
 
     `before` are earlier counts of `health.rejected`: what has grown since is refused, not silent.
     """
-    silent, since, told = [topic for topic in expected if topic not in health.topics], "yet", []
+    silent, since, told = (
+        [topic for topic in expected if topic not in health.topics],
+        "yet",
+        [],
+    )
     if not silent:
         silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
         since = f"for {SILENCE_S:g} s"
     for topic in tuple(silent):
-        counts = {r: n for r, n in health.rejected.items() if r.startswith(f"{topic}: ")}
-        if grown := [reason for reason, n in counts.items() if n > before.get(reason, 0)]:
+        counts = {
+            r: n for r, n in health.rejected.items() if r.startswith(f"{topic}: ")
+        }
+        if grown := [
+            reason for reason, n in counts.items() if n > before.get(reason, 0)
+        ]:
             silent.remove(topic)
             reason = grown[-1].removeprefix(f"{topic}: ")
             told.append(f"{topic}: {sum(counts.values())} refused, the last: {reason}")
-    return "; ".join([*([f"nothing on {', '.join(silent)} {since}"] if silent else ()), *told])
+    return "; ".join(
+        [*([f"nothing on {', '.join(silent)} {since}"] if silent else ()), *told]
+    )
 
 
 def facts(health: Health) -> dict[str, str]:
@@ -114,8 +141,12 @@ def facts(health: Health) -> dict[str, str]:
         found[f"{topic} age [s]"] = f"{each.age_s:.3f}"
         if not math.isnan(each.innovation):
             found[f"{topic} innovation"] = f"{each.innovation:.3g}"
-    found |= {f"rejected, {reason}": str(count) for reason, count in health.rejected.items()}
-    found |= {f"noticed, {reason}": str(count) for reason, count in health.noticed.items()}
+    found |= {
+        f"rejected, {reason}": str(count) for reason, count in health.rejected.items()
+    }
+    found |= {
+        f"noticed, {reason}": str(count) for reason, count in health.noticed.items()
+    }
     return found | {"late and put in place": str(health.replayed)}
 
 

@@ -15,11 +15,19 @@ from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
 # Those that are for its own plugins, or for a loop that a policy, which answers scans, has not.
 UNUSED = {
-    "controller_frequency", "min_x_velocity_threshold", "min_y_velocity_threshold",
-    "min_theta_velocity_threshold", "use_realtime_priority", "odom_topic", "odom_duration",
-    "publish_zero_velocity", "introspection_mode", "bond_heartbeat_period",
-    "action_server_result_timeout", "allow_parameter_qos_overrides",
-}  # fmt: skip
+    "controller_frequency",
+    "min_x_velocity_threshold",
+    "min_y_velocity_threshold",
+    "min_theta_velocity_threshold",
+    "use_realtime_priority",
+    "odom_topic",
+    "odom_duration",
+    "publish_zero_velocity",
+    "introspection_mode",
+    "bond_heartbeat_period",
+    "action_server_result_timeout",
+    "allow_parameter_qos_overrides",
+}
 
 
 KINDS = ("controller", "goal_checker", "progress_checker", "path_handler")
@@ -33,7 +41,9 @@ class ControllerParameters:
         values = {row.name: declare_row(node, row) for row in nav2()}
         self.names = {kind: tuple(values[f"{kind}_plugins"] or ()) for kind in KINDS}
         if empty := [kind for kind, names in self.names.items() if not names]:
-            raise ConfigError(f"parameter '{empty[0]}_plugins' is empty; give one name or more.")
+            raise ConfigError(
+                f"parameter '{empty[0]}_plugins' is empty; give one name or more."
+            )
         if one := values["progress_checker_plugin"]:
             self.names["progress_checker"] = (one,)
         for row in checkers(self.names["goal_checker"], self.names["progress_checker"]):
@@ -41,8 +51,14 @@ class ControllerParameters:
 
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
         """Returns the checks of two names, as Nav2's checkers of these plugins make them."""
-        arrives, gets_on = self._filled(GoalCheck, goal), self._filled(ProgressCheck, progress)
-        kinds = [str(self._node.get_parameter(f"{name}.plugin").value) for name in (goal, progress)]
+        arrives, gets_on = (
+            self._filled(GoalCheck, goal),
+            self._filled(ProgressCheck, progress),
+        )
+        kinds = [
+            str(self._node.get_parameter(f"{name}.plugin").value)
+            for name in (goal, progress)
+        ]
         if kinds[0].endswith(("PositionGoalChecker", "AxisGoalChecker")):
             arrives = replace(arrives, yaw_goal_tolerance=math.inf)
         if not kinds[1].endswith("PoseProgressChecker"):
@@ -50,8 +66,10 @@ class ControllerParameters:
         return arrives, gets_on
 
     def _filled(self, kind: Any, name: str) -> Any:
-        known = {each.name: self._node.get_parameter(f"{name}.{each.name}").value
-                 for each in fields(kind)}  # fmt: skip
+        known = {
+            each.name: self._node.get_parameter(f"{name}.{each.name}").value
+            for each in fields(kind)
+        }
         return kind(**known)
 
     def ignores(self, name: str) -> bool:
@@ -65,4 +83,7 @@ def chosen(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
         return known[0], ""
     if asked in known:
         return asked, ""
-    return "", f"there is no {what} {asked!r}; name one of {', '.join(map(repr, known))}."
+    return (
+        "",
+        f"there is no {what} {asked!r}; name one of {', '.join(map(repr, known))}.",
+    )

@@ -19,10 +19,16 @@ from pathlib import Path
 PROGRAM = Path(__file__).with_name("output_forwarder.py")
 STDOUT, STDERR = 1, 2
 PIPE_BYTES = 2**20  # most that Linux gives a user's process
-COLOUR = "RCUTILS_COLORIZED_OUTPUT"  # of ROS 2: whether log lines are coloured, "0" or "1"
+COLOUR = (
+    "RCUTILS_COLORIZED_OUTPUT"  # of ROS 2: whether log lines are coloured, "0" or "1"
+)
 
 DISABLE_FILES = ["--ros-args", "--disable-external-lib-logs"]
-FILE_CHOICES = ("--disable-external-lib-logs", "--enable-external-lib-logs", "--log-file-name")
+FILE_CHOICES = (
+    "--disable-external-lib-logs",
+    "--enable-external-lib-logs",
+    "--log-file-name",
+)
 
 _forwarder: subprocess.Popen[bytes] | None = None
 
@@ -81,7 +87,9 @@ def forward_output(log: str = "") -> None:
     try:
         _forwarder = _start_forwarder(log, pipes)
     except OSError as error:
-        sys.stderr.write(f"output is written directly, and may block ({error.strerror})\n")
+        sys.stderr.write(
+            f"output is written directly, and may block ({error.strerror})\n"
+        )
     else:
         for descriptor, (_, entrance) in pipes.items():
             _lead_into(entrance, descriptor)
@@ -121,7 +129,9 @@ def _different_outputs() -> list[int]:
     return [STDERR, STDOUT]
 
 
-def _start_forwarder(log: str, pipes: dict[int, tuple[int, int]]) -> subprocess.Popen[bytes]:
+def _start_forwarder(
+    log: str, pipes: dict[int, tuple[int, int]]
+) -> subprocess.Popen[bytes]:
     pairs = [f"{exit_}:{descriptor}" for descriptor, (exit_, _) in pipes.items()]
     return subprocess.Popen(
         [sys.executable, "-I", "-S", str(PROGRAM), log, *pairs],

@@ -48,29 +48,43 @@ class PolicyNode(ManagedNode):
         model = self._model = open_model(str(self.get_parameter("model").value))
         self._open_policy(model)
         self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
-        if len(self._goal) != 2 or not (abs(self._goal).max() <= 1e8 or np.isnan(self._goal).all()):
+        if len(self._goal) != 2 or not (
+            abs(self._goal).max() <= 1e8 or np.isnan(self._goal).all()
+        ):
             needed = "must be [x, y] within 1e8 m, or NaN both to wait for goal_pose"
             raise ConfigError(f"parameter 'goal': {needed}, not {self._goal.tolist()}.")
         names = ("rate", "deadline", "late_limit")
         rate, limit, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit <= 0.0 or patience < 1:
             told = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
-            raise ConfigError(f"{told}: must be at least 0, more than 0, and at least 1.")
+            raise ConfigError(
+                f"{told}: must be at least 0, more than 0, and at least 1."
+            )
         period = model.control_period
         self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
-        self._pace = ActionPace(period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0)
+        self._pace = ActionPace(
+            period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
+        )
         self._acted_ns = 0
-        self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
-        goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
+        self._raw = self.create_lifecycle_publisher(
+            TwistStamped, "cmd_vel_raw", qos.COMMAND
+        )
+        goals = self.create_subscription(
+            PoseStamped, "goal_pose", self._on_goal, qos.COMMAND
+        )
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
-        self._covariance = self._topics.middleware.estimator.covariance[:3, :3]  # at a new goal
+        self._covariance = self._topics.middleware.estimator.covariance[
+            :3, :3
+        ]  # at a new goal
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
         given = self._topics, self._frames, model, self._nav2
-        self._actions = PathActions(self, *given, self._toward, lambda: begin(self._policy))
+        self._actions = PathActions(
+            self, *given, self._toward, lambda: begin(self._policy)
+        )
         self.undo.callback(self._actions.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
@@ -85,7 +99,9 @@ class PolicyNode(ManagedNode):
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        name, fallback = (str(self.get_parameter(key).value) for key in ("policy", "fallback"))
+        name, fallback = (
+            str(self.get_parameter(key).value) for key in ("policy", "fallback")
+        )
         self._policy, self._task = open_policy(name, model, fallback)
         view = rehearse(model)  # so that all compiles now
         self._task.judge(view, {"goal": np.zeros(2)})
@@ -139,17 +155,27 @@ class PolicyNode(ManagedNode):
             told = f"inference was late ({self._deadline.late} so far), its command is dropped"
             self.get_logger().warning(told, throttle_duration_sec=5.0)
         if answer is not Answer.DROP:
-            sent = twist if answer is Answer.SEND and np.isfinite(twist).all() else np.zeros(3)
+            sent = (
+                twist
+                if answer is Answer.SEND and np.isfinite(twist).all()
+                else np.zeros(3)
+            )
             self._raw.publish(self._message(sent, scan_ns))
 
     def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, warns=False, facts={})
         done, longest = self._deadline, f"{1e3 * self._deadline.longest_s:.2f}"
-        facts = {"answered": done.answered, "late": done.late, "longest inference [ms]": longest}
+        facts = {
+            "answered": done.answered,
+            "late": done.late,
+            "longest inference [ms]": longest,
+        }
         if (planned := acted(self._policy)) is not None:
             facts["by the fallback"] = planned
-        return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
+        return runner.Condition(
+            f"{self.state}; {done.late} late inferences", done.late > 0, facts
+        )
 
     def _twist(self) -> Array:
         if self._actions.active:
@@ -159,7 +185,11 @@ class PolicyNode(ManagedNode):
             return np.zeros(3)
         verdict = self._task.judge(self._topics.view(), {"goal": self._goal})
         if verdict.reached or verdict.touched:
-            why = "touching something, stopped" if verdict.touched else self._told_reached()
+            why = (
+                "touching something, stopped"
+                if verdict.touched
+                else self._told_reached()
+            )
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
         return self._toward(self._goal).twist
@@ -173,7 +203,10 @@ class PolicyNode(ManagedNode):
         view = self._topics.view()
         if told := resume(self._policy, self._acted_ns * S_PER_NS):
             self.get_logger().warning(told, throttle_duration_sec=5.0)
-        return Wish(self._asked(view, goal), bool(self._task.judge(view, {"goal": goal}).touched))
+        return Wish(
+            self._asked(view, goal),
+            bool(self._task.judge(view, {"goal": goal}).touched),
+        )
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
         try:
@@ -188,7 +221,9 @@ class PolicyNode(ManagedNode):
             name = self.get_parameter("policy").value
             where = f"{place.filename}, line {place.lineno}"
             fix = "the robot is stopped, mend the policy."
-            raise BridgeError(f"policy {name!r} raised {words} ({where}); {fix}") from error
+            raise BridgeError(
+                f"policy {name!r} raised {words} ({where}); {fix}"
+            ) from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = str(self.get_parameter("base_frame").value)

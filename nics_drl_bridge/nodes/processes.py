@@ -36,7 +36,9 @@ def free_domain_id() -> int:
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
         every = range(1, LAST_DOMAIN_ID + 1)
-        return random.SystemRandom().choice(sorted(set(every) - domains_in_use()) or every)
+        return random.SystemRandom().choice(
+            sorted(set(every) - domains_in_use()) or every
+        )
     if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
         fix = f"it must be a number from 0 to {GREATEST_DOMAIN_ID}, or unset."
         raise ConfigError(f"the environment variable ROS_DOMAIN_ID is {given!r}; {fix}")
@@ -71,33 +73,65 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
     """One node in its own process, which ends with `close`, and on Linux with its parent thread."""
 
     def __init__(
-        self, node: str, folder: Path, parameters: Mapping[str, Any], domain_id: int,
-        namespace: str = "", remap: Mapping[str, str] | None = None, discovery: str = "LOCALHOST",
-    ) -> None:  # fmt: skip
+        self,
+        node: str,
+        folder: Path,
+        parameters: Mapping[str, Any],
+        domain_id: int,
+        namespace: str = "",
+        remap: Mapping[str, str] | None = None,
+        discovery: str = "LOCALHOST",
+    ) -> None:
         self.node = node
         folder.mkdir(parents=True, exist_ok=True)
         self.log = folder / f"{node}.log"
         file = folder / f"{node}.yaml"
-        file.write_text(dump_yaml({"/**": {"ros__parameters": dict(parameters)}}), encoding="utf-8")
+        file.write_text(
+            dump_yaml({"/**": {"ros__parameters": dict(parameters)}}), encoding="utf-8"
+        )
         space = {"__ns": f"/{namespace.strip('/')}"} if namespace else {}
         rules = [f"{old}:={new}" for old, new in {**space, **(remap or {})}.items()]
-        command = [sys.executable, "-m", "nics_drl_bridge.nodes.start", node, "--ros-args"]
-        command += ["--params-file", str(file), *(word for rule in rules for word in ("-r", rule))]
-        chosen = {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery}
-        chosen["PYTHONSAFEPATH"] = "1"  # no modules of the working folder, which may be a model
+        command = [
+            sys.executable,
+            "-m",
+            "nics_drl_bridge.nodes.start",
+            node,
+            "--ros-args",
+        ]
+        command += [
+            "--params-file",
+            str(file),
+            *(word for rule in rules for word in ("-r", rule)),
+        ]
+        chosen = {
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
+        }
+        chosen["PYTHONSAFEPATH"] = (
+            "1"  # no modules of the working folder, which may be a model
+        )
         with self.log.open("wb") as log:
             # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
             self._process = subprocess.Popen(
-                command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                start_new_session=True, preexec_fn=_prepared(),
-            )  # fmt: skip
+                command,
+                env=os.environ | chosen,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                preexec_fn=_prepared(),
+            )
         self.pid = self._process.pid
 
     def check(self) -> None:
         """Raises BackendError with the end of its log if the node has ended by itself."""
         code = self._process.poll()
         if code is not None:
-            lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            lines = (
+                self.log.read_text(encoding="utf-8", errors="replace")
+                .strip()
+                .splitlines()
+            )
             told = [line for line in lines if not line.startswith("[INFO]")] or lines
             last = " | ".join(told[-LOG_LINES:]) or "no output"
             reason = f"ended with code {code}: {last} (its log is {self.log})."
@@ -120,13 +154,19 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
 class Witness(AbstractContextManager["Witness", None]):
     """Observes the true motion of a simulated robot, in its own thread; a context manager."""
 
-    def __init__(self, domain_id: int | None = None, topic: str = "ground_truth") -> None:
+    def __init__(
+        self, domain_id: int | None = None, topic: str = "ground_truth"
+    ) -> None:
         self._poses: list[NDArray[np.float64]] = []
         self._context = open_context(domain_id=domain_id)
-        self._node = Node("witness", context=self._context, start_parameter_services=False)
+        self._node = Node(
+            "witness", context=self._context, start_parameter_services=False
+        )
         self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
         given = self._node, threading.Event()
-        self._thread = threading.Thread(target=spin, args=given, daemon=True, name="witness")
+        self._thread = threading.Thread(
+            target=spin, args=given, daemon=True, name="witness"
+        )
         self._thread.start()
 
     def _take(self, message: Odometry) -> None:
@@ -146,7 +186,9 @@ class Witness(AbstractContextManager["Witness", None]):
 
         def there() -> bool:
             newest = self._poses[-1:]
-            return any(np.linalg.norm(pose[:2] - np.asarray(goal)) < radius for pose in newest)
+            return any(
+                np.linalg.norm(pose[:2] - np.asarray(goal)) < radius for pose in newest
+            )
 
         return holds(there, timeout_s, POLL_S)
 

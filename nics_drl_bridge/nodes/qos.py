@@ -41,7 +41,9 @@ def profile_of(offer: Offer) -> QoSProfile:
         history=rclpy_qos.HistoryPolicy.KEEP_LAST,
         depth=offer.depth,
         reliability=reliability.RELIABLE if offer.reliable else reliability.BEST_EFFORT,
-        durability=durability.TRANSIENT_LOCAL if offer.transient_local else durability.VOLATILE,
+        durability=durability.TRANSIENT_LOCAL
+        if offer.transient_local
+        else durability.VOLATILE,
     )
 
 
@@ -59,7 +61,9 @@ SENSOR = profile_of(Offer(5, reliable=False))
 link a reliable scan arrives half a second late and looks fresh. It matches every publisher. Also in
 lock-step: acknowledging each datum takes a tenth of a step, and lost data are requested again."""
 
-SENSOR_RELIABLE = profile_of(Offer(10))  # publishers of the same: subscribers of both kinds match
+SENSOR_RELIABLE = profile_of(
+    Offer(10)
+)  # publishers of the same: subscribers of both kinds match
 
 EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
@@ -73,18 +77,28 @@ E_STOP = QoSProfile(
 """Subscriptions to `e_stop`. A press lasts for a single message, and the heartbeats that follow it,
 also those of another publisher, must not push it out of the queue while nobody reads it."""
 
-COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
+COMMAND = profile_of(
+    Offer(1)
+)  # commands and goals: only the newest counts, and it has to arrive
 # Commands of which the gate looks at the publisher, too: the one that a second publisher sends
 # at the same moment must not replace the first one's unnoticed.
 EVERY_POLICY = profile_of(Offer(10))
-TRANSFORMS = profile_of(Offer(100))  # `/tf`: like tf2's own, whose listeners request reliable
-LATCHED = profile_of(Offer(1, transient_local=True))  # `/tf_static`, `map`: for late joiners too
-DIAGNOSTICS = profile_of(Offer(10))  # as the diagnostic aggregator expects `/diagnostics`
+TRANSFORMS = profile_of(
+    Offer(100)
+)  # `/tf`: like tf2's own, whose listeners request reliable
+LATCHED = profile_of(
+    Offer(1, transient_local=True)
+)  # `/tf_static`, `map`: for late joiners too
+DIAGNOSTICS = profile_of(
+    Offer(10)
+)  # as the diagnostic aggregator expects `/diagnostics`
 
 MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"
 MOST_WAITING = 10_000  # messages that are taken at once, if a publisher never pauses
 
-OVERRIDES = "qos_overrides."  # parameters of a user for the quality of service of a topic
+OVERRIDES = (
+    "qos_overrides."  # parameters of a user for the quality of service of a topic
+)
 # Topics, by the name before any remapping, whose quality of service decides whether a robot stops.
 FIXED_TOPICS = ("cmd_vel", "cmd_vel_raw", "e_stop", "ackermann_cmd")
 CHOICES: dict[str, Any] = {
@@ -120,12 +134,20 @@ def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]
 def _check_override(name: str, policy: str, value: Any) -> None:
     known = [kind.name.lower() for kind in QoSPolicyKind if kind.name != "INVALID"]
     if policy not in known:
-        raise ConfigError(f"parameter {name!r}: there is no policy {policy!r}; "
-                          f"{nearest(policy, known)}")  # fmt: skip
+        raise ConfigError(
+            f"parameter {name!r}: there is no policy {policy!r}; "
+            f"{nearest(policy, known)}"
+        )
     if policy in CHOICES:
-        values = [choice.name.lower() for choice in CHOICES[policy] if choice.name != "UNKNOWN"]
+        values = [
+            choice.name.lower()
+            for choice in CHOICES[policy]
+            if choice.name != "UNKNOWN"
+        ]
         if str(value).lower() not in values:
-            raise ConfigError(f"parameter {name!r}: is {value!r}; {nearest(str(value), values)}")
+            raise ConfigError(
+                f"parameter {name!r}: is {value!r}; {nearest(str(value), values)}"
+            )
         return
     is_flag = isinstance(value, bool)
     if (policy == FLAG) is not is_flag or not isinstance(value, int) or value < 0:
@@ -140,7 +162,9 @@ class QosWatch(Node):
     service of a topic, and `subscription` likewise; not that of `FIXED_TOPICS`.
     """
 
-    def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
+    def create_publisher(
+        self, kind: Any, topic: str, qos: Any, **options: Any
+    ) -> Publisher:
         """Creates a publisher; see rclpy."""
         profile = copied(qos)
         chosen = self.publisher_options(topic, profile)
@@ -164,13 +188,22 @@ class QosWatch(Node):
     ) -> Subscription:
         """Creates a subscription; see rclpy."""
         profile = copied(qos)
-        chosen: dict[str, Any] = {"event_callbacks": self._subscription_events(topic, profile)}
+        chosen: dict[str, Any] = {
+            "event_callbacks": self._subscription_events(topic, profile)
+        }
         if policies := overridden_policies(self, topic, "subscription"):
             chosen["qos_overriding_options"] = QoSOverridingOptions(policies)
-        return super().create_subscription(kind, topic, callback, profile, **chosen | options)
+        return super().create_subscription(
+            kind, topic, callback, profile, **chosen | options
+        )
 
     def create_lossless_subscription(
-        self, kind: Any, topic: str, callback: Any, qos: Any, lost: Callable[[int], None]
+        self,
+        kind: Any,
+        topic: str,
+        callback: Any,
+        qos: Any,
+        lost: Callable[[int], None],
     ) -> Subscription:
         """Creates a raw subscription that reports how many messages the middleware has lost."""
         events = self._subscription_events(topic, qos)
@@ -179,7 +212,9 @@ class QosWatch(Node):
         try:
             return self.create_subscription(kind, topic, callback, qos, **options)
         except UnsupportedEventTypeError:
-            self.get_logger().warning(f"{topic}: this middleware does not report lost messages")
+            self.get_logger().warning(
+                f"{topic}: this middleware does not report lost messages"
+            )
             return self.create_subscription(kind, topic, callback, qos, raw=True)
 
     def _subscription_events(self, topic: str, qos: Any) -> SubscriptionEventCallbacks:
@@ -197,20 +232,31 @@ class QosWatch(Node):
             name, theirs = self._misfit(resolved, ours, publishing)
             own, other = (_value(profile, policy) for profile in (ours, theirs))
             offered, asked = (own, other) if publishing else (other, own)
-            cure = f"ask for {own}" if publishing else f"offer {own}, or put a relay between"
+            cure = (
+                f"ask for {own}"
+                if publishing
+                else f"offer {own}, or put a relay between"
+            )
             self.get_logger().warning(
                 f"{resolved}: no message passes between this node and {name}: the {policy.lower()} "
                 f"that the publisher offers ({offered}) is less than what the subscription asks "
                 f"for ({asked}); let {name} {cure}."
             )
 
-        timer = self.create_timer(MOMENT_S, say, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        timer = self.create_timer(
+            MOMENT_S, say, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
-    def _misfit(self, topic: str, ours: QoSProfile, publishing: bool) -> tuple[str, Any]:
+    def _misfit(
+        self, topic: str, ours: QoSProfile, publishing: bool
+    ) -> tuple[str, Any]:
         kind = "subscriptions" if publishing else "publishers"
         for peer in reversed(getattr(self, f"get_{kind}_info_by_topic")(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
-            if rclpy_qos.qos_check_compatible(*pair)[0] == rclpy_qos.QoSCompatibility.ERROR:
+            if (
+                rclpy_qos.qos_check_compatible(*pair)[0]
+                == rclpy_qos.QoSCompatibility.ERROR
+            ):
                 return owner(peer) or "a peer", peer.qos_profile
         return "a peer", None
 

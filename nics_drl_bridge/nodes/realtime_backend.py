@@ -21,8 +21,13 @@ from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S, SAY_EVERY_S = 0.01, 2.0
-SERVICES_S = 0.5  # a peer that shows no services this long after its topics is a vehicle [s]
-COMMAND_S, PERIODS = 0.5, 2  # least time and periods that a command lasts; then a zero follows
+SERVICES_S = (
+    0.5  # a peer that shows no services this long after its topics is a vehicle [s]
+)
+COMMAND_S, PERIODS = (
+    0.5,
+    2,
+)  # least time and periods that a command lasts; then a zero follows
 STILL = (0.02, 0.05)  # a slower robot is at rest [m/s, rad/s]
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
@@ -38,19 +43,28 @@ class RealtimeOptions(Schema):
     domain_id: int | None = Field(None, ge=0, le=232)  # the environment's by default
     timeout_s: PositiveFloat = 30.0  # longest wait for a peer or an answer
     vehicle: bool | None = None  # a vehicle has no services; None: detected
-    period_s: PositiveFloat | None = None  # of a step; the model's control period by default
+    period_s: PositiveFloat | None = (
+        None  # of a step; the model's control period by default
+    )
     stale_after_s: PositiveFloat = 0.5  # age from which data are too old for a view
     # An episode on a vehicle waits until it stands at the requested pose, or takes the present one.
     start: Literal["wait", "present"] = "wait"
     # The place where it stands counts as the start: `map` is laid so. Not with a pose sensor.
     lays_map: bool = False
-    tolerance: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.1)  # of the start's pose [m, rad]
+    tolerance: tuple[PositiveFloat, PositiveFloat] = (
+        0.1,
+        0.1,
+    )  # of the start's pose [m, rad]
     start_timeout_s: PositiveFloat = 300.0  # longest wait for that
-    say: Callable[[str], None] | None = None  # told what is missing; the node's logger by default
+    say: Callable[[str], None] | None = (
+        None  # told what is missing; the node's logger by default
+    )
     # `cmd_vel_raw` leads through `command_gate`: then each command is a TwistStamped with the stamp
     # of the scan that it answers.
     command_topic: str = Field("cmd_vel", min_length=1)
-    stamped: bool | None = None  # `cmd_vel` is a TwistStamped; None: as the robot hears it
+    stamped: bool | None = (
+        None  # `cmd_vel` is a TwistStamped; None: as the robot hears it
+    )
     pose_type: str = "none"  # of `pose`, a pose sensor in `map`
     # Topic of the gyro that turns odometry; `auto`: the usual ones, if the model was made with one
     imu: str = Field("auto", min_length=1)
@@ -78,13 +92,16 @@ class RealtimeBackend:
         rehearse(model)
         self._simulated = False
         self._link = Link(
-            chosen.namespace, chosen.domain_id, chosen.command_topic,
-            stamped=True if chosen.gated else chosen.stamped, patience_s=chosen.timeout_s,
+            chosen.namespace,
+            chosen.domain_id,
+            chosen.command_topic,
+            stamped=True if chosen.gated else chosen.stamped,
+            patience_s=chosen.timeout_s,
             parameters={"pose_type": chosen.pose_type, "imu": chosen.imu},
             command_timeout_s=math.inf  # a gate has its own timeout
             if chosen.gated
             else max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S),
-        )  # fmt: skip
+        )
         try:
             declare_sensors(self._link.node, self._commands_are_stamped())
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
@@ -144,11 +161,17 @@ class RealtimeBackend:
     def _await_start(self, start: Start | None) -> None:
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
-        while (start is None or self._is_vehicle()) and (missing := self._missing(start)):
+        while (start is None or self._is_vehicle()) and (
+            missing := self._missing(start)
+        ):
             now = time.monotonic()
             if now - began > self._options.start_timeout_s:
-                late = f"after {self._options.start_timeout_s:g} s the robot is not ready"
-                raise BackendError(f"{late}: {missing}; place it there, or choose start='present'.")
+                late = (
+                    f"after {self._options.start_timeout_s:g} s the robot is not ready"
+                )
+                raise BackendError(
+                    f"{late}: {missing}; place it there, or choose start='present'."
+                )
             if now - said >= SAY_EVERY_S:
                 say(f"waiting for the robot: {missing}")
                 said = now
@@ -169,7 +192,10 @@ class RealtimeBackend:
             return ""
         off = geometry.between(view.pose, start.pose)
         distance, turn = math.hypot(*off[:2]), math.degrees(abs(off[2]))
-        if distance <= self._options.tolerance[0] and abs(off[2]) <= self._options.tolerance[1]:
+        if (
+            distance <= self._options.tolerance[0]
+            and abs(off[2]) <= self._options.tolerance[1]
+        ):
             return ""
         x, y, heading = start.pose
         return (
@@ -192,7 +218,9 @@ class RealtimeBackend:
         for topic in self._topics.expected:
             if topic in newest:
                 behind_ns = latest_ns - newest[topic].stamp_ns
-                silences[topic] = max(now_ns - newest[topic].arrival_ns, behind_ns) / NS_PER_S
+                silences[topic] = (
+                    max(now_ns - newest[topic].arrival_ns, behind_ns) / NS_PER_S
+                )
             elif topic in arrived_ns:
                 silences[topic] = (now_ns - arrived_ns[topic]) / NS_PER_S
         oldest = max(silences, key=lambda topic: silences[topic])
@@ -202,7 +230,9 @@ class RealtimeBackend:
         """Returns a topic without a datum on the present clock, or None."""
         with self._topics.lock:
             there = self._topics.middleware.cache.newest.keys()
-            return next((topic for topic in self._topics.expected if topic not in there), None)
+            return next(
+                (topic for topic in self._topics.expected if topic not in there), None
+            )
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -232,7 +262,10 @@ class RealtimeBackend:
                 self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
                 self._link.frame = self._topics.frames[1]
                 view = self._topics.view()
-                known = {"stamp_ns": self._topics.newest_ns, "deadline_misses": self._misses}
+                known = {
+                    "stamp_ns": self._topics.newest_ns,
+                    "deadline_misses": self._misses,
+                }
                 return view, known | facts
         raise StaleDataError(topic, age_s, limit_s)
 

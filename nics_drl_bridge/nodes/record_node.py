@@ -38,11 +38,16 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 PATIENCE_S = 10.0
 POLL_S = 0.01
-HALT_S = 0.5  # zero is repeated for this long [s]: a best-effort subscriber may miss one
+HALT_S = (
+    0.5  # zero is repeated for this long [s]: a best-effort subscriber may miss one
+)
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 PLACE = "recording"
 FEWEST = 2
-SAME_PACE = (0.8, 1.25)  # of stamps relative to receipt; beyond it, it is another kind of time
+SAME_PACE = (
+    0.8,
+    1.25,
+)  # of stamps relative to receipt; beyond it, it is another kind of time
 
 
 @dataclass(frozen=True)
@@ -63,8 +68,12 @@ def declare_drive(node: Node) -> DriveParameters:
     robot = load_robot(get["robot"]())
     robot.require_cmd_vel()
     out = check_out(Path(get["out"]()))
-    plan = DrivePlan(robot, *(get[name]() for name in ("bound", "duration", "speed", "seed")))
-    topics, silence, stamped = (get[name]() for name in ("topics", "odom_timeout", "stamped"))
+    plan = DrivePlan(
+        robot, *(get[name]() for name in ("bound", "duration", "speed", "seed"))
+    )
+    topics, silence, stamped = (
+        get[name]() for name in ("topics", "odom_timeout", "stamped")
+    )
     roles = topic_roles(topics or None)
     return DriveParameters(plan, out, silence, stamped, roles, get[IMU]())
 
@@ -72,7 +81,9 @@ def declare_drive(node: Node) -> DriveParameters:
 class DriveLog:
     """Keeps a drive in memory; `now` is the clock of receipt [ns], that of the stamps."""
 
-    def __init__(self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]) -> None:
+    def __init__(
+        self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]
+    ) -> None:
         self._spec, self._roles, self._now = spec, roles, now
         # Topic, or `odom twist` -> receipt [ns], stamp [ns] or 0, and values of each message.
         self.rows: dict[str, list[tuple[int, int, Array]]] = defaultdict(list)
@@ -111,7 +122,9 @@ class DriveLog:
         elif measured or self._roles.state:
             what = f"{(measured or ['the state'])[0]} of robot {self._spec.name!r}"
             fix = "has to be measured; start the joints' publisher, or remap the topic."
-            raise BackendError(f"topic 'joint_states': nothing has arrived, but {what} {fix}")
+            raise BackendError(
+                f"topic 'joint_states': nothing has arrived, but {what} {fix}"
+            )
         receive, header = np.array([row[:2] for row in self.rows["odom"]]).T
         heard, rate = (receive[-1] - receive[0]) / NS_PER_S, pace(receive, header)
         if not SAME_PACE[0] <= rate <= SAME_PACE[1]:
@@ -123,7 +136,10 @@ class DriveLog:
         """Returns all streams on their clocks. Raises RecordingError if too little was received."""
         topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
         if len(self.rows["pose"]) >= FEWEST:
-            topics |= {"pose": "pose", "odometry": "odom twist"}  # which determines its noise
+            topics |= {
+                "pose": "pose",
+                "odometry": "odom twist",
+            }  # which determines its noise
         data: dict[str, TopicData] = {}
         for name, topic in topics.items():
             if len(self.rows[topic]) >= FEWEST:
@@ -132,7 +148,9 @@ class DriveLog:
         if not data.keys() >= {"command", "pose"}:
             raise RecordingError("recording: nothing was received that could be saved.")
         if len(self._joints) >= FEWEST:
-            data |= joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
+            data |= joint_streams(
+                "joint_states", self._joints, self._spec, self._roles, PLACE
+            )
         try:
             kept: Any = streams(data, self._roles.stamps, PLACE)
         except RecordingError:
@@ -140,9 +158,11 @@ class DriveLog:
             kept = streams(data, "receive", PLACE)
         tracked = len(self.rows["pose"]) >= FEWEST
         return Recording(
-            **kept, source=PLACE, variables=self._spec.variable_names,
+            **kept,
+            source=PLACE,
+            variables=self._spec.variable_names,
             measured_by="tracker" if tracked else "odometry",
-        )  # fmt: skip
+        )
 
 
 def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
@@ -168,8 +188,12 @@ class DriveResult:
 class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz, zeros at the end or on a fault; records what it hears."""
 
-    def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
-        overrides = [Parameter(name, value=value) for name, value in (given or {}).items()]
+    def __init__(
+        self, context: Context, given: Mapping[str, Any] | None = None
+    ) -> None:
+        overrides = [
+            Parameter(name, value=value) for name, value in (given or {}).items()
+        ]
         super().__init__("record_node", context=context, parameter_overrides=overrides)
         self.outcome: DriveResult | None = None
         self._order = declare_drive(self)
@@ -182,13 +206,17 @@ class RecordNode(qos.QosWatch):
         if self._chosen:
             self._speak(self._order.stamped)
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
-        self.create_subscription(JointState, "joint_states", self._log.joints, qos.SENSOR)
+        self.create_subscription(
+            JointState, "joint_states", self._log.joints, qos.SENSOR
+        )
         take_pose = partial(self._take, "pose", pose_row)
         self.create_subscription(PoseStamped, "pose", take_pose, qos.SENSOR)
         self._imu_topic = ""  # the first that speaks
         self._gyro = GyroReader()
         for topic in imu_topics(self._order.imu, by_default=True):
-            self.create_subscription(Imu, topic, partial(self._take_imu, topic), qos.SENSOR)
+            self.create_subscription(
+                Imu, topic, partial(self._take_imu, topic), qos.SENSOR
+            )
         self._began, self._heard = time.monotonic(), -np.inf
         self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
@@ -219,7 +247,9 @@ class RecordNode(qos.QosWatch):
             self._log.add("imu", stamp(message), (ax, ay, measured[0]))
 
     def _on_odometry(self, message: Odometry) -> None:
-        self._stamp_ns = max(self._stamp_ns, conversions.stamp_from_ros(message.header.stamp))
+        self._stamp_ns = max(
+            self._stamp_ns, conversions.stamp_from_ros(message.header.stamp)
+        )
         pose = self._log.odometry(message)
         if pose is None:
             return
@@ -291,13 +321,19 @@ class RecordNode(qos.QosWatch):
         if age > limit:
             reason = f"nothing new for {age:.2f} s, which may be {limit:g} s"
             place = self._place("odom")
-            raise BackendError(f"topic {place}: {reason}; find out why odometry stopped.")
+            raise BackendError(
+                f"topic {place}: {reason}; find out why odometry stopped."
+            )
         bound, radius = self._order.plan.bound, self._order.plan.robot.footprint_radius
-        x, y, _ = geometry.between(self._start, self._start if self._pose is None else self._pose)
+        x, y, _ = geometry.between(
+            self._start, self._start if self._pose is None else self._pose
+        )
         if np.hypot(x, y) + radius > bound:
             where = f"at x {x:.2f}, y {y:.2f} m from the start with a radius of {radius:g} m"
             fix = "give it a larger bound, less speed, or the parameters that it really has."
-            raise BackendError(f"the robot left its circle of {bound:g} m, {where}; {fix}")
+            raise BackendError(
+                f"the robot left its circle of {bound:g} m, {where}; {fix}"
+            )
 
     def _send(self, command: Array) -> None:
         robot = self._order.plan.robot
@@ -344,10 +380,16 @@ class RecordNode(qos.QosWatch):
         return recording, f"{self._log.seconds:.1f} s are recorded in {self._order.out}"
 
 
-def record(given: dict[str, Any] | None = None, args: Sequence[str] | None = None) -> DriveResult:
+def record(
+    given: dict[str, Any] | None = None, args: Sequence[str] | None = None
+) -> DriveResult:
     """Drives and records until the end, an error or a signal, with parameters beside `args`."""
-    node: RecordNode = runner.run_node(partial(RecordNode, given=given), args, "record_node")
-    return node.outcome or DriveResult(False, None, None, "interrupted: nothing was saved")
+    node: RecordNode = runner.run_node(
+        partial(RecordNode, given=given), args, "record_node"
+    )
+    return node.outcome or DriveResult(
+        False, None, None, "interrupted: nothing was saved"
+    )
 
 
 def main(args: list[str] | None = None) -> None:

@@ -6,7 +6,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Twist,
+    TwistStamped,
+)
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
@@ -24,13 +29,22 @@ from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.command_types import CommandListener
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
-from nics_drl_bridge.nodes.parameters import AUTO, IMU, NO_POSE, POSE_TYPES, STAMPED, sensors
+from nics_drl_bridge.nodes.parameters import (
+    AUTO,
+    IMU,
+    NO_POSE,
+    POSE_TYPES,
+    STAMPED,
+    sensors,
+)
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.topic_roles import IMU_NAMES, imu_topics
 
-KINDS_OF_POSE = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
+KINDS_OF_POSE = {
+    each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)
+}
 
 
 def declare_sensors(node: Node, stamped: bool | None = None) -> None:
@@ -51,26 +65,42 @@ class RobotTopics:
     """
 
     def __init__(
-        self, node: Node, model: SimulatorModel, on_odometry: Callable[[int], None] | None = None,
+        self,
+        node: Node,
+        model: SimulatorModel,
+        on_odometry: Callable[[int], None] | None = None,
         on_scan: Callable[[int], None] | None = None,
         on_lidar: Callable[[LidarSpec], None] | None = None,
         now_ns: Callable[[], int] | None = None,
-    ) -> None:  # fmt: skip
-        self._node, self._model, self._robot, self._lidar = node, model, model.robot, model.lidar
+    ) -> None:
+        self._node, self._model, self._robot, self._lidar = (
+            node,
+            model,
+            model.robot,
+            model.lidar,
+        )
         self._robot.require_cmd_vel()
         self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))
         self.lock = threading.RLock()
         self.middleware = Middleware(model)
         self.restart()
-        self._on_odometry, self._on_scan, self._on_lidar = on_odometry, on_scan, on_lidar
+        self._on_odometry, self._on_scan, self._on_lidar = (
+            on_odometry,
+            on_scan,
+            on_lidar,
+        )
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
         self._header, self._told = b"", ""
-        self._placed: tuple[Array, Array] | None = None  # pose and covariance of `initialpose`
+        self._placed: tuple[Array, Array] | None = (
+            None  # pose and covariance of `initialpose`
+        )
         self._subscriptions: list[Any] = []
         self._commands = CommandListener(
-            node, measurement.CMD_VEL, bool(node.get_parameter(STAMPED).value),
+            node,
+            measurement.CMD_VEL,
+            bool(node.get_parameter(STAMPED).value),
             self._locked(self._take_command),
-        )  # fmt: skip
+        )
         heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
             measurement.SCAN: (LaserScan, self._take_scan),
             measurement.ODOM: (Odometry, self._take_odometry),
@@ -80,7 +110,9 @@ class RobotTopics:
         if self._posed:
             if pose_type not in POSE_TYPES:
                 fix = nearest(pose_type, (NO_POSE, *POSE_TYPES))
-                raise ConfigError(f"parameter 'pose_type': there is no {pose_type!r}; {fix}")
+                raise ConfigError(
+                    f"parameter 'pose_type': there is no {pose_type!r}; {fix}"
+                )
             heard[measurement.POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)
@@ -98,7 +130,9 @@ class RobotTopics:
 
         return locked
 
-    def _subscribe(self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any) -> None:
+    def _subscribe(
+        self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any
+    ) -> None:
         made = self._node.create_subscription(kind, topic, self._locked(take), quality)
         self._subscriptions.append(made)
 
@@ -153,19 +187,27 @@ class RobotTopics:
     def _take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         logger = self._node.get_logger()
         try:
-            pose = initial_pose(message, str(self._node.get_parameter("map_frame").value))
-            spread = START_STD**2 * np.eye(3)  # where nothing corrects it, it defines the map
+            pose = initial_pose(
+                message, str(self._node.get_parameter("map_frame").value)
+            )
+            spread = START_STD**2 * np.eye(
+                3
+            )  # where nothing corrects it, it defines the map
             if self._posed:
                 covariance = conversions.pose_from_ros(message)[1]
                 given = measurement.checked_covariance(covariance, 3, START_STD)
                 spread = spread if given is None else given
         except (ConfigError, ValueError) as error:
-            logger.error(f"{str(error).removesuffix('.')}. The estimate stays as it is.")
+            logger.error(
+                f"{str(error).removesuffix('.')}. The estimate stays as it is."
+            )
             return
         self._placed = pose, spread
         if self._started:
             self.middleware.place(*self._placed)
-        logger.info(f"the robot is at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad")
+        logger.info(
+            f"the robot is at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
+        )
 
     def in_odom(self) -> Array | None:
         """Returns the robot's pose (3,) by odometry at the newest datum; None before any."""
@@ -201,18 +243,28 @@ class RobotTopics:
             return
         ordered = reader.ordered(np.asarray(message.ranges, np.float32))
         ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
-        if self.middleware.scan(stamp, self.now_ns(), ranges) and self._on_scan is not None:
+        if (
+            self.middleware.scan(stamp, self.now_ns(), ranges)
+            and self._on_scan is not None
+        ):
             self._on_scan(stamp)
 
     def _reader_for(self, message: LaserScan) -> Reader | None:
-        fields = [message.angle_min, message.angle_increment, message.range_min, message.range_max]
+        fields = [
+            message.angle_min,
+            message.angle_increment,
+            message.range_min,
+            message.range_max,
+        ]
         header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
         if header == self._header or self._on_lidar is None:
             return self._reader
         self._header, self._reader = header, None
         upside_down = bool(self._node.get_parameter("lidar_upside_down").value)
         try:
-            reader = conversions.reader_from_ros(message, self._model.lidar, upside_down)
+            reader = conversions.reader_from_ros(
+                message, self._model.lidar, upside_down
+            )
             if reader.lidar != self._lidar:
                 self._on_lidar(reader.lidar)
                 self.middleware.expect_beams(reader.lidar.beams)
@@ -220,7 +272,9 @@ class RobotTopics:
             self._reader = reader
         except BridgeError as error:
             if str(error) != self._told:
-                self._node.get_logger().error(f"{measurement.SCAN} is not used: {error}")
+                self._node.get_logger().error(
+                    f"{measurement.SCAN} is not used: {error}"
+                )
             self._told = str(error)
         return self._reader
 
@@ -236,7 +290,11 @@ class RobotTopics:
         variance = messages.turn_variance(message)
         used = self.middleware.odometry(stamp, self.now_ns(), pose, twist, variance)
         newest = self.middleware.cache.newest
-        if used and self._on_odometry is not None and newest[measurement.ODOM].stamp_ns == stamp:
+        if (
+            used
+            and self._on_odometry is not None
+            and newest[measurement.ODOM].stamp_ns == stamp
+        ):
             self._on_odometry(stamp)
 
     def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
@@ -258,10 +316,14 @@ class RobotTopics:
         except ValueError as error:
             self.middleware.cache.reject(f"{sensor.name}: {error}")
         else:
-            self.middleware.sense(sensor.name, messages.stamp(message), self.now_ns(), reading)
+            self.middleware.sense(
+                sensor.name, messages.stamp(message), self.now_ns(), reading
+            )
 
     def _take_command(self, message: Twist | TwistStamped) -> None:
-        self.middleware.command(None, self._robot.from_cmd_vel(conversions.twist_from_ros(message)))
+        self.middleware.command(
+            None, self._robot.from_cmd_vel(conversions.twist_from_ros(message))
+        )
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
@@ -269,7 +331,9 @@ def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
 
     And the covariance (3, 3) of the estimated pose.
     """
-    facts: dict[str, Any] = {"covariance": middleware.estimator.covariance[:3, :3].copy()}
+    facts: dict[str, Any] = {
+        "covariance": middleware.estimator.covariance[:3, :3].copy()
+    }
     for topic, datum in middleware.cache.newest.items():
         facts[f"{topic}_sequence"] = datum.sequence
         facts[f"{topic}_stamp_ns"] = datum.stamp_ns

@@ -44,11 +44,16 @@ EXIT_BAD_INPUT = 2
 SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
 ANSWER_S = 1.5  # a node that does not answer within it is dead; the graph shows it for 20 s more
 DIAGNOSTICS_S = 1.0
-RANGES = {int: (IntegerRange, "integer_range"), float: (FloatingPointRange, "floating_point_range")}
+RANGES = {
+    int: (IntegerRange, "integer_range"),
+    float: (FloatingPointRange, "floating_point_range"),
+}
 SHARED = "model"  # a file sets it for nodes that have no model, too
 
 
-def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
+def open_context(
+    args: Sequence[str] | None = None, domain_id: int | None = None
+) -> Context:
     """Returns a new context, local unless the environment sets a range. Raises BackendError."""
 
     def make() -> Context:
@@ -56,16 +61,26 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
         context.init(None if args is None else list(args), domain_id=domain_id)
         return context
 
-    asked = os.environ.get("ROS_DOMAIN_ID", "0") if domain_id is None else str(domain_id)
-    if asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID:  # DDS would end the process
-        raise BackendError(f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}.")
+    asked = (
+        os.environ.get("ROS_DOMAIN_ID", "0") if domain_id is None else str(domain_id)
+    )
+    if (
+        asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID
+    ):  # DDS would end the process
+        raise BackendError(
+            f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}."
+        )
     try:
         return OF_THIS_PROCESS.open(make)
     except RuntimeError as error:
         if type(error).__name__ == UNKNOWN:
             fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"
-            raise BackendError(f"ROS 2 knows no argument {error}; write them {fix}.") from None
-        raise BackendError(f"ROS 2 does not start: {' '.join(str(error).split())}") from None
+            raise BackendError(
+                f"ROS 2 knows no argument {error}; write them {fix}."
+            ) from None
+        raise BackendError(
+            f"ROS 2 does not start: {' '.join(str(error).split())}"
+        ) from None
 
 
 def last_word(publisher: Publisher, message: Any) -> None:
@@ -75,7 +90,9 @@ def last_word(publisher: Publisher, message: Any) -> None:
 
 
 def run_node(
-    make: Callable[[Context], Node], args: Sequence[str] | None = None, sole_name: str = ""
+    make: Callable[[Context], Node],
+    args: Sequence[str] | None = None,
+    sole_name: str = "",
 ) -> Any:
     """Runs a node until a signal (`ENDING`), then stops and destroys it in order; returns it."""
     stopping, started = threading.Event(), threading.Event()
@@ -151,7 +168,9 @@ def spin(node: Node, stopping: threading.Event) -> None:
 def sole(context: Context, name: str) -> Iterator[None]:
     """Ensures a single instance while a node runs; BackendError if another is running."""
     # The probe resolves its name as the node will.
-    probe = Node(name, context=context, start_parameter_services=False, enable_rosout=False)
+    probe = Node(
+        name, context=context, start_parameter_services=False, enable_rosout=False
+    )
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
         try:
             whole, domain = probe.get_fully_qualified_name(), context.get_domain_id()
@@ -164,7 +183,9 @@ def sole(context: Context, name: str) -> Iterator[None]:
                 taken = True
             if taken or (_seen(probe, whole) and _lives(probe, whole)):
                 fix = "end it, or give this one a namespace: `--ros-args -r __ns:=/robot_2`."
-                raise BackendError(f"a node {whole!r} runs already in ROS domain {domain}; {fix}")
+                raise BackendError(
+                    f"a node {whole!r} runs already in ROS domain {domain}; {fix}"
+                )
         finally:
             probe.destroy_node()
         yield
@@ -187,7 +208,9 @@ def _lives(probe: Node, whole: str) -> bool:
     try:
         holds(client.service_is_ready, ANSWER_S, POLL_S)
         answer = client.call_async(GetParameters.Request())
-        executor.spin_until_future_complete(answer, max(0.1, deadline - time.monotonic()))
+        executor.spin_until_future_complete(
+            answer, max(0.1, deadline - time.monotonic())
+        )
         return bool(answer.done())
     finally:
         executor.shutdown(timeout_sec=1.0)
@@ -195,7 +218,9 @@ def _lives(probe: Node, whole: str) -> bool:
 
 def steadily(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
     """Calls at a period of the steady clock, also while the time of the robot stands still."""
-    return node.create_timer(period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    return node.create_timer(
+        period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME)
+    )
 
 
 def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
@@ -223,11 +248,17 @@ def declare_row(node: Node, row: Row) -> Any:
 
 
 def declare(
-    node: Node, name: str, default: Any, description: str, span: tuple[float, float] | None = None,
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    span: tuple[float, float] | None = None,
     read_only: bool = False,
-) -> Any:  # fmt: skip
+) -> Any:
     """Declares a parameter of the default's type, and returns its value, which lies in a span."""
-    if read_only and hasattr(node, "fixed"):  # a managed node: from configure to cleanup
+    if read_only and hasattr(
+        node, "fixed"
+    ):  # a managed node: from configure to cleanup
         node.fixed.add(name)
         read_only = False
     descriptor = ParameterDescriptor(description=description, read_only=read_only)
@@ -240,7 +271,9 @@ def declare(
         types, value = Parameter.Type, given[name].value
         if given[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
             value = [float(each) for each in value] if many else float(value)
-            given[name] = Parameter(name, types.DOUBLE_ARRAY if many else types.DOUBLE, value)
+            given[name] = Parameter(
+                name, types.DOUBLE_ARRAY if many else types.DOUBLE, value
+            )
     return node.declare_parameter(name, default, descriptor).value
 
 
@@ -257,7 +290,9 @@ def unknown(node: Node) -> list[str]:
     sentences = [
         f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
         for name in sorted(given_values(node))
-        if name not in (*known, SHARED) and not name.startswith(qos.OVERRIDES) and not ignores(name)
+        if name not in (*known, SHARED)
+        and not name.startswith(qos.OVERRIDES)
+        and not ignores(name)
     ]
     return sentences + unused_overrides(node)
 
@@ -270,7 +305,9 @@ def unused_overrides(node: Node) -> list[str]:
     if getattr(node, "state", ACTIVE) == UNCONFIGURED:
         return []
     ends = [f"{qos.OVERRIDES}{each.topic_name}.publisher" for each in node.publishers]
-    ends += [f"{qos.OVERRIDES}{each.topic_name}.subscription" for each in node.subscriptions]
+    ends += [
+        f"{qos.OVERRIDES}{each.topic_name}.subscription" for each in node.subscriptions
+    ]
     return [
         f"parameter {name!r} is ignored: the node has no such publisher or subscription; "
         f"{nearest(name.rpartition('.')[0], ends)}"
@@ -296,8 +333,12 @@ def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
     def publish() -> None:
         found = look()
         level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
-        values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
-        status = DiagnosticStatus(level=level, name=name, message=found.message, values=values)
+        values = [
+            KeyValue(key=key, value=str(value)) for key, value in found.facts.items()
+        ]
+        status = DiagnosticStatus(
+            level=level, name=name, message=found.message, values=values
+        )
         status.hardware_id = found.hardware
         message = DiagnosticArray(status=[status])
         message.header.stamp = node.get_clock().now().to_msg()

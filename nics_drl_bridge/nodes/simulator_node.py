@@ -27,7 +27,14 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
-from nics_drl_bridge.nodes import conversions, device_parameters, parameters, qos, runner, wire
+from nics_drl_bridge.nodes import (
+    conversions,
+    device_parameters,
+    parameters,
+    qos,
+    runner,
+    wire,
+)
 from nics_drl_bridge.nodes.command_types import TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
@@ -39,9 +46,14 @@ from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, vari
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-CLOCK, CLOCK_NS = "/clock", 15_000_000  # longest time between two messages in real time [ns]
+CLOCK, CLOCK_NS = (
+    "/clock",
+    15_000_000,
+)  # longest time between two messages in real time [ns]
 WATCH_S, QUIET_S = 2.0, 5.0
-LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that are due [s]
+LONGEST_TICK_S = (
+    0.005  # longest time between two checks for delayed data that are due [s]
+)
 
 # Makes the simulator of some robots; may declare its own parameters at the node. Its control
 # period is that of the given model.
@@ -57,7 +69,9 @@ class Outbox:
         self._latest: dict[Publisher, int] = {}
         self._numbers = itertools.count()
 
-    def send(self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]) -> None:
+    def send(
+        self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]
+    ) -> None:
         """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
         delay, jitter = late
         if jitter:
@@ -78,7 +92,9 @@ class Outbox:
 
     def drop(self, publishers: Collection[Publisher]) -> None:
         """Drops what waits for publishers that are about to end."""
-        self._waiting = [waiting for waiting in self._waiting if waiting[2] not in publishers]
+        self._waiting = [
+            waiting for waiting in self._waiting if waiting[2] not in publishers
+        ]
         heapq.heapify(self._waiting)
         for publisher in publishers:
             self._latest.pop(publisher, None)
@@ -93,9 +109,14 @@ class RobotPort:
     """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot."""
 
     def __init__(
-        self, node: Node, namespace: str, model: SimulatorModel, frames: device_parameters.Frames,
-        time: device_parameters.DeviceTiming, outbox: Outbox,
-    ) -> None:  # fmt: skip
+        self,
+        node: Node,
+        namespace: str,
+        model: SimulatorModel,
+        frames: device_parameters.Frames,
+        time: device_parameters.DeviceTiming,
+        outbox: Outbox,
+    ) -> None:
         self._node, self._model, self.frames = node, model, frames
         self._outbox = outbox
         self._publishers: list[Publisher] = []
@@ -103,12 +124,17 @@ class RobotPort:
         self._send_scan = partial(outbox.send, late=time.scan_late_ns)
 
         def publisher(kind: Any, topic: str) -> Publisher:
-            made = node.create_publisher(kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE)
+            made = node.create_publisher(
+                kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE
+            )
             self._publishers.append(made)
             return made
 
         self._scans = publisher(LaserScan, "scan")
-        self._odoms, self._truths = publisher(Odometry, "odom"), publisher(Odometry, "ground_truth")
+        self._odoms, self._truths = (
+            publisher(Odometry, "odom"),
+            publisher(Odometry, "ground_truth"),
+        )
         self._joints = publisher(JointState, "joint_states")
         self._sensors = [
             (each, frames.prefix + each.frame, publisher(sensor_type(each), each.name))
@@ -122,7 +148,10 @@ class RobotPort:
         self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
         self._scan = wire.ScanWriter(scan)
         linear, _, turn = variances(model.noise.odometry)
-        odom, truth = (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn), (LEAST_VARIANCE,) * 4
+        odom, truth = (
+            (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn),
+            (LEAST_VARIANCE,) * 4,
+        )
         at_rest = partial(conversions.odometry_to_ros, np.zeros(3), np.zeros(3), 0)
         self._odom = wire.OdometryWriter(at_rest((frames.odom, frames.base), odom))
         self._truth = wire.OdometryWriter(at_rest((frames.map, frames.base), truth))
@@ -141,7 +170,9 @@ class RobotPort:
         if self.frames.footprint:
             mounted.append((self.frames.footprint, (0.0, 0.0, 0.0)))
         base = self.frames.base
-        return [transform_to_ros(base, frame, place, Time()) for frame, place in mounted]
+        return [
+            transform_to_ros(base, frame, place, Time()) for frame, place in mounted
+        ]
 
     def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
         """Returns the transforms odom -> base_link, and map -> odom if requested."""
@@ -154,18 +185,24 @@ class RobotPort:
 
     def publish_odometry(self, sensed: Sensed, now_ns: int) -> None:
         """Publishes odometry, and joints and true pose if they have subscribers."""
-        odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
+        odometry = self._odom.write(
+            now_ns, sensed.odom, sensed.twist, sensed.covariance
+        )
         self._send(self._odoms, odometry, now_ns)
         if self._joints.get_subscription_count():
             joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
             self._send(self._joints, joints, now_ns)
         if self._truths.get_subscription_count():
-            self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
+            self._truths.publish(
+                self._truth.write(now_ns, sensed.pose, sensed.true_twist)
+            )
 
     def publish_scan(self, sensed: Sensed, now_ns: int) -> None:
         """Publishes the scan, stamped with the time of beam 0, and readings of further sensors."""
         ranges = to_device(sensed.ranges, self._model.lidar)
-        self._send_scan(self._scans, self._scan.write(now_ns - self._sweep_ns, ranges), now_ns)
+        self._send_scan(
+            self._scans, self._scan.write(now_ns - self._sweep_ns, ranges), now_ns
+        )
         for sensor, frame, publisher in self._sensors:
             reading = sensor_to_ros(sensor, sensed.readings[sensor.name], now_ns, frame)
             self._send_scan(publisher, reading, now_ns)
@@ -175,14 +212,24 @@ class CommandInlet:
     """Listens to `cmd_vel`, stamped or not, and to `ackermann_cmd` if the robot steers."""
 
     def __init__(
-        self, node: Node, namespace: str, robot: RobotSpec, quality: QoSProfile,
-        take: Callable[[Array], None], too_old: Callable[[int], bool],
-    ) -> None:  # fmt: skip
+        self,
+        node: Node,
+        namespace: str,
+        robot: RobotSpec,
+        quality: QoSProfile,
+        take: Callable[[Array], None],
+        too_old: Callable[[int], bool],
+    ) -> None:
         self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         self._kind = name_of(stamped)
-        kind, hear = TwistStamped if stamped else Twist, partial(self._on_bytes, stamped)
-        heard = node.create_subscription(kind, f"{namespace}cmd_vel", hear, quality, raw=True)
+        kind, hear = (
+            TwistStamped if stamped else Twist,
+            partial(self._on_bytes, stamped),
+        )
+        heard = node.create_subscription(
+            kind, f"{namespace}cmd_vel", hear, quality, raw=True
+        )
         self._topic, self.heard = heard.topic_name, [heard]
         self._types = TypeWatch(node, f"{namespace}cmd_vel")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
@@ -198,7 +245,9 @@ class CommandInlet:
     def _on_bytes(self, stamped: bool, content: bytes) -> None:
         try:
             stamp_ns = wire.stamp_of(content) if stamped else 0
-            twist = wire.stamped_twist_of(content) if stamped else wire.twist_of(content)
+            twist = (
+                wire.stamped_twist_of(content) if stamped else wire.twist_of(content)
+            )
         except wire.UNREADABLE as error:
             self._complain(f"a message that can't be read ({error}) is ignored")
             return
@@ -206,7 +255,9 @@ class CommandInlet:
             self._obey(twist)
 
     def _obey(
-        self, twist: Sequence[float], read: Callable[[Sequence[float]], Array] | None = None
+        self,
+        twist: Sequence[float],
+        read: Callable[[Sequence[float]], Array] | None = None,
     ) -> None:
         if all(map(math.isfinite, twist)):
             self._take((read or self._robot.from_cmd_vel)(twist))
@@ -226,7 +277,9 @@ class CommandInlet:
         return False
 
     def _complain(self, what: str) -> None:
-        self._node.get_logger().warning(f"{self._topic}: {what}", throttle_duration_sec=QUIET_S)
+        self._node.get_logger().warning(
+            f"{self._topic}: {what}", throttle_duration_sec=QUIET_S
+        )
 
     def watch(self) -> None:
         """Warns once of each node that publishes the other type, which is never received."""
@@ -260,14 +313,21 @@ class DeviceNode(qos.QosWatch):
         self.now_ns = self._first_ns
         self._open_topics()
         self._start_time()
-        self.standard = open_services(self)  # its entities are those of the first episode, too
+        self.standard = open_services(
+            self
+        )  # its entities are those of the first episode, too
         self.begin()
 
     def use_world(self, world: AnyWorld) -> None:
         """Simulates a world with the robots that it was started with; `begin` an episode next."""
         simulator = self.make_simulator(world, len(self._names))
-        self.world, self.device = world, DeviceWorld(simulator, self.model, len(self._names))
-        self._identity = identity(self._given, world, device_parameters.randomisation(self))
+        self.world, self.device = (
+            world,
+            DeviceWorld(simulator, self.model, len(self._names)),
+        )
+        self._identity = identity(
+            self._given, world, device_parameters.randomisation(self)
+        )
         self._size(range(len(self._names)))
 
     def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:
@@ -280,7 +340,9 @@ class DeviceNode(qos.QosWatch):
         command_ns_before = self._command_ns
         heard_before = self._heard
         self._command_ns = np.zeros(count, np.int64)
-        self._heard = np.zeros(count, np.bool_)  # in lock-step: those that have their command
+        self._heard = np.zeros(
+            count, np.bool_
+        )  # in lock-step: those that have their command
         known = [k for k in kept if k < len(command_ns_before)]
         self._command_ns[: len(known)] = command_ns_before[known]
         self._heard[: len(known)] = heard_before[known]
@@ -321,9 +383,16 @@ class DeviceNode(qos.QosWatch):
         frames = device_parameters.frames(self, name.strip("/"))
         port = RobotPort(self, space, self.model, frames, self._time, self._outbox)
         commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
-        given = self.model.robot, commands, partial(self._on_command, port), self._too_old
+        given = (
+            self.model.robot,
+            commands,
+            partial(self._on_command, port),
+            self._too_old,
+        )
         inlet = CommandInlet(self, space, *given)
-        inlet.heard.append(self._world_topics.hear(space, lambda: self._ports.index(port)))
+        inlet.heard.append(
+            self._world_topics.hear(space, lambda: self._ports.index(port))
+        )
         self._inlets.append(inlet)
         self._ports.append(port)
 
@@ -357,7 +426,9 @@ class DeviceNode(qos.QosWatch):
         if self._transforms is None:
             silent = "so that neither /tf nor /tf_static is published"
             fix = "install it with your ROS 2 distribution."
-            self.get_logger().warning(f"the package tf2_msgs is not installed, {silent}; {fix}")
+            self.get_logger().warning(
+                f"the package tf2_msgs is not installed, {silent}; {fix}"
+            )
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
         self._fixed = self.create_publisher(self._transforms, "/tf_static", qos.LATCHED)
@@ -403,10 +474,13 @@ class DeviceNode(qos.QosWatch):
 
     def _look(self) -> runner.Condition:
         facts = {
-            "mode": self._time.mode, "rate": self._time.rate, "robots": len(self._names),
+            "mode": self._time.mode,
+            "rate": self._time.rate,
+            "robots": len(self._names),
             "simulated time [s]": f"{self.now_ns / NS_PER_S:.3f}",
-            "times it fell behind real time": self._lags, **self._identity,
-        }  # fmt: skip
+            "times it fell behind real time": self._lags,
+            **self._identity,
+        }
         message = "paused" if self.paused else "running"
         return runner.Condition(message, False, facts, self._hardware)
 
@@ -428,7 +502,12 @@ class DeviceNode(qos.QosWatch):
 
     def _advance_if_complete(self) -> None:
         """In lock-step, moves the world if all robots that are there have their command."""
-        if self._time.lockstep and not self.paused and self._heard.size and self._heard.all():
+        if (
+            self._time.lockstep
+            and not self.paused
+            and self._heard.size
+            and self._heard.all()
+        ):
             self.advance()
 
     def _on_time(self) -> None:
@@ -453,7 +532,9 @@ class DeviceNode(qos.QosWatch):
         if self.paused:
             return
         time_ns = self._real_time.time_at(time.monotonic_ns())
-        if self._told_ns < (between_ns := min(time_ns, self.now_ns + self._time.step_ns - 1)):
+        if self._told_ns < (
+            between_ns := min(time_ns, self.now_ns + self._time.step_ns - 1)
+        ):
             self._tell_time(between_ns)
 
     def _tell_time(self, time_ns: int) -> None:
@@ -468,7 +549,9 @@ class DeviceNode(qos.QosWatch):
     def advance(self) -> None:
         """Moves the world by one step, and publishes what is due."""
         if not self._time.lockstep:  # those that have been silent stop
-            self.device.commands[self.now_ns - self._command_ns > self._timeout_ns()] = 0.0
+            self.device.commands[
+                self.now_ns - self._command_ns > self._timeout_ns()
+            ] = 0.0
         self.device.advance()
         self._heard[:] = False
         self.now_ns += self._time.step_ns
@@ -479,7 +562,9 @@ class DeviceNode(qos.QosWatch):
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
-        self.device.begin(seed, start if given else None)  # may raise, so that all goes on
+        self.device.begin(
+            seed, start if given else None
+        )  # may raise, so that all goes on
         if rewind:
             self.now_ns = self._first_ns
         self._outbox.clear()
@@ -492,7 +577,9 @@ class DeviceNode(qos.QosWatch):
 
     def rewind(self) -> None:
         """Puts the time back to its start, while everything stays where it is."""
-        self._command_ns += self._first_ns - self.now_ns  # commands stay as old as they are
+        self._command_ns += (
+            self._first_ns - self.now_ns
+        )  # commands stay as old as they are
         self.now_ns = self._first_ns
         self._outbox.clear()
         self._odom_pace.begin(self.now_ns)
@@ -524,18 +611,25 @@ class DeviceNode(qos.QosWatch):
             return False, str(error)
         return True, json.dumps({"stamp_ns": self.now_ns, **self._identity})
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _on_pause(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
         try:
             self._require_world()
             self.pause(bool(request.data))
-            response.success, response.message = True, "paused" if self.paused else "running"
+            response.success, response.message = (
+                True,
+                "paused" if self.paused else "running",
+            )
         except BridgeError as error:
             response.success, response.message = False, str(error)
         return response
 
     def _require_world(self) -> None:
         if self.standard is not None and not self.standard.has_world:
-            raise BackendError("no world is loaded; load one by the service load_world.")
+            raise BackendError(
+                "no world is loaded; load one by the service load_world."
+            )
 
     def _repeat(self) -> tuple[bool, str]:
         if not self._time.lockstep:

@@ -23,20 +23,38 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from nics_drl_bridge.errors import BackendError
 
-RANGE, LOCAL, ONLY_LOCAL = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "ROS_LOCALHOST_ONLY"
+RANGE, LOCAL, ONLY_LOCAL = (
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "LOCALHOST",
+    "ROS_LOCALHOST_ONLY",
+)
 SELF_MADE = "SYSTEM_DEFAULT"
-OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")  # rcl treats any other value as LOCALHOST
+OTHER_RANGES = (
+    "SUBNET",
+    "OFF",
+    SELF_MADE,
+    "",
+)  # rcl treats any other value as LOCALHOST
 OLDEST_DISTRIBUTION = "humble"  # it has no discovery ranges
 TRANSPORTS, UDP = "FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"
 PROFILE = Path(__file__).with_name("this_machine.xml")
 # The same variable in Fast DDS 3 and 2 (the library's name tells), and files that it reads here.
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 PROFILES_HERE = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
-FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = b"libfastrtps.so", (OLDEST_DISTRIBUTION, "iron", "jazzy")
-PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")  # discovery that the profile does not do
+FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = (
+    b"libfastrtps.so",
+    (OLDEST_DISTRIBUTION, "iron", "jazzy"),
+)
+PEERS = (
+    "ROS_DISCOVERY_SERVER",
+    "ROS_STATIC_PEERS",
+)  # discovery that the profile does not do
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
 TABLE = Path("/proc/net/udp")
-FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250  # RTPS: a domain's first is that of its multicast
+FIRST_PORT, PORTS_OF_A_DOMAIN = (
+    7400,
+    250,
+)  # RTPS: a domain's first is that of its multicast
 
 
 def stays_here(environment: Mapping[str, str]) -> bool:
@@ -50,7 +68,11 @@ def stays_here(environment: Mapping[str, str]) -> bool:
 def chosen(environment: Mapping[str, str]) -> bool:
     """True if the user has chosen the transports: any but UDP, or by profiles of Fast DDS."""
     named = environment.get(TRANSPORTS, "") not in ("", UDP)
-    return named or any(map(environment.get, PROFILES)) or any(map(os.path.exists, PROFILES_HERE))
+    return (
+        named
+        or any(map(environment.get, PROFILES))
+        or any(map(os.path.exists, PROFILES_HERE))
+    )
 
 
 def stay_on_this_machine(environment: MutableMapping[str, str]) -> None:
@@ -75,7 +97,9 @@ class Transport:
             if self._in_force and not here:
                 earlier = "an earlier node in this process keeps its discovery on this machine"
                 fix = "set it before the first, or use another process."
-                raise BackendError(f"{RANGE} is {os.environ[RANGE]}, but {earlier}; {fix}")
+                raise BackendError(
+                    f"{RANGE} is {os.environ[RANGE]}, but {earlier}; {fix}"
+                )
             fast_dds = str(get_rmw_implementation_identifier()).startswith("rmw_fast")
             if sys.platform != "linux" or not fast_dds or chosen(os.environ):
                 return make()
@@ -89,7 +113,10 @@ class Transport:
     def _open_here(self, make: Callable[[], Context]) -> Context:
         words = {RANGE: SELF_MADE}
         if self._in_force is None:
-            old = os.environ.get("ROS_DISTRO") in FAST_DDS_2_DISTRIBUTIONS or FAST_DDS_2 in _maps()
+            old = (
+                os.environ.get("ROS_DISTRO") in FAST_DDS_2_DISTRIBUTIONS
+                or FAST_DDS_2 in _maps()
+            )
             words[PROFILES[old]] = str(PROFILE)
         with _changed(os.environ, words):
             context = make()
@@ -98,7 +125,9 @@ class Transport:
         if self._in_force:
             return context
         context.try_shutdown()
-        why = "since a node was started in this process before, or discovery went further"
+        why = (
+            "since a node was started in this process before, or discovery went further"
+        )
         get_logger("nics_drl_bridge").warning(
             f"Fast DDS did not take on {PROFILE}, "
             f"{why if PROFILE.is_file() else 'which is missing'}: it sends through shared memory, "
@@ -109,7 +138,9 @@ class Transport:
 
 
 @contextlib.contextmanager
-def _changed(environment: MutableMapping[str, str], words: Mapping[str, str]) -> Iterator[None]:
+def _changed(
+    environment: MutableMapping[str, str], words: Mapping[str, str]
+) -> Iterator[None]:
     # Without the older discovery variable, which overrides the others.
     kept = {key: environment.pop(key, None) for key in (ONLY_LOCAL, *words)}
     environment.update(words)
@@ -128,10 +159,15 @@ def _maps() -> bytes:
 def _is_in_force(context: Context) -> bool:
     try:
         node = Node(
-            "transport_probe", context=context, use_global_arguments=False,
-            start_parameter_services=False, enable_rosout=False,
-            parameter_overrides=[Parameter("start_type_description_service", value=False)],
-        )  # fmt: skip
+            "transport_probe",
+            context=context,
+            use_global_arguments=False,
+            start_parameter_services=False,
+            enable_rosout=False,
+            parameter_overrides=[
+                Parameter("start_type_description_service", value=False)
+            ],
+        )
     except BaseException:
         context.try_shutdown()
         raise
@@ -166,6 +202,8 @@ def domains_in_use() -> set[int]:
 
 
 def _sockets() -> list[tuple[str, int]]:
-    lines = TABLE.read_text(encoding="ascii").splitlines()[1:] if TABLE.is_file() else []
+    lines = (
+        TABLE.read_text(encoding="ascii").splitlines()[1:] if TABLE.is_file() else []
+    )
     rows = [line.split() for line in lines]
     return [(f"socket:[{row[9]}]", int(row[1].split(":")[1], 16)) for row in rows]

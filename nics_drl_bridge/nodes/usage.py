@@ -19,22 +19,28 @@ def help_of(node: str) -> str:
     topics = [
         _hanging(f"{title}: {', '.join(names)}", INDENT)
         for title, names in (
-            ("subscribes to", facts.subscribes), ("publishes", facts.publishes),
+            ("subscribes to", facts.subscribes),
+            ("publishes", facts.publishes),
             ("services", facts.services),
-        ) if names
-    ]  # fmt: skip
+        )
+        if names
+    ]
     parts = [
         f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO --params-file FILE ...]",
-        facts.about, "\n".join(topics), "parameters, with their defaults:",
+        facts.about,
+        "\n".join(topics),
+        "parameters, with their defaults:",
         "\n".join(map(_line, facts.parameters)),
         "and `use_sim_time`, as every node of ROS 2. `ros2 param describe` tells the ranges, too.",
         f"example:\n    ros2 run nics_drl_bridge {node} {ROS} {facts.example}",
-    ]  # fmt: skip
+    ]
     return "\n\n".join(parts) + "\n"
 
 
 def _line(row: Row) -> str:
-    return _hanging(f"    {row.name} = {row.shown or _words(row.default)}: {row.about}", 2 * INDENT)
+    return _hanging(
+        f"    {row.name} = {row.shown or _words(row.default)}: {row.about}", 2 * INDENT
+    )
 
 
 def _words(value: Any) -> str:
@@ -60,5 +66,7 @@ def wrong_with(node: str, words: Sequence[str]) -> str:
         elif ours:
             given = f"-p {word}" if ":=" in word else "-p NAME:=VALUE"
             fix = f"write parameters and remappings behind {ROS}, as in `{node} {ROS} {given}`"
-            return f"{node}: there is no argument {word!r}; {fix}, or see `{node} --help`."
+            return (
+                f"{node}: there is no argument {word!r}; {fix}, or see `{node} --help`."
+            )
     return ""

@@ -36,22 +36,37 @@ class RosSource:
     """
 
     def __init__(
-        self, model: SimulatorModel, world: AnyWorld | None, namespace: str = "",
+        self,
+        model: SimulatorModel,
+        world: AnyWorld | None,
+        namespace: str = "",
         domain_id: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         half = SIDE_M / 2.0
         bounds = (-half, -half, half, half)
-        self._world = world or World(name="map", bounds=bounds, goal_distance=(0.0, 1.0))
-        self._within = None if world is None else world.members[0]  # the one that is shown
-        self._model, self.period_s, self._title = model, PERIOD_S, namespace or "live topics"
+        self._world = world or World(
+            name="map", bounds=bounds, goal_distance=(0.0, 1.0)
+        )
+        self._within = (
+            None if world is None else world.members[0]
+        )  # the one that is shown
+        self._model, self.period_s, self._title = (
+            model,
+            PERIOD_S,
+            namespace or "live topics",
+        )
         self._trail, self._goal = Track(), np.zeros((0, 2))
         self._gate: str | None = None
         self._truth: Array | None = None
-        self._map_frame = "map"  # in which goals are; as the estimate or the simulator names it
+        self._map_frame = (
+            "map"  # in which goals are; as the estimate or the simulator names it
+        )
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
         self._context = open_context([], domain_id)
-        self._node = Node(NAME, context=self._context, namespace=namespace_of(namespace))
+        self._node = Node(
+            NAME, context=self._context, namespace=namespace_of(namespace)
+        )
         declare_sensors(self._node)
         self._topics = RobotTopics(self._node, model, on_lidar=self._take_lidar)
         self._goals = self._node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
@@ -83,7 +98,9 @@ class RosSource:
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.endswith(GATE):
-                self._gate = "" if status.level in (DiagnosticStatus.OK, 0) else status.message
+                self._gate = (
+                    "" if status.level in (DiagnosticStatus.OK, 0) else status.message
+                )
 
     def stage(self) -> Stage:
         """See `show.FrameSource`."""
@@ -98,13 +115,20 @@ class RosSource:
             heard = sorted(middleware.cache.newest)
         pose = view.pose if self._truth is None else self._truth
         shot = Snapshot(
-            pose[None], view.ranges[None], np.zeros((0, BODY)), self._goal,
-            estimates=view.pose[None], covariance=covariance, commands=command[None],
+            pose[None],
+            view.ranges[None],
+            np.zeros((0, BODY)),
+            self._goal,
+            estimates=view.pose[None],
+            covariance=covariance,
+            commands=command[None],
             gate=self._gate,
-        )  # fmt: skip
+        )
         state = "" if heard else "waiting for topics"
         world = WorldFrame(shot, self._title, 0, self._trail.ways, state)
-        return Frame(view.stamp_s, (world,), f"hears {', '.join(heard)}" if heard else "")
+        return Frame(
+            view.stamp_s, (world,), f"hears {', '.join(heard)}" if heard else ""
+        )
 
     def advance(self) -> bool:
         """Follows the robot's way where there is news; True after scans of another lidar."""

@@ -16,7 +16,10 @@ from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
 Bytes = bytes | bytearray
 HEAD = 4  # bytes of the header, not counted for alignment; the second one gives the byte order
 STAMP, FRAME = 4, 12  # offsets of stamp and frame of a message's header
-UNREADABLE = (ValueError, struct.error)  # raised by all readers for bytes of another type
+UNREADABLE = (
+    ValueError,
+    struct.error,
+)  # raised by all readers for bytes of another type
 PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
 # Numbers of an odometry before each: pose, its covariance, twist, its covariance.
@@ -68,7 +71,9 @@ def numbers_of(content: Bytes) -> Array:
 def frames_of(content: Bytes) -> tuple[str, str]:
     """Returns the frame of the header and the child frame of a serialised Odometry."""
     order = _order(content)
-    return _text(content, FRAME, order), _text(content, _after_text(content, FRAME, order), order)
+    return _text(content, FRAME, order), _text(
+        content, _after_text(content, FRAME, order), order
+    )
 
 
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
@@ -117,7 +122,9 @@ class OdometryWriter:
     def __init__(self, message: Odometry) -> None:
         self._content = bytearray(serialize_message(message))
         self._stamp = struct.Struct(f"{_order(self._content)}iI")
-        self._numbers = numbers_of(self._content)  # writable, because it is a view of a bytearray
+        self._numbers = numbers_of(
+            self._content
+        )  # writable, because it is a view of a bytearray
         self._covariance = self._numbers[POSE_COVARIANCE:TWIST].reshape(6, 6)
 
     def write(
@@ -140,7 +147,9 @@ class ScanWriter:
     def __init__(self, message: LaserScan) -> None:
         self._content = bytearray(serialize_message(message))
         self._stamp = struct.Struct(f"{_order(self._content)}iI")
-        self._ranges = ranges_of(self._content)  # writable, because it is a view of a bytearray
+        self._ranges = ranges_of(
+            self._content
+        )  # writable, because it is a view of a bytearray
 
     def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
         """Returns a message with ranges (B,), as the device reports them."""
@@ -154,7 +163,9 @@ def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int, frame: str) -> bytes
     x, y, w = np.asarray(twist, np.float64).tolist()
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     text = frame.encode() + b"\0"
-    header = NATIVE + struct.pack(f"=iII{len(text)}s", seconds, nanoseconds, len(text), text)
+    header = NATIVE + struct.pack(
+        f"=iII{len(text)}s", seconds, nanoseconds, len(text), text
+    )
     padding = bytes(_aligned(len(header), 8) - len(header))
     return header + padding + struct.pack("=6d", x, y, 0.0, 0.0, 0.0, w)
 

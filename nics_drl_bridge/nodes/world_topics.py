@@ -35,7 +35,9 @@ class WorldTopics:
     def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
         """Listens for a robot, whose number is looked up at each message."""
         kind, topic = PoseWithCovarianceStamped, f"{namespace}{INITIAL_POSE}"
-        return self._node.create_subscription(kind, topic, partial(self._take, robot), qos.COMMAND)
+        return self._node.create_subscription(
+            kind, topic, partial(self._take, robot), qos.COMMAND
+        )
 
     def _look(self) -> None:
         if self._shown is None and not self._map.get_subscription_count():
@@ -44,24 +46,38 @@ class WorldTopics:
         simulator = world.simulator
         member = int(simulator.data.member[0])
         still = standing(simulator.sampler, member, simulator.obstacles[0])
-        shown = world, member, [(shape, tuple(np.asarray(pose))) for shape, pose in still]
+        shown = (
+            world,
+            member,
+            [(shape, tuple(np.asarray(pose))) for shape, pose in still],
+        )
         if shown != self._shown:
             self._shown = shown
             grid = occupancy(simulator.world.members[member], still, self._cell)
-            self._map.publish(conversions.map_to_ros(grid, self._node.now_ns, self._frame))
+            self._map.publish(
+                conversions.map_to_ros(grid, self._node.now_ns, self._frame)
+            )
 
-    def _take(self, robot: Callable[[], int], message: PoseWithCovarianceStamped) -> None:
+    def _take(
+        self, robot: Callable[[], int], message: PoseWithCovarianceStamped
+    ) -> None:
         logger, simulator = self._node.get_logger(), self._world().simulator
         try:
             pose = initial_pose(message, self._frame)
-            x1, y1, x2, y2 = simulator.world.members[int(simulator.data.member[0])].extent
+            x1, y1, x2, y2 = simulator.world.members[
+                int(simulator.data.member[0])
+            ].extent
             if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
                 where = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
                 place = f"x {pose[0]:.2f} m, y {pose[1]:.2f} m"
-                raise ConfigError(f"{INITIAL_POSE}: {place} is outside the world ({where}).")
+                raise ConfigError(
+                    f"{INITIAL_POSE}: {place} is outside the world ({where})."
+                )
         except ConfigError as error:
             logger.error(f"{error} The robot stays where it is.")
             return
         simulator.put_robot(robot(), pose, np.zeros(simulator.data.state.shape[-1]))
         self._world().put(robot())
-        logger.info(f"a robot is put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad")
+        logger.info(
+            f"a robot is put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
+        )

@@ -28,7 +28,9 @@ SUFFIX = ".onnx"
 MAPPINGS = (".yaml", ".yml")  # suffixes of the mapping of a foreign policy
 GOLDEN = 16
 GOLDEN_SEED = 0
-GOLDEN_SPREAD = 3.0  # distance from zero of golden observations, if their limits are wider
+GOLDEN_SPREAD = (
+    3.0  # distance from zero of golden observations, if their limits are wider
+)
 GAP_PERIODS = 5  # control periods without an observation after which a state is reset
 MOST_ENTRIES = 20_000
 CHECKSUM = 8  # hexadecimal digits of a field's checksum, which detects mistakes but is no signature
@@ -43,7 +45,9 @@ def shipped() -> Path:
 class TaskEntry(Schema):
     """The task of a policy."""
 
-    name: str = Field(min_length=1)  # as in `env.registry.TASKS`, or the name of a user's class
+    name: str = Field(
+        min_length=1
+    )  # as in `env.registry.TASKS`, or the name of a user's class
     options: dict[str, Any]  # all of its options except `scan` and `sensors`
     sha256: str = Field(pattern="^[0-9a-f]{64}$")  # over name, options and observation
 
@@ -62,7 +66,9 @@ class StateEntry(Schema):
 
     size: int = Field(ge=1, le=200_000)
     start: float = Field(ge=-1e6, le=1e6)  # each element when an episode begins
-    longest_gap: float = Field(gt=0.0)  # between two observations [s]; after a longer one: as above
+    longest_gap: float = Field(
+        gt=0.0
+    )  # between two observations [s]; after a longer one: as above
 
 
 class GoldenEntry(Schema):
@@ -87,35 +93,51 @@ class Contract(Schema):
     format: Literal["nics_drl_bridge/policy/1"]
     robot: RobotSpec
     lidar: LidarSpec
-    scan: ScanLayout | None  # sectors of its observations; None: the beams of exactly this lidar
+    scan: (
+        ScanLayout | None
+    )  # sectors of its observations; None: the beams of exactly this lidar
     sensors: tuple[AnySensor, ...] = ()  # further ones that it observes
     task: TaskEntry
     observation: ObservationEntry
-    state: StateEntry | None = None  # None: each action follows from one observation alone
-    batch: Literal[1] | None = None  # greatest number of observations in one run; None: any
+    state: StateEntry | None = (
+        None  # None: each action follows from one observation alone
+    )
+    batch: Literal[1] | None = (
+        None  # greatest number of observations in one run; None: any
+    )
     actions: Literal["continuous", "discrete"]
     control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
     # time limit of the episodes that it learnt in; older files do not tell it
     max_episode_steps: int | None = Field(default=None, ge=1)
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
     provenance: dict[str, Any]  # command, seed and versions of its making
-    graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")  # of the graph, including the weights
+    graph_sha256: str = Field(
+        pattern="^[0-9a-f]{64}$"
+    )  # of the graph, including the weights
     golden: GoldenEntry  # pairs that must be reproduced
     checksums: dict[str, str]  # of each entry above, by its path
 
     @field_validator("provenance")
     @classmethod
     def _plain(cls, provenance: dict[str, Any]) -> dict[str, Any]:
-        if any(not isinstance(v, str | int | float | bool | None) for v in provenance.values()):
+        if any(
+            not isinstance(v, str | int | float | bool | None)
+            for v in provenance.values()
+        ):
             raise ValueError("must hold words and numbers only")
         return provenance
 
 
 def contract_of(
-    task: Task, model: SimulatorModel, golden: Mapping[str, Rows], graph_sha256: str,
-    provenance: Mapping[str, Any], state: tuple[int, float] | None = None,
-    batch: Literal[1] | None = None, max_episode_steps: int | None = None,
-) -> str:  # fmt: skip
+    task: Task,
+    model: SimulatorModel,
+    golden: Mapping[str, Rows],
+    graph_sha256: str,
+    provenance: Mapping[str, Any],
+    state: tuple[int, float] | None = None,
+    batch: Literal[1] | None = None,
+    max_episode_steps: int | None = None,
+) -> str:
     """Writes the contract of a policy as JSON; the state is its size and start value.
 
     Raises ConfigError if an entry has a wrong type.
@@ -155,7 +177,10 @@ def contract_of(
 def golden_observations(task: Task) -> Rows:
     """Observations (16, O) within the limits of a task's, always the same ones."""
     space = task.observation_space
-    low, high = np.maximum(space.low, -GOLDEN_SPREAD), np.minimum(space.high, GOLDEN_SPREAD)
+    low, high = (
+        np.maximum(space.low, -GOLDEN_SPREAD),
+        np.minimum(space.high, GOLDEN_SPREAD),
+    )
     rng = np.random.default_rng(GOLDEN_SEED)
     return rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
 
@@ -177,14 +202,19 @@ def observation_entry(task: Task) -> dict[str, Any]:
     """Observation of a task, as the entries of `ObservationEntry`."""
     space, parts = task.observation_space, task.scan_parts
     return {
-        "size": int(space.shape[0]), "scan_parts": parts,
+        "size": int(space.shape[0]),
+        "scan_parts": parts,
         "rest_low": [float(value) for value in space.low[parts:]],
         "rest_high": [float(value) for value in space.high[parts:]],
-    }  # fmt: skip
+    }
 
 
 def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
-    known = {"name": entry["name"], "options": entry["options"], "observation": observation}
+    known = {
+        "name": entry["name"],
+        "options": entry["options"],
+        "observation": observation,
+    }
     return sha256(json.dumps(known, sort_keys=True).encode())
 
 
@@ -200,7 +230,9 @@ def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 def checksums(data: Mapping[str, Any]) -> dict[str, str]:
     """Checksum of each entry except `checksums`, by path."""
     known = {name: value for name, value in data.items() if name != "checksums"}
-    return {path: sha256(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)}
+    return {
+        path: sha256(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)
+    }
 
 
 def read_contract(text: str, source: str) -> Contract:
@@ -213,7 +245,9 @@ def read_contract(text: str, source: str) -> Contract:
         data = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         reason = f"is not JSON as `export_policy` writes it ({str(error)[:80]})"
-        raise PolicyError(source, "metadata", f"{reason}; export the policy anew.") from None
+        raise PolicyError(
+            source, "metadata", f"{reason}; export the policy anew."
+        ) from None
     given = data.get("format") if isinstance(data, dict) else None
     if given != FORMAT:
         reason = f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version."
@@ -223,7 +257,9 @@ def read_contract(text: str, source: str) -> Contract:
     except ConfigError as error:
         reason = str(error).removeprefix(f"{source}: ")
         # What is missing can't be added to a file that is signed.
-        reason = reason.replace("is missing; add it.", "is missing; export the policy anew.")
+        reason = reason.replace(
+            "is missing; add it.", "is missing; export the policy anew."
+        )
         quoted = reason.split("'")
         key = quoted[1] if len(quoted) > 2 and "key" in quoted[0] else "metadata"
         raise PolicyError(source, key, reason) from None
@@ -259,11 +295,15 @@ def _check_agreement(contract: Contract, source: str) -> None:
         reason = f"is {parts}, but observations hold {observation.scan_parts} parts of a scan."
         raise PolicyError(source, name, reason)
     if observation.size != parts + rest or len(observation.rest_high) != rest:
-        reason = f"is {observation.size}, not the {parts} of the scan and {rest} others."
+        reason = (
+            f"is {observation.size}, not the {parts} of the scan and {rest} others."
+        )
         raise PolicyError(source, "observation.size", reason)
     seen = observation.model_dump(mode="json")
     if contract.task.sha256 != _task_hash(contract.task.model_dump(), seen):
-        raise PolicyError(source, "task.sha256", "does not belong to the task and observation.")
+        raise PolicyError(
+            source, "task.sha256", "does not belong to the task and observation."
+        )
     commands = len(contract.robot.command)
     actions = 1 if contract.actions == "discrete" else commands
     sizes = {"observations": observation.size, "commands": commands, "actions": actions}
@@ -273,5 +313,7 @@ def _check_agreement(contract: Contract, source: str) -> None:
         except ValueError:
             raise PolicyError(source, f"golden.{name}", "is damaged.") from None
         if rows.shape != (GOLDEN, size) or not np.isfinite(rows).all():
-            reason = f"must be {GOLDEN} rows of {size} finite numbers, not {rows.shape}."
+            reason = (
+                f"must be {GOLDEN} rows of {size} finite numbers, not {rows.shape}."
+            )
             raise PolicyError(source, f"golden.{name}", reason)

@@ -20,7 +20,9 @@ class LookAhead(NamedTuple):
     reaction: float  # time until a robot that is told to stop brakes [s]
     slowness: float  # inverse of the deceleration that follows [s^2/m]
     lever: float  # by which a turn rate adds to the speed that is braked [m]
-    turn_reaction: float  # likewise of a turn that brakes apart from the speed, else 0 [s]
+    turn_reaction: (
+        float  # likewise of a turn that brakes apart from the speed, else 0 [s]
+    )
     turn_slowness: float  # inverse of its deceleration [s^2/rad]
     far: float  # distance along an axis, beyond which nothing is known [m]
 
@@ -30,7 +32,9 @@ class TwistWeights(NamedTuple):
 
     gap: float  # left on the way to the goal [1/m]
     aim: float  # of the heading, from 0 along that way to 1 the other way
-    clearance: float  # of the nearest obstacle on the way, from 0 far away to 1 at the margin
+    clearance: (
+        float  # of the nearest obstacle on the way, from 0 far away to 1 at the margin
+    )
     time: float  # until a contact
 
 
@@ -103,5 +107,7 @@ def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-de
         pace = max(pace, present + ahead.lever * abs(twist[2]))
     rest = faster * (ahead.reaction + 0.5 * pace * ahead.slowness)
     if aimed[2] != 0.0:
-        rest = max(rest, ahead.turn_reaction + 0.5 * abs(aimed[2]) * ahead.turn_slowness)
+        rest = max(
+            rest, ahead.turn_reaction + 0.5 * abs(aimed[2]) * ahead.turn_slowness
+        )
     return cost + (2.0 * INADMISSIBLE if moves and free * period < rest else 0.0)

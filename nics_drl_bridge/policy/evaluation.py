@@ -22,9 +22,13 @@ from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
 
 Flags = NDArray[np.bool_]
-Act = Callable[[NDArray[np.float32]], NDArray[Any]]  # actions (N, C) for observations (N, O)
+Act = Callable[
+    [NDArray[np.float32]], NDArray[Any]
+]  # actions (N, C) for observations (N, O)
 
-FIRST_SEED = 1_000_000  # first seed of an evaluation, far from the seeds of any training
+FIRST_SEED = (
+    1_000_000  # first seed of an evaluation, far from the seeds of any training
+)
 DRIFT_M = 0.1  # a robot stops where it believes its goal is; odometry may have drifted by this much
 ELSEWHERE = "elsewhere"
 CONFIDENCE = 0.95
@@ -43,7 +47,9 @@ class Episode:
     reward: float  # sum over the episode
     believed: str | None = None  # by the robot itself, where `result` is by the truth
     planned: int | None = None  # actions of the fallback, if the policy has one
-    uncertain: Uncertainty | None = None  # of the estimate, gained since the start, where known
+    uncertain: Uncertainty | None = (
+        None  # of the estimate, gained since the start, where known
+    )
 
     @property
     def believed_success(self) -> bool:
@@ -68,18 +74,27 @@ class Episode:
     def plain(self) -> dict[str, Any]:
         """The episode as plain data."""
         return {
-            "seed": self.seed, "result": self.result, "believed": self.believed,
-            "goal_distance_m": round(self.miss, 4), "steps": self.steps,
-            "length_m": round(self.length, 4), "fallback_actions": self.planned,
-            "goal": self.goal.tolist(), "path": np.round(self.path, 4).tolist(),
+            "seed": self.seed,
+            "result": self.result,
+            "believed": self.believed,
+            "goal_distance_m": round(self.miss, 4),
+            "steps": self.steps,
+            "length_m": round(self.length, 4),
+            "fallback_actions": self.planned,
+            "goal": self.goal.tolist(),
+            "path": np.round(self.path, 4).tolist(),
             "uncertain": None if self.uncertain is None else self.uncertain._asdict(),
-        }  # fmt: skip
+        }
 
 
 def drive(
-    env: gymnasium.Env[Any, Any], policy: Policy, seed: int, options: dict[str, Any] | None = None,
-    on_start: Callable[[], None] = lambda: None, touched: Callable[[], bool] | None = None,
-) -> Episode:  # fmt: skip
+    env: gymnasium.Env[Any, Any],
+    policy: Policy,
+    seed: int,
+    options: dict[str, Any] | None = None,
+    on_start: Callable[[], None] = lambda: None,
+    touched: Callable[[], bool] | None = None,
+) -> Episode:
     """Drives one episode to its end; halts the robot if the policy or a callback raises."""
     try:
         observation, info = env.reset(seed=seed, options=options)
@@ -105,14 +120,20 @@ def drive(
         believed = "success" if np.all(info.get("is_success", False)) else collided
         driven = np.array(paths), np.array(estimates), goal, bodies, total
         planned = None if before is None else (acted(policy) or 0) - before
-        uncertain = gained_uncertainty(covariances[0], covariances[-1]) if covariances else None
+        uncertain = (
+            gained_uncertainty(covariances[0], covariances[-1]) if covariances else None
+        )
         if "true_pose" not in info:
-            return Episode(seed, believed, *driven, planned=planned, uncertain=uncertain)
+            return Episode(
+                seed, believed, *driven, planned=planned, uncertain=uncertain
+            )
         known = info.get("true_collision")
         if known is None:  # then `touched` tells, or else the robot itself
             known = believed == "collision" if touched is None else touched()
         hit = bool(np.any(known))
-        there = truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all()
+        there = truly_near(
+            getattr(env.unwrapped, "task", None), info["true_pose"], goal
+        ).all()
         wrong = (believed == "success" and not there) or believed == "collision"
         true = ELSEWHERE if wrong else believed
         return Episode(seed, "collision" if hit else true, *driven, believed, planned)
@@ -126,7 +147,9 @@ def drive(
 def _answer(act: Act, observation: NDArray[np.float32], step: int) -> NDArray[Any]:
     action = act(observation)
     if not np.isfinite(action).all():
-        raise ConfigError(f"the policy's action in step {step} holds NaN or inf; train it anew.")
+        raise ConfigError(
+            f"the policy's action in step {step} holds NaN or inf; train it anew."
+        )
     return action
 
 
@@ -139,10 +162,12 @@ def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
 
 
 def drive_all(
-    env: gymnasium.Env[Any, Any], policy: Policy, seeds: Iterable[int],
+    env: gymnasium.Env[Any, Any],
+    policy: Policy,
+    seeds: Iterable[int],
     on_episode: Callable[[Episode], None] = lambda _: None,
     touched: Callable[[], bool] | None = None,
-) -> list[Episode]:  # fmt: skip
+) -> list[Episode]:
     """Drives one episode per seed and calls `on_episode` as each ends."""
     episodes = []
     for seed in seeds:
@@ -159,7 +184,9 @@ def successes(episodes: Iterable[Episode]) -> int:
 def deviation(one: Episode, other: Episode) -> float:
     """Maximum distance between two paths at the same step, over their common length [m]."""
     steps = min(len(one.path), len(other.path))
-    return float(np.linalg.norm(one.path[:steps, :2] - other.path[:steps, :2], axis=1).max())
+    return float(
+        np.linalg.norm(one.path[:steps, :2] - other.path[:steps, :2], axis=1).max()
+    )
 
 
 @dataclass(frozen=True)
@@ -187,12 +214,16 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
     """
     width, given = env.num_envs, checked_seeds(seeds)
     # The last batch is padded with seeds that are driven but not counted.
-    batches = (np.resize(given[k : k + width], width) for k in range(0, len(given), width))
+    batches = (
+        np.resize(given[k : k + width], width) for k in range(0, len(given), width)
+    )
     done = zip(*(_drive_once(env, act, batch) for batch in batches), strict=True)
     return Outcomes(given, *(np.concatenate(rows)[: len(given)] for rows in done))
 
 
-def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tuple[Any, ...]:
+def _drive_once(
+    env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]
+) -> tuple[Any, ...]:
     """Drives one episode in each world: the fields of `Outcomes` but seeds, each (N,)."""
     count = env.num_envs
     observation, info = env.reset(seed=list(seeds))
@@ -212,7 +243,9 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
         steps += running
         ended = running & (terminated | truncated)
         seen = _robots(info, "collision").any(axis=1)
-        hit = _robots(info, "true_collision" if "true_collision" in info else "collision")
+        hit = _robots(
+            info, "true_collision" if "true_collision" in info else "collision"
+        )
         collision |= ended & hit.any(axis=1)
         arrived = ended & ~seen & _robots(info, "is_success").all(axis=1)
         believed |= arrived
@@ -243,7 +276,9 @@ class ConfidenceInterval:
         if math.isnan(self.value):
             return "unknown"
         known = f"{self.value:.2f} {unit}"
-        return known + (f" ({self.low:.2f} to {self.high:.2f})" if math.isfinite(self.low) else "")
+        return known + (
+            f" ({self.low:.2f} to {self.high:.2f})" if math.isfinite(self.low) else ""
+        )
 
 
 def rate(hits: int, trials: int) -> ConfidenceInterval:
@@ -253,7 +288,11 @@ def rate(hits: int, trials: int) -> ConfidenceInterval:
     share, z = hits / trials, float(special.ndtri(0.5 + CONFIDENCE / 2.0))
     scale = 1.0 + z * z / trials
     middle = (share + z * z / (2.0 * trials)) / scale
-    half = z / scale * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
+    half = (
+        z
+        / scale
+        * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
+    )
     # With no hits, or hits only, rounding must not move the end away from 0 or 1.
     low = 0.0 if hits == 0 else middle - half
     return ConfidenceInterval(share, low, 1.0 if hits == trials else middle + half)
@@ -311,28 +350,40 @@ class Tally(Summary):
         """The tally as plain data, an interval as a list; non-finite values become null."""
         figures: dict[str, Any] = {}
         for name, value in vars(self).items():
-            ends = vars(value).values() if isinstance(value, ConfidenceInterval) else [value]
+            ends = (
+                vars(value).values()
+                if isinstance(value, ConfidenceInterval)
+                else [value]
+            )
             known = [each if math.isfinite(each) else None for each in ends]
             figures[name] = known if isinstance(value, ConfidenceInterval) else known[0]
         return figures
 
 
-def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dict[str, Tally]:
+def tallies(
+    runs: Mapping[str, Sequence[Episode]], control_period: float
+) -> dict[str, Tally]:
     """Computes the figures of each world, compared with the same seeds in the first."""
     first, found = next(iter(runs.values())), {}
     for place, episodes in runs.items():
         rows = (
-            (e.seed, e.result, e.steps, e.length, e.reward, e.believed_success) for e in episodes
+            (e.seed, e.result, e.steps, e.length, e.reward, e.believed_success)
+            for e in episodes
         )
         seeds, results, *figures = map(np.array, zip(*rows, strict=True))
-        outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
+        outcomes = Outcomes(
+            seeds, results == "success", results == "collision", *figures
+        )
         pairs = list(zip(episodes, first, strict=True))
         gaps = [deviation(one, other) for one, other in pairs]
         planned = [one.planned for one in episodes if one.planned is not None]
         found[place] = Tally(
             **vars(summarise(outcomes, control_period)),
             same=sum(one.result == other.result for one, other in pairs) / len(pairs),
-            deviation=mean(gaps), greatest_deviation=max(gaps),
-            fallback=sum(planned) / max(int(sum(figures[0])), 1) if planned else math.nan,
-        )  # fmt: skip
+            deviation=mean(gaps),
+            greatest_deviation=max(gaps),
+            fallback=sum(planned) / max(int(sum(figures[0])), 1)
+            if planned
+            else math.nan,
+        )
     return found

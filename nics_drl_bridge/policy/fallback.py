@@ -28,7 +28,11 @@ class Fallback:
     """
 
     def __init__(
-        self, policy: Policy, planner: Policy, task: Navigation, model: SimulatorModel | None
+        self,
+        policy: Policy,
+        planner: Policy,
+        task: Navigation,
+        model: SimulatorModel | None,
     ) -> None:
         self._policy, self._planner, self._task = policy, planner, task
         self._judge = Mppi(task, model, samples=1, clearance=KEPT)
@@ -65,8 +69,13 @@ def check_readable(task: Navigation, planner: str) -> None:
     """Raises ConfigError for observations that no planner reads, and actions that none gives."""
     kind, named = type(task), f"fallback {planner!r}"
     own = any(getattr(kind, one, None) is not getattr(Navigation, one) for one in READ)
-    if own or getattr(kind, "step_into", None) not in (Navigation.step_into, Task.step_into):
-        reason = f"reads what 'navigation' observes, and {kind.__name__} observes otherwise"
+    if own or getattr(kind, "step_into", None) not in (
+        Navigation.step_into,
+        Task.step_into,
+    ):
+        reason = (
+            f"reads what 'navigation' observes, and {kind.__name__} observes otherwise"
+        )
         raise ConfigError(f"{named} {reason}; leave it out.")
     if task.actions == "discrete":
         reason = "gives continuous actions, and those of the policy are discrete"

@@ -23,7 +23,9 @@ class GoalCheck:
     xy_goal_tolerance: float = 0.25  # [m]
     yaw_goal_tolerance: float = 0.25  # [rad]; robots that steer are not turned
     stateful: bool = True  # a place that was reached stays so while the robot turns
-    path_length_tolerance: float = 1.0  # greatest length of the way that may be left [m]
+    path_length_tolerance: float = (
+        1.0  # greatest length of the way that may be left [m]
+    )
 
 
 @dataclass(frozen=True)
@@ -56,14 +58,20 @@ class PlannedPath:
         if not len(poses):
             raise ConfigError("the path is empty; give one with at least one pose.")
         if not (np.abs(poses) < FARTHEST).all():
-            raise ConfigError("the path has a coordinate that is no number, or out of all reach.")
+            raise ConfigError(
+                "the path has a coordinate that is no number, or out of all reach."
+            )
         along = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
         if along[-1] > LONGEST:
-            raise ConfigError(f"the path has {along[-1]:.3g} m, and {LONGEST:g} m are the most.")
+            raise ConfigError(
+                f"the path has {along[-1]:.3g} m, and {LONGEST:g} m are the most."
+            )
         count = max(1, math.ceil(along[-1] / SPACING)) + 1
         self.end = poses[-1]
         self._along = np.linspace(0.0, along[-1], count)
-        self._points = np.column_stack([np.interp(self._along, along, poses[:, i]) for i in (0, 1)])
+        self._points = np.column_stack(
+            [np.interp(self._along, along, poses[:, i]) for i in (0, 1)]
+        )
         self._given = np.minimum(np.searchsorted(along, self._along), len(poses) - 1)
         self._at = 0
 
@@ -77,20 +85,30 @@ class PlannedPath:
 
         It goes on to the nearest point.
         """
-        last = int(np.searchsorted(self._along, self._along[self._at] + WINDOW, "right"))
+        last = int(
+            np.searchsorted(self._along, self._along[self._at] + WINDOW, "right")
+        )
         away = np.hypot(*(self._points[self._at : last] - pose[:2]).T)
         at = self._at = self._at + int(np.argmin(away))
-        ahead = int(np.searchsorted(self._along, self._along[at] + lookahead, "right")) - 1
+        ahead = (
+            int(np.searchsorted(self._along, self._along[at] + lookahead, "right")) - 1
+        )
         after = min(at + 1, len(self._points) - 1)
         direction = self._points[after] - self._points[max(after - 1, 0)]
-        heading = math.atan2(direction[1], direction[0]) if direction.any() else float(pose[2])
+        heading = (
+            math.atan2(direction[1], direction[0])
+            if direction.any()
+            else float(pose[2])
+        )
         off = pose[:2] - self._points[at]
         return Place(
-            self._points[ahead], int(self._given[at]), self.length - float(self._along[at]),
+            self._points[ahead],
+            int(self._given[at]),
+            self.length - float(self._along[at]),
             math.dist(pose[:2], self.end[:2]),
             math.cos(heading) * off[1] - math.sin(heading) * off[0],
             float(wrap_angle(heading - pose[2])),
-        )  # fmt: skip
+        )
 
 
 class GoalChecker:
@@ -107,7 +125,9 @@ class GoalChecker:
         self._there = here or (self._there and check.stateful)
         if not self._there:
             return None
-        turn = float(wrap_angle(end[2] - pose[2])) if self._turns and len(end) > 2 else 0.0
+        turn = (
+            float(wrap_angle(end[2] - pose[2])) if self._turns and len(end) > 2 else 0.0
+        )
         return turn if abs(turn) > check.yaw_goal_tolerance else 0.0
 
 
@@ -121,7 +141,10 @@ class ProgressChecker:
     def stuck(self, time_s: float, pose: Array) -> bool:
         """True if a robot, at a pose (3,) at a time, has not moved enough for too long."""
         check = self.check
-        since, place = self._base or (math.inf, pose)  # later than now if the clock was set back
+        since, place = self._base or (
+            math.inf,
+            pose,
+        )  # later than now if the clock was set back
         moved = math.dist(pose[:2], place[:2]) > check.required_movement_radius
         turned = abs(wrap_angle(pose[2] - place[2])) > check.required_movement_angle
         if time_s < since or moved or turned:

@@ -14,7 +14,13 @@ from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.policy import leapp_bundle, onnx_graph, policy_file, rehearsal
-from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, Rows, contract_of, golden_observations
+from nics_drl_bridge.policy.contract import (
+    MAPPINGS,
+    SUFFIX,
+    Rows,
+    contract_of,
+    golden_observations,
+)
 from nics_drl_bridge.policy.foreign_graph import Composer, Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
 from nics_drl_bridge.policy.onnx_graph import STATE_IN
@@ -31,14 +37,18 @@ class Order:
     sha256: str  # of the network's files
 
 
-def load_any(path: str | Path, model: SimulatorModel | None = None) -> policy_file.PolicyFile:
+def load_any(
+    path: str | Path, model: SimulatorModel | None = None
+) -> policy_file.PolicyFile:
     """Loads a policy file, see `load_policy`, or makes one of the YAML file of a foreign policy.
 
     That is for a robot; None: the one that the mapping names. Raises ConfigError for a wrong
     mapping, PolicyError for what does not fit together.
     """
     if str(path).endswith(MAPPINGS):
-        return policy_file.policy_of(_content(_ordered(Path(path), model), model), Path(path))
+        return policy_file.policy_of(
+            _content(_ordered(Path(path), model), model), Path(path)
+        )
     return policy_file.load_policy(path)
 
 
@@ -54,7 +64,9 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
     if (ours := bundle.ours) is not None:
         return ours
     if model is None:
-        raise ConfigError(f"{path}: a bundle of others names no robot; say which with --robot.")
+        raise ConfigError(
+            f"{path}: a bundle of others names no robot; say which with --robot."
+        )
     mapping = validate(leapp_bundle.mapping_of(bundle, model), ForeignPolicy, str(path))
     return _content(Order(mapping, bundle.network, path, bundle.sha256), model)
 
@@ -77,7 +89,9 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
     try:
         if file.stat().st_size > onnx_graph.SIZE_LIMIT:
             most = f"{onnx_graph.SIZE_LIMIT // 2**20} MB, as no policy is; not opened."
-            raise PolicyError(str(path), "network", f"{mapping.network!r} has more than {most}")
+            raise PolicyError(
+                str(path), "network", f"{mapping.network!r} has more than {most}"
+            )
         content = file.read_bytes()
     except OSError as error:
         reason = f"{mapping.network!r} can't be read ({error.strerror}); it is beside the mapping."
@@ -98,9 +112,13 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
     period = model.control_period
     if abs((mapping.control_period or period) - period) > policy_file.PERIOD_TOLERANCE:
         reason = f"is {mapping.control_period:g} s, but the robot's is {period:g} s"
-        raise PolicyError(source, "control_period", f"{reason}; use a model with that period.")
+        raise PolicyError(
+            source, "control_period", f"{reason}; use a model with that period."
+        )
     try:
-        task = Navigation(model.robot, model.lidar, scan=layout_of(mapping.scan, model.lidar))
+        task = Navigation(
+            model.robot, model.lidar, scan=layout_of(mapping.scan, model.lidar)
+        )
     except ConfigError as error:
         raise ConfigError(f"{source}: key 'scan': {error}") from None
     graph, size = Composer(order.network, mapping, task, source).compose()
@@ -119,7 +137,9 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
     content = graph.SerializeToString()
     widths: dict[str, int | None] = {STATE_IN: size} if size else {}
     needs = GraphNeeds(widths, batch=1, graph_sha256="", start=0.0 if size else None)
-    rehearsal.rehearse_graph(content, needs, seen, source)  # before anything of it runs here
+    rehearsal.rehearse_graph(
+        content, needs, seen, source
+    )  # before anything of it runs here
     onnx_graph.rows_at_once(graph, source, 1)
     session = open_session(content, source)
     names = (onnx_graph.INPUT, STATE_IN)
@@ -130,10 +150,14 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
             return list(session.run(None, dict(zip(names, given, strict=False))))
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
             words = " ".join(str(error).split())[:120]
-            raise PolicyError(source, "network", f"onnxruntime can't run it ({words}).") from None
+            raise PolicyError(
+                source, "network", f"onnxruntime can't run it ({words})."
+            ) from None
 
     rows = in_turn(run if size else lambda one, state: [*run(one), state], seen, start)
     if not all(np.isfinite(part).all() for part in rows):
-        reason = "gives NaN or inf for ordinary observations; check scaling and weights."
+        reason = (
+            "gives NaN or inf for ordinary observations; check scaling and weights."
+        )
         raise PolicyError(source, "network", reason)
     return {"observations": seen, "actions": rows[0], "commands": rows[1]}

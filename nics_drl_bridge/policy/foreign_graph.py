@@ -18,7 +18,9 @@ from nics_drl_bridge.robot.spec import RobotSpec
 THEIRS = "network/"  # before every name of the foreign graph
 OLDEST_OPSET = 8  # from which on the operators used here broadcast
 SLOWEST = 1e-6  # speed below which a steering angle is 0 [m/s]
-FIELDS = dict(zip(foreign_mapping.TWIST, ("linear.x", "linear.y", "angular.z"), strict=True))
+FIELDS = dict(
+    zip(foreign_mapping.TWIST, ("linear.x", "linear.y", "angular.z"), strict=True)
+)
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,9 @@ class Network:
     """A foreign network, and its states as far as its own files tell them."""
 
     model: Any  # onnx.ModelProto
-    states: Mapping[str, foreign_mapping.ForeignState] = field(default_factory=dict)  # by input
+    states: Mapping[str, foreign_mapping.ForeignState] = field(
+        default_factory=dict
+    )  # by input
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -44,10 +48,18 @@ class Composer:
     """Builds the graph of a policy file around a foreign network, for one observation at once."""
 
     def __init__(
-        self, network: Network, mapping: foreign_mapping.ForeignPolicy, task: Navigation,
+        self,
+        network: Network,
+        mapping: foreign_mapping.ForeignPolicy,
+        task: Navigation,
         source: str,
-    ) -> None:  # fmt: skip
-        self._network, self._mapping, self._task, self._source = network, mapping, task, source
+    ) -> None:
+        self._network, self._mapping, self._task, self._source = (
+            network,
+            mapping,
+            task,
+            source,
+        )
         self._states = {**network.states, **mapping.states}
         self._build = Builder()
         self._past: dict[str, str] = {}  # rows of the state by what they keep
@@ -61,7 +73,9 @@ class Composer:
         ends = np.cumsum([0, *sizes.values()])
         if sizes:
             ranges = zip(sizes, ends[:-1], ends[1:], strict=True)
-            self._past = {n: build.pick(onnx_graph.STATE_IN, range(i, j)) for n, i, j in ranges}
+            self._past = {
+                n: build.pick(onnx_graph.STATE_IN, range(i, j)) for n, i, j in ranges
+            }
         self._feed(theirs)
         build.nodes += theirs.graph.node
         build.weights += theirs.graph.initializer
@@ -69,7 +83,9 @@ class Composer:
         low, high = self._task.command_limits
         command = build.cut(command, (low, high))
         build.add("Identity", command, name=onnx_graph.COMMAND)
-        action = build.affine(command, 2.0 / (high - low), -1.0 - 2.0 * low / (high - low))
+        action = build.affine(
+            command, 2.0 / (high - low), -1.0 - 2.0 * low / (high - low)
+        )
         build.add("Identity", build.cut(action, (-1.0, 1.0)), name=onnx_graph.ACTION)
         if sizes:
             self._remember()
@@ -80,20 +96,32 @@ class Composer:
         return PolicyError(self._source, place, reason)
 
     def _check_names(self) -> None:
-        mapping, taken, given = self._mapping, self._network.inputs, self._network.outputs
+        mapping, taken, given = (
+            self._mapping,
+            self._network.inputs,
+            self._network.outputs,
+        )
         for name in (*mapping.inputs, *self._states):
             if name not in taken:
                 where = "inputs" if name in mapping.inputs else "states"
                 fix = nearest(name, taken)
-                raise self._fault(f"{where}.{name}", f"the network has no such input; {fix}")
+                raise self._fault(
+                    f"{where}.{name}", f"the network has no such input; {fix}"
+                )
         for name in taken:
             if name not in mapping.inputs and name not in self._states:
-                reason = "the network takes this input, and nothing says what it is; add it."
+                reason = (
+                    "the network takes this input, and nothing says what it is; add it."
+                )
                 raise self._fault(f"inputs.{name}", reason)
             if name in mapping.inputs and name in self._states:
-                raise self._fault(f"states.{name}", "is an input as well; keep one of them.")
+                raise self._fault(
+                    f"states.{name}", "is an input as well; keep one of them."
+                )
         commands = mapping.outputs.items()
-        named = [(f"outputs.{key}.of", one.of) for key, one in commands if one.of is not None]
+        named = [
+            (f"outputs.{key}.of", one.of) for key, one in commands if one.of is not None
+        ]
         named += [(f"states.{key}.next", one.next) for key, one in self._states.items()]
         named += [] if mapping.choices is None else [("choices.of", mapping.choices.of)]
         named += [
@@ -113,16 +141,22 @@ class Composer:
         """The foreign graph with names of its own, fixed shapes, and inputs that are fed here."""
         model = onnx.ModelProto()
         model.CopyFrom(self._network.model)
-        versions = [one.version for one in model.opset_import if one.domain in ("", "ai.onnx")]
+        versions = [
+            one.version for one in model.opset_import if one.domain in ("", "ai.onnx")
+        ]
         if not versions or max(versions) < OLDEST_OPSET:
-            reason = f"is {max(versions, default=0)}, needed is {OLDEST_OPSET} or newer."
+            reason = (
+                f"is {max(versions, default=0)}, needed is {OLDEST_OPSET} or newer."
+            )
             raise self._fault("network.opset", reason)
         for one in model.graph.input:
             if one.name in self._network.inputs:
                 shape = one.type.tensor_type.shape
                 for place, size in zip(shape.dim, self._shape(one.name), strict=True):
                     place.dim_value = size
-        rehearsal.rehearse_folding(model.SerializeToString(), max(versions), self._source)
+        rehearsal.rehearse_folding(
+            model.SerializeToString(), max(versions), self._source
+        )
         try:
             model = onnx.compose.add_prefix(model, THEIRS)
             self._made = graph_folding.fold_shapes(model.graph, max(versions))
@@ -139,7 +173,9 @@ class Composer:
             sizes[0] = 1
         needed = self._given_size(name)
         if needed is not None and sizes.count(0) == 1:
-            sizes[sizes.index(0)] = max(needed // max(math.prod(s for s in sizes if s), 1), 1)
+            sizes[sizes.index(0)] = max(
+                needed // max(math.prod(s for s in sizes if s), 1), 1
+            )
         sizes = [size or 1 for size in sizes]
         if needed is not None and math.prod(sizes) != needed:
             parts = self._mapping.inputs[name].parts
@@ -169,7 +205,10 @@ class Composer:
         if hasattr(self, "_made"):
             sizes: Sequence[int] = self._made[THEIRS + name]
         else:
-            sizes = [d.dim_value for d in self._network.outputs[name].type.tensor_type.shape.dim]
+            sizes = [
+                d.dim_value
+                for d in self._network.outputs[name].type.tensor_type.shape.dim
+            ]
         return math.prod(size or 1 for size in sizes)
 
     def _state_sizes(self) -> dict[str, int]:
@@ -184,7 +223,9 @@ class Composer:
                 if part.history > 1:
                     kept = self._part_size(part) // part.history * (part.history - 1)
                     sizes[f"history {name} {k}"] = kept
-        return {"begun": 1, **sizes} if sizes else {}  # begun: 0 in the first step, then 1
+        return (
+            {"begun": 1, **sizes} if sizes else {}
+        )  # begun: 0 in the first step, then 1
 
     # Inputs.
 
@@ -193,16 +234,22 @@ class Composer:
         taken = {one.name: one.type.tensor_type.elem_type for one in theirs.graph.input}
         for name in self._network.inputs:
             if name in self._states:
-                row = self._begun(f"state {name}", self._states[name].start, f"states.{name}.start")
+                row = self._begun(
+                    f"state {name}", self._states[name].start, f"states.{name}.start"
+                )
             else:
                 one = self._mapping.inputs[name]
                 parts = [self._part(name, k, part) for k, part in enumerate(one.parts)]
                 self._check_scaled(one, self._given_size(name) or 0, f"inputs.{name}")
-                row = build.scale(parts[0] if len(parts) == 1 else build.join(parts), one)
+                row = build.scale(
+                    parts[0] if len(parts) == 1 else build.join(parts), one
+                )
             row = build.add("Reshape", row, build.constant(self._shape(name), np.int64))
             build.add("Cast", row, name=THEIRS + name, to=taken[THEIRS + name])
 
-    def _check_scaled(self, scaled: foreign_mapping.Scaled, size: int, place: str) -> None:
+    def _check_scaled(
+        self, scaled: foreign_mapping.Scaled, size: int, place: str
+    ) -> None:
         for key in ("subtract", "divide"):
             values = getattr(scaled, key)
             if isinstance(values, tuple) and len(values) != size:
@@ -212,11 +259,15 @@ class Composer:
     def _begun(self, key: str, start: Any, place: str = "") -> str:
         """Returns the name of what the state keeps, or of its start in the first step."""
         past = self._past[key]
-        if isinstance(start, tuple) and len(start) != (size := self._state_sizes()[key]):
+        if isinstance(start, tuple) and len(start) != (
+            size := self._state_sizes()[key]
+        ):
             raise self._fault(place, f"has {len(start)} numbers, the state {size}.")
         if not np.any(start):
             return past
-        return self._build.blend(self._past["begun"], past, self._build.constant([start]))
+        return self._build.blend(
+            self._past["begun"], past, self._build.constant([start])
+        )
 
     def _part(self, name: str, k: int, part: foreign_mapping.InputPart) -> str:
         build, size = self._build, self._part_size(part) // part.history
@@ -226,11 +277,15 @@ class Composer:
             return row
         key = f"history {name} {k}"
         first = build.join([row] * (part.history - 1))
-        past = build.blend(self._past["begun"], self._past[key], first)  # the oldest first
+        past = build.blend(
+            self._past["begun"], self._past[key], first
+        )  # the oldest first
         rows = build.join([past, row])
         self._next[key] = build.pick(rows, range(size, size * part.history))
         if part.newest_first:
-            places = np.arange(size * part.history).reshape(part.history, size)[::-1].ravel()
+            places = (
+                np.arange(size * part.history).reshape(part.history, size)[::-1].ravel()
+            )
             rows = build.pick(rows, places.tolist())
         return rows
 
@@ -243,19 +298,27 @@ class Composer:
             shares = build.pick(onnx_graph.INPUT, places)
             return build.affine(shares, self._task.sight.range_max, 0.0)
         if of == "constant":
-            return build.constant(np.reshape(np.asarray(part.value, np.float32), (1, -1)))
+            return build.constant(
+                np.reshape(np.asarray(part.value, np.float32), (1, -1))
+            )
         if of == "velocity":
-            return build.pick(onnx_graph.INPUT, [scan + 3 + foreign_mapping.TWIST.index(which)])
+            return build.pick(
+                onnx_graph.INPUT, [scan + 3 + foreign_mapping.TWIST.index(which)]
+            )
         if part.output is not None:
             return self._past[f"output {part.output}"]
         if of == "last":
             choices = self._mapping.choices
             rows = [self._mapping.outputs] if choices is None else choices.commands
             if not all(name in foreign_mapping.TWIST for row in rows for name in row):
-                reason = "is known of policies that command forward, left and turn alone."
+                reason = (
+                    "is known of policies that command forward, left and turn alone."
+                )
                 raise self._fault(f"inputs.{name}", f"{part.of} {reason}")
             return build.pick(self._past["twist"], [foreign_mapping.TWIST.index(which)])
-        distance, cosine, sine = (build.pick(onnx_graph.INPUT, [scan + k]) for k in range(3))
+        distance, cosine, sine = (
+            build.pick(onnx_graph.INPUT, [scan + k]) for k in range(3)
+        )
         if which == "bearing":
             return build.angle(cosine, sine)
         if which in ("x", "y"):
@@ -268,9 +331,13 @@ class Composer:
         """An output as a row of float32."""
         made = self._made[THEIRS + name]
         if not all(made):
-            reason = f"gives {name!r} of shape {made}, which can't be known before it runs."
+            reason = (
+                f"gives {name!r} of shape {made}, which can't be known before it runs."
+            )
             raise self._fault("network", reason)
-        flat = self._build.add("Reshape", THEIRS + name, self._build.constant([1, -1], np.int64))
+        flat = self._build.add(
+            "Reshape", THEIRS + name, self._build.constant([1, -1], np.int64)
+        )
         return self._build.add("Cast", flat, to=TensorProto.FLOAT)
 
     def _command(self) -> str:
@@ -302,17 +369,25 @@ class Composer:
         for name in given:
             if name not in own:
                 fix = nearest(name, (*foreign_mapping.TWIST, *own))
-                raise self._fault(f"{place}.{name}", f"the robot has no such command; {fix}")
+                raise self._fault(
+                    f"{place}.{name}", f"the robot has no such command; {fix}"
+                )
         for name in own:
             if name not in given and place == "outputs":
-                raise self._fault(f"{place}.{name}", "is missing; say which output it is.")
+                raise self._fault(
+                    f"{place}.{name}", "is missing; say which output it is."
+                )
         return own
 
-    def _check_twist(self, outputs: Mapping[str, foreign_mapping.OutputCommand]) -> None:
+    def _check_twist(
+        self, outputs: Mapping[str, foreign_mapping.OutputCommand]
+    ) -> None:
         fields = [command.cmd_vel for command in self._task.robot.command]
         for name in ("forward", "turn"):
             if name not in outputs:
-                raise self._fault(f"outputs.{name}", "is missing; say which output it is.")
+                raise self._fault(
+                    f"outputs.{name}", "is missing; say which output it is."
+                )
         for name in outputs:
             if FIELDS[name] not in fields:
                 reason = f"the robot {self._task.robot.name!r} has no command for it; remove it."
@@ -326,7 +401,9 @@ class Composer:
         if command.index >= size:
             reason = f"is {command.index}, but the output {command.of!r} has {size} elements."
             raise self._fault(f"outputs.{name}.index", reason)
-        row = build.cut(build.pick(self._flat(command.of), [command.index]), command.limits)
+        row = build.cut(
+            build.pick(self._flat(command.of), [command.index]), command.limits
+        )
         return build.cut(build.affine(row, command.multiply, command.add), command.clip)
 
     def _of_twist(self, twist: Sequence[str], robot: RobotSpec) -> str:
@@ -349,8 +426,12 @@ class Composer:
     def _chosen(self, choices: foreign_mapping.Choices) -> str:
         """The command by the greatest element of an output, or by a whole number."""
         build, robot = self._build, self._task.robot
-        names = self._names({name: 0.0 for row in choices.commands for name in row}, "choices")
-        rows = np.array([[row.get(name, 0.0) for name in names] for row in choices.commands])
+        names = self._names(
+            {name: 0.0 for row in choices.commands for name in row}, "choices"
+        )
+        rows = np.array(
+            [[row.get(name, 0.0) for name in names] for row in choices.commands]
+        )
         size, beyond = self._output_size(choices.of), ""
         kind = self._network.outputs[choices.of].type.tensor_type.elem_type
         if kind in onnx_graph.INTEGERS and size == 1:
@@ -359,16 +440,22 @@ class Composer:
             given = build.add("Cast", given, to=TensorProto.INT64)
             index = build.add("Clip", given, *ends)
             # Of a number that chooses nothing the command is NaN, which no robot is sent.
-            beyond = build.add("Cast", build.add("Sub", given, index), to=TensorProto.FLOAT)
+            beyond = build.add(
+                "Cast", build.add("Sub", given, index), to=TensorProto.FLOAT
+            )
             beyond = build.add("Sqrt", build.add("Neg", build.add("Abs", beyond)))
         elif size == len(rows):
             index = build.add("ArgMax", self._flat(choices.of), axis=1, keepdims=0)
         else:
-            reason = f"are {len(rows)}, but the output {choices.of!r} has {size} elements."
+            reason = (
+                f"are {len(rows)}, but the output {choices.of!r} has {size} elements."
+            )
             raise self._fault("choices.commands", reason)
         commands = rows
         if names == foreign_mapping.TWIST:
-            self._next["twist"] = build.add("Gather", build.constant(rows), index, axis=0)
+            self._next["twist"] = build.add(
+                "Gather", build.constant(rows), index, axis=0
+            )
             if robot.steers:
                 speed, angle = robot.bicycle.command(rows)
                 commands = np.stack([speed, rows[:, 1], angle], axis=-1)
@@ -389,16 +476,30 @@ class Composer:
                 self._next[key] = self._flat(key.removeprefix("output "))
 
     def _model(self, theirs: Any, state: int) -> Any:
-        width, commands = self._task.observation_space.shape[0], len(self._task.robot.command)
-        inputs, outputs = {onnx_graph.INPUT: width}, {
-            onnx_graph.ACTION: commands, onnx_graph.COMMAND: commands,
-        }  # fmt: skip
+        width, commands = (
+            self._task.observation_space.shape[0],
+            len(self._task.robot.command),
+        )
+        inputs, outputs = (
+            {onnx_graph.INPUT: width},
+            {
+                onnx_graph.ACTION: commands,
+                onnx_graph.COMMAND: commands,
+            },
+        )
         if state:
             inputs[onnx_graph.STATE_IN] = outputs[onnx_graph.STATE_OUT] = state
         made = [
-            [onnx.helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, w]) for n, w in ends]
+            [
+                onnx.helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, w])
+                for n, w in ends
+            ]
             for ends in (inputs.items(), outputs.items())
         ]
-        graph = onnx.helper.make_graph(self._build.nodes, "foreign", *made, self._build.weights)
+        graph = onnx.helper.make_graph(
+            self._build.nodes, "foreign", *made, self._build.weights
+        )
         imports = [one for one in theirs.opset_import if one.domain in ("", "ai.onnx")]
-        return onnx.helper.make_model(graph, opset_imports=imports, ir_version=theirs.ir_version)
+        return onnx.helper.make_model(
+            graph, opset_imports=imports, ir_version=theirs.ir_version
+        )

@@ -9,10 +9,22 @@ from nics_drl_bridge.config import Schema
 Numbers = float | tuple[float, ...]
 Limits = tuple[float, float]
 Quantity = Literal[
-    "scan", "goal.distance", "goal.bearing", "goal.cosine", "goal.sine", "goal.x", "goal.y",
-    "velocity.forward", "velocity.left", "velocity.turn",
-    "last.forward", "last.left", "last.turn", "last.output", "constant",
-]  # fmt: skip
+    "scan",
+    "goal.distance",
+    "goal.bearing",
+    "goal.cosine",
+    "goal.sine",
+    "goal.x",
+    "goal.y",
+    "velocity.forward",
+    "velocity.left",
+    "velocity.turn",
+    "last.forward",
+    "last.left",
+    "last.turn",
+    "last.output",
+    "constant",
+]
 TWIST = ("forward", "left", "turn")  # [m/s, m/s, rad/s]
 MOST_SCANS = 64  # of a history
 
@@ -21,8 +33,12 @@ class Scaled(Schema):
     """Numbers as a network takes them: cut to `limits`, (x - subtract) / divide, cut to `clip`."""
 
     limits: Limits | None = None  # least and greatest before scaling; None: not cut
-    subtract: Numbers = 0.0  # subtracted first: one number for all elements, or one for each
-    divide: Numbers = 1.0  # by which that is divided: one number for all elements, or one for each
+    subtract: Numbers = (
+        0.0  # subtracted first: one number for all elements, or one for each
+    )
+    divide: Numbers = (
+        1.0  # by which that is divided: one number for all elements, or one for each
+    )
     clip: Limits | None = None  # least and greatest after scaling; None: not cut
 
     @field_validator("divide")
@@ -45,9 +61,13 @@ class InputPart(Scaled):
 
     of: Quantity  # the quantity; the guide lists them with their units
     clockwise: bool = False  # order of a scan
-    history: int = Field(default=1, ge=1, le=MOST_SCANS)  # steps of it, this and earlier ones
+    history: int = Field(
+        default=1, ge=1, le=MOST_SCANS
+    )  # steps of it, this and earlier ones
     newest_first: bool = False  # order of a history
-    output: str | None = None  # the network's, whose numbers of the step before are `last.output`
+    output: str | None = (
+        None  # the network's, whose numbers of the step before are `last.output`
+    )
     value: Numbers | None = None  # of a `constant`
 
     @model_validator(mode="after")
@@ -64,7 +84,9 @@ class InputPart(Scaled):
 class ForeignInput(Scaled):
     """An input of the network: its parts in order, then scaled as a whole."""
 
-    parts: tuple[InputPart, ...] = Field(min_length=1)  # quantities that fill it, in order
+    parts: tuple[InputPart, ...] = Field(
+        min_length=1
+    )  # quantities that fill it, in order
 
 
 class ForeignState(Schema):
@@ -82,14 +104,18 @@ class OutputCommand(Schema):
     limits: Limits | None = None  # least and greatest before scaling; None: not cut
     multiply: float = 1.0  # factor on the element
     add: float = 0.0  # added after that, in the unit of the command
-    clip: Limits | None = None  # least and greatest command; None: the robot's own limits alone
+    clip: Limits | None = (
+        None  # least and greatest command; None: the robot's own limits alone
+    )
 
 
 class Choices(Schema):
     """Commands to choose from: by the greatest number of an output, or by its whole number."""
 
     of: str  # name of the output that chooses
-    commands: tuple[dict[str, float], ...] = Field(min_length=1)  # in order; what a row omits is 0
+    commands: tuple[dict[str, float], ...] = Field(
+        min_length=1
+    )  # in order; what a row omits is 0
 
 
 class ForeignPolicy(Schema):
@@ -99,14 +125,28 @@ class ForeignPolicy(Schema):
     """
 
     kind: Literal["foreign policy"]  # says what the file is
-    network: str = Field(min_length=1)  # an .onnx file or a LEAPP bundle, relative to the mapping
-    robot: str | None = None  # that it drives where none is named: a shipped one or a model
-    control_period: float | None = Field(default=None, gt=0.0, le=10.0)  # None: the robot's [s]
+    network: str = Field(
+        min_length=1
+    )  # an .onnx file or a LEAPP bundle, relative to the mapping
+    robot: str | None = (
+        None  # that it drives where none is named: a shipped one or a model
+    )
+    control_period: float | None = Field(
+        default=None, gt=0.0, le=10.0
+    )  # None: the robot's [s]
     scan: Any = None  # as in `sectors.layout_of`; None: the beams of the robot's lidar
-    inputs: dict[str, ForeignInput] = Field(min_length=1)  # the network's inputs, by their names
-    states: dict[str, ForeignState] = Field(default_factory=dict)  # its recurrent inputs, by name
-    outputs: dict[str, OutputCommand] = Field(default_factory=dict)  # the commands, by their names
-    choices: Choices | None = None  # instead of `outputs`: fixed commands, of which it chooses one
+    inputs: dict[str, ForeignInput] = Field(
+        min_length=1
+    )  # the network's inputs, by their names
+    states: dict[str, ForeignState] = Field(
+        default_factory=dict
+    )  # its recurrent inputs, by name
+    outputs: dict[str, OutputCommand] = Field(
+        default_factory=dict
+    )  # the commands, by their names
+    choices: Choices | None = (
+        None  # instead of `outputs`: fixed commands, of which it chooses one
+    )
 
     @model_validator(mode="after")
     def _one_way_out(self) -> "ForeignPolicy":

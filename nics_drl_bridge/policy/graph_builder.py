@@ -24,7 +24,9 @@ class Builder:
     def constant(self, values: ArrayLike, kind: Any = np.float32) -> str:
         """Adds an array."""
         name = f"{self._prefix}constant_{len(self.weights)}"
-        self.weights.append(onnx.numpy_helper.from_array(np.asarray(values, kind), name))
+        self.weights.append(
+            onnx.numpy_helper.from_array(np.asarray(values, kind), name)
+        )
         return name
 
     def add(self, kind: str, *inputs: str, name: str = "", **settings: Any) -> str:

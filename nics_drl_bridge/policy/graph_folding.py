@@ -10,8 +10,21 @@ from onnx.shape_inference import infer_node_outputs
 
 from nics_drl_bridge.policy.onnx_graph import INTEGERS, MOST_AXES, SMALL, Shape
 
-FOLDED = ("Add", "Cast", "Concat", "Constant", "Div", "Gather", "Identity", "Mul", "Reshape",
-          "Slice", "Squeeze", "Sub", "Unsqueeze")  # fmt: skip
+FOLDED = (
+    "Add",
+    "Cast",
+    "Concat",
+    "Constant",
+    "Div",
+    "Gather",
+    "Identity",
+    "Mul",
+    "Reshape",
+    "Slice",
+    "Squeeze",
+    "Sub",
+    "Unsqueeze",
+)
 """Operators of sizes; none costs more than its inputs and its output, which are small here."""
 
 
@@ -36,18 +49,28 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
             graph.node.append(node)
         else:
             known[value.name] = value
-    used = {one.name for one in graph.output}.union(*(node.input for node in graph.node))
-    graph.initializer.extend(one for name, one in (weights | known).items() if name in used)
+    used = {one.name for one in graph.output}.union(
+        *(node.input for node in graph.node)
+    )
+    graph.initializer.extend(
+        one for name, one in (weights | known).items() if name in used
+    )
     return {one.name: _shape(types[one.name]) for one in graph.output}
 
 
 def _shape(kind: Any) -> Shape:
     tensor = kind.tensor_type
-    return tuple(d.dim_value for d in tensor.shape.dim) if tensor.HasField("shape") else (0,)
+    return (
+        tuple(d.dim_value for d in tensor.shape.dim)
+        if tensor.HasField("shape")
+        else (0,)
+    )
 
 
 def _is_small(kind: Any) -> bool:
-    return kind.tensor_type.elem_type in INTEGERS and 0 < math.prod(_shape(kind)) <= SMALL
+    return (
+        kind.tensor_type.elem_type in INTEGERS and 0 < math.prod(_shape(kind)) <= SMALL
+    )
 
 
 def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) -> Any:
@@ -59,7 +82,9 @@ def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) 
         return numpy_helper.from_array(sizes, name)
     if node.op_type not in FOLDED or None in given or not _is_small(types[name]):
         return None
-    if node.op_type == "Div" and any(numpy_helper.to_array(one).min() <= 0 for one in given):
+    if node.op_type == "Div" and any(
+        numpy_helper.to_array(one).min() <= 0 for one in given
+    ):
         return None  # by zero, or rounded to another side
     graph = helper.make_graph([node], "", [], [ValueInfoProto(name=name)], given)
     (value,) = ReferenceEvaluator(graph, opsets={"": opset}).run(None, {})

@@ -65,7 +65,9 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
             start = np.full((1, state.size), state.start, np.float32)
             data = _safetensors(f"{NODE}/{onnx_graph.STATE_IN}", start)
             write_bytes(temporary / start_values, data)
-        write_text(temporary / marker, dump_yaml(_described(policy, pieces, made, place)))
+        write_text(
+            temporary / marker, dump_yaml(_described(policy, pieces, made, place))
+        )
     return place / marker
 
 
@@ -86,16 +88,27 @@ def _pieces(policy: PolicyFile) -> list[Piece]:
         return [*pieces, Piece("rest", rest, tuple(range(rest)), facts)]
     goal: Data = {"kind": "command/goal/polar", "unit": "m"}
     names = [["goal.distance", "goal.cosine", "goal.sine"]]
-    linear: Data = {"kind": "state/body/linear_velocity", "element_names": [[*VELOCITIES]]}
-    angular: Data = {"kind": "state/body/angular_velocity", "element_names": [[*VELOCITIES]]}
+    linear: Data = {
+        "kind": "state/body/linear_velocity",
+        "element_names": [[*VELOCITIES]],
+    }
+    angular: Data = {
+        "kind": "state/body/angular_velocity",
+        "element_names": [[*VELOCITIES]],
+    }
     pieces += [
         Piece("goal", 3, (0, 1, 2), {**goal, "element_names": names}),
         Piece("linear_velocity", 3, (0, 1), {**linear, "unit": "m/s"}),
         Piece("angular_velocity", 3, (2,), {**angular, "unit": "rad/s"}),
     ]
     for sensor in contract.sensors:
-        facts = {"kind": f"state/{sensor.kind}", "sensor": sensor.model_dump(mode="json")}
-        pieces.append(Piece(sensor.name, sensor.parts, tuple(range(sensor.parts)), facts))
+        facts = {
+            "kind": f"state/{sensor.kind}",
+            "sensor": sensor.model_dump(mode="json"),
+        }
+        pieces.append(
+            Piece(sensor.name, sensor.parts, tuple(range(sensor.parts)), facts)
+        )
     return pieces
 
 
@@ -107,7 +120,9 @@ def _split(model: Any, pieces: Iterable[Piece]) -> None:
     entry.value = base64.b64encode(model.graph.input[0].SerializeToString()).decode()
     rows, infos, others = [], [], list(model.graph.input)[1:]
     for piece in pieces:
-        infos.append(onnx.helper.make_tensor_value_info(piece.name, TensorProto.FLOAT, [1, 1]))
+        infos.append(
+            onnx.helper.make_tensor_value_info(piece.name, TensorProto.FLOAT, [1, 1])
+        )
         infos[-1].type.tensor_type.shape.dim[0].CopyFrom(batch)
         infos[-1].type.tensor_type.shape.dim[1].dim_value = piece.width
         whole = len(piece.kept) == piece.width
@@ -138,31 +153,43 @@ def restored(model: Any) -> bytes | None:
         return None
     ours.CopyFrom(model)
     ours.metadata_props.remove(found[0])
-    first = next((k for k, n in enumerate(ours.graph.node) if onnx_graph.INPUT in n.output), -1)
+    first = next(
+        (k for k, n in enumerate(ours.graph.node) if onnx_graph.INPUT in n.output), -1
+    )
     del ours.graph.node[: first + 1]
     weights = [one for one in ours.graph.initializer if not one.name.startswith(OURS)]
     states = [one for one in model.graph.input if one.name == onnx_graph.STATE_IN]
-    for held, values in ((ours.graph.initializer, weights), (ours.graph.input, [taken, *states])):
+    for held, values in (
+        (ours.graph.initializer, weights),
+        (ours.graph.input, [taken, *states]),
+    ):
         del held[:]
         held.extend(values)
     return bytes(ours.SerializeToString(deterministic=True))
 
 
-def _described(policy: PolicyFile, pieces: Iterable[Piece], made: bytes, place: Path) -> Data:
+def _described(
+    policy: PolicyFile, pieces: Iterable[Piece], made: bytes, place: Path
+) -> Data:
     contract, name = policy.contract, place.resolve().name
     inputs = [_tensor(piece.name, [1, piece.width], **piece.facts) for piece in pieces]
     outputs = _outputs(contract)
     pipeline: Data = {
         "configs": {
-            "frequency": 1.0 / contract.control_period, "control_period": contract.control_period,
-            "robot": contract.robot.name, "task": contract.task.name,
+            "frequency": 1.0 / contract.control_period,
+            "control_period": contract.control_period,
+            "robot": contract.robot.name,
+            "task": contract.task.name,
         },
-        "data_flow": {}, "feedback_flow": {},
+        "data_flow": {},
+        "feedback_flow": {},
         "inputs": {NODE: [piece.name for piece in pieces]},
         "outputs": {NODE: [onnx_graph.ACTION, onnx_graph.COMMAND]},
-    }  # fmt: skip
+    }
     if (state := contract.state) is not None:
-        one, other = (f"{NODE}/{end}" for end in (onnx_graph.STATE_OUT, onnx_graph.STATE_IN))
+        one, other = (
+            f"{NODE}/{end}" for end in (onnx_graph.STATE_OUT, onnx_graph.STATE_IN)
+        )
         pipeline["feedback_flow"] = {one: [other]}
         pipeline["initial_values"] = f"{name}_initial_values.safetensors"
         pipeline["configs"]["longest_gap"] = state.longest_gap
@@ -170,8 +197,11 @@ def _described(policy: PolicyFile, pieces: Iterable[Piece], made: bytes, place: 
         outputs.append(_tensor(onnx_graph.STATE_OUT, [1, state.size]))
     md5 = hashlib.md5(made, usedforsecurity=False).hexdigest()
     parameters = {
-        "model_path": f"{NODE}.onnx", "md5sum": md5, "sha256sum": sha256(made), "backend": "onnx",
-    }  # fmt: skip
+        "model_path": f"{NODE}.onnx",
+        "md5sum": md5,
+        "sha256sum": sha256(made),
+        "backend": "onnx",
+    }
     node = {"inputs": inputs, "outputs": outputs, "parameters": parameters}
     system = {"leapp config version": CONFIG_VERSION, "made by": onnx_graph.KEY}
     return {"models": {NODE: node}, "pipeline": pipeline, "system information": system}
@@ -186,16 +216,21 @@ def _outputs(contract: Contract) -> list[Data]:
     names = [str(command.cmd_vel) if of_twist else command.name for command in commands]
     return [
         _tensor(
-            onnx_graph.ACTION, [1] if discrete else [1, size],
-            dtype="int64" if discrete else "float32", kind="target/action",
+            onnx_graph.ACTION,
+            [1] if discrete else [1, size],
+            dtype="int64" if discrete else "float32",
+            kind="target/action",
             **({} if discrete else {"limits": [[-1.0, 1.0] for _ in commands]}),
         ),
         _tensor(
-            onnx_graph.COMMAND, [1, size],
+            onnx_graph.COMMAND,
+            [1, size],
             kind="target/body/velocity" if of_twist else "target/command",
-            element_names=[names], units=[command.unit for command in commands], limits=limits,
+            element_names=[names],
+            units=[command.unit for command in commands],
+            limits=limits,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _tensor(name: str, shape: list[int], dtype: str = "float32", **facts: Any) -> Data:
@@ -204,7 +239,11 @@ def _tensor(name: str, shape: list[int], dtype: str = "float32", **facts: Any) -
 
 def _safetensors(name: str, array: NDArray[np.float32]) -> bytes:
     """An array in the format of safetensors: length of the head, JSON head, numbers."""
-    facts = {"dtype": "F32", "shape": list(array.shape), "data_offsets": [0, array.nbytes]}
+    facts = {
+        "dtype": "F32",
+        "shape": list(array.shape),
+        "data_offsets": [0, array.nbytes],
+    }
     text = json.dumps({name: facts}).encode()
     text += b" " * (-len(text) % 8)
     return struct.pack("<Q", len(text)) + text + array.astype("<f4").tobytes()

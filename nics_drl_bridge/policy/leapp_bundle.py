@@ -26,17 +26,23 @@ LINEAR = {"x": "velocity.forward", "y": "velocity.left", "z": ZERO}
 ANGULAR = {"x": ZERO, "y": ZERO, "z": "velocity.turn"}
 BOTH = {f"linear.{k}": v for k, v in LINEAR.items()}
 BOTH |= {f"angular.{k}": v for k, v in ANGULAR.items()}
-GOAL = {f"goal.{name}": f"goal.{name}" for name in
-        ("distance", "bearing", "cosine", "sine", "x", "y")}  # fmt: skip
+GOAL = {
+    f"goal.{name}": f"goal.{name}"
+    for name in ("distance", "bearing", "cosine", "sine", "x", "y")
+}
 SEEN = {  # meaning of elements by kind and name; without names they are in this order
-    "state/body/linear_velocity": LINEAR, "state/body/angular_velocity": ANGULAR,
-    "state/body/velocity": BOTH, "command/goal/polar": GOAL, "command/goal": GOAL,
+    "state/body/linear_velocity": LINEAR,
+    "state/body/angular_velocity": ANGULAR,
+    "state/body/velocity": BOTH,
+    "command/goal/polar": GOAL,
+    "command/goal": GOAL,
     "command/body/pose": {"x": "goal.x", "y": "goal.y", "z": ZERO},
-}  # fmt: skip
+}
 DONE = {  # the same of outputs
-    "target/body/linear_velocity": LINEAR, "target/body/angular_velocity": ANGULAR,
+    "target/body/linear_velocity": LINEAR,
+    "target/body/angular_velocity": ANGULAR,
     "target/body/velocity": BOTH,
-}  # fmt: skip
+}
 MAPPING = "say what it is in a mapping of your own (docs/foreign_policies.md)"
 
 
@@ -130,9 +136,17 @@ class Bundle:
     def name_of(self, end: str) -> str:
         """The name of `node/output` or `node/input` in the network of all nodes."""
         pipeline = self.description.pipeline
-        ends = [f"{node}/{name}" for some in (pipeline.inputs, pipeline.outputs)
-                for node, names in some.items() for name in names]  # fmt: skip
-        ends += [one for some in pipeline.feedback_flow.items() for one in (some[0], *some[1])]
+        ends = [
+            f"{node}/{name}"
+            for some in (pipeline.inputs, pipeline.outputs)
+            for node, names in some.items()
+            for name in names
+        ]
+        ends += [
+            one
+            for some in pipeline.feedback_flow.items()
+            for one in (some[0], *some[1])
+        ]
         short = end.partition("/")[2]
         return end if sum(one.endswith(f"/{short}") for one in set(ends)) > 1 else short
 
@@ -142,19 +156,29 @@ class Bundle:
             if node not in self.description.models:
                 fix = nearest(node, self.description.models)
                 raise self.fault(f"pipeline.{side}", f"names no node {node!r}; {fix}")
-            known = {one.name: one for one in getattr(self.description.models[node], side)}
+            known = {
+                one.name: one for one in getattr(self.description.models[node], side)
+            }
             for name in names:
                 if name not in known:
                     fix = nearest(name, known)
-                    raise self.fault(f"pipeline.{side}.{node}", f"has no {name!r}; {fix}")
+                    raise self.fault(
+                        f"pipeline.{side}.{node}", f"has no {name!r}; {fix}"
+                    )
                 found[self.name_of(f"{node}/{name}")] = known[name]
         return found
 
     def _states(self) -> dict[str, ForeignState]:
         pipeline = self.description.pipeline
-        start = {} if pipeline.initial_values is None else self._initial(pipeline.initial_values)
+        start = (
+            {}
+            if pipeline.initial_values is None
+            else self._initial(pipeline.initial_values)
+        )
         return {
-            self.name_of(target): ForeignState(next=self.name_of(out), start=start.get(target, 0.0))
+            self.name_of(target): ForeignState(
+                next=self.name_of(out), start=start.get(target, 0.0)
+            )
             for out, targets in pipeline.feedback_flow.items()
             for target in targets
         }
@@ -170,7 +194,9 @@ class Bundle:
             for key, entry in head.items():
                 if key != "__metadata__":
                     begin, end = entry["data_offsets"]
-                    values = np.frombuffer(data[8 + size :][begin:end], kinds[entry["dtype"]])
+                    values = np.frombuffer(
+                        data[8 + size :][begin:end], kinds[entry["dtype"]]
+                    )
                     found[key] = tuple(values.astype(float).tolist())
         except (struct.error, ValueError, KeyError, TypeError, AttributeError):
             reason = f"{name!r} is no file of safetensors with numbers; export the bundle anew."
@@ -188,10 +214,14 @@ def description_of(place: Path) -> Path | None:
     Raises PolicyError if a folder holds none or several, ConfigError if it can't be read.
     """
     if place.is_file() and place.suffix not in (".yaml", ".yml"):
-        reason = "is no YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
+        reason = (
+            "is no YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
+        )
         raise PolicyError(str(place), "file", reason)
     files = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
-    found = [file for file in files if "models" in parse_yaml(read_text(file), str(file))]
+    found = [
+        file for file in files if "models" in parse_yaml(read_text(file), str(file))
+    ]
     if place.is_dir() and len(found) != 1:
         reason = f"holds {len(found)} descriptions of a bundle; give the path of a YAML file."
         raise PolicyError(str(place), "file", reason)
@@ -200,7 +230,9 @@ def description_of(place: Path) -> Path | None:
 
 def read_bundle(path: Path) -> Bundle:
     """Reads a bundle and checks its networks. Raises ConfigError or PolicyError."""
-    description = validate(parse_yaml(read_text(path), str(path)), Description, str(path))
+    description = validate(
+        parse_yaml(read_text(path), str(path)), Description, str(path)
+    )
     models: dict[str, Any] = {}
     bundle = Bundle(path, description, models, "")
     digests = []
@@ -233,7 +265,9 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
             raise bundle.fault(place, f"{name!r} has more than {most} MB; not opened.")
         return file.read_bytes()
     except OSError as error:
-        raise bundle.fault(place, f"{name!r} can't be read ({error.strerror}).") from None
+        raise bundle.fault(
+            place, f"{name!r} can't be read ({error.strerror})."
+        ) from None
 
 
 def _merged(bundle: Bundle) -> Any:
@@ -243,9 +277,15 @@ def _merged(bundle: Bundle) -> Any:
     opsets: dict[int, Any] = {}
     ready: set[str] = set()
     infos: dict[str, Any] = {}
-    source_of = {t: source for source, targets in pipeline.data_flow.items() for t in targets}
-    outside = {f"{node}/{name}" for node, names in pipeline.inputs.items() for name in names}
-    outside |= {target for targets in pipeline.feedback_flow.values() for target in targets}
+    source_of = {
+        t: source for source, targets in pipeline.data_flow.items() for t in targets
+    }
+    outside = {
+        f"{node}/{name}" for node, names in pipeline.inputs.items() for name in names
+    }
+    outside |= {
+        target for targets in pipeline.feedback_flow.values() for target in targets
+    }
     for name in description.models:
         model = onnx.compose.add_prefix(bundle.models[name], f"{name}/")
         held = {tensor.name for tensor in model.graph.initializer}
@@ -259,25 +299,37 @@ def _merged(bundle: Bundle) -> Any:
                 reason = f"nothing before the node gives {one.name!r}; connect it."
                 raise bundle.fault("pipeline.data_flow", reason)
             if source != one.name:
-                graph.node.append(onnx.helper.make_node("Identity", [source], [one.name]))
+                graph.node.append(
+                    onnx.helper.make_node("Identity", [source], [one.name])
+                )
         graph.node.extend(model.graph.node)
         graph.initializer.extend(model.graph.initializer)
         infos |= {one.name: one for one in model.graph.output}
         ready |= infos.keys()
-        opsets |= {one.version: one for one in model.opset_import if one.domain in ("", "ai.onnx")}
+        opsets |= {
+            one.version: one
+            for one in model.opset_import
+            if one.domain in ("", "ai.onnx")
+        }
         newest = max(newest, model.ir_version)
     if len(opsets) != 1:
         reason = f"have opsets {sorted(opsets)}; export them with the same one."
         raise bundle.fault("models", reason)
-    given = {f"{node}/{name}" for node, names in pipeline.outputs.items() for name in names}
+    given = {
+        f"{node}/{name}" for node, names in pipeline.outputs.items() for name in names
+    }
     for end in sorted(given | pipeline.feedback_flow.keys()):
         if end not in infos:
             raise bundle.fault("pipeline.outputs", f"no network gives {end!r}.")
         infos[end].name = bundle.name_of(end)
         graph.output.append(infos[end])
         if infos[end].name != end:
-            graph.node.append(onnx.helper.make_node("Identity", [end], [infos[end].name]))
-    return onnx.helper.make_model(graph, opset_imports=list(opsets.values()), ir_version=newest)
+            graph.node.append(
+                onnx.helper.make_node("Identity", [end], [infos[end].name])
+            )
+    return onnx.helper.make_model(
+        graph, opset_imports=list(opsets.values()), ir_version=newest
+    )
 
 
 # What a bundle of others means, as far as it says so.
@@ -289,21 +341,33 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
     Raises PolicyError for an input whose meaning is not told.
     """
     frequency = bundle.description.pipeline.configs.get("frequency")
-    period = 1.0 / frequency if isinstance(frequency, int | float) and frequency > 0 else None
+    period = (
+        1.0 / frequency
+        if isinstance(frequency, int | float) and frequency > 0
+        else None
+    )
     data: Data = {
-        "kind": "foreign policy", "network": bundle.path.name,
+        "kind": "foreign policy",
+        "network": bundle.path.name,
         "control_period": None if period is None else round(period, 9),
-        "inputs": {}, "outputs": {},
-    }  # fmt: skip
+        "inputs": {},
+        "outputs": {},
+    }
     for name, entry in bundle.inputs.items():
         if name in bundle.network.states:
             continue
         data["inputs"][name] = {"parts": _parts(bundle, name, entry, data)}
     for name, entry in bundle.outputs.items():
         _add_commands(data["outputs"], name, entry, model)
-    missing = [] if data["outputs"].keys() >= {"forward", "turn"} else ["forward", "turn"]
-    if missing and data["outputs"].keys() != {command.name for command in model.robot.command}:
-        kinds = ", ".join(f"{name!r} of kind {one.kind!r}" for name, one in bundle.outputs.items())
+    missing = (
+        [] if data["outputs"].keys() >= {"forward", "turn"} else ["forward", "turn"]
+    )
+    if missing and data["outputs"].keys() != {
+        command.name for command in model.robot.command
+    }:
+        kinds = ", ".join(
+            f"{name!r} of kind {one.kind!r}" for name, one in bundle.outputs.items()
+        )
         reason = f"{kinds}: none is told to be the robot's velocity; {MAPPING}."
         raise bundle.fault("pipeline.outputs", reason)
     return data
@@ -319,7 +383,9 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
         return [{"of": "scan", "divide": far.get("range_max", 1.0) if share else 1.0}]
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
     meanings, names = SEEN.get(kind, {}), entry.names
-    if not names and len(meanings) == size and "pose" not in kind:  # that may have a heading
+    if (
+        not names and len(meanings) == size and "pose" not in kind
+    ):  # that may have a heading
         names = list(meanings)
     if not names or len(names) != size or not all(one in meanings for one in names):
         told = f"kind {entry.kind!r}" + (f" with elements {names}" if names else "")
@@ -329,7 +395,9 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
     return [zero if meanings[one] == ZERO else {"of": meanings[one]} for one in names]
 
 
-def _add_commands(outputs: Data, name: str, entry: Tensor, model: SimulatorModel) -> None:
+def _add_commands(
+    outputs: Data, name: str, entry: Tensor, model: SimulatorModel
+) -> None:
     meanings, size = DONE.get(entry.kind or "", {}), math.prod(entry.shape or [0])
     names = entry.names or (list(meanings) if len(meanings) == size else [])
     own = {command.name for command in model.robot.command}

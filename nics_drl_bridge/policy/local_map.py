@@ -32,7 +32,9 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
     corners = np.array(robot.footprint)
     low, high = corners.min(axis=0), corners.max(axis=0)
     spacing = max(FINE_M, math.sqrt(float(np.prod(high - low)) / MOST_POINTS))
-    axes = (np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True))
+    axes = (
+        np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True)
+    )
     lattice = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     depth = depths(lattice, corners)
     lattice, depth = lattice[depth > 0.0], depth[depth > 0.0]
@@ -75,7 +77,10 @@ def _count_covered(centres: Array, radii: Array, points: Array) -> NDArray[np.in
 
 
 def scratch_of(
-    parts: int, outline: kernels.FootprintDiscs, clearance: kernels.Clearance, half: float
+    parts: int,
+    outline: kernels.FootprintDiscs,
+    clearance: kernels.Clearance,
+    half: float,
 ) -> kernels.MapScratch:
     """Memory for maps of scans of P parts that reach `half` [m] to each side, `MOST_M` at most."""
     coarse = 2 * math.ceil(min(half, MOST_M) / (kernels.COARSE * CELL_M))

@@ -222,7 +222,12 @@ def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
     middle, per_cell = 0.5 * grid.shape[0] - 0.5, 1.0 / seen.cell
     if max(abs(at_x), abs(at_y)) + outline.outer > (middle - 1.0) * seen.cell:
         return away - outline.inner  # at the border of the map
-    u, v, c, s = middle + x * per_cell, middle + y * per_cell, c * per_cell, s * per_cell
+    u, v, c, s = (
+        middle + x * per_cell,
+        middle + y * per_cell,
+        c * per_cell,
+        s * per_cell,
+    )
     least = seen.reach
     for d in range(discs.shape[0]):
         px, py = discs[d, 0], discs[d, 1]

@@ -17,7 +17,12 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.policy import mppi_kernels as kernels
 from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
-from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
+from nics_drl_bridge.policy.local_map_kernels import (
+    Clearance,
+    FootprintDiscs,
+    MapScratch,
+    ScanRays,
+)
 from nics_drl_bridge.policy.stopping import longest_stop_s
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.braking import braking_of
@@ -46,7 +51,10 @@ class Mppi:
     samples: int = 256  # roll-outs of each round
     horizon: float = 2.0  # [s]
     knots: int = 4  # actions along a roll-out, linear in between
-    spreads: tuple[float, ...] = (0.4, 0.2)  # of the noise in the rounds after the first
+    spreads: tuple[float, ...] = (
+        0.4,
+        0.2,
+    )  # of the noise in the rounds after the first
     temperature: float = 0.05  # of the weights of roll-outs, as a way [m]
     clearance: Clearance = CLEARANCE
     worth: kernels.Worth = WORTH
@@ -59,11 +67,15 @@ class Mppi:
         """See `Policy`."""
         given = self._seen(observation)
         out = np.empty((len(given[0]), len(self.task.robot.command)))
-        self._run(kernels.plan_all, (out, *given), self._plant, self._sampling, self.worth)
+        self._run(
+            kernels.plan_all, (out, *given), self._plant, self._sampling, self.worth
+        )
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
 
-    def can_stop(self, observation: NDArray[np.float32], commands: Array) -> NDArray[np.bool_]:
+    def can_stop(
+        self, observation: NDArray[np.float32], commands: Array
+    ) -> NDArray[np.bool_]:
         """True (...) where a robot that follows a command (..., C) for a period can stop after it.
 
         That is with a margin between its true outline and all that the observation (..., O) shows;
@@ -79,7 +91,10 @@ class Mppi:
 
     def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
         """Scans (N, P) in shares, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
-        parts, rows = self.task.scan_parts, np.atleast_2d(observation).astype(np.float64)
+        parts, rows = (
+            self.task.scan_parts,
+            np.atleast_2d(observation).astype(np.float64),
+        )
         goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
         scans, twists = rows[:, :parts], rows[:, parts + 3 : parts + 6]
         return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
@@ -91,7 +106,9 @@ class Mppi:
 
         def part(rows: slice) -> None:
             scratch, lanes = self._free.pop() if self._free else self._memory()
-            kernel(*(each[rows] for each in arrays), (*self._sense, scratch), *given, lanes)
+            kernel(
+                *(each[rows] for each in arrays), (*self._sense, scratch), *given, lanes
+            )
             self._free.append((scratch, lanes))
 
         run_parts(part, [slice(*ends) for ends in pairwise(cuts)])
@@ -103,8 +120,15 @@ class Mppi:
     def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
         robot, (_, outline, clearance) = self.task.robot, self._sense
         low, high = self.task.command_limits
-        ends = np.stack([low, high]) if self.task.robot.takes_cmd_vel else np.zeros((1, len(low)))
-        half = math.hypot(*np.abs(steady_twist(robot, ends))[:, :2].max(axis=0)) * self.horizon
+        ends = (
+            np.stack([low, high])
+            if self.task.robot.takes_cmd_vel
+            else np.zeros((1, len(low)))
+        )
+        half = (
+            math.hypot(*np.abs(steady_twist(robot, ends))[:, :2].max(axis=0))
+            * self.horizon
+        )
         if self._halt.most > 0:
             half = self._reach
         half = min(half or np.inf, self.task.sight.range_max) + outline.outer
@@ -112,10 +136,19 @@ class Mppi:
         (states, count), many = self._plant.settled.shape, self.samples
         x, rate = np.ones(states + count + 1), np.zeros(3 + states)
         return scratch, kernels.RollOuts(
-            np.zeros((6, many)), np.repeat(x[:, None], many, 1), np.repeat(rate[:, None], many, 1),
-            np.zeros((many, self.knots, count)), np.zeros((self.knots, count)), np.zeros(count),
-            x, rate, np.zeros(3), np.zeros(many), np.zeros(many), np.zeros(many, np.int64),
-        )  # fmt: skip
+            np.zeros((6, many)),
+            np.repeat(x[:, None], many, 1),
+            np.repeat(rate[:, None], many, 1),
+            np.zeros((many, self.knots, count)),
+            np.zeros((self.knots, count)),
+            np.zeros(count),
+            x,
+            rate,
+            np.zeros(3),
+            np.zeros(many),
+            np.zeros(many),
+            np.zeros(many, np.int64),
+        )
 
     @cached_property
     def _sense(self) -> tuple[ScanRays, FootprintDiscs, Clearance]:
@@ -126,7 +159,9 @@ class Mppi:
         if self.model is not None:
             return self.model.kinematics
         robot = self.task.robot
-        return identify(textbook.record(robot, np.random.default_rng(BUILTIN_SEED)), robot).model
+        return identify(
+            textbook.record(robot, np.random.default_rng(BUILTIN_SEED)), robot
+        ).model
 
     @property
     def _period(self) -> float:
@@ -153,13 +188,17 @@ class Mppi:
         if longest <= 0.5 * self.horizon:
             return kernels.Halt(angles, still(robot), 0, math.inf)
         far = min(self._reach, self.task.sight.range_max, MOST_M)
-        return kernels.Halt(angles, still(robot), math.ceil(longest / self._period), far)
+        return kernels.Halt(
+            angles, still(robot), math.ceil(longest / self._period), far
+        )
 
     @property
     def _reach(self) -> float:
         """Way of a roll-out at full speed, and of the stop that follows on it [m]."""
         fastest = np.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
-        braking = braking_of(self.task.robot, self._kinematics, *self.task.command_limits)
+        braking = braking_of(
+            self.task.robot, self._kinematics, *self.task.command_limits
+        )
         return float(fastest * self.horizon + braking.distance(fastest))
 
     @cached_property
@@ -168,18 +207,32 @@ class Mppi:
         terms, latency = term_arrays(model), float(model.delays.max(initial=0.0))
         if self.model is not None:
             latency += max(0.0, self.model.calibration.command_latency_s)
-        own = (terms.dof >= 3) & (terms.degree == 1) & (terms.factors[:, 0] == terms.dof - 3)
+        own = (
+            (terms.dof >= 3)
+            & (terms.degree == 1)
+            & (terms.factors[:, 0] == terms.dof - 3)
+        )
         fastest = np.abs(terms.coefficient[own]).max(initial=0.0)
-        substeps = min(max(1, math.ceil(period * fastest / FINEST)), round(period / model.dt))
+        substeps = min(
+            max(1, math.ceil(period * fastest / FINEST)), round(period / model.dt)
+        )
         rows = np.repeat(terms.coefficient[:, None], self.samples, axis=1)
         return kernels.Plant(
-            with_coefficients(terms, rows), terms, SERIES, period / substeps, substeps, latency,
-            _settled(model, robot.command_high), *self.task.command_limits,
-        )  # fmt: skip
+            with_coefficients(terms, rows),
+            terms,
+            SERIES,
+            period / substeps,
+            substeps,
+            latency,
+            _settled(model, robot.command_high),
+            *self.task.command_limits,
+        )
 
     @cached_property
     def _sampling(self) -> kernels.Sampling:
-        offers, noise = np.empty((2, self.samples, self.knots, len(self.task.robot.command)))
+        offers, noise = np.empty(
+            (2, self.samples, self.knots, len(self.task.robot.command))
+        )
         low, high = self.task.command_limits
         rest = 2.0 * (still(self.task.robot) - low) / (high - low) - 1.0
         kernels.draw(offers, noise, rest, self.seed)

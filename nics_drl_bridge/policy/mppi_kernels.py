@@ -17,7 +17,9 @@ from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, bend, rates, run
 
 HIT = 1e3  # cost of a touch at once; later ones cost less
-BEYOND = 1.3  # offers are drawn over this much of the range and cut: many are at its ends
+BEYOND = (
+    1.3  # offers are drawn over this much of the range and cut: many are at its ends
+)
 STOPPED = 0.01  # speed of the outline at which a robot has stopped [m/s]
 PASSES, EASE = 12, 1e-6  # over the commands, to find those that a twist follows
 
@@ -39,7 +41,9 @@ class Plant(NamedTuple):
 class Halt(NamedTuple):
     """A stop that follows on a command."""
 
-    holds: NDArray[np.bool_]  # (C,) True for commands that are held while the robot stops
+    holds: NDArray[
+        np.bool_
+    ]  # (C,) True for commands that are held while the robot stops
     rest: Array  # (C,) of the others
     most: int  # periods that it may take
     far: float  # distance along an axis, beyond which nothing is known [m]
@@ -90,8 +94,12 @@ def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
             for c in range(offers.shape[2]):
                 i = (k * offers.shape[1] + q) * offers.shape[2] + c
                 drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
-                held = k < offers.shape[0] // 2 and q > 0  # half of them hold one action
-                offers[k, q, c] = offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
+                held = (
+                    k < offers.shape[0] // 2 and q > 0
+                )  # half of them hold one action
+                offers[k, q, c] = (
+                    offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
+                )
                 if k == 0:
                     offers[k, q, c] = rest[c]
                 noise[k, q, c] = normal(seed, PLANNER_STREAM, 3 * i + 1)
@@ -154,7 +162,15 @@ def _stops(command, twist, around, plant, halt, lanes):  # type: ignore[no-untyp
         for c in range(command.shape[0]):
             given = command[c] if t == 0 or halt.holds[c] else halt.rest[c]
             lanes.x[states + c, 0] = bend(given, plant.single.curves[c])
-        run(lanes.pose, lanes.x, lanes.dq, plant.terms, plant.series, plant.dt, plant.substeps)
+        run(
+            lanes.pose,
+            lanes.x,
+            lanes.dq,
+            plant.terms,
+            plant.series,
+            plant.dt,
+            plant.substeps,
+        )
         pose = lanes.pose
         if maps.room_at(pose[0, 0], pose[1, 0], pose[2, 0], pose[3, 0], around) < limit:
             return False
@@ -250,7 +266,15 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
                 for q in range(lanes.nominal.shape[0]):
                     action += sampling.between[t, q] * lanes.actions[k, q, c]
                 row[k] = bend(middle + half * action, curve)
-        run(lanes.pose, lanes.x, lanes.dq, plant.terms, plant.series, plant.dt, plant.substeps)
+        run(
+            lanes.pose,
+            lanes.x,
+            lanes.dq,
+            plant.terms,
+            plant.series,
+            plant.dt,
+            plant.substeps,
+        )
         for k in range(lanes.cost.shape[0]):
             if lanes.ended[k] < 0:
                 _judge(k, t, periods, limit, around, worth, lanes)
@@ -271,7 +295,15 @@ def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
         for c in range(plant.low.shape[0]):
             if not halt.holds[c]:
                 lanes.x[states + c, :] = bend(halt.rest[c], plant.single.curves[c])
-        run(lanes.pose, lanes.x, lanes.dq, plant.terms, plant.series, plant.dt, plant.substeps)
+        run(
+            lanes.pose,
+            lanes.x,
+            lanes.dq,
+            plant.terms,
+            plant.series,
+            plant.dt,
+            plant.substeps,
+        )
         pose = lanes.pose
         for k in range(lanes.cost.shape[0]):
             if lanes.ended[k] >= 0:
@@ -290,7 +322,10 @@ def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
     for k in range(lanes.cost.shape[0]):
         change = 0.0
         for c in range(count):
-            before = 2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c]) - 1.0
+            before = (
+                2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c])
+                - 1.0
+            )
             for q in range(lanes.nominal.shape[0]):
                 change += (lanes.actions[k, q, c] - before) ** 2
                 before = lanes.actions[k, q, c]
@@ -328,4 +363,6 @@ def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyp
     if math.hypot(around.goal[0] - x, around.goal[1] - y) < maps.ARRIVED_M:
         lanes.ended[k], lanes.way[k] = t, 0.0
     elif t == periods - 1:
-        lanes.cost[k] += worth.astray * maps.astray(x, y, c, s, way, around) * min(way, 1.0)
+        lanes.cost[k] += (
+            worth.astray * maps.astray(x, y, c, s, way, around) * min(way, 1.0)
+        )

@@ -21,35 +21,107 @@ MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six lev
 MOST_PACKED = 2**20  # maximum size of packed integers in one part, as a shape [bytes]
 MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozens
 MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
-CONTRACT_LIMIT = 4 * 2**20  # maximum size of the contract [bytes], mostly golden observations
+CONTRACT_LIMIT = (
+    4 * 2**20
+)  # maximum size of the contract [bytes], mostly golden observations
 MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
-MOST_WORK = 20_000_000  # multiplications, or numbers read and written, for one observation
-MOST_AT_ONCE = 64 * MOST_NUMBERS  # of all nodes' outputs in one run: at most 256 MB of float32
+MOST_WORK = (
+    20_000_000  # multiplications, or numbers read and written, for one observation
+)
+MOST_AT_ONCE = (
+    64 * MOST_NUMBERS
+)  # of all nodes' outputs in one run: at most 256 MB of float32
 ROWS = 16  # observations for which the sizes are computed, as many as there are golden ones
-SMALL = 1024  # maximum length of an integer array that may be a shape, an axis or an index
+SMALL = (
+    1024  # maximum length of an integer array that may be a shape, an axis or an index
+)
 GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
 MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
 INPUT, ACTION, COMMAND = "observation", "action", "command"
 STATE_IN, STATE_OUT = "state_in", "state_out"  # of a policy with a state
-RECURRENT = frozenset({"GRU", "LSTM", "RNN"})  # over sequences whose length the graph tells
-OPERATORS = RECURRENT | frozenset({
-    "Abs", "Add", "ArgMax", "Atan", "AveragePool", "BatchNormalization", "Cast", "Clip", "Concat",
-    "Constant", "Conv", "Cos", "Div", "Elu", "Erf", "Exp", "Flatten", "Gather", "Gelu", "Gemm",
-    "GlobalAveragePool", "HardSigmoid", "HardSwish", "Identity", "LayerNormalization", "LeakyRelu",
-    "Log", "LogSoftmax", "MatMul", "Max", "MaxPool", "Min", "Mish", "Mul", "Neg", "Pow", "PRelu",
-    "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "Reciprocal", "Relu", "Reshape", "Selu",
-    "Shape", "Sigmoid", "Sign", "Sin", "Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt",
-    "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
-})  # fmt: skip
+RECURRENT = frozenset(
+    {"GRU", "LSTM", "RNN"}
+)  # over sequences whose length the graph tells
+OPERATORS = RECURRENT | frozenset(
+    {
+        "Abs",
+        "Add",
+        "ArgMax",
+        "Atan",
+        "AveragePool",
+        "BatchNormalization",
+        "Cast",
+        "Clip",
+        "Concat",
+        "Constant",
+        "Conv",
+        "Cos",
+        "Div",
+        "Elu",
+        "Erf",
+        "Exp",
+        "Flatten",
+        "Gather",
+        "Gelu",
+        "Gemm",
+        "GlobalAveragePool",
+        "HardSigmoid",
+        "HardSwish",
+        "Identity",
+        "LayerNormalization",
+        "LeakyRelu",
+        "Log",
+        "LogSoftmax",
+        "MatMul",
+        "Max",
+        "MaxPool",
+        "Min",
+        "Mish",
+        "Mul",
+        "Neg",
+        "Pow",
+        "PRelu",
+        "ReduceMax",
+        "ReduceMean",
+        "ReduceMin",
+        "ReduceSum",
+        "Reciprocal",
+        "Relu",
+        "Reshape",
+        "Selu",
+        "Shape",
+        "Sigmoid",
+        "Sign",
+        "Sin",
+        "Slice",
+        "Softmax",
+        "Softplus",
+        "Softsign",
+        "Split",
+        "Sqrt",
+        "Squeeze",
+        "Sub",
+        "Tanh",
+        "Transpose",
+        "Unsqueeze",
+    }
+)
 """Operators of networks: no loops, branches, random draws or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
 INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
-NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}  # types as large in memory as in the file
-DIVIDING = frozenset({"Div", "ReduceMean"})  # of integers by zero, or minimum by -1: a crash
+NUMBERS = (
+    FLOATS | INTEGERS | {TensorProto.BOOL}
+)  # types as large in memory as in the file
+DIVIDING = frozenset(
+    {"Div", "ReduceMean"}
+)  # of integers by zero, or minimum by -1: a crash
 OTHER_FORMATS = (
-    (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"), (b"\x80", "a pickle"),
-    (b"\x93NUMPY", "a numpy array"), (b"\x89HDF", "an HDF5 file"), (b"\x1f\x8b", "a gzip file"),
-)  # fmt: skip
+    (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"),
+    (b"\x80", "a pickle"),
+    (b"\x93NUMPY", "a numpy array"),
+    (b"\x89HDF", "an HDF5 file"),
+    (b"\x1f\x8b", "a gzip file"),
+)
 """First bytes of files that trainers write and that are never opened here."""
 _VARINT, _BYTES = 0, 2  # types of a field on the wire
 _FIXED = {1: 8, 5: 4}  # other types, and their sizes [bytes]
@@ -91,7 +163,9 @@ def _check_form(data: bytes, source: str) -> None:
 
 
 def _no_policy(source: str, what: str) -> PolicyError:
-    return PolicyError(source, "file", f"{what}, which no policy is; export or copy it again.")
+    return PolicyError(
+        source, "file", f"{what}, which no policy is; export or copy it again."
+    )
 
 
 def metadata_in(data: bytes, source: str) -> str:
@@ -120,7 +194,9 @@ def metadata(model: Any, source: str) -> str:
     """The text of the contract. Raises PolicyError unless there is exactly one."""
     found = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if len(found) != 1:
-        reason = f"{len(found)} contracts in it; only files of `export_policy` are policies."
+        reason = (
+            f"{len(found)} contracts in it; only files of `export_policy` are policies."
+        )
         raise PolicyError(source, "metadata", reason)
     if len(found[0]) > CONTRACT_LIMIT:
         reason = f"has {len(found[0])} characters, a contract at most {CONTRACT_LIMIT}; not read."
@@ -159,7 +235,9 @@ class WireError(ValueError):
 def check_wire(data: bytes) -> None:
     """Raises WireError unless the bytes are of a ModelProto with few parts and little nesting."""
     view, parts = memoryview(data), 0
-    ahead: list[tuple[int, int, Any, int]] = [(0, len(data), onnx.ModelProto.DESCRIPTOR, 1)]
+    ahead: list[tuple[int, int, Any, int]] = [
+        (0, len(data), onnx.ModelProto.DESCRIPTOR, 1)
+    ]
     while ahead:
         start, end, kind, depth = ahead.pop()
         if depth > MOST_NESTED:
@@ -179,9 +257,12 @@ def check_wire(data: bytes) -> None:
             if field.message_type is not None:
                 ahead.append((begin, start, field.message_type, depth + 1))
             elif size > MOST_PACKED and field.type in (
-                field.TYPE_INT64, field.TYPE_UINT64, field.TYPE_INT32, field.TYPE_UINT32,
+                field.TYPE_INT64,
+                field.TYPE_UINT64,
+                field.TYPE_INT32,
+                field.TYPE_UINT32,
                 field.TYPE_ENUM,
-            ):  # fmt: skip
+            ):
                 # Numbers of variable length grow when they are parsed.
                 raise WireError(f"has {size} bytes of {field.name!r}, not weights")
 
@@ -207,7 +288,9 @@ def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
 
 def check_graph(model: Any, source: str) -> None:
     """Raises PolicyError for a graph that is not self-contained, or has other operators."""
-    for field, reason in itertools.chain(_graph_faults(model), _weight_faults(model.graph)):
+    for field, reason in itertools.chain(
+        _graph_faults(model), _weight_faults(model.graph)
+    ):
         raise PolicyError(source, field, reason)
     try:
         onnx.checker.check_model(model)
@@ -223,23 +306,36 @@ def _shown(error: Exception) -> str:
 def _graph_faults(model: Any) -> Iterator[Fault]:
     graph = model.graph
     if len(graph.node) > MOST_NODES:
-        reason = f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run."
+        reason = (
+            f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run."
+        )
         yield "graph.node", reason
     for tensor in _tensors(graph):
         name = f"weights.{tensor.name}"
         if tensor.data_type not in NUMBERS or len(tensor.dims) > MOST_DIMENSIONS:
             reason = f"is no array of numbers with at most {MOST_DIMENSIONS} dimensions; not run."
             yield name, reason
-        location = next((entry.value for entry in tensor.external_data if entry.key), "")
+        location = next(
+            (entry.value for entry in tensor.external_data if entry.key), ""
+        )
         if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
             fix = "export with `external_data=False`, or `onnx.save(onnx.load(FILE), FILE)`"
-            yield name, f"refers to another file ({location!r}); a policy holds its weights: {fix}."
-    if len(model.functions) or len(model.training_info) or len(graph.sparse_initializer):
+            yield (
+                name,
+                f"refers to another file ({location!r}); a policy holds its weights: {fix}.",
+            )
+    if (
+        len(model.functions)
+        or len(model.training_info)
+        or len(graph.sparse_initializer)
+    ):
         yield "graph", "holds functions, training or sparse weights; remove."
     for node in graph.node:
         if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
-            reason = f"the operator {name} is not one of a feed-forward network; not run."
+            reason = (
+                f"the operator {name} is not one of a feed-forward network; not run."
+            )
             yield "graph.node", reason
         for a in node.attribute:
             if a.HasField("g") or len(a.graphs):
@@ -297,11 +393,15 @@ def check_ends(
     for end in (*inputs, *model.graph.output):
         tensor, width = end.type.tensor_type, widths[end.name]
         kind = TensorProto.INT64 if width is None else TensorProto.FLOAT
-        sizes = [d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim]
+        sizes = [
+            d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim
+        ]
         wanted = [batch] if width is None else [batch, width]
         if tensor.elem_type != kind or sizes != wanted:
             name = TensorProto.DataType.Name(tensor.elem_type)
-            reason = f"is {name} of shape {sizes}, where {wanted} is needed; export anew."
+            reason = (
+                f"is {name} of shape {sizes}, where {wanted} is needed; export anew."
+            )
             raise PolicyError(source, f"graph.{end.name}", reason)
 
 
@@ -311,12 +411,16 @@ def rows_at_once(model: Any, source: str, batch: int | None = None) -> int:
     Raises PolicyError if a size is unknown or far too large.
     """
     rows = batch or ROWS
-    faults = itertools.chain(_setting_faults(model.graph), _integer_faults(model, rows, source))
+    faults = itertools.chain(
+        _setting_faults(model.graph), _integer_faults(model, rows, source)
+    )
     for field, reason in faults:
         raise PolicyError(source, field, reason)
     numbers, work = _costs(model, rows, source)
     if max(numbers / MOST_NUMBERS, work / MOST_WORK) > rows:
-        needs = f"needs {numbers / rows:.3g} numbers and {work / rows:.3g} multiplications"
+        needs = (
+            f"needs {numbers / rows:.3g} numbers and {work / rows:.3g} multiplications"
+        )
         limits = f"for an observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}"
         raise PolicyError(source, "graph", f"{needs} {limits}; not run.")
     if batch is not None:
@@ -333,7 +437,9 @@ def _setting_faults(graph: Any) -> Iterator[Fault]:
     lengths = {tensor.name: math.prod(tensor.dims) for tensor in graph.initializer}
     for node in graph.node:
         for attribute in node.attribute:
-            if node.op_type != "Slice" and any(abs(n) > GREATEST_SETTING for n in attribute.ints):
+            if node.op_type != "Slice" and any(
+                abs(n) > GREATEST_SETTING for n in attribute.ints
+            ):
                 reason = f"of {node.op_type} is beyond {GREATEST_SETTING}; not run."
                 yield f"graph.node.{attribute.name}", reason
         if node.op_type == "Constant":
@@ -345,7 +451,9 @@ def _setting_faults(graph: Any) -> Iterator[Fault]:
             named = [lengths.get(name, 1) for name in node.input[1:2]]
             added += max(named + [len(a.ints) for a in node.attribute], default=0)
     if added > MOST_AXES:
-        reason = f"reshapes to {added} dimensions in all, a policy to {MOST_AXES}; not run."
+        reason = (
+            f"reshapes to {added} dimensions in all, a policy to {MOST_AXES}; not run."
+        )
         yield "graph.node", reason
 
 
@@ -354,8 +462,14 @@ def _integer_faults(model: Any, rows: int, source: str) -> Iterator[Fault]:
     kinds, shapes = _sizes(model, rows, source, values=False)
     for node in model.graph.node:
         if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
-            yield "graph.node", f"{node.op_type} of whole numbers may end the process; use float32."
-        if node.op_type in ("Concat", "Gather") and kinds.get(node.output[0]) not in FLOATS:
+            yield (
+                "graph.node",
+                f"{node.op_type} of whole numbers may end the process; use float32.",
+            )
+        if (
+            node.op_type in ("Concat", "Gather")
+            and kinds.get(node.output[0]) not in FLOATS
+        ):
             size = math.prod(shapes.get(node.output[0], (0,)))
             if size > SMALL * rows:
                 reason = f"of {size} whole numbers is no shape and no index; not run."
@@ -367,10 +481,14 @@ def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
     numbers = work = 0
     for node in model.graph.node:
         try:
-            given = [shapes[name] for name in node.input if name]  # without those that are omitted
+            given = [
+                shapes[name] for name in node.input if name
+            ]  # without those that are omitted
             made = [shapes[name] for name in node.output if name]
         except KeyError:
-            reason = f"the size of what {node.op_type} gives can't be known before it runs."
+            reason = (
+                f"the size of what {node.op_type} gives can't be known before it runs."
+            )
             raise PolicyError(source, "graph.node", reason) from None
         buffer, multiplied = _work(node, given, made)
         numbers += sum(map(math.prod, made)) + buffer
@@ -382,13 +500,19 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
     """Numbers that the runtime allocates in addition to the output, and multiplications."""
     settings = {attribute.name: attribute for attribute in node.attribute}
     if node.op_type in ("MatMul", "Gemm"):
-        turned = node.op_type == "Gemm" and "transA" in settings and settings["transA"].i
+        turned = (
+            node.op_type == "Gemm" and "transA" in settings and settings["transA"].i
+        )
         return 0, math.prod(made[0]) * (given[0][0] if turned else given[0][-1])
     if node.op_type == "Conv":
         groups = int(settings["group"].i) if "group" in settings else 1
         kernel = math.prod(given[1][1:])
-        return math.prod(made[0][2:]) * kernel * max(groups, 1), math.prod(made[0]) * kernel
-    if node.op_type in RECURRENT:  # given: a sequence (T, n, I), weights (D, G H, I), (D, G H, H)
+        return math.prod(made[0][2:]) * kernel * max(groups, 1), math.prod(
+            made[0]
+        ) * kernel
+    if (
+        node.op_type in RECURRENT
+    ):  # given: a sequence (T, n, I), weights (D, G H, I), (D, G H, H)
         steps = math.prod(given[0][:2])
         return steps * math.prod(given[1][:2]), steps * sum(map(math.prod, given[1:3]))
     if "kernel_shape" in settings:  # of a pool
@@ -402,17 +526,25 @@ def _sizes(
     """Type and known shape of every tensor for `rows` observations; also by integers' `values`."""
     bare = _without_weights(model, rows)
     try:
-        graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph
+        graph = onnx.shape_inference.infer_shapes(
+            bare, strict_mode=True, data_prop=values
+        ).graph
     except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
-        raise PolicyError(source, "graph", f"its shapes do not fit ({_shown(error)}).") from None
+        raise PolicyError(
+            source, "graph", f"its shapes do not fit ({_shown(error)})."
+        ) from None
     kinds = {tensor.name: tensor.data_type for tensor in graph.initializer}
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
     for value in (*graph.input, *graph.value_info, *graph.output):
         tensor = value.type.tensor_type
         kinds[value.name] = tensor.elem_type
-        if tensor.HasField("shape") and all(d.HasField("dim_value") for d in tensor.shape.dim):
+        if tensor.HasField("shape") and all(
+            d.HasField("dim_value") for d in tensor.shape.dim
+        ):
             shapes[value.name] = tuple(d.dim_value for d in tensor.shape.dim)
-    return kinds, {name: shape for name, shape in shapes.items() if min(shape, default=0) >= 0}
+    return kinds, {
+        name: shape for name, shape in shapes.items() if min(shape, default=0) >= 0
+    }
 
 
 def _without_weights(model: Any, rows: int) -> Any:

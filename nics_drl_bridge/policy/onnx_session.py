@@ -17,10 +17,14 @@ Rows = NDArray[np.float32]
 class GraphNeeds:
     """What a policy file says about its graph, as plain data."""
 
-    widths: dict[str, int | None]  # of inputs and outputs; None: whole numbers, one for each row
+    widths: dict[
+        str, int | None
+    ]  # of inputs and outputs; None: whole numbers, one for each row
     batch: int | None  # greatest number of observations in one run; None: any
     graph_sha256: str
-    start: float | None = None  # of each element of the state; None: the policy has no state
+    start: float | None = (
+        None  # of each element of the state; None: the policy has no state
+    )
 
 
 def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> int:
@@ -42,13 +46,17 @@ def open_session(data: bytes, source: str) -> Any:
         import onnxruntime
     except ImportError:
         fix = "pip install 'nics_drl_bridge[deploy]'."
-        raise ConfigError(f"a policy file needs the module 'onnxruntime'; {fix}") from None
+        raise ConfigError(
+            f"a policy file needs the module 'onnxruntime'; {fix}"
+        ) from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.log_severity_level = 4
     try:
-        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(
+            data, options, providers=["CPUExecutionProvider"]
+        )
     except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
         raise cannot_run(source, error) from None
 

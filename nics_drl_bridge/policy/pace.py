@@ -33,7 +33,9 @@ class Pace:
     @property
     def steps(self) -> int:
         """Suitable time limit [steps]."""
-        return math.ceil(max(LEAST_S, ROOM * self.far / self.speed) / self.period - 1e-9)
+        return math.ceil(
+            max(LEAST_S, ROOM * self.far / self.speed) / self.period - 1e-9
+        )
 
     def shortfall(self, steps: int) -> str | None:
         """A sentence if a goal can't be reached in time; ConfigError if none can."""
@@ -50,7 +52,9 @@ class Pace:
         return reason
 
 
-def pace_of(model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None = None) -> Pace:
+def pace_of(
+    model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None = None
+) -> Pace:
     """The pace of a robot, at most of a top speed [m/s], in worlds."""
     members = [member for world in worlds for member in world.members]
     far, name = max(
@@ -58,14 +62,22 @@ def pace_of(model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None
         for one in members
     )
     near = min(member.goal_distance[0] for member in members)
-    return Pace(name, near, far, min(top or math.inf, top_speed(model.robot)), model.control_period)
+    return Pace(
+        name,
+        near,
+        far,
+        min(top or math.inf, top_speed(model.robot)),
+        model.control_period,
+    )
 
 
 def top_speed(robot: RobotSpec) -> float:
     """Greatest speed along one axis of a robot [m/s]; inf if neither kind nor commands tell."""
     if has_textbook(robot):
         return float(reach(robot)[:2].max())
-    told = [max(abs(one.min), abs(one.max)) for one in robot.command if one.unit == "m/s"]
+    told = [
+        max(abs(one.min), abs(one.max)) for one in robot.command if one.unit == "m/s"
+    ]
     return max(told, default=math.inf)
 
 
@@ -94,12 +106,16 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
         name = f"own_{kin(open_model(robot).robot)}"
         told.append(f"settings {name!r}, as the robot {robot!r} has none of its own")
     settings = recordings.chosen_settings(task, name, changes)
-    inherited = name in shipped and recordings.load_training(str(name)).robot != settings.robot
+    inherited = (
+        name in shipped and recordings.load_training(str(name)).robot != settings.robot
+    )
     made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)
     return Fitted(made.settings, (*told, *made.told))
 
 
-def fitted(settings: recordings.TrainingSettings, model: SimulatorModel, inherited: bool) -> Fitted:
+def fitted(
+    settings: recordings.TrainingSettings, model: SimulatorModel, inherited: bool
+) -> Fitted:
     """Settings with a time limit for robot and worlds, unless they have one; ConfigError if short.
 
     Those inherited from another robot get its lidar's layout of a scan, and a time reward and a
@@ -111,22 +127,34 @@ def fitted(settings: recordings.TrainingSettings, model: SimulatorModel, inherit
     pace = pace_of(model, worlds, options.get("top_speed"))
     changed: dict[str, Any] = {}
     if inherited and options.get("scan") == "around" and not covers(lidar, "around"):
-        scan = options["scan"] = "front" if covers(lidar, "front") else sectors_over(lidar)
+        scan = options["scan"] = (
+            "front" if covers(lidar, "front") else sectors_over(lidar)
+        )
         far = LAYOUTS["around"].range_max
-        told.append(f"the lidar {lidar.name!r} does not see {far:g} m all around: scan: {scan}")
-    if "max_episode_steps" not in settings.model_fields_set and pace.steps != MAX_EPISODE_STEPS:
+        told.append(
+            f"the lidar {lidar.name!r} does not see {far:g} m all around: scan: {scan}"
+        )
+    if (
+        "max_episode_steps" not in settings.model_fields_set
+        and pace.steps != MAX_EPISODE_STEPS
+    ):
         changed["max_episode_steps"] = pace.steps
         limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"
         told.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
         if inherited and pace.steps > MAX_EPISODE_STEPS:
-            changed |= _stretched(settings, options, pace.steps / MAX_EPISODE_STEPS, told)
+            changed |= _stretched(
+                settings, options, pace.steps / MAX_EPISODE_STEPS, told
+            )
     made = settings.model_copy(update={**changed, "task_options": options})
     short = pace.shortfall(made.max_episode_steps)
     return Fitted(made, tuple(told) if short is None else (*told, short))
 
 
 def _stretched(
-    settings: recordings.TrainingSettings, options: dict[str, Any], factor: float, told: list[str]
+    settings: recordings.TrainingSettings,
+    options: dict[str, Any],
+    factor: float,
+    told: list[str],
 ) -> dict[str, Any]:
     """Returns the changes for episodes longer by a factor; those of `options` are made in place."""
     if reward := options.get("time_reward"):

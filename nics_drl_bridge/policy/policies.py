@@ -19,7 +19,12 @@ from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
 from nics_drl_bridge.policy.fallback import Fallback, check_readable
 from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
-from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
+from nics_drl_bridge.policy.local_map_kernels import (
+    Clearance,
+    FootprintDiscs,
+    MapScratch,
+    ScanRays,
+)
 from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.policy.stateful import Policy, Stateful
 from nics_drl_bridge.policy.stopping import braking_for
@@ -30,7 +35,9 @@ if TYPE_CHECKING:
     from nics_drl_bridge.policy.policy_file import PolicyFile
 
 
-CLEARANCE = Clearance(margin=0.1, soft=0.4)  # of the dynamic window, whose twists are few
+CLEARANCE = Clearance(
+    margin=0.1, soft=0.4
+)  # of the dynamic window, whose twists are few
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
 SETTLED_S = 5.0  # after which a held command has led to its twist
 LEAST_REACH = 1e-3  # of a component of the twist that no command moves [m/s, rad/s]
@@ -41,8 +48,14 @@ def _grid(robot: RobotSpec) -> Array:
     """Returns commands (K, C) over the whole range of each, with rest."""
     counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
     axes = [
-        np.unique(np.append(np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)))
-        for one, count in zip(robot.command, counts or [3] * len(robot.command), strict=True)
+        np.unique(
+            np.append(
+                np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)
+            )
+        )
+        for one, count in zip(
+            robot.command, counts or [3] * len(robot.command), strict=True
+        )
     ]
     return np.array(list(itertools.product(*axes)))
 
@@ -67,7 +80,9 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
 def actions_of(task: Navigation, commands: Array) -> NDArray[np.float32]:
     """Returns the continuous actions (..., C) that give commands (..., C), cut to [-1, 1]."""
     low, high = task.command_limits
-    return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+    return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0).astype(
+        np.float32
+    )
 
 
 @dataclass(frozen=True)
@@ -75,12 +90,16 @@ class StraightToGoal:
     """Turns to the goal and drives there, ignoring obstacles; ConfigError: see `command_for`."""
 
     task: Navigation
-    model: SimulatorModel | None = None  # tells the twists of a robot whose kind does not
+    model: SimulatorModel | None = (
+        None  # tells the twists of a robot whose kind does not
+    )
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `Policy`."""
         robot, first = self.task.robot, self.task.scan_parts + 1
-        cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
+        cosine, sine = np.moveaxis(
+            observation[..., first : first + 2].astype(float), -1, 0
+        )
         turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
         ahead = np.maximum(cosine, 0.0 if self._turns_in_place else CREEP)
         shares = np.stack([ahead, np.zeros_like(ahead), turn], axis=-1)
@@ -145,7 +164,12 @@ class DynamicWindow:
     clearance: Clearance = CLEARANCE
     period: float = 0.1  # between commands [s]
     steps: int = 10  # of the look-ahead, each a period and a half long
-    weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)  # see `TwistWeights`
+    weights: tuple[float, float, float, float] = (
+        1.0,
+        0.6,
+        0.3,
+        1.5,
+    )  # see `TwistWeights`
     model: SimulatorModel | None = None  # tells the twists of a robot without `cmd_vel`
 
     def __post_init__(self) -> None:
@@ -158,22 +182,36 @@ class DynamicWindow:
         goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
         chosen = np.empty(len(seen), np.int64)
         kernels.choose_all(
-            chosen, np.ascontiguousarray(seen[:, :parts]), goals,
-            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]), *self._search, self._sense,
-        )  # fmt: skip
+            chosen,
+            np.ascontiguousarray(seen[:, :parts]),
+            goals,
+            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
+            *self._search,
+            self._sense,
+        )
         return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
     def _search(self) -> tuple[Array, kernels.LookAhead, kernels.TwistWeights]:
         robot = self.task.robot
         twists = _settled(self.task, self._commands, self.model)
-        lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
+        lags = [
+            value for name, value in robot.parameters.items() if name.endswith("_lag")
+        ]
         lag = max(lags, default=0.0)
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
         braking = braking_for(self.task, self.model)
-        steps = [np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T]
-        reach = np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6  # one step at least
-        late = 0.0 if self.model is None else max(0.0, self.model.calibration.command_latency_s)
+        steps = [
+            np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T
+        ]
+        reach = (
+            np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6
+        )  # one step at least
+        late = (
+            0.0
+            if self.model is None
+            else max(0.0, self.model.calibration.command_latency_s)
+        )
         # A twist is held for a period and looked at a period later; then the robot reacts. Its
         # reaction is known no finer than the steps of its model.
         held = 2.0 * self.period + late
@@ -188,7 +226,9 @@ class DynamicWindow:
         needed = math.ceil((reaction + slowest) / step)
         far = math.inf
         count = self.steps
-        if needed > count:  # it looks ahead for as long as the robot needs, on ground that it sees
+        if (
+            needed > count
+        ):  # it looks ahead for as long as the robot needs, on ground that it sees
             count = needed
             fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
             far = min(fastest * step * count, self.task.sight.range_max, MOST_M)
@@ -208,7 +248,11 @@ class DynamicWindow:
     @cached_property
     def _sense(self) -> tuple[ScanRays, FootprintDiscs, Clearance, MapScratch]:
         outline, (twists, ahead, _) = outline_of(self.task.robot), self._search
-        far = float(np.hypot(twists[:, 0], twists[:, 1]).max()) * ahead.period * ahead.steps
+        far = (
+            float(np.hypot(twists[:, 0], twists[:, 1]).max())
+            * ahead.period
+            * ahead.steps
+        )
         half = min(far, self.task.sight.range_max) + outline.outer
         scratch = scratch_of(self.task.scan_parts, outline, self.clearance, half)
         return rays_of(self.task), outline, self.clearance, scratch
@@ -244,8 +288,14 @@ def is_policy_file(name: str) -> bool:
     Raises ConfigError if unknown.
     """
     files = shipped_policies()
-    if name not in POLICIES and not name.endswith((SUFFIX, *MAPPINGS)) and name not in files:
-        raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
+    if (
+        name not in POLICIES
+        and not name.endswith((SUFFIX, *MAPPINGS))
+        and name not in files
+    ):
+        raise ConfigError(
+            f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}"
+        )
     return name not in POLICIES
 
 
@@ -258,7 +308,9 @@ def make_policy(
     """
     if not is_policy_file(name):
         return _backed(POLICIES[name](task, model), name, fallback, task, model)
-    from nics_drl_bridge.policy.foreign import load_any  # the others need no onnxruntime
+    from nics_drl_bridge.policy.foreign import (
+        load_any,
+    )  # the others need no onnxruntime
 
     policy = load_any(name, model)
     policy.check_fits(model, task)
@@ -283,7 +335,9 @@ def open_policy(
     policy = load_any(name, model)
     found: Any = policy.make_task(model, kind)  # of a kind it is any task
     if kind is None and not isinstance(found, Navigation):
-        reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
+        reason = (
+            f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
+        )
         raise PolicyError(name, "task.name", reason)
     return _backed(_acting(policy), name, fallback, found, model), found
 
@@ -291,14 +345,22 @@ def open_policy(
 def check_fallback(fallback: str, policy: str) -> None:
     """Raises ConfigError unless a name is '', or a planner's other than the policy."""
     if fallback and fallback not in PLANNERS:
-        raise ConfigError(f"fallback {fallback!r}: no such planner; {nearest(fallback, PLANNERS)}")
+        raise ConfigError(
+            f"fallback {fallback!r}: no such planner; {nearest(fallback, PLANNERS)}"
+        )
     if fallback and fallback == policy:
         others = " or ".join(repr(name) for name in PLANNERS if name != policy)
-        raise ConfigError(f"fallback {fallback!r} is the policy itself; take {others}, or none.")
+        raise ConfigError(
+            f"fallback {fallback!r} is the policy itself; take {others}, or none."
+        )
 
 
 def _backed(
-    policy: Policy, name: str, fallback: str, task: Navigation, model: SimulatorModel | None
+    policy: Policy,
+    name: str,
+    fallback: str,
+    task: Navigation,
+    model: SimulatorModel | None,
 ) -> Policy:
     """The policy of a name, with the planner of another behind it unless that is ''."""
     check_fallback(fallback, name)

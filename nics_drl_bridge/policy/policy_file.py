@@ -36,7 +36,9 @@ LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 class PolicyFile:
     """A loaded and checked policy, with the path of its file and its contract."""
 
-    def __init__(self, path: Path, contract: Contract, session: Any, rows_at_once: int) -> None:
+    def __init__(
+        self, path: Path, contract: Contract, session: Any, rows_at_once: int
+    ) -> None:
         self.path, self.contract, self._session = path, contract, session
         self._rows_at_once = rows_at_once
 
@@ -66,10 +68,14 @@ class PolicyFile:
         wanted = None if kept is None else (*given.shape[:-1], kept.size)
         if wanted != (None if state is None else np.shape(state)):
             reason = f"must be given as {wanted}, not {None if state is None else np.shape(state)}"
-            raise PolicyError(str(self.path), "state", f"{reason}; `make_policy` keeps it.")
+            raise PolicyError(
+                str(self.path), "state", f"{reason}; `make_policy` keeps it."
+            )
         feeds = {onnx_graph.INPUT: given.reshape(-1, size)}
         if kept is not None:
-            feeds[onnx_graph.STATE_IN] = np.asarray(state, np.float32).reshape(-1, kept.size)
+            feeds[onnx_graph.STATE_IN] = np.asarray(state, np.float32).reshape(
+                -1, kept.size
+            )
         firsts = range(0, max(len(feeds[onnx_graph.INPUT]), 1), self._rows_at_once)
         out = [self._run_rows(feeds, slice(k, k + self._rows_at_once)) for k in firsts]
         whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
@@ -83,7 +89,9 @@ class PolicyFile:
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
             raise cannot_run(str(self.path), error) from None
         if any(len(part) != len(rows) for part in out):
-            reason = f"gives {[part.shape for part in out]} for {len(rows)} observations."
+            reason = (
+                f"gives {[part.shape for part in out]} for {len(rows)} observations."
+            )
             raise PolicyError(str(self.path), "graph", reason)
         return out
 
@@ -91,40 +99,57 @@ class PolicyFile:
     def task_options(self) -> dict[str, Any]:
         """Arguments of the policy's task: its options, scan and sensors."""
         scan = self.contract.scan
-        options = {**self.contract.task.options, **({} if scan is None else {"scan": scan})}
+        options = {
+            **self.contract.task.options,
+            **({} if scan is None else {"scan": scan}),
+        }
         if self.contract.sensors:
             options["sensors"] = self.contract.sensors
         return options
 
-    def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
+    def make_task(
+        self, model: SimulatorModel, kind: str | type[Task] | None = None
+    ) -> Task:
         """Makes the policy's task for a robot; PolicyError names a field that does not fit."""
         name = self.contract.task.name
         if kind is None and name not in TASKS:
             place = f"path/to/file.py:{name if name.isidentifier() else 'ClassName'}"
-            reason = f"{name!r} is no shipped task; say --task {place}, or task= in Python."
+            reason = (
+                f"{name!r} is no shipped task; say --task {place}, or task= in Python."
+            )
             raise PolicyError(str(self.path), "task.name", reason)
         self.check_fits(model)
         task = make_task(kind or name, model, self.task_options)
         self.check_fits(model, task)
         return task
 
-    def check_fits(self, model: SimulatorModel | None, task: Task | None = None) -> None:
+    def check_fits(
+        self, model: SimulatorModel | None, task: Task | None = None
+    ) -> None:
         """Raises PolicyError, with the field, unless the policy fits a robot and a task."""
         if model is not None:
             self._check_robot(model.robot, model.lidar)
-            known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}
-            self._compare({"sensors": [known.get(each.name) for each in self.contract.sensors]})
+            known = {
+                sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors
+            }
+            self._compare(
+                {"sensors": [known.get(each.name) for each in self.contract.sensors]}
+            )
             period = model.control_period
             if abs(self.contract.control_period - period) > PERIOD_TOLERANCE:
                 self._compare({"control_period": period})
         if task is not None:
             self._check_robot(task.robot, task.lidar)
-            self._compare({
-                "task": {"name": contracts.task_entry(task)["name"]},
-                "actions": task.actions,
-                "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
-                "observation": contracts.observation_entry(task),
-            })  # fmt: skip
+            self._compare(
+                {
+                    "task": {"name": contracts.task_entry(task)["name"]},
+                    "actions": task.actions,
+                    "scan": None
+                    if task.scan is None
+                    else task.scan.model_dump(mode="json"),
+                    "observation": contracts.observation_entry(task),
+                }
+            )
 
     def _check_robot(self, robot: RobotSpec, lidar: LidarSpec) -> None:
         theirs = {"robot": robot.model_dump(mode="json", include=ROBOT)}
@@ -134,7 +159,9 @@ class PolicyFile:
             try:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
-                reason = f"sees more than this lidar does: {str(error).partition(';')[0]}"
+                reason = (
+                    f"sees more than this lidar does: {str(error).partition(';')[0]}"
+                )
                 fix = "use another lidar, or a policy that was trained for this one"
                 raise PolicyError(str(self.path), "scan", f"{reason}; {fix}.") from None
         self._compare(theirs)
@@ -147,7 +174,9 @@ class PolicyFile:
             other = dict(leaves({name: entry}))
             for path in (*ours, *other):
                 if ours.get(path) != other.get(path):
-                    reason = f"is {ours.get(path)!r}, but the robot's is {other.get(path)!r}"
+                    reason = (
+                        f"is {ours.get(path)!r}, but the robot's is {other.get(path)!r}"
+                    )
                     reason += "; use a policy that was trained so."
                     raise PolicyError(str(self.path), path, reason)
 
@@ -159,21 +188,31 @@ def load_policy(path: str | Path) -> PolicyFile:
     if not (str(path).endswith(suffix) or file.is_file()):
         file = contracts.shipped() / f"{path}{suffix}"
         if not file.is_file():
-            hint = nearest(str(path), (each.stem for each in file.parent.glob(f"*{suffix}")))
-            raise PolicyError(str(path), "file", f"is neither a file nor a shipped policy; {hint}")
+            hint = nearest(
+                str(path), (each.stem for each in file.parent.glob(f"*{suffix}"))
+            )
+            raise PolicyError(
+                str(path), "file", f"is neither a file nor a shipped policy; {hint}"
+            )
     source = str(file)
     try:
         size, limit = file.stat().st_size, onnx_graph.SIZE_LIMIT
         if not file.is_file():
-            raise PolicyError(source, "file", "is no file; give the path of an .onnx file.")
+            raise PolicyError(
+                source, "file", "is no file; give the path of an .onnx file."
+            )
         if size > limit:
             sizes = f"is {size / 2**20:.0f} MB, a policy is at most {limit // 2**20} MB"
             raise PolicyError(source, "file", f"{sizes}; not opened.")
         data = file.read_bytes()
     except FileNotFoundError:
-        raise PolicyError(source, "file", "there is no such file; check the path.") from None
+        raise PolicyError(
+            source, "file", "there is no such file; check the path."
+        ) from None
     except OSError as error:
-        raise PolicyError(source, "file", f"can't be read ({error.strerror}).") from None
+        raise PolicyError(
+            source, "file", f"can't be read ({error.strerror})."
+        ) from None
     return policy_of(data, file)
 
 
@@ -181,10 +220,14 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     """Makes a policy from a file's content; see `load_policy`."""
     source = str(path)
     contract = contracts.read_contract(onnx_graph.metadata_in(data, source), source)
-    onnx_graph.check_seal(data, source)  # what was changed since has a reason above, if it is known
+    onnx_graph.check_seal(
+        data, source
+    )  # what was changed since has a reason above, if it is known
     needs = _needs_of(contract)
     seen = contract.golden.rows("observations")
-    if path.parent != contracts.shipped():  # these are part of the package, as its code is
+    if (
+        path.parent != contracts.shipped()
+    ):  # these are part of the package, as its code is
         rehearsal.rehearse_policy(data, needs, seen, source)
     rows = check_policy_graph(data, needs, source)
     policy = PolicyFile(path, contract, open_session(data, source), rows)
@@ -219,7 +262,9 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
     robot = policy.contract.robot
     beyond = (command < robot.command_low - GOLDEN_TOLERANCE).any()
     if beyond or (command > robot.command_high + GOLDEN_TOLERANCE).any():
-        raise PolicyError(source, "robot.command", "the graph gives commands beyond its limits.")
+        raise PolicyError(
+            source, "robot.command", "the graph gives commands beyond its limits."
+        )
 
 
 def summary(policy: PolicyFile) -> dict[str, Any]:

@@ -29,7 +29,9 @@ from nics_drl_bridge.policy.onnx_session import (
 )
 
 MEMORY = 512 * 2**20  # beyond what the libraries use [bytes]
-MEMORY_OF_SIZE = 8  # the same for each byte of the file: a network is held several times
+MEMORY_OF_SIZE = (
+    8  # the same for each byte of the file: a network is held several times
+)
 CPU_S = 10  # time of a processor; a network of 32 MB takes a tenth of it here
 WALL_S = 60.0  # on a computer that is busy with other things
 MOST_REMEMBERED = 10_000
@@ -84,7 +86,9 @@ def _answer_of(request: bytes) -> tuple[str, str] | None:
     """The field and the reason for which another process refused a request; None if it did not."""
     # The same modules as here: `python -c` alone would look for them in the working folder.
     code = _CODE.format(path=sys.path, module=__name__)
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    single = dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+    )
     try:
         done = subprocess.run(
             [sys.executable, "-c", code],
@@ -101,10 +105,18 @@ def _answer_of(request: bytes) -> tuple[str, str] | None:
     if done.returncode == 0:
         answer = json.loads(done.stdout)
         return None if answer is None else (str(answer[0]), str(answer[1]))
-    if done.returncode == EXIT_MEMORY or done.returncode < 0:  # of a signal: out of time, a crash
+    if (
+        done.returncode == EXIT_MEMORY or done.returncode < 0
+    ):  # of a signal: out of time, a crash
         most = f"{MEMORY // 2**20} MB of memory or {CPU_S} s"
-        return "graph", f"takes more than {most} to open, which no policy does; not opened."
-    last = (done.stderr.decode(errors="replace").strip().splitlines() or ["nothing was said"])[-1]
+        return (
+            "graph",
+            f"takes more than {most} to open, which no policy does; not opened.",
+        )
+    last = (
+        done.stderr.decode(errors="replace").strip().splitlines()
+        or ["nothing was said"]
+    )[-1]
     return "file", f"the process that opens it first failed ({last}); not opened."
 
 
@@ -158,7 +170,9 @@ def _do(told: dict[str, Any], data: bytes) -> None:
             fold_shapes(model.graph, told["opset"])
         except Exception as error:
             words = " ".join(str(error).split())[:120]
-            raise PolicyError(source, "network", f"its shapes do not fit ({words}).") from error
+            raise PolicyError(
+                source, "network", f"its shapes do not fit ({words})."
+            ) from error
         return
     needs = GraphNeeds(**told["needs"])
     *shape, text = told["seen"]

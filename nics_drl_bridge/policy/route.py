@@ -36,7 +36,10 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     number = np.arange(room.size).reshape(room.shape)
     links = []
     for down, right, far in STEPS:
-        a = (slice(0, room.shape[0] - down), slice(max(0, -right), room.shape[1] - max(0, right)))
+        a = (
+            slice(0, room.shape[0] - down),
+            slice(max(0, -right), room.shape[1] - max(0, right)),
+        )
         b = (slice(down, None), slice(max(0, right), room.shape[1] - max(0, -right)))
         both = passable[a] & passable[b]
         cost = far * 0.5 * (dear[a] + dear[b])
@@ -46,19 +49,29 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     begin, end = (int(number[cell]) for cell in ends)
     far, before = dijkstra(graph, directed=False, indices=end, return_predecessors=True)
     if not np.isfinite(far[begin]):
-        reason = f"for a robot of radius {radius:g} m there is no way to the goal on the map"
+        reason = (
+            f"for a robot of radius {radius:g} m there is no way to the goal on the map"
+        )
         raise ConfigError(f"{reason}; give a goal in the space that it reaches.")
     cells = [begin]
     while cells[-1] != end:
         cells.append(int(before[cells[-1]]))
-    middles = coarse.cell_to_world(np.stack(np.divmod(cells[1:-1], room.shape[1]), axis=-1))
-    return np.array([np.asarray(start, np.float64)[:2], *middles, np.asarray(goal, np.float64)[:2]])
+    middles = coarse.cell_to_world(
+        np.stack(np.divmod(cells[1:-1], room.shape[1]), axis=-1)
+    )
+    return np.array(
+        [np.asarray(start, np.float64)[:2], *middles, np.asarray(goal, np.float64)[:2]]
+    )
 
 
 def _coarse(grid: GridMap, parts: int) -> GridMap:
     """Returns the map with cells several times as large, occupied if a part of them is."""
     rows, columns = (math.ceil(count / parts) * parts for count in grid.cells.shape)
     cells = np.full((rows, columns), FREE, np.int8)
-    cells[: grid.cells.shape[0], : grid.cells.shape[1]] = np.where(grid.blocked, OCCUPIED, FREE)
-    large = cells.reshape(rows // parts, parts, columns // parts, parts).max(axis=(1, 3))
+    cells[: grid.cells.shape[0], : grid.cells.shape[1]] = np.where(
+        grid.blocked, OCCUPIED, FREE
+    )
+    large = cells.reshape(rows // parts, parts, columns // parts, parts).max(
+        axis=(1, 3)
+    )
     return GridMap(large, grid.resolution * parts, grid.origin)

@@ -44,15 +44,23 @@ class Shadow:
         """Mean of policy minus drive by command; its magnitude; the share of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
-            one, other, band = self.policy[:, c], self.driven[:, c], DEAD_BAND * self.scale[c]
+            one, other, band = (
+                self.policy[:, c],
+                self.driven[:, c],
+                DEAD_BAND * self.scale[c],
+            )
             gap, size = one - other, np.abs(one - other)
             signed = (np.abs(one) > band) & (np.abs(other) > band)
-            opposite = (one[signed] * other[signed] < 0.0).mean() if signed.any() else 0.0
+            opposite = (
+                (one[signed] * other[signed] < 0.0).mean() if signed.any() else 0.0
+            )
             found[name] = {
-                "mean": float(gap.mean()), "mean_size": float(size.mean()),
+                "mean": float(gap.mean()),
+                "mean_size": float(size.mean()),
                 **{f"p{q}": float(np.percentile(size, q)) for q in PERCENTILES},
-                "greatest": float(size.max()), "opposite": float(opposite),
-            }  # fmt: skip
+                "greatest": float(size.max()),
+                "opposite": float(opposite),
+            }
         return found
 
 
@@ -65,9 +73,13 @@ class _Moment:
 
 
 def shadow(
-    path: str | Path, model: SimulatorModel, policy: str, topics: Mapping[str, str],
-    goal: ArrayLike | None = None, ahead_s: float = 4.0,
-) -> Shadow:  # fmt: skip
+    path: str | Path,
+    model: SimulatorModel,
+    policy: str,
+    topics: Mapping[str, str],
+    goal: ArrayLike | None = None,
+    ahead_s: float = 4.0,
+) -> Shadow:
     """Runs a policy on a recorded drive, in process and deterministically.
 
     The goal (2,) [m] is in `map`; None uses the robot's position `ahead_s` later. Raises
@@ -78,12 +90,16 @@ def shadow(
     messages = played(path, topics, model.gyro)
     for role in (SCAN, CMD_VEL):
         if role not in messages:
-            reason = f"has no {role}, which a policy is compared by; say which topic it is"
+            reason = (
+                f"has no {role}, which a policy is compared by; say which topic it is"
+            )
             raise RecordingError(f"{path}: {reason}, as in --topic {role}=/car/{role}.")
     playback = Playback(model, POSE in messages, any_lidar=True)
     moments = _moments(playback, messages, model)
     if not moments:
-        raise RecordingError(f"{path}: no scan with an odometry could be used; see nics bag info.")
+        raise RecordingError(
+            f"{path}: no scan with an odometry could be used; see nics bag info."
+        )
     goals = _goals(moments, goal, ahead_s)
     return _answered(moments, goals, policy, replace(model, lidar=playback.lidar))
 
@@ -128,16 +144,22 @@ def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Ar
         return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
     places = np.array([moment.view.pose[:2] for moment in moments])
-    return np.stack([np.interp(times + ahead_s, times, place) for place in places.T], axis=-1)
+    return np.stack(
+        [np.interp(times + ahead_s, times, place) for place in places.T], axis=-1
+    )
 
 
-def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorModel) -> Shadow:
+def _answered(
+    moments: list[_Moment], goals: Array, name: str, model: SimulatorModel
+) -> Shadow:
     policy, task = open_policy(name, model)
     robot, rows, resets = model.robot, list[tuple[Any, ...]](), 0
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
         verdict = task.judge(moment.view, memory := {"goal": goal})
-        if not (verdict.touched or verdict.reached):  # its state needs what is not compared, too
+        if not (
+            verdict.touched or verdict.reached
+        ):  # its state needs what is not compared, too
             resets += bool(resume(policy, moment.stamp_ns * S_PER_NS))
             command = task.command(policy.act(task.observation(moment.view, memory)))
         if moment.driven is None:
@@ -148,13 +170,28 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
             skipped["at the goal"] += 1
         else:
             wanted = robot.through_cmd_vel(command)
-            rows.append((moment.stamp_ns, moment.view.pose, goal, wanted, moment.driven))
+            rows.append(
+                (moment.stamp_ns, moment.view.pose, goal, wanted, moment.driven)
+            )
     if not rows:
-        reasons = ", ".join(f"{count} times {why}" for why, count in skipped.items() if count)
-        raise RecordingError(f"nothing to compare the policy by: {reasons}; choose another goal.")
-    stamps, poses, aims, wanted, driven = (np.array(column) for column in zip(*rows, strict=True))
+        reasons = ", ".join(
+            f"{count} times {why}" for why, count in skipped.items() if count
+        )
+        raise RecordingError(
+            f"nothing to compare the policy by: {reasons}; choose another goal."
+        )
+    stamps, poses, aims, wanted, driven = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
     return Shadow(
-        tuple(one.name for one in robot.command), tuple(one.unit for one in robot.command),
-        (stamps - stamps[0]) * S_PER_NS, poses, aims, wanted, driven,
-        np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)), skipped, resets,
-    )  # fmt: skip
+        tuple(one.name for one in robot.command),
+        tuple(one.unit for one in robot.command),
+        (stamps - stamps[0]) * S_PER_NS,
+        poses,
+        aims,
+        wanted,
+        driven,
+        np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)),
+        skipped,
+        resets,
+    )

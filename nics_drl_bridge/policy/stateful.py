@@ -24,7 +24,9 @@ class Policy(Protocol):
 class Stateful:
     """Acts with a state that it keeps from step to step of an episode, a row for each world."""
 
-    def __init__(self, step: Step, size: int, start: float, longest_gap: float = math.inf) -> None:
+    def __init__(
+        self, step: Step, size: int, start: float, longest_gap: float = math.inf
+    ) -> None:
         self._step, self._start = step, np.full(size, start, np.float32)
         self._longest_gap = longest_gap  # between two observations [s]
         self._state: Rows | None = None

@@ -18,7 +18,9 @@ def braking_for(task: Navigation, model: SimulatorModel | None) -> Braking:
     """
     robot = task.robot
     if model is None:
-        lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
+        lags = [
+            value for name, value in robot.parameters.items() if name.endswith("_lag")
+        ]
         return Braking(max(lags, default=0.0), math.inf)
     return braking_of(robot, model.kinematics, *task.command_limits)
 

@@ -23,13 +23,23 @@ from nics_drl_bridge.files import json_of, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import train_algorithms as algorithms
 from nics_drl_bridge.policy import train_checkpoint as checkpoints
-from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
+from nics_drl_bridge.policy.evaluation import (
+    FIRST_SEED,
+    Outcomes,
+    Summary,
+    drive_worlds,
+    summarise,
+)
 from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_ppo import LeanPpo
 from nics_drl_bridge.policy.train_stop import Stop
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import TrainingSettings, is_code, read_settings
+from nics_drl_bridge.policy.training_settings import (
+    TrainingSettings,
+    is_code,
+    read_settings,
+)
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -38,7 +48,9 @@ EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
 MOST_WEIGHT = 80.0  # whose exponential, a spread of actions, is just finite
 TRIED = 8  # worlds, and steps in each
-GREATEST_SEED = 2**32 - 1  # of numpy's global generator, from which Stable-Baselines3 draws
+GREATEST_SEED = (
+    2**32 - 1
+)  # of numpy's global generator, from which Stable-Baselines3 draws
 Tell = checkpoints.Tell
 
 
@@ -53,9 +65,13 @@ class Trained:
 
 
 def train(
-    settings: TrainingSettings, seed: int, folder: Path, tell: Tell = lambda _: None,
-    resumed: bool = False, on_env: Callable[[TrainVecEnv], None] = lambda _: None,
-) -> Trained:  # fmt: skip
+    settings: TrainingSettings,
+    seed: int,
+    folder: Path,
+    tell: Tell = lambda _: None,
+    resumed: bool = False,
+    on_env: Callable[[TrainVecEnv], None] = lambda _: None,
+) -> Trained:
     """Trains a policy, resumed bit-identically from `folder`. Raises ConfigError if it can't.
 
     `on_env` gets the worlds before the first step, as to be called by their `on_step`.
@@ -70,7 +86,9 @@ def train(
         rng = np.random.default_rng(seed)
         env.seed(int(rng.integers(SEEDS)))
         training = engine(settings, env, seed, algorithms.observed(env, rng))
-        env.seed(int(rng.integers(SEEDS)))  # replaces the algorithm's, near those of other runs
+        env.seed(
+            int(rng.integers(SEEDS))
+        )  # replaces the algorithm's, near those of other runs
     else:
         check_same(content["about"], about, path)
         size = int(np.prod(env.observation_space.shape))
@@ -85,7 +103,9 @@ def train(
     if training.steps < settings.steps and not stop.over:
         logger = configure(str(folder), ["tensorboard"])
         try:
-            training.learn(checkpoints.Watch(env, seed, settings, save, tell, stop), logger)
+            training.learn(
+                checkpoints.Watch(env, seed, settings, save, tell, stop), logger
+            )
         except (RuntimeError, ValueError, gymnasium.error.InvalidAction):
             refuse_diverged(training, MOST_WEIGHT)
             raise
@@ -97,63 +117,96 @@ def train(
 
 def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) -> None:
     """Raises ConfigError if the weights of a training are not within a bound."""
-    if not all(bool((part.abs() < bound).all()) for part in training.networks.parameters()):
+    if not all(
+        bool((part.abs() < bound).all()) for part in training.networks.parameters()
+    ):
         fault = f"after {training.steps} steps its weights are beyond all bounds"
         raise ConfigError(f"the training diverged: {fault}; lower its learning_rate.")
 
 
 def make_train_env(
-    settings: TrainingSettings, model: SimulatorModel | None = None,
+    settings: TrainingSettings,
+    model: SimulatorModel | None = None,
     scenes: Mapping[str, AnyWorld] | None = None,
-) -> TrainVecEnv:  # fmt: skip
+) -> TrainVecEnv:
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot, settings.lidar)
     if margin := settings.teaching.margin:
         model = replace(model, robot=model.robot.grown(margin))
     envs = [
         BridgeVectorEnv(
-            count, model, (scenes or {}).get(world, world), settings.task, settings.task_options,
-            settings.max_episode_steps, "SameStep", randomisation=settings.randomisation,
+            count,
+            model,
+            (scenes or {}).get(world, world),
+            settings.task,
+            settings.task_options,
+            settings.max_episode_steps,
+            "SameStep",
+            randomisation=settings.randomisation,
         )
         for world, count in settings.worlds.items()
-    ]  # fmt: skip
+    ]
     for env in envs:
         env.teach(settings.teaching)
     return TrainVecEnv(*envs)
 
 
 def _restore(
-    content: dict[str, Any], parts: Iterable[LeanPpo | Sb3Training | Stop], env: TrainVecEnv,
+    content: dict[str, Any],
+    parts: Iterable[LeanPpo | Sb3Training | Stop],
+    env: TrainVecEnv,
     path: Path,
-) -> None:  # fmt: skip
+) -> None:
     try:
         for part in parts:
             part.restore(content["state"])
         checkpoints.restore_envs(content, env)
-    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+    except (
+        AttributeError,
+        IndexError,
+        KeyError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
         reason = f"does not hold what a training needs ({shortened(str(error), 120)})"
         raise ConfigError(f"{path}: {reason}; train anew.") from None
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
     """Raises ConfigError unless a checkpoint has the settings and seed of a training."""
-    if not isinstance(old, dict) or not isinstance(old.get("settings"), dict) or "seed" not in old:
+    if (
+        not isinstance(old, dict)
+        or not isinstance(old.get("settings"), dict)
+        or "seed" not in old
+    ):
         raise ConfigError(f"{path}: does not say of which training it is; train anew.")
     for key, value in new["settings"].items():
         if (then := old["settings"].get(key)) != value:
             reason = f"was trained with {key} {then!r}, not {value!r}"
-            raise ConfigError(f"{path}: {reason}; resume it so, or train anew in another folder.")
+            raise ConfigError(
+                f"{path}: {reason}; resume it so, or train anew in another folder."
+            )
     if old["seed"] != new["seed"]:
-        raise ConfigError(f"{path}: is of seed {old['seed']}, not {new['seed']}; name that one.")
+        raise ConfigError(
+            f"{path}: is of seed {old['seed']}, not {new['seed']}; name that one."
+        )
 
 
 def evaluate(
-    algorithm: BaseAlgorithm | Actor, settings: TrainingSettings, world: str, episodes: int,
+    algorithm: BaseAlgorithm | Actor,
+    settings: TrainingSettings,
+    world: str,
+    episodes: int,
     model: SimulatorModel | None = None,
-) -> Outcomes:  # fmt: skip
+) -> Outcomes:
     """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
-    env = _env_of(settings, world, episodes, model or open_model(settings.robot, settings.lidar))
-    return drive_worlds(env, algorithms.act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
+    env = _env_of(
+        settings, world, episodes, model or open_model(settings.robot, settings.lidar)
+    )
+    return drive_worlds(
+        env, algorithms.act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes)
+    )
 
 
 def _stop_of(settings: TrainingSettings) -> Stop:
@@ -161,7 +214,10 @@ def _stop_of(settings: TrainingSettings) -> Stop:
     if (given := settings.stop) is None:
         return Stop(None, {})
     model = open_model(settings.robot, settings.lidar)
-    envs = {world: _env_of(settings, world, given.episodes, model) for world in settings.worlds}
+    envs = {
+        world: _env_of(settings, world, given.episodes, model)
+        for world in settings.worlds
+    }
     return Stop(given, envs)
 
 
@@ -170,12 +226,19 @@ def _env_of(
 ) -> BridgeVectorEnv:
     """Copies of a world for an evaluation, one for each episode; without any teaching."""
     return BridgeVectorEnv(
-        episodes, model, world, settings.task, settings.task_options, settings.max_episode_steps,
+        episodes,
+        model,
+        world,
+        settings.task,
+        settings.task_options,
+        settings.max_episode_steps,
         randomisation=settings.randomisation,
-    )  # fmt: skip
+    )
 
 
-Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]  # a function like `train`
+Learn = Callable[
+    [TrainingSettings, int, Path, Tell, bool], Trained
+]  # a function like `train`
 
 
 @dataclass(frozen=True)
@@ -191,7 +254,9 @@ class SeedResult:
 class TrainOrder:
     """An order for a training run."""
 
-    settings: TrainingSettings  # what to learn; for a resumed run its own, see `settings_of`
+    settings: (
+        TrainingSettings  # what to learn; for a resumed run its own, see `settings_of`
+    )
     seeds: Sequence[int]
     out: Path  # folder of the run; each seed gets one below it
     episodes: int  # number of episodes of the evaluation in each world
@@ -200,17 +265,24 @@ class TrainOrder:
 
 
 def run(
-    order: TrainOrder, tell: Tell = lambda _: None,
-    done: Callable[[SeedResult], None] = lambda _: None, learn: Learn = train,
+    order: TrainOrder,
+    tell: Tell = lambda _: None,
+    done: Callable[[SeedResult], None] = lambda _: None,
+    learn: Learn = train,
     evaluating: Callable[[str], None] = lambda _: None,
-) -> list[SeedResult]:  # fmt: skip
+) -> list[SeedResult]:
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.settings, order.seeds, order.out, order.resumed)
-    settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
+    settings, model = (
+        order.settings,
+        open_model(order.settings.robot, order.settings.lidar),
+    )
     trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
     algorithms.check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)
-    for _ in range(TRIED):  # a task that gives no numbers is refused before a folder is begun
+    for _ in range(
+        TRIED
+    ):  # a task that gives no numbers is refused before a folder is begun
         trial.step(trial.action_space.sample())
     del trial
     results = []
@@ -223,11 +295,15 @@ def run(
             summaries = {}
             for world in settings.worlds:
                 evaluating(world)
-                driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
+                driven = evaluate(
+                    trained.algorithm, settings, world, order.episodes, model
+                )
                 summaries[world] = summarise(driven, model.control_period)
             result = SeedResult(seed, trained, summaries)
             plain: dict[str, Any] = {"training_steps": trained.steps}
-            plain |= {world: dataclasses.asdict(one) for world, one in summaries.items()}
+            plain |= {
+                world: dataclasses.asdict(one) for world, one in summaries.items()
+            }
             write_text(folder / EVALUATION, json_of(plain, 2) + "\n")
             export(settings, result, order.command, folder / POLICY)
             done(result)
@@ -245,7 +321,9 @@ def _alone(out: Path) -> Iterator[None]:
             try:
                 yield
             except ConfigError:
-                if not known and not seeds_of(out):  # settings of no training bar no others
+                if not known and not seeds_of(
+                    out
+                ):  # settings of no training bar no others
                     (out / SETTINGS).unlink(missing_ok=True)
                 raise
     except filelock.Timeout:
@@ -253,19 +331,33 @@ def _alone(out: Path) -> Iterator[None]:
         raise ConfigError(f"{out}: another training is at work there; {fix}.") from None
 
 
-def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
+def export(
+    settings: TrainingSettings, result: SeedResult, command: str, path: Path
+) -> None:
     """Writes the policy file `*.onnx`, with the user's command line and the success rates."""
     model = open_model(settings.robot, settings.lidar)
     task = make_task(settings.task, model, settings.task_options)
-    rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
-    provenance = {"command": command, "seed": result.seed, "steps": result.trained.steps, **rates}
-    if settings.robot not in shipped_names("robots"):  # where an evaluation finds the robot
+    rates = {
+        f"success in {world}": one.success.value
+        for world, one in result.summaries.items()
+    }
+    provenance = {
+        "command": command,
+        "seed": result.seed,
+        "steps": result.trained.steps,
+        **rates,
+    }
+    if settings.robot not in shipped_names(
+        "robots"
+    ):  # where an evaluation finds the robot
         provenance["model"] = str(Path(settings.robot).resolve())
     limit = settings.max_episode_steps
     export_policy(result.trained.algorithm, task, model, path, None, provenance, limit)
 
 
-def _check(settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed: bool) -> None:
+def _check(
+    settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed: bool
+) -> None:
     checked_seeds(seeds, GREATEST_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
@@ -274,7 +366,11 @@ def _check(settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed:
         fix = "add --resume, or choose another --out."
         raise ConfigError(f"{out}: holds checkpoints of these seeds; {fix}")
     own_task = settings.task if is_code(settings.task) else None
-    if (out / SETTINGS).is_file() and not resumed and settings_of(out, own_task) != settings:
+    if (
+        (out / SETTINGS).is_file()
+        and not resumed
+        and settings_of(out, own_task) != settings
+    ):
         fix = "choose another --out, or remove it."
         raise ConfigError(f"{out}: holds a run with other settings; {fix}")
     if resumed and not begun:
@@ -285,7 +381,10 @@ def _check(settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed:
 
 def seeds_of(out: Path) -> list[int]:
     """Returns the seeds whose training was begun in the folder of a run."""
-    begun = (path.parent.name.removeprefix("seed_") for path in out.glob(f"seed_*/{CHECKPOINT}"))
+    begun = (
+        path.parent.name.removeprefix("seed_")
+        for path in out.glob(f"seed_*/{CHECKPOINT}")
+    )
     return sorted(int(seed) for seed in begun if seed.isdecimal())
 
 
@@ -295,7 +394,9 @@ def settings_of(out: Path, task: str | None = None) -> TrainingSettings:
     A run of a task of the user's own needs that `task` again: its folder never starts a program.
     """
     if not (out / SETTINGS).is_file():
-        raise ConfigError(f"{out}: holds no {SETTINGS}; name the folder of a run with --out.")
+        raise ConfigError(
+            f"{out}: holds no {SETTINGS}; name the folder of a run with --out."
+        )
     return read_settings(out / SETTINGS, task)
 
 

@@ -37,11 +37,28 @@ NEAR = 0.1  # share of the range that counts as half of it, see `bend`
 LEAST_SHARE = 0.25  # of the span of an observation, or of its mean if that is less
 OBSERVED_STEPS, OBSERVED_WORLDS = 32, 256
 GAIN = 2.0**0.5
-ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are near zero
-LOG_EVERY = {"ppo": 1, "sac": 1000}  # roll-outs or episodes between two entries of TensorBoard
-COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
+ACTION_GAIN = (
+    0.01  # initial gain of an actor's last layer: all its actions are near zero
+)
+LOG_EVERY = {
+    "ppo": 1,
+    "sac": 1000,
+}  # roll-outs or episodes between two entries of TensorBoard
+COUNTERS = (
+    "num_timesteps",
+    "_n_updates",
+    "_episode_num",
+    "_current_progress_remaining",
+)
 LAST = ("_last_obs", "_last_episode_starts")
-REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+REPLAYED = (
+    "observations",
+    "next_observations",
+    "actions",
+    "rewards",
+    "dones",
+    "timeouts",
+)
 
 
 def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
@@ -61,7 +78,9 @@ def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
     """Returns the deterministic policy of an algorithm, without exploration noise."""
     if isinstance(algorithm, Actor) and algorithm.memory.size:
-        return Stateful(algorithm.step, algorithm.memory.size, algorithm.memory.start).act
+        return Stateful(
+            algorithm.step, algorithm.memory.size, algorithm.memory.start
+        ).act
 
     def act(observations: NDArray[np.float32]) -> NDArray[Any]:
         seen = torch.as_tensor(observations)
@@ -93,7 +112,9 @@ class Normaliser(BaseFeaturesExtractor):
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Normalises observations (N, O)."""
-        return torch.clamp((bend(observations, self.shares) - self.mean) / self.std, -LIMIT, LIMIT)
+        return torch.clamp(
+            (bend(observations, self.shares) - self.mean) / self.std, -LIMIT, LIMIT
+        )
 
 
 def shares_of(space: gymnasium.spaces.Box) -> NDArray[np.float32]:
@@ -124,13 +145,17 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
             if isinstance(space, gymnasium.spaces.Discrete):
                 actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
             else:
-                actions = rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
+                actions = rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(
+                    np.float32
+                )
         seen.append(np.array(env.step(actions)[0][some]))
     rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
     rows = bend(rows, shares_of(env.observation_space))
     mean = rows.mean(axis=0)
     # What is seen later may differ by more than what is seen near the starts.
-    span = np.minimum(env.observation_space.high - env.observation_space.low, np.abs(mean))
+    span = np.minimum(
+        env.observation_space.high - env.observation_space.low, np.abs(mean)
+    )
     return mean, np.maximum(rows.std(axis=0), np.maximum(LEAST_STD, LEAST_SHARE * span))
 
 
@@ -141,15 +166,25 @@ class Actor(torch.nn.Module):
     """
 
     def __init__(
-        self, observations: gymnasium.spaces.Box,
-        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete, hidden: Sequence[int],
-        normaliser: tuple[Array, Array], activation: type[torch.nn.Module] = torch.nn.Tanh,
+        self,
+        observations: gymnasium.spaces.Box,
+        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete,
+        hidden: Sequence[int],
+        normaliser: tuple[Array, Array],
+        activation: type[torch.nn.Module] = torch.nn.Tanh,
         memory: Memory | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         self.memory = Memory() if memory is None else memory
-        self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
-        count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
+        self.discrete, size = (
+            isinstance(actions, gymnasium.spaces.Discrete),
+            actions.shape or (),
+        )
+        count = int(
+            actions.n
+            if isinstance(actions, gymnasium.spaces.Discrete)
+            else np.prod(size)
+        )
         self.normaliser = Normaliser(observations, *normaliser)
         widths = [self.normaliser.features_dim + self.memory.extra, *hidden, count]
         self.layers = layers_of(widths, ACTION_GAIN, activation)
@@ -179,7 +214,9 @@ class Actor(torch.nn.Module):
 
 
 def layers_of(
-    widths: Sequence[int], gain: float, activation: type[torch.nn.Module] = torch.nn.Tanh
+    widths: Sequence[int],
+    gain: float,
+    activation: type[torch.nn.Module] = torch.nn.Tanh,
 ) -> torch.nn.Sequential:
     """Linear layers, initialised as in Stable-Baselines3, the last by gain."""
     layers: list[torch.nn.Module] = []
@@ -196,9 +233,12 @@ class Sb3Training:
     """A training by an algorithm of Stable-Baselines3; `normaliser` is mean and deviation (O,)."""
 
     def __init__(
-        self, settings: TrainingSettings, env: TrainVecEnv, seed: int,
+        self,
+        settings: TrainingSettings,
+        env: TrainVecEnv,
+        seed: int,
         normaliser: tuple[Array, Array],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.policy = make_algorithm(settings, env, seed, normaliser)
         self.networks = self.policy.policy
         self._total, self._log_every = settings.steps, LOG_EVERY[settings.algorithm]
@@ -211,7 +251,10 @@ class Sb3Training:
     def learn(self, watch: Watch, logger: Logger) -> None:
         """Learns until all steps are done."""
         self.policy.set_logger(logger)
-        left, companion = self._total - self.steps, Companion(watch, act_of(self.policy))
+        left, companion = (
+            self._total - self.steps,
+            Companion(watch, act_of(self.policy)),
+        )
         self.policy.learn(left, companion, self._log_every, reset_num_timesteps=False)
 
     def state(self) -> dict[str, Any]:
@@ -258,12 +301,19 @@ class Sb3Training:
 
 
 def make_algorithm(
-    settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
+    settings: TrainingSettings,
+    env: TrainVecEnv,
+    seed: int,
+    normaliser: tuple[Array, Array],
 ) -> BaseAlgorithm:
     """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
     check_serves(settings, env.envs[0])
     torch.set_num_threads(settings.threads)
-    shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
+    shared: dict[str, Any] = {
+        "seed": seed,
+        "device": "cpu",
+        "stats_window_size": RECENT,
+    }
     network: dict[str, Any] = {
         "net_arch": list(settings.hidden),
         "features_extractor_class": Normaliser,
@@ -272,19 +322,35 @@ def make_algorithm(
     if settings.algorithm == "sac":
         sac = settings.sac
         return SAC(
-            "MlpPolicy", env, sac.learning_rate, buffer_size=sac.buffer,
-            learning_starts=sac.begin_after, batch_size=sac.batch, tau=sac.soft_update,
-            gamma=sac.discount, train_freq=1, gradient_steps=sac.updates,
-            policy_kwargs=network, **shared,
-        )  # fmt: skip
+            "MlpPolicy",
+            env,
+            sac.learning_rate,
+            buffer_size=sac.buffer,
+            learning_starts=sac.begin_after,
+            batch_size=sac.batch,
+            tau=sac.soft_update,
+            gamma=sac.discount,
+            train_freq=1,
+            gradient_steps=sac.updates,
+            policy_kwargs=network,
+            **shared,
+        )
     ppo = settings.ppo
     network |= {"log_std_init": ppo.log_std, "activation_fn": torch.nn.Tanh}
     return PPO(
-        "MlpPolicy", env, lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
-        n_steps=ppo.rollout, batch_size=ppo.batch, n_epochs=ppo.epochs, gamma=ppo.discount,
-        gae_lambda=ppo.gae_lambda, clip_range=ppo.clip, ent_coef=ppo.entropy,
-        policy_kwargs=network, **shared,
-    )  # fmt: skip
+        "MlpPolicy",
+        env,
+        lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
+        n_steps=ppo.rollout,
+        batch_size=ppo.batch,
+        n_epochs=ppo.epochs,
+        gamma=ppo.discount,
+        gae_lambda=ppo.gae_lambda,
+        clip_range=ppo.clip,
+        ent_coef=ppo.entropy,
+        policy_kwargs=network,
+        **shared,
+    )
 
 
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
@@ -303,7 +369,9 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
     shared = json.loads(content["numpy"])
     shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
     np.random.set_state(shared)  # noqa: NPY002 - as above
-    algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])
+    algorithm.action_space.np_random.bit_generator.state = json.loads(
+        content["actions"]
+    )
 
 
 class Companion(BaseCallback):
@@ -323,10 +391,16 @@ class Companion(BaseCallback):
 
     def _on_step(self) -> bool:
         for n in np.flatnonzero(self.locals["dones"]):
-            self._watch.collisions.append(bool(self.locals["infos"][n].get("collision", False)))
-        if self._ends:  # Stable-Baselines3 can't be ended before the first step of a roll-out
+            self._watch.collisions.append(
+                bool(self.locals["infos"][n].get("collision", False))
+            )
+        if (
+            self._ends
+        ):  # Stable-Baselines3 can't be ended before the first step of a roll-out
             self._on_rollout_end()
         return not self._ends
 
     def _on_rollout_end(self) -> None:
-        self._watch.report(self.num_timesteps, self.model.ep_success_buffer or (), self.logger)
+        self._watch.report(
+            self.num_timesteps, self.model.ep_success_buffer or (), self.logger
+        )

@@ -33,7 +33,9 @@ def save_checkpoint(
 ) -> None:
     """Writes a checkpoint between two roll-outs; `about` identifies the training."""
     content = {"format": FORMAT, "about": json.dumps(about), "state": state}
-    write_content(path, content | {"envs": [tensors(snapshot(one)) for one in env.envs]})
+    write_content(
+        path, content | {"envs": [tensors(snapshot(one)) for one in env.envs]}
+    )
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
@@ -46,7 +48,9 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
     """Reads a checkpoint of a format; ConfigError if it is missing, damaged, or another kind."""
     if not path.is_file():
-        raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
+        raise ConfigError(
+            f"{path}: no such checkpoint; leave out --resume to begin anew."
+        )
     try:
         size = path.stat().st_size
         if size > MOST_BYTES:
@@ -64,9 +68,13 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
         read = {**content, "about": json.loads(content["about"])}
     except Exception:  # noqa: BLE001 - a damaged file breaks torch in any way
         reason = "is no checkpoint of a training, or a damaged one"
-        raise ConfigError(f"{path}: {reason}; leave out --resume to begin anew.") from None
+        raise ConfigError(
+            f"{path}: {reason}; leave out --resume to begin anew."
+        ) from None
     if found != kind:
-        raise ConfigError(f"{path}: is a {found!r}, not a {kind!r}; resume with the same --engine.")
+        raise ConfigError(
+            f"{path}: is a {found!r}, not a {kind!r}; resume with the same --engine."
+        )
     return read
 
 
@@ -75,7 +83,10 @@ def _check_tensors(content: Any, size: int) -> None:
     parts = content.values() if isinstance(content, dict) else content
     for part in parts if isinstance(content, dict | list | tuple) else ():
         _check_tensors(part, size)
-    if isinstance(content, torch.Tensor) and content.numel() * content.element_size() > size:
+    if (
+        isinstance(content, torch.Tensor)
+        and content.numel() * content.element_size() > size
+    ):
         raise ValueError("a tensor is larger than the file")
 
 
@@ -87,7 +98,10 @@ def restore_envs(content: dict[str, Any], env: TrainVecEnv) -> None:
 
 def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
     """Arrays by name as tensors."""
-    return {name: torch.from_numpy(np.ascontiguousarray(rows)) for name, rows in arrays.items()}
+    return {
+        name: torch.from_numpy(np.ascontiguousarray(rows))
+        for name, rows in arrays.items()
+    }
 
 
 RECENT = 1000  # number of episodes over which the progress reports its rates
@@ -105,13 +119,19 @@ class Progress:
     collision: float
     steps_per_s: float  # since this process began or resumed it
     env_share: float  # share of the wall time that went to the simulator
-    held_out: float = math.nan  # least success of a world in the latest evaluation of `stop`
+    held_out: float = (
+        math.nan
+    )  # least success of a world in the latest evaluation of `stop`
 
     @property
     def line(self) -> str:
         """Success, as far as any is known, and speed, for people."""
         unknown = math.isnan(self.success)
-        known = "no episode has ended yet" if unknown else f"success {100 * self.success:.1f} %"
+        known = (
+            "no episode has ended yet"
+            if unknown
+            else f"success {100 * self.success:.1f} %"
+        )
         return f"{known}, {self.steps_per_s:,.0f} steps/s"
 
 
@@ -123,9 +143,14 @@ class Watch:
     """Follows a training: tells its progress, and saves it now and then, between two roll-outs."""
 
     def __init__(
-        self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell,
+        self,
+        env: TrainVecEnv,
+        seed: int,
+        settings: TrainingSettings,
+        save: Save,
+        tell: Tell,
         stop: Stop,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._env, self._seed, self._save, self._tell = env, seed, save, tell
         self._stop = stop
         self._levels = list(settings.worlds) if settings.teaching.curriculum else []
@@ -162,9 +187,15 @@ class Watch:
         recent = successes, self.collisions
         success, collision = (float(np.mean(r)) if r else np.nan for r in recent)
         progress = Progress(
-            self._seed, steps, self._total, success, collision, (steps - self._first) / taken,
-            (self._env.stepping_s - self._busy) / taken, self._stop.least,
-        )  # fmt: skip
+            self._seed,
+            steps,
+            self._total,
+            success,
+            collision,
+            (steps - self._first) / taken,
+            (self._env.stepping_s - self._busy) / taken,
+            self._stop.least,
+        )
         logger.record("rollout/success_rate", progress.success)
         logger.record("rollout/collision_rate", progress.collision)
         logger.record("time/env_share", progress.env_share)

@@ -14,7 +14,13 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, Rows, contract_of, golden_observations
+from nics_drl_bridge.policy.contract import (
+    GOLDEN,
+    SUFFIX,
+    Rows,
+    contract_of,
+    golden_observations,
+)
 
 with extensions.needed_by("the export of a policy"):
     import onnx
@@ -31,7 +37,9 @@ OPSET = 17
 class Deployed(torch.nn.Module):  # type: ignore[misc]
     """The graph of a policy file; Stable-Baselines3's recipe omits clipping, scale, normaliser."""
 
-    def __init__(self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None) -> None:
+    def __init__(
+        self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None
+    ) -> None:
         super().__init__()
         self.actor, self.discrete = actor, task.actions == "discrete"
         self.limit = None if normaliser is None else float(normaliser[2])
@@ -52,7 +60,9 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
             return None
         return memory.size, memory.start
 
-    def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(
+        self, observation: torch.Tensor, *state: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
         """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, for observations (n, O).
 
         An actor with a state takes one (n, S) in addition, and gives the next.
@@ -66,7 +76,11 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
             return action, self.commands[action], *following
         action = torch.clamp(raw, -1.0, 1.0)
         command = self.low + (action + 1.0) / 2.0 * (self.high - self.low)
-        return action, torch.minimum(torch.maximum(command, self.low), self.high), *following
+        return (
+            action,
+            torch.minimum(torch.maximum(command, self.low), self.high),
+            *following,
+        )
 
 
 def actor_of(model: Any) -> torch.nn.Module:
@@ -77,7 +91,9 @@ def actor_of(model: Any) -> torch.nn.Module:
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
         latent = policy.mlp_extractor.policy_net
-        return torch.nn.Sequential(policy.pi_features_extractor, latent, policy.action_net)
+        return torch.nn.Sequential(
+            policy.pi_features_extractor, latent, policy.action_net
+        )
     if hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
         actor = policy.actor  # its mode is the tanh of the mean
         parts = actor.features_extractor, actor.latent_pi, actor.mu, torch.nn.Tanh()
@@ -89,10 +105,14 @@ def actor_of(model: Any) -> torch.nn.Module:
 
 
 def export_policy(
-    model: Any, task: Task, simulator_model: SimulatorModel, path: str | Path,
-    normaliser: Normaliser | None = None, provenance: Mapping[str, Any] | None = None,
+    model: Any,
+    task: Task,
+    simulator_model: SimulatorModel,
+    path: str | Path,
+    normaliser: Normaliser | None = None,
+    provenance: Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
-) -> policy_file.PolicyFile:  # fmt: skip
+) -> policy_file.PolicyFile:
     """Writes a trained model as a policy file, and loads it as a robot would.
 
     The normaliser is mean (O,), deviation (O,) and limit, or None. Raises ConfigError if the model
@@ -100,15 +120,22 @@ def export_policy(
     """
     file = Path(path)
     if file.suffix != SUFFIX:
-        raise ConfigError(f"{file}: a policy file ends with {SUFFIX!r}; change the name.")
+        raise ConfigError(
+            f"{file}: a policy file ends with {SUFFIX!r}; change the name."
+        )
     deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
     graph = _graph(deployed, task)
     golden = _golden(deployed, graph, task, str(file))
     sha256 = onnx_graph.graph_hash(graph)
     text = contract_of(
-        task, simulator_model, golden, sha256, provenance or {}, deployed.state,
+        task,
+        simulator_model,
+        golden,
+        sha256,
+        provenance or {},
+        deployed.state,
         max_episode_steps=max_episode_steps,
-    )  # fmt: skip
+    )
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
     rehearsal.remember(data)  # the network is one of this process
@@ -145,15 +172,23 @@ def _graph(deployed: Deployed, task: Task) -> Any:
     examples, buffer = [torch.zeros(1, task.observation_space.shape[0])], io.BytesIO()
     if deployed.state is not None:
         examples.append(torch.zeros(1, deployed.state[0]))
-        inputs, outputs = [*inputs, onnx_graph.STATE_IN], [*outputs, onnx_graph.STATE_OUT]
+        inputs, outputs = (
+            [*inputs, onnx_graph.STATE_IN],
+            [*outputs, onnx_graph.STATE_OUT],
+        )
     with warnings.catch_warnings():
         # This exporter is deprecated; the new one takes several times longer.
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            deployed, tuple(examples), buffer,
-            input_names=inputs, output_names=outputs, opset_version=OPSET,
-            dynamic_axes={name: {0: "n"} for name in (*inputs, *outputs)}, dynamo=False,
-        )  # fmt: skip
+            deployed,
+            tuple(examples),
+            buffer,
+            input_names=inputs,
+            output_names=outputs,
+            opset_version=OPSET,
+            dynamic_axes={name: {0: "n"} for name in (*inputs, *outputs)},
+            dynamo=False,
+        )
     return onnx.load_model_from_string(buffer.getvalue())
 
 

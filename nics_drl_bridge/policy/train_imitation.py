@@ -28,7 +28,9 @@ class Shown(NamedTuple):
 
     seen: torch.Tensor  # (R, O) observations
     actions: torch.Tensor  # (R, C) of the expert
-    returns: torch.Tensor  # (R,) discounted; NaN if the episode did not end in time to know
+    returns: (
+        torch.Tensor
+    )  # (R,) discounted; NaN if the episode did not end in time to know
 
 
 def expert_of(settings: TrainingSettings, env: TrainVecEnv) -> Policy:
@@ -37,14 +39,20 @@ def expert_of(settings: TrainingSettings, env: TrainVecEnv) -> Policy:
     box = isinstance(env.action_space, gymnasium.spaces.Box)
     if not isinstance(task, Navigation) or not box:
         fix = "leave imitation out."
-        raise ConfigError(f"imitation: experts drive continuous 'navigation' alone; {fix}")
+        raise ConfigError(
+            f"imitation: experts drive continuous 'navigation' alone; {fix}"
+        )
     return make_policy(name, task, env.envs[0].model)
 
 
 def drive(
-    env: TrainVecEnv, expert: Policy, last: NDArray[np.float32], steps: int, discount: float,
+    env: TrainVecEnv,
+    expert: Policy,
+    last: NDArray[np.float32],
+    steps: int,
+    discount: float,
     rng: np.random.Generator,
-) -> tuple[Shown, NDArray[np.float32]]:  # fmt: skip
+) -> tuple[Shown, NDArray[np.float32]]:
     """Drives all worlds for steps of each, from observations (N, O); returns the last ones, too."""
     seen, actions, rewards, ended = [], [], [], []
     for _ in range(steps):
@@ -63,7 +71,9 @@ def drive(
     return Shown(*(torch.from_numpy(each) for each in rows)), last
 
 
-def imitate(networks: Any, shown: Shown, epochs: int, generator: torch.Generator) -> float:
+def imitate(
+    networks: Any, shown: Shown, epochs: int, generator: torch.Generator
+) -> float:
     """Fits actor, spread and critic of `train_ppo.Networks`; returns the actions' squared error."""
     optimiser = torch.optim.Adam(networks.parameters(), lr=RATE)
     actor = networks.actor

@@ -19,7 +19,9 @@ LOG_NORM = np.float32(0.5 * np.log(2.0 * np.pi))  # of the normal distribution
 class Net(NamedTuple):
     """Linear layers with ReLU in between, and memory for the rows of a batch."""
 
-    weights: NDArray[np.float32]  # (W,) layer after layer: (outs, ins), and biases (outs,)
+    weights: NDArray[
+        np.float32
+    ]  # (W,) layer after layer: (outs, ins), and biases (outs,)
     gradients: NDArray[np.float32]  # (W,)
     widths: NDArray[np.int64]  # (L + 1,) inputs, and outputs of each layer
     kept: NDArray[np.float32]  # (L, at least n times the widest) outputs of each layer
@@ -45,7 +47,10 @@ def forward(net, seen):  # type: ignore[no-untyped-def]
         middle, out = at + ins * outs, net.kept[k, : n * outs].reshape(n, outs)
         np.dot(rows, net.weights[at:middle].reshape(outs, ins).T, out)
         at, rows = middle + outs, out
-        bias, least = net.weights[middle:at], NONE if k + 2 < net.widths.shape[0] else -np.inf
+        bias, least = (
+            net.weights[middle:at],
+            NONE if k + 2 < net.widths.shape[0] else -np.inf,
+        )
         for i in range(n):
             for j in range(outs):
                 out[i, j] = max(out[i, j] + bias[j], np.float32(least))
@@ -100,7 +105,9 @@ def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore
     n, actions = raw.shape[0], batch.actions
     out = net.spare[0, : raw.size].reshape(raw.shape)
     mean, share = gains.mean(), ONE / np.float32(n)
-    scale = ONE / (np.sqrt(np.square(gains - mean).sum() / np.float32(n - 1)) + np.float32(1e-8))
+    scale = ONE / (
+        np.sqrt(np.square(gains - mean).sum() / np.float32(n - 1)) + np.float32(1e-8)
+    )
     spread[:] = -entropy
     loss, parts = NONE, np.empty(raw.shape[1], np.float32)
     for i in range(n):
@@ -117,7 +124,9 @@ def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore
                 out[i, j] = -pull * parts[j] * np.exp(-log_std[j])
                 spread[j] -= pull * (parts[j] * parts[j] - ONE)
             else:
-                out[i, j] = np.exp(parts[j]) * (pull + share * entropy * (parts[j] + mixed))
+                out[i, j] = np.exp(parts[j]) * (
+                    pull + share * entropy * (parts[j] + mixed)
+                )
         if log_std.size == 0:
             out[i, int(actions[i, 0])] -= pull
     backward(net, batch.seen, out)

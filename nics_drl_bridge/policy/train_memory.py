@@ -30,7 +30,9 @@ class Memory(torch.nn.Module):  # type: ignore[misc]
         """The state (n, S), anew where an episode is `done` (n,)."""
         return torch.where(done[:, None] > 0, self.begin(1), state)
 
-    def unroll(self, seen: torch.Tensor, state: torch.Tensor, done: torch.Tensor) -> torch.Tensor:
+    def unroll(
+        self, seen: torch.Tensor, state: torch.Tensor, done: torch.Tensor
+    ) -> torch.Tensor:
         """Features (T, n, O + E) of steps (T, n, O) with ends of episodes (T, n), from a state."""
         features = []
         for given, over in zip(seen, done, strict=True):
@@ -59,7 +61,9 @@ class Stack(Memory):
         past = (1.0 - unset) * state + unset * torch.cat([scan] * self._kept, 1)
         first = range(0, self.size, self._parts * self._every)
         added = [past[:, k : k + self._parts] for k in first]
-        return torch.cat([seen, *added], 1), torch.cat([past[:, self._parts :], scan], 1)
+        return torch.cat([seen, *added], 1), torch.cat(
+            [past[:, self._parts :], scan], 1
+        )
 
 
 class Gru(Memory):
@@ -88,8 +92,14 @@ class Gru(Memory):
         return torch.cat([seen, following], 1), following
 
 
-def memory_of(settings: StackMemory | GruMemory | None, inputs: int, scan_parts: int) -> Memory:
+def memory_of(
+    settings: StackMemory | GruMemory | None, inputs: int, scan_parts: int
+) -> Memory:
     """Makes the memory of settings, for observations (n, inputs) that begin with a scan."""
     if settings is None:
         return Memory()
-    return Gru(settings, inputs) if isinstance(settings, GruMemory) else Stack(settings, scan_parts)
+    return (
+        Gru(settings, inputs)
+        if isinstance(settings, GruMemory)
+        else Stack(settings, scan_parts)
+    )

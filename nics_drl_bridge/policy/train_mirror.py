@@ -19,15 +19,23 @@ class Reflection:
 
     def __init__(self, mirror: Mirror, extra: int, parts: int) -> None:
         self._mirror, count = mirror, len(mirror.places)
-        scans = [first + mirror.places[:parts] for first in range(count, count + extra, parts or 1)]
+        scans = [
+            first + mirror.places[:parts]
+            for first in range(count, count + extra, parts or 1)
+        ]
         places = np.concatenate([mirror.places, *scans])
         signs = np.concatenate([mirror.signs, np.ones(extra)])
-        self._places, self._acted = torch.from_numpy(places), torch.from_numpy(mirror.acted)
+        self._places, self._acted = (
+            torch.from_numpy(places),
+            torch.from_numpy(mirror.acted),
+        )
         self._signs, self._scale, self._offset = (
             torch.from_numpy(each.astype(np.float32))
             for each in (signs, mirror.scale, mirror.offset)
         )
-        self._uneven = torch.from_numpy((mirror.offset != 0.0) | (np.abs(mirror.scale) != 1.0))
+        self._uneven = torch.from_numpy(
+            (mirror.offset != 0.0) | (np.abs(mirror.scale) != 1.0)
+        )
 
     def balanced(self, mean: Array, std: Array) -> tuple[Array, Array]:
         """Mean and deviation (O,) of observations and their mirror images together.
@@ -54,8 +62,11 @@ class Reflection:
         """Adds the mirror images of the transitions, of those that the robot can do."""
         actions, possible = self.actions(rollout.actions)
         more = rollout._replace(
-            seen=self.seen(rollout.seen), actions=actions,
+            seen=self.seen(rollout.seen),
+            actions=actions,
             log_probs=rollout.log_probs - self._scale.abs().log().sum(),
-        )  # fmt: skip
+        )
         pairs = zip(rollout[:5], more[:5], strict=True)
-        return type(rollout)(*(torch.cat([one, other[possible]]) for one, other in pairs))
+        return type(rollout)(
+            *(torch.cat([one, other[possible]]) for one, other in pairs)
+        )

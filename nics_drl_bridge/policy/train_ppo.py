@@ -48,7 +48,9 @@ class Networks(torch.nn.Module):
             [actor.layers[0].in_features, *hidden, 1], 1.0, torch.nn.ReLU
         )
         outputs = actor.layers[-1].out_features
-        self.log_std = torch.nn.Parameter(torch.full((0 if actor.discrete else outputs,), log_std))
+        self.log_std = torch.nn.Parameter(
+            torch.full((0 if actor.discrete else outputs,), log_std)
+        )
 
     def draw(self, raw: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Draws actions (n, C) or (n,), by the outputs of the actor (n, C)."""
@@ -81,7 +83,10 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
     sizes = [one.numel() for one in every]
     parts = zip(every, flat.detach().split(sizes), flat.grad.split(sizes), strict=True)
     for parameter, values, gradient in parts:
-        parameter.data, parameter.grad = values.view_as(parameter), gradient.view_as(parameter)
+        parameter.data, parameter.grad = (
+            values.view_as(parameter),
+            gradient.view_as(parameter),
+        )
     return flat
 
 
@@ -94,12 +99,18 @@ def net_of(layers: torch.nn.Sequential, rows: int) -> Net:
         for first in (every[0].detach(), every[0].grad)
     )
     widths = np.array([every[0].shape[1], *(len(bias) for bias in every[1::2])])
-    kept, spare = (np.empty((k, rows * widths.max()), np.float32) for k in (len(widths) - 1, 2))
+    kept, spare = (
+        np.empty((k, rows * widths.max()), np.float32) for k in (len(widths) - 1, 2)
+    )
     return Net(weights, gradients, widths, kept, spare)
 
 
 def advantages_of(
-    rewards: torch.Tensor, values: torch.Tensor, done: torch.Tensor, discount: float, decay: float
+    rewards: torch.Tensor,
+    values: torch.Tensor,
+    done: torch.Tensor,
+    discount: float,
+    decay: float,
 ) -> torch.Tensor:
     """Generalised advantage estimates (T, N) (Schulman and others 2016); `decay` is lambda.
 
@@ -114,9 +125,12 @@ def advantages_of(
 
 
 def loss_of(
-    networks: Networks, raw: torch.Tensor, values: torch.Tensor, batch: Transitions,
+    networks: Networks,
+    raw: torch.Tensor,
+    values: torch.Tensor,
+    batch: Transitions,
     ppo: PpoSettings,
-) -> torch.Tensor:  # fmt: skip
+) -> torch.Tensor:
     """The loss of PPO with clipped ratios, as in Stable-Baselines3.
 
     `raw` (n, C) are the outputs of the actor, `values` (n, 1) those of the critic.
@@ -124,8 +138,12 @@ def loss_of(
     gains = batch.advantages
     gains = (gains - gains.mean()) / (gains.std() + 1e-8)
     ratio = torch.exp(networks.log_probs(raw, batch.actions) - batch.log_probs)
-    policy = -torch.min(gains * ratio, gains * ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip)).mean()
-    loss = policy + VALUE_WEIGHT * torch.nn.functional.mse_loss(values.squeeze(-1), batch.returns)
+    policy = -torch.min(
+        gains * ratio, gains * ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip)
+    ).mean()
+    loss = policy + VALUE_WEIGHT * torch.nn.functional.mse_loss(
+        values.squeeze(-1), batch.returns
+    )
     return loss - ppo.entropy * networks.entropy(raw) if ppo.entropy else loss
 
 
@@ -133,28 +151,49 @@ class Learner:
     """Moves the weights by gradients of the loss."""
 
     def __init__(
-        self, networks: Networks, ppo: PpoSettings, seed: int, reflection: Reflection | None = None
+        self,
+        networks: Networks,
+        ppo: PpoSettings,
+        seed: int,
+        reflection: Reflection | None = None,
     ) -> None:
         self.networks, self.ppo, self._reflection = networks, ppo, reflection
         self.generator = torch.Generator().manual_seed(seed)
         self._all = flattened(networks)
         self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
-        self._nets = [net_of(p, ppo.batch) for p in (networks.actor.layers, networks.critic)]
+        self._nets = [
+            net_of(p, ppo.batch) for p in (networks.actor.layers, networks.critic)
+        ]
         self.core_is_free = threading.Event()  # no thread collects meanwhile
 
     def judge(self, driven: Driven) -> Transitions:
         """Advantages and returns of a rollout, by the present critic, and mirror images."""
         networks, ppo = self.networks, self.ppo
         with torch.no_grad():
-            values, rewards = networks.critic(driven.seen).squeeze(-1), driven.rewards.clone()
+            values, rewards = (
+                networks.critic(driven.seen).squeeze(-1),
+                driven.rewards.clone(),
+            )
             # What would have come after the time limits:
-            rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(driven.final).squeeze(-1)
-        gains = advantages_of(rewards, values, driven.done, ppo.discount, ppo.gae_lambda)
-        rows = driven.seen[:-1], driven.actions, driven.log_probs, gains, gains + values[:-1]
+            rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(
+                driven.final
+            ).squeeze(-1)
+        gains = advantages_of(
+            rewards, values, driven.done, ppo.discount, ppo.gae_lambda
+        )
+        rows = (
+            driven.seen[:-1],
+            driven.actions,
+            driven.log_probs,
+            gains,
+            gains + values[:-1],
+        )
         rollout = Transitions(*(each.flatten(0, 1) for each in rows))
         if networks.actor.memory.learnt:
             rollout = rollout._replace(state=driven.state, done=driven.done)
-        return rollout if self._reflection is None else self._reflection.doubled(rollout)
+        return (
+            rollout if self._reflection is None else self._reflection.doubled(rollout)
+        )
 
     def learn(self, rollout: Transitions, rate: float) -> float:
         """Learns from a rollout with a learning rate; returns the loss of the last batch."""
@@ -172,13 +211,17 @@ class Learner:
         if batch.state is not None and batch.done is not None:
             return self._through_time(batch, batch.state, batch.done)
         columns = batch.actions.float().view(len(batch.seen), -1)
-        given = Batch(*(each.numpy() for each in batch[:5]))._replace(actions=columns.numpy())
+        given = Batch(*(each.numpy() for each in batch[:5]))._replace(
+            actions=columns.numpy()
+        )
         (actor, critic), spread = self._nets, self.networks.log_std
         own = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
         jobs: list[Callable[[], Any]] = [
             partial(train_kernels.actor_gradients, actor, given, *own, *bounds),
-            partial(train_kernels.critic_gradients, critic, given, np.float32(VALUE_WEIGHT)),
+            partial(
+                train_kernels.critic_gradients, critic, given, np.float32(VALUE_WEIGHT)
+            ),
         ]
         free = self.core_is_free.is_set()
         losses = run_parts(lambda job: job(), jobs) if free else [job() for job in jobs]
@@ -201,7 +244,9 @@ class Learner:
 class Collector:
     """Drives the worlds with a copy of the networks."""
 
-    def __init__(self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int) -> None:
+    def __init__(
+        self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int
+    ) -> None:
         self.env, self.networks, self.ppo = env, copy.deepcopy(networks), ppo
         self.generator = torch.Generator().manual_seed(seed)
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
@@ -210,7 +255,11 @@ class Collector:
     def collect(self) -> tuple[Driven, Ended]:
         """Drives all worlds for the steps of a rollout."""
         steps, worlds = self.ppo.rollout, self.env.num_envs
-        networks, first, space = self.networks, self.state, cast("Any", self.env.action_space)
+        networks, first, space = (
+            self.networks,
+            self.state,
+            cast("Any", self.env.action_space),
+        )
         seen = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
         rewards, done = torch.zeros(2, steps, worlds)
         raw, actions, ended, cut, final = [], [], [], [], [seen[0, :0]]
@@ -226,7 +275,9 @@ class Collector:
                 rewards[t], done[t] = torch.from_numpy(reward), torch.from_numpy(over)
                 for n in np.flatnonzero(over):
                     one = infos[n]
-                    ended.append((one.get("is_success", False), one.get("collision", False)))
+                    ended.append(
+                        (one.get("is_success", False), one.get("collision", False))
+                    )
                     if one["TimeLimit.truncated"]:
                         cut.append(t * worlds + int(n))
                         last = one["terminal_observation"][None]
@@ -235,13 +286,17 @@ class Collector:
             seen[steps], _ = self._see(self.last, self.state)
             beyond = torch.tensor(cut, dtype=torch.int64), torch.cat(final)
             drawn = torch.stack(actions)
-            log_probs = networks.log_probs(torch.cat(raw), drawn.flatten(0, 1)).view_as(rewards)
+            log_probs = networks.log_probs(torch.cat(raw), drawn.flatten(0, 1)).view_as(
+                rewards
+            )
             return Driven(seen, drawn, log_probs, rewards, done, *beyond, first), ended
 
     def _see(self, observations: NDArray[np.float32], state: torch.Tensor) -> Seen:
         """Features of observations (n, O) for the networks, and the next state (n, S)."""
         actor = self.networks.actor
-        seen: Seen = actor.memory(actor.normaliser(torch.from_numpy(observations)), state)
+        seen: Seen = actor.memory(
+            actor.normaliser(torch.from_numpy(observations)), state
+        )
         return seen
 
 
@@ -249,9 +304,12 @@ class LeanPpo:
     """A training with PPO; `normaliser` is mean and deviation (O,). See `check_serves`."""
 
     def __init__(
-        self, settings: TrainingSettings, env: TrainVecEnv, seed: int,
+        self,
+        settings: TrainingSettings,
+        env: TrainVecEnv,
+        seed: int,
         normaliser: tuple[Array, Array],
-    ) -> None:  # fmt: skip
+    ) -> None:
         train_algorithms.check_serves(settings, env.envs[0])
         torch.set_num_threads(settings.threads)
         torch.manual_seed(seed)
@@ -262,12 +320,18 @@ class LeanPpo:
         if self._ppo.mirror:
             reflection = Reflection(env.envs[0].task.mirror(), memory.extra, parts)
             normaliser = reflection.balanced(*normaliser)
-        actor = train_algorithms.Actor(*spaces, hidden, normaliser, torch.nn.ReLU, memory)
+        actor = train_algorithms.Actor(
+            *spaces, hidden, normaliser, torch.nn.ReLU, memory
+        )
         self.networks = Networks(actor, hidden, self._ppo.log_std)
         seeds = np.random.SeedSequence(seed).generate_state(3)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
         self.learner = Learner(self.networks, self._ppo, int(seeds[1]), reflection)
-        self.policy, self._settings, self._imitation_seed = actor, settings, int(seeds[2])
+        self.policy, self._settings, self._imitation_seed = (
+            actor,
+            settings,
+            int(seeds[2]),
+        )
         self.steps = 0  # of all worlds together, learnt from so far
         self._rollout: Driven | None = None  # the next one to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
@@ -295,11 +359,16 @@ class LeanPpo:
         given, part = self._settings.imitation, self.collector
         if given is None:
             return
-        steps, rng = given.steps // part.env.num_envs, np.random.default_rng(self._imitation_seed)
+        steps, rng = (
+            given.steps // part.env.num_envs,
+            np.random.default_rng(self._imitation_seed),
+        )
         expert = train_imitation.expert_of(self._settings, part.env)
         drive = partial(train_imitation.drive, discount=self._ppo.discount, rng=rng)
         shown, part.last = drive(part.env, expert, part.last, steps)
-        train_imitation.imitate(self.networks, shown, given.epochs, self.learner.generator)
+        train_imitation.imitate(
+            self.networks, shown, given.epochs, self.learner.generator
+        )
         part.networks.load_state_dict(self.networks.state_dict())
         self.steps = len(shown.seen)
 
@@ -315,7 +384,9 @@ class LeanPpo:
             lambda: learner.learn(learner.judge(rollout), rate),
             self._collect,
         ]
-        loss, *collected = run_parts(lambda job: job(), jobs[: 1 + (self.steps < self._total)])
+        loss, *collected = run_parts(
+            lambda job: job(), jobs[: 1 + (self.steps < self._total)]
+        )
         self._rollout = None
         for one in collected:
             self._take(watch, *one)
@@ -336,12 +407,17 @@ class LeanPpo:
     def state(self) -> dict[str, Any]:
         """All that changes, for a checkpoint."""
         return {
-            "weights": self.networks.state_dict(), "optimiser": self.learner.optimiser.state_dict(),
-            "steps": self.steps, "recent": list(self._successes),
-            "last": torch.from_numpy(self.collector.last), "memory": self.collector.state,
+            "weights": self.networks.state_dict(),
+            "optimiser": self.learner.optimiser.state_dict(),
+            "steps": self.steps,
+            "recent": list(self._successes),
+            "last": torch.from_numpy(self.collector.last),
+            "memory": self.collector.state,
             "rollout": self._rollout and self._rollout._asdict(),
-            "random": [part.generator.get_state() for part in (self.collector, self.learner)],
-        }  # fmt: skip
+            "random": [
+                part.generator.get_state() for part in (self.collector, self.learner)
+            ],
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continues with the state of another, made with the same arguments."""

@@ -40,7 +40,9 @@ class Transitions(NamedTuple):
             return
         steps, worlds = self.done.shape
         firsts = worlds * torch.arange(steps)[:, None]
-        for some in torch.randperm(worlds, generator=generator).split(max(1, size // steps)):
+        for some in torch.randperm(worlds, generator=generator).split(
+            max(1, size // steps)
+        ):
             rows = (firsts + some).flatten()
             part = Transitions(*(each[rows] for each in self[:5]))
             yield part._replace(state=self.state[some], done=self.done[:, some])

@@ -12,7 +12,9 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import Act, drive_worlds
 from nics_drl_bridge.policy.training_settings import StopSettings
 
-HELD_OUT_SEED = 2**41  # first of the episodes, beyond those of trainings and of the protocol
+HELD_OUT_SEED = (
+    2**41
+)  # first of the episodes, beyond those of trainings and of the protocol
 IN_A_ROW = 2
 
 
@@ -24,9 +26,14 @@ class Stop:
         envs: by the name of their worlds, with as many copies as an evaluation has episodes.
     """
 
-    def __init__(self, given: StopSettings | None, envs: Mapping[str, BridgeVectorEnv]) -> None:
+    def __init__(
+        self, given: StopSettings | None, envs: Mapping[str, BridgeVectorEnv]
+    ) -> None:
         self._given, self._envs = given, envs
-        self._due, self._reached = 0, 0  # number of the latest evaluation; reached in a row
+        self._due, self._reached = (
+            0,
+            0,
+        )  # number of the latest evaluation; reached in a row
         self.shares: dict[str, float] = {}  # success by world in the latest evaluation
 
     @property
@@ -47,14 +54,20 @@ class Stop:
         self._due = steps // given.every
         first = HELD_OUT_SEED + self._due * given.episodes
         seeds = range(first, first + given.episodes)
-        driven = {world: drive_worlds(env, act, seeds) for world, env in self._envs.items()}
-        self.shares = {world: float(one.success.mean()) for world, one in driven.items()}
+        driven = {
+            world: drive_worlds(env, act, seeds) for world, env in self._envs.items()
+        }
+        self.shares = {
+            world: float(one.success.mean()) for world, one in driven.items()
+        }
         self._reached = self._reached + 1 if self.least >= given.success else 0
         return True
 
     def state(self) -> dict[str, Any]:
         """All that changes, for a checkpoint."""
-        return {"stop": {"due": self._due, "reached": self._reached, "shares": self.shares}}
+        return {
+            "stop": {"due": self._due, "reached": self._reached, "shares": self.shares}
+        }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues with the state of another; with one of before there was any, as if new."""

@@ -25,7 +25,10 @@ class TrainVecEnv(VecEnv):
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:
         for env in envs:
-            if env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP or not env.copy:
+            if (
+                env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP
+                or not env.copy
+            ):
                 needed = "autoreset_mode='SameStep', copy=True"
                 raise ConfigError(f"Stable-Baselines3 needs BridgeVectorEnv({needed}).")
         first = envs[0]
@@ -38,12 +41,16 @@ class TrainVecEnv(VecEnv):
         edges = np.cumsum([0, *(env.num_envs for env in envs)])
         self._rows = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
         count = int(edges[-1])
-        super().__init__(count, first.single_observation_space, first.single_action_space)
+        super().__init__(
+            count, first.single_observation_space, first.single_action_space
+        )
         self._infos: list[dict[str, Any]] = [{} for _ in range(count)]
         self._ended: list[int] = []
         self._actions: NDArray[Any] = np.zeros(0)
         self.stepping_s = 0.0  # wall time in the envs [s]
-        self.on_step: Callable[[], None] | None = None  # called after each step of all worlds
+        self.on_step: Callable[[], None] | None = (
+            None  # called after each step of all worlds
+        )
 
     def reset(self) -> Observation:
         """Begins an episode in every world, with the seeds given to `seed`."""
@@ -60,14 +67,21 @@ class TrainVecEnv(VecEnv):
         """Stores the actions of the next step."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[Any]]:
+    def step_wait(
+        self,
+    ) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[Any]]:
         """Advances every world by one control period; see Stable-Baselines3."""
         begin = time.perf_counter()
         for n in self._ended:  # new dicts: an algorithm may still refer to the old ones
             self._infos[n] = {}
         self._ended = []
-        parts = [self._step_env(env, rows) for env, rows in zip(self.envs, self._rows, strict=True)]
-        observation, reward, done = (_together(list(each)) for each in zip(*parts, strict=True))
+        parts = [
+            self._step_env(env, rows)
+            for env, rows in zip(self.envs, self._rows, strict=True)
+        ]
+        observation, reward, done = (
+            _together(list(each)) for each in zip(*parts, strict=True)
+        )
         self.stepping_s += time.perf_counter() - begin
         if self.on_step is not None:
             self.on_step()
@@ -82,17 +96,23 @@ class TrainVecEnv(VecEnv):
         if over := np.flatnonzero(done).tolist():
             flags = {"TimeLimit.truncated": truncated & ~terminated}
             for name in {"is_success", "collision"} & info["final_info"].keys():
-                flags[name] = info["final_info"][name].reshape(len(done), -1).all(axis=1)
+                flags[name] = (
+                    info["final_info"][name].reshape(len(done), -1).all(axis=1)
+                )
             told = {name: flag.tolist() for name, flag in flags.items()}
             for n in over:
                 self._ended.append(rows.start + n)
                 own = {name: each[n] for name, each in told.items()}
-                self._infos[rows.start + n] = own | {"terminal_observation": info["final_obs"][n]}
+                self._infos[rows.start + n] = own | {
+                    "terminal_observation": info["final_obs"][n]
+                }
         return observation, reward, done
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute of the vector env of each world."""
-        every = [getattr(env, attr_name) for env in self.envs for _ in range(env.num_envs)]
+        every = [
+            getattr(env, attr_name) for env in self.envs for _ in range(env.num_envs)
+        ]
         return [every[n] for n in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -101,23 +121,35 @@ class TrainVecEnv(VecEnv):
             setattr(env, attr_name, value)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: Any = None,
+        **method_kwargs: Any,
     ) -> list[Any]:
         """Calls a method of each vector env once; returns its result for each of its worlds."""
         every: list[Any] = []
         for env in self.envs:
-            every += [getattr(env, method_name)(*method_args, **method_kwargs)] * env.num_envs
+            every += [
+                getattr(env, method_name)(*method_args, **method_kwargs)
+            ] * env.num_envs
         return [every[n] for n in self._get_indices(indices)]
 
     def env_is_wrapped(
-        self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
+        self,
+        wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]],
+        indices: Any = None,
     ) -> list[bool]:
         """False for every world."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """A picture of every world."""
-        return [picture for env in self.envs for picture in env.render() or [None] * env.num_envs]
+        return [
+            picture
+            for env in self.envs
+            for picture in env.render() or [None] * env.num_envs
+        ]
 
     def close(self) -> None:
         """Closes the vector envs."""

@@ -7,7 +7,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from nics_drl_bridge.config import Schema, find_config, load_yaml, shipped_names, validate
+from nics_drl_bridge.config import (
+    Schema,
+    find_config,
+    load_yaml,
+    shipped_names,
+    validate,
+)
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -27,16 +33,22 @@ class PpoSettings(Schema):
     """
 
     engine: Literal["lean", "sb3"] = "lean"  # implementation, see above
-    learning_rate: float = Field(default=1e-3, gt=0.0)  # at the start; falls linearly to a fiftieth
+    learning_rate: float = Field(
+        default=1e-3, gt=0.0
+    )  # at the start; falls linearly to a fiftieth
     rollout: Count = 32  # steps in each world between two updates
     batch: Count = 2048  # transitions of one gradient step
     epochs: Count = 5  # passes of an update through the roll-outs
     discount: Share = 0.98  # gamma, per step
     gae_lambda: Share = 0.95  # lambda of generalised advantage estimation
     clip: float = Field(default=0.2, gt=0.0)  # range of the probability ratio around 1
-    entropy: float = Field(default=0.0, ge=0.0)  # weight of the entropy bonus; more explores more
+    entropy: float = Field(
+        default=0.0, ge=0.0
+    )  # weight of the entropy bonus; more explores more
     log_std: float = -0.5  # of the actions at the start
-    mirror: bool = False  # True learns from each transition with left and right exchanged, too
+    mirror: bool = (
+        False  # True learns from each transition with left and right exchanged, too
+    )
 
 
 class StackMemory(Schema):
@@ -70,7 +82,9 @@ class ImitationSettings(Schema):
     """A start of the lean engine from what an expert does, by behaviour cloning."""
 
     expert: str  # name of a planner, or a policy file
-    steps: Count = 50_000  # driven by it, of all worlds together; they count as steps of training
+    steps: Count = (
+        50_000  # driven by it, of all worlds together; they count as steps of training
+    )
     epochs: Count = 10  # passes through them
 
 
@@ -79,7 +93,9 @@ class StopSettings(Schema):
 
     success: Share  # least share of the episodes in each world
     every: Count = 200_000  # environment steps between two evaluations
-    episodes: int = Field(default=200, ge=1, le=10_000)  # in each world, others each time
+    episodes: int = Field(
+        default=200, ge=1, le=10_000
+    )  # in each world, others each time
 
 
 class TrainingSettings(Schema):
@@ -87,50 +103,80 @@ class TrainingSettings(Schema):
 
     # a shipped task's name; `path/to/file.py:ClassName` if the caller names the same, as `--task`
     task: str = "navigation"
-    task_options: dict[str, Any] = Field(default_factory=dict)  # arguments of the task's class
+    task_options: dict[str, Any] = Field(
+        default_factory=dict
+    )  # arguments of the task's class
     robot: str = DEFAULT_ROBOT  # name of a shipped robot, or the folder of a model
     lidar: str | None = None  # a shipped one or a file, instead of the model's own
-    worlds: dict[str, Count] = Field(default={"circles": 256}, min_length=1)  # copies of each world
-    randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
-    teaching: Teaching = Teaching()  # rewards by what only the simulator knows, and repetition
-    steps: Count = 1_000_000  # environment steps of all worlds together, at most with `stop`
+    worlds: dict[str, Count] = Field(
+        default={"circles": 256}, min_length=1
+    )  # copies of each world
+    randomisation: str | None = (
+        None  # quantities drawn in each episode: a shipped one or a file
+    )
+    teaching: Teaching = (
+        Teaching()
+    )  # rewards by what only the simulator knows, and repetition
+    steps: Count = (
+        1_000_000  # environment steps of all worlds together, at most with `stop`
+    )
     stop: StopSettings | None = None  # early end; None: after all steps
     # time limit of an episode [steps]; left out, `nics train` makes it 30 s, or 1.8 times what the
     # longest straight way to a goal of the worlds takes at top speed, if that is more
     max_episode_steps: Count = 300
-    algorithm: Literal["ppo", "sac"] = "ppo"  # learning algorithm; its settings are under its name
+    algorithm: Literal["ppo", "sac"] = (
+        "ppo"  # learning algorithm; its settings are under its name
+    )
     # sizes of the hidden layers, in actor and critic alike
-    hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
+    hidden: tuple[Width, ...] = Field(
+        default=(64, 64), min_length=1, max_length=MOST_LAYERS
+    )
     # what the actor remembers between steps, with the engine `lean` only; None: nothing
-    memory: Annotated[StackMemory | GruMemory, Field(discriminator="kind")] | None = None
-    threads: Annotated[int, Field(ge=1, le=1024)] = 1  # of PyTorch; results depend on it slightly
+    memory: Annotated[StackMemory | GruMemory, Field(discriminator="kind")] | None = (
+        None
+    )
+    threads: Annotated[int, Field(ge=1, le=1024)] = (
+        1  # of PyTorch; results depend on it slightly
+    )
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()  # used if `algorithm` is `ppo`
     sac: SacSettings = SacSettings()  # used if `algorithm` is `sac`
-    imitation: ImitationSettings | None = None  # start by imitating an expert; None: from scratch
+    imitation: ImitationSettings | None = (
+        None  # start by imitating an expert; None: from scratch
+    )
 
     @field_validator("task_options")
     @classmethod
     def _named(cls, options: dict[str, Any]) -> dict[str, Any]:
         if taken := sorted({"robot", "lidar"} & set(options)):
-            raise ValueError(f"task_options can't hold {taken[0]!r}, which the model gives")
+            raise ValueError(
+                f"task_options can't hold {taken[0]!r}, which the model gives"
+            )
         return options
 
     @model_validator(mode="after")
     def _holdable(self) -> TrainingSettings:
         if self.memory is not None and not self.lean:
-            raise ValueError("ppo's engine 'lean' alone learns a memory; use it, or leave it out")
+            raise ValueError(
+                "ppo's engine 'lean' alone learns a memory; use it, or leave it out"
+            )
         if self.ppo.mirror and not self.lean:
-            raise ValueError("ppo's engine 'lean' alone learns by ppo.mirror; leave that out")
+            raise ValueError(
+                "ppo's engine 'lean' alone learns by ppo.mirror; leave that out"
+            )
         if self.ppo.mirror and isinstance(self.memory, GruMemory):
-            raise ValueError("the state of a gru has no mirror image; leave out ppo.mirror")
+            raise ValueError(
+                "the state of a gru has no mirror image; leave out ppo.mirror"
+            )
         if self.num_envs > MOST_WORLDS:
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
         rows = self.num_envs * self.ppo.rollout * (1 + self.ppo.mirror)
         kept = rows if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
             kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"
-            raise ValueError(f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer")
+            raise ValueError(
+                f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer"
+            )
         return self
 
     @model_validator(mode="after")
@@ -138,7 +184,9 @@ class TrainingSettings(Schema):
         if (given := self.imitation) is None:
             return self
         if not self.lean:
-            raise ValueError("imitation needs the lean engine of ppo; choose it, or leave that out")
+            raise ValueError(
+                "imitation needs the lean engine of ppo; choose it, or leave that out"
+            )
         if not self.num_envs <= given.steps < self.steps:
             span = f"from {self.num_envs}, one in each world, to less than all {self.steps}"
             raise ValueError(f"imitation.steps must be {span}; change them")
@@ -187,7 +235,9 @@ def is_code(task: str) -> bool:
     return ":" in task or task.endswith(".py")
 
 
-def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
+def chosen_settings(
+    task: str, name: str | None, changes: dict[str, Any]
+) -> TrainingSettings:
     """Settings by name or file, else those shipped for task and robot, with changes by the user."""
     robot = str(changes.get("robot", DEFAULT_ROBOT))
     if name is None and f"{task}_{robot}" not in shipped_names("training"):
@@ -200,6 +250,8 @@ def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> Tra
     if engine := changed.pop("engine", None):
         given = changed.get("algorithm", base.algorithm)
         if engine == "lean" and given != "ppo":
-            raise ConfigError(f"--engine lean learns with ppo, not {given!r}; leave it out.")
+            raise ConfigError(
+                f"--engine lean learns with ppo, not {given!r}; leave it out."
+            )
         changed["ppo"] = changed.get("ppo", {}) | {"engine": engine}
     return validate(changed, TrainingSettings, "training settings")

@@ -13,7 +13,13 @@ import numpy as np
 
 from nics_drl_bridge.config import no_device, parse_yaml, read_text
 from nics_drl_bridge.errors import BridgeError, RecordingError, shortened
-from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, stamp, with_types
+from nics_drl_bridge.recording.messages import (
+    Offer,
+    check_libraries,
+    offers_of,
+    stamp,
+    with_types,
+)
 from nics_drl_bridge.recording.stamping import Nanoseconds
 
 if TYPE_CHECKING:
@@ -29,7 +35,10 @@ SUFFIXES = (".mcap", DATABASE)
 ROS_1 = ".bag"
 COMPRESSED = (".zst", ".zstd")
 URI_SIGNS = "?#%"
-LONGEST_NAME, LONGEST_REASON = 60, 260  # of a topic or type, and of a fault [characters]
+LONGEST_NAME, LONGEST_REASON = (
+    60,
+    260,
+)  # of a topic or type, and of a fault [characters]
 
 
 @dataclass(frozen=True)
@@ -75,7 +84,9 @@ def opened(path: str | Path) -> "Iterator[BagFile]":
             raise RecordingError(f"{place}: {fault}; rename the folder.")
         for file in files:
             no_device(file)
-        with TemporaryDirectory() as room:  # before rosbags, which unpacks chunks of any size
+        with (
+            TemporaryDirectory() as room
+        ):  # before rosbags, which unpacks chunks of any size
             for file in _listed(place, Path(room)) if place.is_dir() else [place]:
                 _check_storage(file)
         with Reader(place) as reader:
@@ -135,7 +146,9 @@ def metadata_of(folder: Path) -> dict[str, Any]:
 def _listed(folder: Path, room: Path) -> list[Path]:
     """Returns the files of a bag; those compressed as a whole are unpacked to another folder."""
     about = metadata_of(folder)
-    listed = [folder / Path(str(name)).name for name in about.get("relative_file_paths") or ()]
+    listed = [
+        folder / Path(str(name)).name for name in about.get("relative_file_paths") or ()
+    ]
     files = [file for file in listed if file.is_file()]
     if str(about.get("compression_mode", "")).lower() != "file":
         return files
@@ -171,9 +184,13 @@ def _check_summary(reader: "Reader") -> None:
     summary, held = _counts(reader), sum(map(_counts, storages), Counter())
     told, there = summary.total(), sum(each.metadata.message_count for each in storages)
     if there != told:
-        raise ValueError(f"its summary speaks of {told} messages, its files hold {there}")
+        raise ValueError(
+            f"its summary speaks of {told} messages, its files hold {there}"
+        )
     if (whole := reader.message_count) != told:
-        raise ValueError(f"its summary speaks of {whole} messages, its topics add up to {told}")
+        raise ValueError(
+            f"its summary speaks of {whole} messages, its topics add up to {told}"
+        )
     if not all(isinstance(topic, str) and topic for topic, _ in summary):
         raise ValueError("its summary has lost the name of a topic")
     for topic, kind in sorted(set(summary + held), key=str):
@@ -207,7 +224,9 @@ class BagFile:
 
     def __init__(self, reader: "AnyBag", place: str, is_ros_1: bool = False) -> None:
         if not reader.message_count:
-            raise RecordingError(f"{place}: holds no messages; record a drive of 20 s or more.")
+            raise RecordingError(
+                f"{place}: holds no messages; record a drive of 20 s or more."
+            )
         self._reader, self._is_ros_1 = reader, is_ros_1
         self._store = with_types(reader.connections)
         self.place = place  # its name, for errors
@@ -216,8 +235,12 @@ class BagFile:
             self._connections.setdefault(connection.topic, []).append(connection)
         topics = self._connections.items()
         # Message type of each topic; several are joined by `and`.
-        self.types = {t: " and ".join(sorted({c.msgtype for c in some})) for t, some in topics}
-        self.empty = frozenset(t for t, some in topics if not sum(c.msgcount for c in some))
+        self.types = {
+            t: " and ".join(sorted({c.msgtype for c in some})) for t, some in topics
+        }
+        self.empty = frozenset(
+            t for t, some in topics if not sum(c.msgcount for c in some)
+        )
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -226,7 +249,9 @@ class BagFile:
 
     def offers(self, topic: str) -> tuple[Offer, ...]:
         """Returns the offers of a topic's publishers, as far as the bag contains them."""
-        some = (getattr(c.ext, "offered_qos_profiles", ()) for c in self._connections[topic])
+        some = (
+            getattr(c.ext, "offered_qos_profiles", ()) for c in self._connections[topic]
+        )
         return tuple(offer for profiles in some for offer in offers_of(profiles))
 
     def knows(self, topic: str) -> bool:
@@ -242,12 +267,18 @@ class BagFile:
     def messages(self, topic: str) -> list[Message]:
         """Returns all messages of a topic."""
         found = []
-        decode = self._store.deserialize_ros1 if self._is_ros_1 else self._store.deserialize_cdr
+        decode = (
+            self._store.deserialize_ros1
+            if self._is_ros_1
+            else self._store.deserialize_cdr
+        )
         for k, (kind, ns, data) in enumerate(self._raw(topic)):
             try:
                 found.append(Message(ns, decode(data, kind)))
             except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
-                what = f"topic {topic!r}: message {k} can't be decoded as {kind} ({error})"
+                what = (
+                    f"topic {topic!r}: message {k} can't be decoded as {kind} ({error})"
+                )
                 raise ValueError(what) from None
         return found
 
@@ -261,11 +292,15 @@ class BagFile:
 
     def _raw(self, topic: str) -> list[tuple[str, int, bytes]]:
         connections = self._connections[topic]
-        raw = [(c.msgtype, ns, data) for c, ns, data in self._reader.messages(connections)]
+        raw = [
+            (c.msgtype, ns, data) for c, ns, data in self._reader.messages(connections)
+        ]
         promised = sum(connection.msgcount for connection in connections)
         first, last = self.span_ns
         if len(raw) != promised:
-            raise ValueError(f"topic {topic!r} has {len(raw)} messages, by the summary {promised}")
+            raise ValueError(
+                f"topic {topic!r} has {len(raw)} messages, by the summary {promised}"
+            )
         if any(not first <= ns <= last for _, ns, _ in raw):
             fault = f"topic {topic!r} has messages outside of the time span"
             raise ValueError(f"{fault} of its summary")

@@ -17,7 +17,12 @@ from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_o
 from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, up_axis_of, vector_of
 from nics_drl_bridge.recording.pose_source import source_of_pose
 from nics_drl_bridge.recording.recording import W_FIRST, Recording, check, w_first
-from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicData, streams
+from nics_drl_bridge.recording.stamping import (
+    SAME_CLOCK_S,
+    Nanoseconds,
+    TopicData,
+    streams,
+)
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
 from nics_drl_bridge.robot.noise import Delay, Latency
 from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
@@ -29,7 +34,9 @@ PERCENTILES = (5.0, 50.0, 95.0)
 SPANNED = 0.9  # share of a uniform distribution between the first and last of these percentiles
 
 
-def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> Recording:
+def load_bag(
+    path: str | Path, spec: RobotSpec | None, mapping: TopicRoles
+) -> Recording:
     """Reads a robot's drive from a bag, guessing missing roles of topics; RecordingError if bad."""
     if spec is None:
         raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
@@ -54,14 +61,21 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
         measured_by = source_of_pose(pose, bag.types[pose])
     made: Any = streams(data, mapping.stamps, str(path))
     recording = Recording(
-        **made, source=str(path), variables=spec.variable_names, latency=latency,
-        measured_by=measured_by, repairs=repairs,
-    )  # fmt: skip
+        **made,
+        source=str(path),
+        variables=spec.variable_names,
+        latency=latency,
+        measured_by=measured_by,
+        repairs=repairs,
+    )
     return check(recording, spec)
 
 
 def _table(
-    bag: BagFile, topic: str, row: Callable[[Any], msgs.Row], some: Sequence[Message] | None = None
+    bag: BagFile,
+    topic: str,
+    row: Callable[[Any], msgs.Row],
+    some: Sequence[Message] | None = None,
 ) -> TopicData:
     messages = bag.messages(topic) if some is None else some
     receive, header = times_of(messages)
@@ -76,7 +90,9 @@ def _table(
 def _imu(bag: BagFile, topic: str) -> tuple[TopicData, UpAxis]:
     """Reads accelerations and yaw rates about the axis that points up."""
     messages = bag.messages(topic)
-    accelerations = np.array([vector_of(m.content.linear_acceleration) for m in messages])
+    accelerations = np.array(
+        [vector_of(m.content.linear_acceleration) for m in messages]
+    )
     axis = up_axis_of(np.median(accelerations, axis=0))
     data = _table(bag, topic, msgs.imu_row, messages)
     if axis.is_usual:
@@ -96,7 +112,9 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
             advice = "choose the robot that drove, or another topic"
             raise RecordingError(f"{fault}, but {other}; {advice}.")
     data = _table(bag, topic, msgs.command_row)
-    commands = spec.of_fields(data.values) if steered else spec.from_cmd_vel(data.values)
+    commands = (
+        spec.of_fields(data.values) if steered else spec.from_cmd_vel(data.values)
+    )
     return replace(data, values=commands)
 
 
@@ -117,7 +135,11 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
 
 
 def of_one_body(
-    bag: BagFile, topic: str, messages: Sequence[Message], frame: str | None, child: str | None
+    bag: BagFile,
+    topic: str,
+    messages: Sequence[Message],
+    frame: str | None,
+    child: str | None,
 ) -> list[Message]:
     """Returns the transforms between two frames, or the only two frames; else RecordingError."""
     single = [
@@ -129,7 +151,9 @@ def of_one_body(
     pairs = {
         pair
         for pair in there
-        if all(w is None or w.strip("/") == f for w, f in zip(wanted, pair, strict=True))
+        if all(
+            w is None or w.strip("/") == f for w, f in zip(wanted, pair, strict=True)
+        )
     }
     if len(pairs) == 1:
         return [message for pair, message in single if pair in pairs]
@@ -143,11 +167,18 @@ def of_one_body(
 
 
 def joint_streams(
-    topic: str, messages: Sequence[Message], spec: RobotSpec, mapping: TopicRoles, place: str
+    topic: str,
+    messages: Sequence[Message],
+    spec: RobotSpec,
+    mapping: TopicRoles,
+    place: str,
 ) -> dict[str, TopicData]:
     """Returns state and wheels, each if the joints show it; for errors see `state_of`."""
     joints = gather(topic, messages)
-    state, wheels = state_of(joints, spec, mapping, place), wheels_of(joints, mapping, place)
+    state, wheels = (
+        state_of(joints, spec, mapping, place),
+        wheels_of(joints, mapping, place),
+    )
     found = {"state": state, "wheels": wheels}
     return {name: data for name, data in found.items() if data is not None}
 
@@ -165,7 +196,9 @@ class Joints(NamedTuple):
 
 def gather(topic: str, messages: Sequence[Message]) -> Joints:
     """Collects messages, which may contain different joints, in one table."""
-    names = tuple(dict.fromkeys(name for message in messages for name in message.content.name))
+    names = tuple(
+        dict.fromkeys(name for message in messages for name in message.content.name)
+    )
     position, velocity = np.full((2, len(messages), len(names)), np.nan)
     for row, message in enumerate(messages):
         told = message.content
@@ -176,7 +209,9 @@ def gather(topic: str, messages: Sequence[Message]) -> Joints:
     return Joints(topic, *times_of(messages), names, position, velocity)
 
 
-def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
+def state_of(
+    joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str
+) -> TopicData | None:
     """Returns the measured state (T, S), or None without joints; RecordingError if it is needed."""
     known = [v.name for v in spec.state]
     for name in sorted(mapping.state.keys() - set(known)):
@@ -188,13 +223,21 @@ def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -
         columns = []
         for variable, source in zip(spec.state, found, strict=True):
             usual = "position" if variable.unit in msgs.POSITION_UNITS else "velocity"
-            table = joints.position if (source.field or usual) == "position" else joints.velocity
+            table = (
+                joints.position
+                if (source.field or usual) == "position"
+                else joints.velocity
+            )
             columns.append(source.scale * table[:, joints.names.index(source.joint)])
-        return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
+        return _complete(
+            joints, np.stack(columns, axis=1), [s.joint for s in found], place
+        )
     if mapping.state or any(v.must_be_measured for v in spec.state):
         missing = next(name for name, source in sources.items() if source is None)
         fault = f"no joint is known for the state {missing!r}"
-        listed = f"the joints of {joints.topic!r} are {', '.join(joints.names) or 'none'}"
+        listed = (
+            f"the joints of {joints.topic!r} are {', '.join(joints.names) or 'none'}"
+        )
         advice = f"name it in the topics file, as in state: {{{missing}: JOINT}}"
         raise RecordingError(f"{place}: {fault}; {listed}: {advice}.")
     return None
@@ -238,13 +281,17 @@ def _alike(names: Iterable[str], wanted: str) -> str | None:
     return wanted if wanted in found else found[0] if len(found) == 1 else None
 
 
-def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:
+def _complete(
+    joints: Joints, values: Array, names: Sequence[str], place: str
+) -> TopicData:
     keep = np.asarray(np.isfinite(values).all(axis=1))
     if not keep.any():
         fault = f"no message tells the position or velocity that is needed of {', '.join(names)}"
         advice = "check what the joints' driver publishes"
         raise RecordingError(f"{place}: topic {joints.topic!r}: {fault}; {advice}.")
-    return TopicData(joints.topic, joints.receive_ns, joints.header_ns, values).rows(keep)
+    return TopicData(joints.topic, joints.receive_ns, joints.header_ns, values).rows(
+        keep
+    )
 
 
 def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
@@ -255,7 +302,11 @@ def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
 
 def _topic(bag: BagFile, kind: str, name: str) -> str | None:
     """Returns the only topic of a type, or the only one of several with the usual name."""
-    of_kind = [topic for topic, one in bag.types.items() if one == kind and topic not in bag.empty]
+    of_kind = [
+        topic
+        for topic, one in bag.types.items()
+        if one == kind and topic not in bag.empty
+    ]
     named = [topic for topic in of_kind if re.search(rf"(^|/){name}$", topic)]
     found = of_kind if len(of_kind) == 1 else named
     return found[0] if len(found) == 1 else None
@@ -267,8 +318,13 @@ def _delay(bag: BagFile, topic: str | None) -> Delay | None:
     if len(messages) < LEAST_MESSAGES or stamps is None or not stamps.all():
         return None
     late = (receive - stamps) * S_PER_NS
-    if hasattr(messages[0].content, "ranges"):  # a scan's stamp is that of beam 0, not of its last
-        scans = [(max(0.0, float(m.content.time_increment)), m.content.ranges) for m in messages]
+    if hasattr(
+        messages[0].content, "ranges"
+    ):  # a scan's stamp is that of beam 0, not of its last
+        scans = [
+            (max(0.0, float(m.content.time_increment)), m.content.ranges)
+            for m in messages
+        ]
         late -= [increment * max(len(ranges) - 1, 0) for increment, ranges in scans]
     low, middle, high = np.percentile(late, PERCENTILES)
     if not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:

@@ -14,20 +14,33 @@ from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, times_of
 from nics_drl_bridge.recording.bag_reader import latency_of, of_one_body
 from nics_drl_bridge.recording.recording import Stream
-from nics_drl_bridge.recording.stamping import ROBOT_STREAMS, TopicData, go_on_together, streams
+from nics_drl_bridge.recording.stamping import (
+    ROBOT_STREAMS,
+    TopicData,
+    go_on_together,
+    streams,
+)
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.robot.noise import Latency
 
 LONGEST_ARRAY = 64  # of which each element is listed
-SCENES = re.compile(r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$")  # of no single numbers
+SCENES = re.compile(
+    r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$"
+)  # of no single numbers
 PART = re.compile(r"[^.\[\]]+")
-STAMPS: dict[str, roles.Stamps] = {"": "auto", mapped.HEADER: "header", mapped.ARRIVAL: "receive"}
+STAMPS: dict[str, roles.Stamps] = {
+    "": "auto",
+    mapped.HEADER: "header",
+    mapped.ARRIVAL: "receive",
+}
 NAMES = "name"  # field of JointState with a name for each element of the other arrays
 
 
 def fields_of(message: Any, path: str = "") -> Iterator[str]:
     """Yields the paths of all numbers and texts in a message, as `pose.position.x`, `data[0]`."""
-    if isinstance(message, (bool, int, float, str, np.generic)) or hasattr(message, "nanosec"):
+    if isinstance(message, (bool, int, float, str, np.generic)) or hasattr(
+        message, "nanosec"
+    ):
         yield path
     elif isinstance(message, (list, tuple, np.ndarray)):
         for k in range(len(message) if len(message) <= LONGEST_ARRAY else 0):
@@ -52,13 +65,23 @@ def reader_of_field(path: str) -> Callable[[Any], Any]:
         for part in parts:
             if isinstance(message, (list, tuple, np.ndarray)):
                 labels = getattr(within, NAMES, [])
-                k = int(part) if part.isdecimal() else labels.index(part) if part in labels else -1
+                k = (
+                    int(part)
+                    if part.isdecimal()
+                    else labels.index(part)
+                    if part in labels
+                    else -1
+                )
                 if not 0 <= k < len(message):
                     return np.nan
                 message = message[k]
             else:
                 within, message = message, getattr(message, part)
-        return message.sec + message.nanosec * S_PER_NS if hasattr(message, "nanosec") else message
+        return (
+            message.sec + message.nanosec * S_PER_NS
+            if hasattr(message, "nanosec")
+            else message
+        )
 
     return read
 
@@ -93,7 +116,10 @@ class Bag(Source):
         known = bag.types.keys() - bag.empty
         scenes = {topic for topic in known if SCENES.search(bag.types[topic])}
         super().__init__(bag.place, sorted(t for t in known - scenes if bag.knows(t)))
-        self._bag, self._frames = bag, (None, None) if mapping is None else mapping.pose.frames
+        self._bag, self._frames = (
+            bag,
+            (None, None) if mapping is None else mapping.pose.frames,
+        )
         # topics that are read, and whether they come from the robot's computer, for common stamps
         self._used = {} if mapping is None else topics_used(mapping, self.names)
         self._messages: dict[str, Sequence[Message]] = {}
@@ -110,7 +136,10 @@ class Bag(Source):
         messages = self._of(name)
         place = f"{self.place}: topic {name!r}"
         names = tuple(dict.fromkeys(fields_of(messages[0].content)))
-        column, stamps = partial(column_of, place, names, messages), partial(self._stamps_of, name)
+        column, stamps = (
+            partial(column_of, place, names, messages),
+            partial(self._stamps_of, name),
+        )
         notes = self._notes.setdefault(name, [])
         kind = self._bag.types[name]
         return Table(place, names, column, "message {}".format, notes, stamps, kind)
@@ -128,7 +157,11 @@ class Bag(Source):
         topics = tuple(self._used) or (topic,)
         bare = [each for each in topics if not np.any(times_of(self._of(each))[1])]
         # Beside topics without headers these are compared with the arrival, as if nobody asked.
-        stamps = "auto" if which == mapped.HEADER and bare and topic not in bare else STAMPS[which]
+        stamps = (
+            "auto"
+            if which == mapped.HEADER and bare and topic not in bare
+            else STAMPS[which]
+        )
         if (key := (which, stamps, *topics)) not in self._stamps:
             data = {}
             for each in topics:
@@ -143,7 +176,9 @@ class Bag(Source):
                     raise
                 fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
                 stamps = "header" if go_on_together(data.values()) else "receive"
-                by = "headers, which go on together" if stamps == "header" else "arrival"
+                by = (
+                    "headers, which go on together" if stamps == "header" else "arrival"
+                )
                 note = f"{fault}; all messages were stamped by their {by}."
                 self._notes.setdefault(topic, []).append(note)
                 self._stamps[key] = streams(data, stamps, self.place, robot)
@@ -164,7 +199,9 @@ def topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, boo
                 walk(each, own)
         elif isinstance(part, str):
             named = {part, *(part[:k] for k, sign in enumerate(part) if sign == ":")}
-            for topic in (t for t in topics if t in named or t.removeprefix("/") in named):
+            for topic in (
+                t for t in topics if t in named or t.removeprefix("/") in named
+            ):
                 found[topic] = found.get(topic, False) or own
 
     walk(mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True), False)

@@ -20,34 +20,196 @@ from nics_drl_bridge.robot.spec import find_kind, kind_names
 from nics_drl_bridge.robot.template import names_of
 
 # Words that say that something was sent to the robot: beyond doubt, and of a goal of a controller.
-COMMANDING = {"cmd", "command", "commanded", "commands", "cmdvel", "ctrl", "control", "controls"}
-WISHING = {"ref", "reference", "setpoint", "target", "desired", "des", "input", "inputs", "set"}
+COMMANDING = {
+    "cmd",
+    "command",
+    "commanded",
+    "commands",
+    "cmdvel",
+    "ctrl",
+    "control",
+    "controls",
+}
+WISHING = {
+    "ref",
+    "reference",
+    "setpoint",
+    "target",
+    "desired",
+    "des",
+    "input",
+    "inputs",
+    "set",
+}
 WISHING |= {"u", "req", "request", "requested", "demand"}
 # Words that say that something was measured or computed from measurements.
 MEASURING = {
-    *("odom", "odometry", "imu", "measured", "measurement", "meas", "encoder", "enc", "feedback"),
-    *("fb", "model", "actual", "act", "state", "states", "real", "true", "truth", "gt", "est"),
-    *("groundtruth", "estimated", "estimate", "sensor", "sensors", "gyro", "gps", "gnss", "fix"),
-    *("ekf", "vicon", "mocap", "vrpn", "optitrack", "pf", "filtered", "predicted", "pred", "joint"),
-    *("core", "telemetry", "status", "current", "voltage", "battery", "temp", "temperature"),
+    *(
+        "odom",
+        "odometry",
+        "imu",
+        "measured",
+        "measurement",
+        "meas",
+        "encoder",
+        "enc",
+        "feedback",
+    ),
+    *(
+        "fb",
+        "model",
+        "actual",
+        "act",
+        "state",
+        "states",
+        "real",
+        "true",
+        "truth",
+        "gt",
+        "est",
+    ),
+    *(
+        "groundtruth",
+        "estimated",
+        "estimate",
+        "sensor",
+        "sensors",
+        "gyro",
+        "gps",
+        "gnss",
+        "fix",
+    ),
+    *(
+        "ekf",
+        "vicon",
+        "mocap",
+        "vrpn",
+        "optitrack",
+        "pf",
+        "filtered",
+        "predicted",
+        "pred",
+        "joint",
+    ),
+    *(
+        "core",
+        "telemetry",
+        "status",
+        "current",
+        "voltage",
+        "battery",
+        "temp",
+        "temperature",
+    ),
 }
 # Words of columns that no robot is driven by.
 NEVER = {
-    *("header", "stamp", "seq", "index", "id", "row", "frame", "time", "timestamp", "layout"),
-    *("range", "ranges", "scan", "laser", "lidar", "beam", "beams", "intensity", "intensities"),
+    *(
+        "header",
+        "stamp",
+        "seq",
+        "index",
+        "id",
+        "row",
+        "frame",
+        "time",
+        "timestamp",
+        "layout",
+    ),
+    *(
+        "range",
+        "ranges",
+        "scan",
+        "laser",
+        "lidar",
+        "beam",
+        "beams",
+        "intensity",
+        "intensities",
+    ),
     *("depth", "image", "pixel", "sonar", "ultrasonic", "bumper", "cliff"),
-    *("slam", "amcl", "orb", "lio", "loam", "cartographer", "rtabmap", "localization", "map"),
-    *("pose", "position", "orientation", "quaternion", "quat", "pos", "translation", "rotation"),
-    *("yaw", "heading", "roll", "pitch", "easting", "northing", "utm", "goal", "waypoint", "path"),
-    *("acc", "accel", "acceleration", "jerk", "mag", "magnetic", "magnetometer", "gravity"),
-    *("gear", "brake", "error", "err", "std", "stddev", "sigma", "var", "fps", "latency"),
+    *(
+        "slam",
+        "amcl",
+        "orb",
+        "lio",
+        "loam",
+        "cartographer",
+        "rtabmap",
+        "localization",
+        "map",
+    ),
+    *(
+        "pose",
+        "position",
+        "orientation",
+        "quaternion",
+        "quat",
+        "pos",
+        "translation",
+        "rotation",
+    ),
+    *(
+        "yaw",
+        "heading",
+        "roll",
+        "pitch",
+        "easting",
+        "northing",
+        "utm",
+        "goal",
+        "waypoint",
+        "path",
+    ),
+    *(
+        "acc",
+        "accel",
+        "acceleration",
+        "jerk",
+        "mag",
+        "magnetic",
+        "magnetometer",
+        "gravity",
+    ),
+    *(
+        "gear",
+        "brake",
+        "error",
+        "err",
+        "std",
+        "stddev",
+        "sigma",
+        "var",
+        "fps",
+        "latency",
+    ),
     *("torque", "force", "status", "axes", "buttons", "level", "line"),
 }
 NEVER_WORDS = NEVER | NO_COMMANDS
 TICKS = {"tick", "ticks", "encoder", "enc", "encoders", "count", "counts"}
 WHEEL_WORDS = TICKS | {"wheel", "wheels", "rpm"}
-NO_SPEED = {"pos", "position", "angle", "current", "force", "torque", "slip", "distance", "dist"}
-NO_SPEED |= {"pressure", "load", "temp", "effort", "travel", "accel", "acc", "steer", "steering"}
+NO_SPEED = {
+    "pos",
+    "position",
+    "angle",
+    "current",
+    "force",
+    "torque",
+    "slip",
+    "distance",
+    "dist",
+}
+NO_SPEED |= {
+    "pressure",
+    "load",
+    "temp",
+    "effort",
+    "travel",
+    "accel",
+    "acc",
+    "steer",
+    "steering",
+}
 LEFT = {"left", "l", "lw", "wl", "vl", "le"}
 RIGHT = {"right", "r", "rw", "wr", "vr", "ri"}
 FRONT = {"front", "f"}
@@ -61,7 +223,18 @@ CORNERS = {
 STEERING = {"steering", "steer", "delta", "servo"}
 THROTTLE = {"throttle", "gas", "accelerator", "pedal", "pwm", "duty"}
 TURNING = {"angular", "ang", "omega", "yawrate", "wz", "w", "turn", "rot", "rotational"}
-SPEED = {"speed", "velocity", "vel", "v", "vx", "linear", "lin", "forward", "trans", "cmdvel"}
+SPEED = {
+    "speed",
+    "velocity",
+    "vel",
+    "v",
+    "vx",
+    "linear",
+    "lin",
+    "forward",
+    "trans",
+    "cmdvel",
+}
 # Kinds of robots by the meaning of their commands, and their names for them; kinds that a file of
 # its own describes have theirs in `words`.
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -81,7 +254,17 @@ STANDARD_PACKAGES = re.compile(
     r"|rcl_interfaces|dynamic_reconfigure|map|stereo|shape|trajectory|bond|theora_image_transport"
     r"|gazebo|gps_common|geographic)(_msgs)?/"
 )
-ROUNDABOUT = {"raw", "mux", "nav", "navi", "teleop", "joy", "smoother", "unfiltered", "key"}
+ROUNDABOUT = {
+    "raw",
+    "mux",
+    "nav",
+    "navi",
+    "teleop",
+    "joy",
+    "smoother",
+    "unfiltered",
+    "key",
+}
 BARE_TWIST = {"cmd", "vel"}
 
 CERTAIN, LIKELY, POSSIBLE = 3, 2, 1
@@ -108,11 +291,17 @@ class CommandGuess(NamedTuple):
 
     kind: str | None  # None: nothing tells it
     commands: dict[str, Candidate]  # by the robot's names; empty if none is certain
-    candidates: dict[str, Candidate]  # by the robot's names, for the user to choose from
-    of_wheels: bool = False  # True: no command was recorded, the wheels' own motion stands in
+    candidates: dict[
+        str, Candidate
+    ]  # by the robot's names, for the user to choose from
+    of_wheels: bool = (
+        False  # True: no command was recorded, the wheels' own motion stands in
+    )
 
 
-def guess_command(tables: Sequence[TableSurvey], pose: PoseGuess | None) -> CommandGuess:
+def guess_command(
+    tables: Sequence[TableSurvey], pose: PoseGuess | None
+) -> CommandGuess:
     """Finds the columns that drive a robot of a known kind; else what may be its commands."""
     found = [each for table in tables for each in _candidates_of(table, tables, pose)]
     found = _with_partner(found)
@@ -139,7 +328,11 @@ def _candidates_of(
         return
     of_pose = pose is not None and pose.table is table
     # The name of a file tells what it holds only beside other files, and if the pose is elsewhere.
-    context = {*words_of(table.name)} if table.kind or (len(tables) > 1 and not of_pose) else set()
+    context = (
+        {*words_of(table.name)}
+        if table.kind or (len(tables) > 1 and not of_pose)
+        else set()
+    )
     if context & (NEVER_WORDS | MEASURING) and not context & COMMANDING:
         return
     taken = {*pose.columns} if pose is not None and of_pose else set()
@@ -151,7 +344,9 @@ def _candidates_of(
             words = {*words_of(table.name)}
         if words & (NEVER_WORDS | MEASURING) or _is_place_on_earth(column):
             continue
-        meaning = meaning_of(words | (context & {"cmd", "vel"} if table.kind else set()))
+        meaning = meaning_of(
+            words | (context & {"cmd", "vel"} if table.kind else set())
+        )
         strength = _strength_of(table, words, context, meaning)
         known = meaning is not None or strength >= LIKELY
         if known and not (table.kind in TWIST_KINDS and meaning is None):
@@ -198,7 +393,11 @@ def meaning_of(words: set[str]) -> str | None:
         return "throttle"
     if "traction" in words:
         return "traction"
-    if words & TURNING or {"yaw", "rate"} <= words or (words & {"theta", "th"} and moves):
+    if (
+        words & TURNING
+        or {"yaw", "rate"} <= words
+        or (words & {"theta", "th"} and moves)
+    ):
         return None if words & {"x", "y", "linear"} else "turn"
     if "vy" in words or (words & SPEED and "y" in words):
         return "side"
@@ -209,7 +408,9 @@ def meaning_of(words: set[str]) -> str | None:
 
 def _with_partner(found: Sequence[Candidate]) -> list[Candidate]:
     """Takes a plain `steering` for a command where a throttle is recorded beside it."""
-    throttle = any(each.meaning == "throttle" and each.strength >= LIKELY for each in found)
+    throttle = any(
+        each.meaning == "throttle" and each.strength >= LIKELY for each in found
+    )
     made = []
     for each in found:
         words = unit_in(each.column.name)[0]
@@ -220,9 +421,15 @@ def _with_partner(found: Sequence[Candidate]) -> list[Candidate]:
     return made
 
 
-def _fitting_kind(found: Sequence[Candidate]) -> tuple[str | None, dict[str, Candidate]]:
+def _fitting_kind(
+    found: Sequence[Candidate],
+) -> tuple[str | None, dict[str, Candidate]]:
     """Returns the kind of robot that these columns drive best, and its commands by its names."""
-    own = [(name, kind.template.words) for name in kind_names() if (kind := find_kind(name))]
+    own = [
+        (name, kind.template.words)
+        for name in kind_names()
+        if (kind := find_kind(name))
+    ]
     best: tuple[tuple[int, int, int], str, dict[str, Candidate]] | None = None
     for order, (kind, names) in enumerate((*own, *KINDS)):
         commands = _by_meaning(names, found) if names else {}
@@ -237,7 +444,9 @@ def _fitting_kind(found: Sequence[Candidate]) -> tuple[str | None, dict[str, Can
     return (None, {}) if best is None else best[1:]
 
 
-def _by_meaning(names: Mapping[str, str], found: Sequence[Candidate]) -> dict[str, Candidate]:
+def _by_meaning(
+    names: Mapping[str, str], found: Sequence[Candidate]
+) -> dict[str, Candidate]:
     """Finds a column for each of a kind's commands; none if one is missing or can't be told."""
     commands: dict[str, Candidate] = {}
     for meaning, name in names.items():
@@ -265,11 +474,17 @@ def _wheels_of(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
         for column in table.numbers:
             words, _ = unit_in(column.name)
             spoken = {*words_of(column.name)}
-            if not spoken & WHEEL_WORDS or spoken & NO_SPEED or column.low == column.high:
+            if (
+                not spoken & WHEEL_WORDS
+                or spoken & NO_SPEED
+                or column.low == column.high
+            ):
                 continue
             meaning = meaning_of({*words} - TICKS - {"speed", "velocity", "vel"})
             if meaning in ("left", "right", *WHEELS):
-                yield Candidate(table, column, meaning, LIKELY, int(bool(spoken & TICKS)))
+                yield Candidate(
+                    table, column, meaning, LIKELY, int(bool(spoken & TICKS))
+                )
 
 
 def _is_place_on_earth(column: Survey) -> bool:

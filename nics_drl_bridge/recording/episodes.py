@@ -21,7 +21,12 @@ class EpisodeOfTable(Source):
     """The rows of one episode in a table that holds all that a mapping reads."""
 
     def __init__(
-        self, source: Source, table: Table, name: str, rows: NDArray[np.intp], episode: str
+        self,
+        source: Source,
+        table: Table,
+        name: str,
+        rows: NDArray[np.intp],
+        episode: str,
     ) -> None:
         super().__init__(f"{source.place} (episode {episode})", [name])
         self.episode = episode
@@ -94,7 +99,9 @@ def _name_of(source: Source, table: Table) -> str:
 def _tables_used(source: Source, mapping: Mapping) -> Iterator[str]:
     """Yields the tables that the values of a mapping are of."""
     reader = MappedReader(source, mapping)
-    references: list[tuple[Any, str | None]] = [(v.from_, None) for v in mapping.command.values()]
+    references: list[tuple[Any, str | None]] = [
+        (v.from_, None) for v in mapping.command.values()
+    ]
     references += [(value.from_, None) for value in mapping.state.values()]
     references.append((mapping.pose.x.from_ if mapping.pose.x else 0, mapping.pose.in_))
     for reference, within in references:

@@ -23,9 +23,14 @@ STILL_S = 1.0  # standstill at both ends of a drive [s]
 RAMP_S = 0.25
 SEGMENT_S = (0.4, 1.6)
 CANDIDATES = 12
-ALONE, REDRAWN = 0.5, 0.6  # probability to change a single command; else, each further one
+ALONE, REDRAWN = (
+    0.5,
+    0.6,
+)  # probability to change a single command; else, each further one
 BINS = 4
-CENTRED = 2.0  # weight of the distance from the centre against the familiarity of a command
+CENTRED = (
+    2.0  # weight of the distance from the centre against the familiarity of a command
+)
 # The path stays inside the circle by a margin plus the way of a reaction at top speed.
 MARGIN_M, REACTION_S, TOLERANCE_M = 0.05, 0.2, 0.005
 # Turning back uses shares of the greatest commands, as a reserve for a robot that turns worse.
@@ -47,10 +52,15 @@ class Exploration:
     def __init__(self, plan: "DrivePlan", rng: np.random.Generator) -> None:
         spec, self._plan = plan.robot, plan
         self._motion, self._rng = expected_motion(spec), rng
-        share = np.array([1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command])
+        share = np.array(
+            [1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command]
+        )
         self.low, self.high = share * spec.command_low, share * spec.command_high
         self.rest = np.clip(np.zeros(len(spec.command)), self.low, self.high)
-        self._ticks, self._still = round(plan.duration / PERIOD_S), round(STILL_S / PERIOD_S)
+        self._ticks, self._still = (
+            round(plan.duration / PERIOD_S),
+            round(STILL_S / PERIOD_S),
+        )
         self._ramp = round(RAMP_S / PERIOD_S)
         self._visits = np.full((BINS,) * len(spec.command), 1.0 / BINS)
         self._tick, self._lost, self._turn = 0, 0, 0
@@ -111,7 +121,9 @@ class Exploration:
         if not self._seen or self._tick >= self._ticks - self._still:
             return False
         self._seen = False
-        return bool(_distance(self._roll(self._queue[None])[0]).max() > self._limit() + MARGIN_M)
+        return bool(
+            _distance(self._roll(self._queue[None])[0]).max() > self._limit() + MARGIN_M
+        )
 
     def _limit(self) -> float:
         """Returns the greatest allowed distance from the start, at least the present one [m]."""
@@ -119,12 +131,17 @@ class Exploration:
 
     def _roll(self, commands: Array, period: float = PERIOD_S) -> tuple[Array, Array]:
         many = len(commands)
-        pose, state = np.repeat(self.pose[None], many, 0), np.repeat(self._state[None], many, 0)
+        pose, state = (
+            np.repeat(self.pose[None], many, 0),
+            np.repeat(self._state[None], many, 0),
+        )
         return self._motion.roll(pose, state, commands, period)
 
     def _cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
         share = (command - self.low) / (self.high - self.low)
-        return tuple(np.moveaxis(np.clip((share * BINS).astype(np.intp), 0, BINS - 1), -1, 0))
+        return tuple(
+            np.moveaxis(np.clip((share * BINS).astype(np.intp), 0, BINS - 1), -1, 0)
+        )
 
     def _segment(self) -> Array:
         left = self._ticks - self._still - self._tick
@@ -164,8 +181,12 @@ class Exploration:
 
     def _towards(self, levels: Array, length: int) -> Array:
         """Returns commands (K, T, C) that go smoothly from the present one to levels (K, C)."""
-        share = (1.0 - np.cos(np.pi * np.minimum(np.arange(1, length + 1) / self._ramp, 1.0))) / 2.0
-        return np.asarray(self._command + share[None, :, None] * (levels - self._command)[:, None])
+        share = (
+            1.0 - np.cos(np.pi * np.minimum(np.arange(1, length + 1) / self._ramp, 1.0))
+        ) / 2.0
+        return np.asarray(
+            self._command + share[None, :, None] * (levels - self._command)[:, None]
+        )
 
     def _ways_back(self, factor: Array) -> Array:
         """Returns constant commands (E, T, C) for turning back: half a turn by the fastest one."""
@@ -184,13 +205,24 @@ class Exploration:
         """Returns the least distance from the centre, over the radius, of ways back; maybe inf."""
         many = len(self._ways)
         start = np.repeat(pose, many, 0), np.repeat(state, many, 0)
-        poses, _ = self._motion.roll(*start, np.tile(self._ways, (len(pose), 1, 1)), WAY_STEP_S)
+        poses, _ = self._motion.roll(
+            *start, np.tile(self._ways, (len(pose), 1, 1)), WAY_STEP_S
+        )
         away = _distance(poses)
         inside = away.max(axis=1) <= limit
-        turned = np.abs(np.unwrap(poses[..., 2], axis=1) - poses[:, :1, 2]).max(axis=1) >= np.pi
-        back = (away.min(axis=1) < NEARER * away[:, 0]) | (away[:, 0] < NEAR * self._outermost)
+        turned = (
+            np.abs(np.unwrap(poses[..., 2], axis=1) - poses[:, :1, 2]).max(axis=1)
+            >= np.pi
+        )
+        back = (away.min(axis=1) < NEARER * away[:, 0]) | (
+            away[:, 0] < NEAR * self._outermost
+        )
         useful = (inside & (turned | back)).reshape(len(pose), many).any(axis=1)
-        reached = np.where(inside, away.min(axis=1), np.inf).reshape(len(pose), many).min(axis=1)
+        reached = (
+            np.where(inside, away.min(axis=1), np.inf)
+            .reshape(len(pose), many)
+            .min(axis=1)
+        )
         return np.where(useful, reached / self._outermost, np.inf)
 
     def _least_harm(self, length: int) -> Array:
@@ -212,7 +244,9 @@ class Pattern:
     period: float  # time for which each command is held [s]
     command: Array  # (T, C)
     pose: Array  # (T + 1, 3) at the start of each period, and at the end
-    bound: float  # radius of the circle around the start that contains the whole robot [m]
+    bound: (
+        float  # radius of the circle around the start that contains the whole robot [m]
+    )
     footprint: float  # radius of the robot [m]
 
     @property
@@ -224,7 +258,9 @@ class Pattern:
     def box(self) -> Array:
         """Least and greatest x and y (2, 2) that the robot's body reaches [m]."""
         place = self.pose[:, :2]
-        return np.array([place.min(axis=0) - self.footprint, place.max(axis=0) + self.footprint])
+        return np.array(
+            [place.min(axis=0) - self.footprint, place.max(axis=0) + self.footprint]
+        )
 
     @property
     def reach(self) -> float:
@@ -261,16 +297,22 @@ class ExpectedMotion:
     """Expected motion of a robot."""
 
     size: int  # S, of the state
-    respond: Callable[[Array, Array, float], Array]  # state, command, time held [s] -> state
+    respond: Callable[
+        [Array, Array, float], Array
+    ]  # state, command, time held [s] -> state
     twist: Callable[[Array, Array], Array]  # state, command -> body twist
 
-    def roll(self, pose: Array, state: Array, command: Array, period: float) -> tuple[Array, Array]:
+    def roll(
+        self, pose: Array, state: Array, command: Array, period: float
+    ) -> tuple[Array, Array]:
         """Rolls commands (K, T, C) out to poses (K, T + 1, 3) and states; one arc a period [s]."""
         poses, states = [pose], [state]
         for n in range(command.shape[1]):
             now = command[:, n]
             middle = self.respond(state, now, period / 2.0)
-            pose = geometry.compose(pose, geometry.exp(self.twist(middle, now) * period))
+            pose = geometry.compose(
+                pose, geometry.exp(self.twist(middle, now) * period)
+            )
             state = self.respond(state, now, period)
             poses.append(pose)
             states.append(state)
@@ -292,7 +334,9 @@ def expected_motion(spec: RobotSpec) -> ExpectedMotion:
             advice = "add `textbook:` and its `parameters:` to the robot's YAML file"
             raise ConfigError(f"robot {spec.name!r}: {fault}; {advice}.")
     return ExpectedMotion(
-        len(spec.state), lambda state, *_: state, lambda _, command: spec.to_cmd_vel(command)
+        len(spec.state),
+        lambda state, *_: state,
+        lambda _, command: spec.to_cmd_vel(command),
     )
 
 
@@ -301,7 +345,9 @@ class DrivePlan:
     """Options of a drive; a value out of its range raises ConfigError."""
 
     robot: RobotSpec  # the robot that drives
-    bound: float = 2.0  # radius of the circle around the start that contains the whole robot [m]
+    bound: float = (
+        2.0  # radius of the circle around the start that contains the whole robot [m]
+    )
     duration: float = 60.0  # [s]
     speed: float = 1.0  # share of the greatest speeds and rates to use
     seed: int = 0  # of the pattern
@@ -314,7 +360,9 @@ class DrivePlan:
             ("speed", self.speed, 0.05, 1.0, ""),
         ):
             if not low <= value <= high:
-                raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}{unit}.")
+                raise ConfigError(
+                    f"{name} {value:g}: must be from {low:g} to {high:g}{unit}."
+                )
 
     def begin(self) -> Exploration:
         """Returns the previewed drive, at its start; raises ConfigError as `preview` does."""
@@ -337,4 +385,6 @@ class DrivePlan:
                 return number, pattern
         circle = f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small"
         motion = f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s"
-        raise ConfigError(f"{circle} {motion}; give it more space, less speed, or more time.")
+        raise ConfigError(
+            f"{circle} {motion}; give it more space, less speed, or more time."
+        )

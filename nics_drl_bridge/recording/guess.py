@@ -41,7 +41,10 @@ LARGEST_ANGLE = 1.6  # of a steering [rad]
 MOST_LISTED = 20  # unused columns of a table
 STILL = "; it is 0"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
-MIRRORED, MIRRORED_BETTER = 0.6, 0.3  # shares from which on a draft turns a heading round
+MIRRORED, MIRRORED_BETTER = (
+    0.6,
+    0.3,
+)  # shares from which on a draft turns a heading round
 
 
 def first_mapping(tables: Sequence[TableSurvey]) -> str:
@@ -51,9 +54,15 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     guess = guess_command(tables, pose)
     times = [table.time for table in tables if table.time is not None]
     common = max(times, key=times.count) if times else None
-    pose_lines = _pose_lines(pose, alone, common) if pose else [NO_POSE, "pose:", "  x: ", "  y: "]
+    pose_lines = (
+        _pose_lines(pose, alone, common)
+        if pose
+        else [NO_POSE, "pose:", "  x: ", "  y: "]
+    )
     values = _pose_values(pose, pose_lines) if pose else None
-    switch = guess_switch(tables, values) if guess.commands or guess.candidates else None
+    switch = (
+        guess_switch(tables, values) if guess.commands or guess.candidates else None
+    )
     lines = [f"{DOUBT} {doubt}" for doubt in doubts_of_commands(guess, values)]
     if not guess.commands and not guess.candidates:
         lines.append(f"{DOUBT} {NO_COMMAND}")
@@ -61,7 +70,9 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     if common is not None:
         lines.append(f"time: {common}  {GUESSED}")
     elif any(table.t is None and table.rows for table in tables):
-        lines.append(f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second")
+        lines.append(
+            f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
+        )
     lines += pose_lines
     lines += _clock_lines(pose, guess.commands or guess.candidates)
     backwards = reversed_wheels(guess, values)
@@ -78,9 +89,7 @@ def _robot_line(guess: CommandGuess, radius: float) -> str:
         example = f"{{kind: differential, footprint_radius: {radius}}}"
         return f"robot:  # which kind is not certain, as in {example}"
     alike = "".join(f", or {each}" for each in look_alikes(guess.kind))
-    return (
-        f"robot: {{kind: {guess.kind}, footprint_radius: {radius}}}  {GUESSED}{alike}; radius in m"
-    )
+    return f"robot: {{kind: {guess.kind}, footprint_radius: {radius}}}  {GUESSED}{alike}; radius in m"
 
 
 def _command_lines(
@@ -110,12 +119,16 @@ def _command_lines(
         yield f"command:  # {NO_COMMAND}"
 
 
-def _value_of(name: str, candidate: Candidate, when: str, alone: bool, common: str | None) -> str:
+def _value_of(
+    name: str, candidate: Candidate, when: str, alone: bool, common: str | None
+) -> str:
     """Returns a command as a mapping has it: a column, or a column with more keys."""
     table, column = candidate.table, candidate.column
     reference = table.reference(column.name, alone)
     keys = [*_unit_keys(name, table, column)]
-    if when and "steer" not in name:  # a switch cuts the motor; the steering stays as it is
+    if (
+        when and "steer" not in name
+    ):  # a switch cuts the motor; the steering stays as it is
         keys.append(when)
     if table.time not in (common, None):
         keys.append(f"time: {table.time}")
@@ -126,8 +139,12 @@ def _unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
     words = {*words_of(column.name)}
     unit = unit_in(column.name)[1]
     if words & TICKS:
-        counters = [table.data[c.name] for c in table.numbers if {*words_of(c.name)} & TICKS]
-        step = np.abs(np.concatenate([np.diff(each.astype(np.float64)) for each in counters]))
+        counters = [
+            table.data[c.name] for c in table.numbers if {*words_of(c.name)} & TICKS
+        ]
+        step = np.abs(
+            np.concatenate([np.diff(each.astype(np.float64)) for each in counters])
+        )
         yield "unit: ticks"
         if "steer" in name:
             yield "differentiate: false"
@@ -140,7 +157,9 @@ def _unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
         yield "unit: deg"
 
 
-def _clock_lines(pose: PoseGuess | None, commands: Mapping[str, Candidate]) -> list[str]:
+def _clock_lines(
+    pose: PoseGuess | None, commands: Mapping[str, Candidate]
+) -> list[str]:
     """Returns the line that gives the pose a clock of its own, if it has one by its stamps."""
     if pose is None or (t := pose.table.t) is None or not pose.table.stamps:
         return []
@@ -166,7 +185,9 @@ def _free_yaw_rate(
         return None
     table, column = found
     commands = (*guess.commands.values(), *guess.candidates.values())
-    taken = any(each.table is table and each.column.name == column.name for each in commands)
+    taken = any(
+        each.table is table and each.column.name == column.name for each in commands
+    )
     return None if taken else found
 
 
@@ -232,7 +253,11 @@ def _pose_units(pose: PoseGuess) -> list[str]:
     turned = unit_in(pose.heading or "")[1]
     said = []
     for key, unit in (("unit", place), ("heading_unit", turned)):
-        if unit is not None and UNITS[unit].factor != 1.0 and UNITS[unit].si in ("m", "rad"):
+        if (
+            unit is not None
+            and UNITS[unit].factor != 1.0
+            and UNITS[unit].si in ("m", "rad")
+        ):
             said.append(f"  {key}: {unit}  {GUESSED}")
     if place is not None or turned is not None:
         return said
@@ -283,7 +308,9 @@ def _pose_values(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array] |
         values[part] *= UNITS[unit].factor
         if key == "unit" and UNITS[unit].si == "rad":
             values[part] = np.stack(east_and_north(*values[part].T), axis=1)
-    if turned_round := re.search(r"^  heading: .* scale: -1(?:, offset: ([\d.]+))?}", text, re.M):
+    if turned_round := re.search(
+        r"^  heading: .* scale: -1(?:, offset: ([\d.]+))?}", text, re.M
+    ):
         values[:, 2] = float(turned_round[1] or 0.0) - values[:, 2]
     return table.t[whole], values[whole]
 
@@ -298,6 +325,9 @@ def _radius(values: tuple[Array, Array] | None, fastest: float = FAR_AWAY) -> fl
         return NO_RADIUS
     t, pose = values
     path = np.hypot(*np.diff(pose[:: max(1, len(t) // 200), :2], axis=0).T).sum()
-    surveyed = np.abs(pose[:, :2]).min() > FAR_AWAY and np.ptp(pose[:, :2], axis=0).max() < FAR_AWAY
+    surveyed = (
+        np.abs(pose[:, :2]).min() > FAR_AWAY
+        and np.ptp(pose[:, :2], axis=0).max() < FAR_AWAY
+    )
     fast = FAST_CAR * float(np.ptp(t)) < path < fastest
     return CAR_RADIUS if surveyed or fast else NO_RADIUS

@@ -22,9 +22,14 @@ STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at res
 STANDING_RADPS = 0.005
 FEWEST_AT_REST = 2  # blocks; of fewer, the bias is taken from the drive instead
 LEAST_BIAS_STD = 1e-5  # rad/s
-USUAL_BIAS, USUAL_FACTOR = 0.01, 0.5  # deviations of a bias [rad/s], of a factor of turns from 1
+USUAL_BIAS, USUAL_FACTOR = (
+    0.01,
+    0.5,
+)  # deviations of a bias [rad/s], of a factor of turns from 1
 LEAST_RATE_NOISE = 1e-3  # of a block's mean rate [rad/s]
-UNLIKE_BLOCKS = 2.0  # factor of errors, as blocks of a drive are not independent of each other
+UNLIKE_BLOCKS = (
+    2.0  # factor of errors, as blocks of a drive are not independent of each other
+)
 DRIFTS = 4.0  # standard errors of its slope beyond which a bias drifts
 DRIFT_SPAN_S = 20.0  # a drift of the bias shows only between rests so far apart
 LEAST_TURN_RAD = 1.0  # sum of all turns, below which a drive does not show a scale
@@ -70,7 +75,11 @@ class Turning:
     def in_degrees(self) -> bool:
         """True if the gyro seems to measure in degrees per second."""
         low, high = IN_DEGREES
-        return self.compared and self.alike > ALIKE and low < 1.0 / max(self.scale, 1e-9) < high
+        return (
+            self.compared
+            and self.alike > ALIKE
+            and low < 1.0 / max(self.scale, 1e-9) < high
+        )
 
     @property
     def plausible(self) -> bool:
@@ -81,7 +90,9 @@ class Turning:
     @property
     def contradicts(self) -> bool:
         """True if they disagree by more than the gyro's own errors explain."""
-        return self.compared and self.apart > max(LEAST_APART_RAD, CLEARLY * self.apart_std)
+        return self.compared and self.apart > max(
+            LEAST_APART_RAD, CLEARLY * self.apart_std
+        )
 
 
 def compare_turning(
@@ -131,7 +142,9 @@ def turn_by_gyro(
     moved = geometry.exp(step)
     heading = pose[0, 2] + np.concatenate([[0.0], np.cumsum(moved[:, 2])])
     shift = geometry.rotate(moved[:, :2], heading[:-1])
-    position = pose[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(shift, axis=0)])
+    position = pose[0, :2] + np.concatenate(
+        [np.zeros((1, 2)), np.cumsum(shift, axis=0)]
+    )
     turned = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     span = np.diff(t)
     driven = span < LONGEST_PAUSE_S  # between two recordings there is no drive
@@ -153,7 +166,9 @@ class _Blocks:
 def _turns(t: Array, gyro_t: Array, yaw_rate: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Returns the gyro's turns (T - 1,) between times (T,) [s], and whether it covers them."""
     span = np.diff(gyro_t)
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span)])
+    total = np.concatenate(
+        [[0.0], np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span)]
+    )
     turn = np.diff(np.interp(t, gyro_t, total))
     # Time without a gyro up to each moment; none may pass within an interval that it covers.
     lost = np.concatenate([[0.0], np.cumsum(np.where(span > LONGEST_GAP_S, span, 0.0))])
@@ -186,10 +201,16 @@ def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     rest = (blocks.speed < STANDING_MPS) & (np.abs(blocks.odom_rate) < STANDING_RADPS)
     if rest.sum() < FEWEST_AT_REST:
         return _bias_while_driving(blocks)
-    rate, when, rest_s = blocks.gyro_rate[rest], blocks.middle[rest], float(blocks.span[rest].sum())
+    rate, when, rest_s = (
+        blocks.gyro_rate[rest],
+        blocks.middle[rest],
+        float(blocks.span[rest].sum()),
+    )
     usual = float(np.median(rate))
     scatter = 1.4826 * float(np.median(np.abs(rate - usual)))
-    near = np.abs(rate - usual) <= max(5.0 * scatter, 1e-3)  # not where somebody turned it
+    near = np.abs(rate - usual) <= max(
+        5.0 * scatter, 1e-3
+    )  # not where somebody turned it
     rate, when = rate[near], when[near]
     middle = float(when.mean())
     bias = float(rate.mean())
@@ -222,7 +243,9 @@ def _bias_while_driving(blocks: _Blocks) -> tuple[float, float, float, float, fl
     return float(bias), max(std, LEAST_BIAS_STD), 0.0, float(blocks.middle.mean()), 0.0
 
 
-def _scale_of(odom_rate: Array, gyro_rate: Array, span: Array) -> tuple[float, float, float]:
+def _scale_of(
+    odom_rate: Array, gyro_rate: Array, span: Array
+) -> tuple[float, float, float]:
     """Returns odometry's turn per turn of the gyro, its deviation, and their correlation."""
     turned = max(float((np.abs(rate) * span).sum()) for rate in (odom_rate, gyro_rate))
     power, odom_power = float(gyro_rate @ gyro_rate), float(odom_rate @ odom_rate)

@@ -7,9 +7,14 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 
 AXES = "xyz"
-GRAVITY = (7.0, 13.0)  # an acceleration at rest [m/s^2]; others have gravity removed, or are none
+GRAVITY = (
+    7.0,
+    13.0,
+)  # an acceleration at rest [m/s^2]; others have gravity removed, or are none
 UPRIGHT = 0.85  # least share of gravity along the axis that points up
-REMEMBERED = 200  # messages over which the acceleration is averaged while a robot drives
+REMEMBERED = (
+    200  # messages over which the acceleration is averaged while a robot drives
+)
 
 
 class UpAxis(NamedTuple):
@@ -58,11 +63,14 @@ class GyroReader:
         if covariance[0] == -1.0:
             return None
         acceleration = vector_of(message.linear_acceleration)
-        if np.isfinite(acceleration).all() and message.linear_acceleration_covariance[0] != -1.0:
+        if (
+            np.isfinite(acceleration).all()
+            and message.linear_acceleration_covariance[0] != -1.0
+        ):
             self._count = min(self._count + 1, REMEMBERED)
-            self._acceleration = self._acceleration + (acceleration - self._acceleration) / float(
-                self._count
-            )
+            self._acceleration = self._acceleration + (
+                acceleration - self._acceleration
+            ) / float(self._count)
         axis = up_axis_of(self._acceleration)
         rate = axis.sign * float(getattr(message.angular_velocity, AXES[axis.place]))
         return rate, float(covariance[4 * axis.place])

@@ -9,9 +9,25 @@ from nics_drl_bridge.recording.names import words_of
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
 
 OF_MESSAGE = "angular_velocity.z"  # of sensor_msgs/Imu
-TURNING = ({"gyro", "z"}, {"gz"}, {"gyroz"}, {"gyro", "yaw"}, {"yaw", "rate"}, {"yawrate"})
+TURNING = (
+    {"gyro", "z"},
+    {"gz"},
+    {"gyroz"},
+    {"gyro", "yaw"},
+    {"yaw", "rate"},
+    {"yawrate"},
+)
 TURNING_OF_IMU = (*TURNING, {"w"}, {"wz"}, {"omega"}, {"angular", "z"}, {"z", "rate"})
-NOT_MEASURED = {"cmd", "command", "commanded", "ref", "setpoint", "target", "desired", "covariance"}
+NOT_MEASURED = {
+    "cmd",
+    "command",
+    "commanded",
+    "ref",
+    "setpoint",
+    "target",
+    "desired",
+    "covariance",
+}
 NOT_OF_GYRO = {"odom", "odometry", "vicon", "mocap", "gt", "truth"}
 USUAL_NAMES = ("/imu", "/imu/data")  # of topics; the first that is there is chosen
 FASTEST_RADPS = 20.0  # a robot that seems to turn faster does so in degrees
@@ -24,7 +40,9 @@ def guess_yaw_rate(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] 
     return next(iter(usual or found), None)
 
 
-def imu_line(table: TableSurvey, column: Survey, alone: bool, common: str | None) -> str:
+def imu_line(
+    table: TableSurvey, column: Survey, alone: bool, common: str | None
+) -> str:
     """Returns the line of a mapping for a yaw rate, beside the stamps that are common to all."""
     keys = [f"from: {table.reference(column.name, alone)}"]
     if column.name.startswith("angular_velocity.") and _up_axis(table).sign < 0.0:
@@ -34,7 +52,9 @@ def imu_line(table: TableSurvey, column: Survey, alone: bool, common: str | None
         keys.append("unit: deg/s")
     if table.time not in (common, None):
         keys.append(f"time: {table.time}")
-    value = f"{{{', '.join(keys)}}}" if len(keys) > 1 else keys[0].removeprefix("from: ")
+    value = (
+        f"{{{', '.join(keys)}}}" if len(keys) > 1 else keys[0].removeprefix("from: ")
+    )
     return f"imu: {{yaw_rate: {value}}}"
 
 
@@ -64,5 +84,9 @@ def _of_columns(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, Su
             around = words | {*words_of(table.name)}
             wanted = TURNING_OF_IMU if around & {"imu", "gyro"} else ()
             named = any(each <= words for each in wanted)
-            if named and column.low < column.high and not around & (NOT_MEASURED | NOT_OF_GYRO):
+            if (
+                named
+                and column.low < column.high
+                and not around & (NOT_MEASURED | NOT_OF_GYRO)
+            ):
                 yield table, column

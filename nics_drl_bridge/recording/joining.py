@@ -17,7 +17,9 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import STREAMS, Episode, Recording, Stream
 
 LEARNT_SHARE = 2.0 / 3.0  # of each recording
-APART_S = 30.0  # between two episodes: longer than any prediction and any search for a delay
+APART_S = (
+    30.0  # between two episodes: longer than any prediction and any search for a delay
+)
 LEAD_S = 2.0  # of commands before an episode, for states to follow them
 SETTLE_S = 5.0  # for which the first of these commands counts before them
 AFTER_S = 5.0  # of commands after an episode, for searches of a delay
@@ -50,16 +52,22 @@ def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Reco
     return _laid_out(aligned, learnt, held_out)
 
 
-def split_at(recording: Recording, starts: Sequence[float], names: Sequence[str]) -> Recording:
+def split_at(
+    recording: Recording, starts: Sequence[float], names: Sequence[str]
+) -> Recording:
     """Makes episodes of a recording that start at times [s] of the clock that its streams share."""
     ends = [*starts[1:], np.inf]
     parts = []
     for start, end, name in zip(starts, ends, names, strict=True):
         pose = recording.pose
-        own = replace(recording, pose=pose.rows((pose.t >= start) & (pose.t < end)), source=name)
+        own = replace(
+            recording, pose=pose.rows((pose.t >= start) & (pose.t < end)), source=name
+        )
         if len(own.pose.t) > 1:
             parts.append(own)
-    return replace(join(parts), source=recording.source) if len(parts) > 1 else recording
+    return (
+        replace(join(parts), source=recording.source) if len(parts) > 1 else recording
+    )
 
 
 def _on_one_clock(recording: Recording, offset: float) -> Recording:
@@ -97,7 +105,9 @@ def _parts_of(recording: Recording) -> list[_Part]:
     end = float(pose[-1])
     if not begin < end:
         fault = "its commands and poses share no time"
-        raise RecordingError(f"{recording.source}: {fault}; check that they are of one drive.")
+        raise RecordingError(
+            f"{recording.source}: {fault}; check that they are of one drive."
+        )
     if end - begin < SHORTEST_SPLIT_S:
         return [_Part(recording, begin, end, True, recording.source)]
     middle = begin + LEARNT_SHARE * (end - begin)
@@ -113,7 +123,9 @@ def _laid_out(
     recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
 ) -> Recording:
     """Lays parts out on one time axis, each pose beginning where the one before ended."""
-    shared = [name for name in STREAMS if all(name in each.streams for each in recordings)]
+    shared = [
+        name for name in STREAMS if all(name in each.streams for each in recordings)
+    ]
     streams: dict[str, list[Stream]] = {name: [] for name in shared}
     episodes = []
     start, place = 0.0, np.zeros(3)
@@ -127,10 +139,14 @@ def _laid_out(
             streams[name].append(replace(stream, t=stream.t + shift))
         episodes.append(Episode(part.source, start, part.end_s + shift))
         start = part.end_s + shift + APART_S
-    made: dict[str, Any] = {name: _end_to_end(name, parts) for name, parts in streams.items()}
+    made: dict[str, Any] = {
+        name: _end_to_end(name, parts) for name, parts in streams.items()
+    }
     sources = list(dict.fromkeys(part.source for part in (*learnt, *held_out)))
     until = episodes[len(learnt) - 1].end_s
-    without: dict[str, Any] = dict.fromkeys(name for name in STREAMS if name not in shared)
+    without: dict[str, Any] = dict.fromkeys(
+        name for name in STREAMS if name not in shared
+    )
     return replace(
         recordings[0],
         **without,
@@ -191,7 +207,9 @@ def _end_to_end(name: str, parts: Sequence[Stream]) -> Stream:
     """Appends streams; a deviation counts only if all of them have one."""
     for before, after in pairwise(parts):
         if after.t[0] < before.t[-1]:
-            raise RecordingError(f"{name}: two episodes overlap in time; this is a fault of ours.")
+            raise RecordingError(
+                f"{name}: two episodes overlap in time; this is a fault of ours."
+            )
     known = all(part.sigma is not None for part in parts)
     sigmas = [part.sigma for part in parts if part.sigma is not None]
     sigma = np.concatenate(sigmas) if known else None
@@ -201,13 +219,26 @@ def _end_to_end(name: str, parts: Sequence[Stream]) -> Stream:
 
 
 def _about(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
-    names = ", ".join(sources) if len(sources) <= 10 else f"{sources[0]} to {sources[-1]}"
+    names = (
+        ", ".join(sources) if len(sources) <= 10 else f"{sources[0]} to {sources[-1]}"
+    )
     held = "the last third of each was held out of the first fit"
-    held = held if is_split else "all were learnt from, as they are too short to hold a part out"
-    return (f"{len(sources)} drives were joined ({names}): {held}; no prediction crosses over.",)
+    held = (
+        held
+        if is_split
+        else "all were learnt from, as they are too short to hold a part out"
+    )
+    return (
+        f"{len(sources)} drives were joined ({names}): {held}; no prediction crosses over.",
+    )
 
 
-def _repairs_of(recordings: Sequence[Recording], shared: Sequence[str]) -> tuple[str, ...]:
+def _repairs_of(
+    recordings: Sequence[Recording], shared: Sequence[str]
+) -> tuple[str, ...]:
     lost = {name for each in recordings for name in each.streams} - {*shared}
-    told = [f"{name} was left out, as not all of the recordings have it." for name in sorted(lost)]
+    told = [
+        f"{name} was left out, as not all of the recordings have it."
+        for name in sorted(lost)
+    ]
     return (*told, *dict.fromkeys(said for each in recordings for said in each.repairs))

@@ -37,7 +37,9 @@ from nics_drl_bridge.recording.values import MappedReader, Series, together, uni
 
 QUATERNION_TOLERANCE = 0.05
 MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
-MOST_UNTRACKED = 0.05  # share of poses whose quaternion is zero: the tracker had lost the body
+MOST_UNTRACKED = (
+    0.05  # share of poses whose quaternion is zero: the tracker had lost the body
+)
 NO_LENGTH = 1e-9
 SHORTEST_S = 1.0
 SHORT_OF_EARTH = {"lat", "lon", "lng", "long"}  # short names of latitude and longitude
@@ -68,11 +70,16 @@ def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
     reader = MappedReader(source, mapping)
     _check_commands(reader, mapping.command)
     found: dict[str, Stream] = {"pose": read_pose(reader, mapping.pose)}
-    groups: Names[str, Names[str, Value]] = {"command": mapping.command, "state": mapping.state}
+    groups: Names[str, Names[str, Value]] = {
+        "command": mapping.command,
+        "state": mapping.state,
+    }
     for name, values in groups.items():
         if values:
             held = name == "command"
-            parts = [reader.series(f"{name}.{k}", v, None, held) for k, v in values.items()]
+            parts = [
+                reader.series(f"{name}.{k}", v, None, held) for k, v in values.items()
+            ]
             found[name] = together(name, parts, held)
     if mapping.imu is not None and mapping.imu.heading is not None:
         found["imu"] = _turn_rate_of_heading(reader, mapping.imu, mapping.imu.heading)
@@ -86,10 +93,16 @@ def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
     names, streams = (*mapping.state, *mapping.command), cast(Any, found)
     measured_by = mapping.pose.measured_by or _source_of_pose(source, mapping)
     made = Recording(
-        **streams, source=source.place, variables=names, latency=source.latency,
+        **streams,
+        source=source.place,
+        variables=names,
+        latency=source.latency,
         measured_by=measured_by,
-    )  # fmt: skip
-    check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
+    )
+    check_streams(
+        made,
+        {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2},
+    )
     shifted: Any = _from_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
     since = float(found["pose"].t[0] - shifted["pose"].t[0])
     return replace(made, **shifted, repairs=tuple(reader.notes)), since
@@ -99,7 +112,9 @@ def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
     """Refuses what was measured, by the name of its column, where a command is needed."""
     for name, value in commands.items():
         table, which = reader.place(value.from_)
-        is_number = isinstance(which, int) or (which not in table.names and which.isdecimal())
+        is_number = isinstance(which, int) or (
+            which not in table.names and which.isdecimal()
+        )
         known = is_number and int(which) < len(table.names)
         column = table.names[int(which)] if known else str(which)
         if why := why_no_command(column):
@@ -107,7 +122,9 @@ def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
         words = {*words_of(column)}
         if words & SHORT_OF_EARTH and _stays_near(numbers_of(table, which)):
             fault = f"{column!r} looks like a latitude or longitude, and was not sent to the robot"
-            raise ConfigError(f"{table.place}: command.{name}: {fault}; name a column that was.")
+            raise ConfigError(
+                f"{table.place}: command.{name}: {fault}; name a column that was."
+            )
 
 
 def _stays_near(values: Array) -> bool:
@@ -129,12 +146,16 @@ def _source_of_pose(source: Source, mapping: Mapping) -> MeasuredBy:
     return source_by_names((str(name) for name in names if name is not None), kind)
 
 
-def _turn_rate_of_heading(reader: MappedReader, imu: ImuSource, heading: Value) -> Stream:
+def _turn_rate_of_heading(
+    reader: MappedReader, imu: ImuSource, heading: Value
+) -> Stream:
     """Reads a second heading as accelerations of zero and the turn rate that integrates to it."""
     heading = heading.model_copy(update={"unit": heading.unit or "rad"})
     unit = unit_of(heading).si
     if unit != "rad":
-        raise ConfigError(f"imu.heading: is in {unit}, where rad is needed; check its unit.")
+        raise ConfigError(
+            f"imu.heading: is in {unit}, where rad is needed; check its unit."
+        )
     series = reader.series("imu.heading", heading, imu, held=False)
     joined = together("imu", [series], held=False)
     t = joined.t
@@ -144,13 +165,19 @@ def _turn_rate_of_heading(reader: MappedReader, imu: ImuSource, heading: Value) 
         return replace(joined, values=np.zeros((len(t), 3)))
     turned = np.unwrap(joined.values[:, 0])
     rate = np.gradient(turned, t)
-    return replace(joined, values=np.stack([np.zeros_like(t), np.zeros_like(t), rate], axis=1))
+    return replace(
+        joined, values=np.stack([np.zeros_like(t), np.zeros_like(t), rate], axis=1)
+    )
 
 
 def _check_units(reader: MappedReader, pose: Stream) -> None:
     """Refuses poses, as they were recorded, that only a wrong unit explains."""
     mapping = reader.mapping
-    given = mapping.robot.get("footprint_radius") if isinstance(mapping.robot, dict) else None
+    given = (
+        mapping.robot.get("footprint_radius")
+        if isinstance(mapping.robot, dict)
+        else None
+    )
     radius = float(given) if isinstance(given, (int, float)) else 0.0
     if fault := implausible_pose(pose.t, pose.values, radius=radius):
         time = mapping.pose.time or mapping.time
@@ -164,13 +191,23 @@ def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
     parts: list[Series | None] = []
     for key, kinds in schema.SI[name].items():
         value: Value | None = getattr(stream, key)
-        if value is not None and value.unit is not None and unit_of(value).si not in kinds:
+        if (
+            value is not None
+            and value.unit is not None
+            and unit_of(value).si not in kinds
+        ):
             fault = f"{name}.{key}: is in {unit_of(value).si}"
-            raise ConfigError(f"{fault}, where {' or '.join(kinds)} is needed; check its unit.")
-        parts.append(reader.series(f"{name}.{key}", value, stream, False) if value else None)
+            raise ConfigError(
+                f"{fault}, where {' or '.join(kinds)} is needed; check its unit."
+            )
+        parts.append(
+            reader.series(f"{name}.{key}", value, stream, False) if value else None
+        )
     joined = together(name, [part for part in parts if part is not None], held=False)
     columns = iter(joined.values.T)
-    full = [np.zeros(len(joined.t)) if part is None else next(columns) for part in parts]
+    full = [
+        np.zeros(len(joined.t)) if part is None else next(columns) for part in parts
+    ]
     return replace(joined, values=np.stack(full, axis=1))
 
 
@@ -194,13 +231,19 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
             raise ConfigError(f"{fault}; check its unit.")
         parts.append(reader.series(f"pose.{key}", value, pose, held=False))
         factors.append(abs(unit_of(value).factor * value.scale))
-        if key == "y" and unit_of(value).si == "rad":  # longitude, latitude; covariances are in m
+        if (
+            key == "y" and unit_of(value).si == "rad"
+        ):  # longitude, latitude; covariances are in m
             ground = east_and_north(parts[0].values, parts[1].values)
-            parts = [each._replace(values=v) for each, v in zip(parts, ground, strict=True)]
+            parts = [
+                each._replace(values=v) for each, v in zip(parts, ground, strict=True)
+            ]
             factors = [1.0, 1.0]
     _check_units(reader, together("pose", parts, held=False))
     heading = parts[2]
-    parts[2] = heading._replace(values=np.unwrap(heading.values))  # as it may be interpolated
+    parts[2] = heading._replace(
+        values=np.unwrap(heading.values)
+    )  # as it may be interpolated
     made = together("pose", parts, held=False)
     made.values[:, 2] = wrap_angle(made.values[:, 2])
     if pose.covariance is None:
@@ -209,11 +252,15 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
     return made if sigma is None else replace(made, sigma=sigma * np.array(factors))
 
 
-def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference]) -> Series:
+def _heading(
+    reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference]
+) -> Series:
     """Returns the heading of quaternions; those of length 0 are left out."""
     each = [f"{given}.{axis}" for axis in "xyzw"] if isinstance(given, str) else given
     parts = [
-        reader.series("pose.quaternion", Value.model_validate({"from": which}), pose, held=False)
+        reader.series(
+            "pose.quaternion", Value.model_validate({"from": which}), pose, held=False
+        )
         for which in each
     ]
     made = together("pose.quaternion", parts, held=False)
@@ -224,13 +271,17 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
         reader.say(f"pose: {some} were left out.")
         made, norm = made.rows(~lost), norm[~lost]
     for k in np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)[:1]:
-        where = f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
+        where = (
+            f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
+        )
         fault = f"{where} the quaternion has the length {norm[k]:.3f} and not 1"
         raise RecordingError(f"{fault}; list its columns in the order x, y, z, w.")
     if recordings.w_first(made.values):
         raise RecordingError(f"{reader.source.place}: pose: {recordings.W_FIRST}.")
     x, y, z, w = made.values.T
-    tilt = np.degrees(np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0))))
+    tilt = np.degrees(
+        np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0)))
+    )
     if tilt > MOST_TILT_DEG:
         fault = f"pose: by its quaternion the body is tilted by {tilt:.0f} deg"
         advice = "list its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]"
@@ -242,9 +293,10 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
 POSES = (
     ("pose.pose.position.{}", "pose.pose.orientation", "pose.covariance"),
     ("pose.position.{}", "pose.orientation", None),
-    ("transform.translation.{}", "transform.rotation", None), ("position.{}", "orientation", None),
+    ("transform.translation.{}", "transform.rotation", None),
+    ("position.{}", "orientation", None),
     ("{}", "theta", None),
-)  # fmt: skip
+)
 """Fields of messages that are poses: position, orientation, covariance."""
 
 
@@ -261,7 +313,9 @@ def _of_message(reader: MappedReader, pose: PoseSource) -> PoseSource:
                 known["covariance"] = covariance
             return PoseSource.model_validate({**given, **known})
     fault = f"{table.place}: its messages are no poses of a known form"
-    raise RecordingError(f"{fault}; name x, y and heading or quaternion in the mapping.")
+    raise RecordingError(
+        f"{fault}; name x, y and heading or quaternion in the mapping."
+    )
 
 
 def _deviations(
@@ -289,18 +343,24 @@ def _deviations(
         return None
     if unknown.any():
         rows = int(unknown.any(axis=1).sum())
-        reader.say(f"pose: {rows} of {len(t)} rows have a variance that is not positive: unknown.")
+        reader.say(
+            f"pose: {rows} of {len(t)} rows have a variance that is not positive: unknown."
+        )
     return sigma
 
 
-def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dict[str, Stream]:
+def _from_zero(
+    found: dict[str, Stream], main: str, reader: MappedReader
+) -> dict[str, Stream]:
     """Shifts stamps to begin near 0: by one origin, but for clocks whose spans do not overlap."""
     spans: dict[str, list[float]] = {}
     for name, stream in found.items():
         first, last = float(stream.t[0]), float(stream.t[-1])
         span = spans.setdefault(stream.clock, [first, last])
         if first > span[1] or last < span[0]:
-            fault = f"{reader.source.place}: {name} lasts from {first:.3f} to {last:.3f} s"
+            fault = (
+                f"{reader.source.place}: {name} lasts from {first:.3f} to {last:.3f} s"
+            )
             other = f"the streams before it from {span[0]:.3f} to {span[1]:.3f} s, on one clock"
             advice = "check their `time:`, or give one of them a `clock:` of its own"
             raise RecordingError(f"{fault}, {other}; {advice}.")
@@ -310,16 +370,26 @@ def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dic
         lasts, usual = np.ptp(stream.t), max(np.ptp(pose.t), 1e-9)
         if name == "pose" and lasts < SHORTEST_S:
             fault = f"{reader.source.place}: the pose lasts {lasts:.3g} s"
-            raise RecordingError(f"{fault}; give the `unit:` of its `time:`, as s, min or h.")
+            raise RecordingError(
+                f"{fault}; give the `unit:` of its `time:`, as s, min or h."
+            )
         if lasts and not 1.0 / MOST_RATIO < lasts / usual < MOST_RATIO:
             fault = f"{reader.source.place}: {name} lasts {lasts:.4g} s, the pose {usual:.4g} s"
-            raise RecordingError(f"{fault}; give the `unit:` of the `time:` that is wrong.")
+            raise RecordingError(
+                f"{fault}; give the `unit:` of the `time:` that is wrong."
+            )
     base = spans.get(main) or next(iter(spans.values()))
     origin = {}
-    together = [span for span in spans.values() if span[0] <= base[1] and span[1] >= base[0]]
+    together = [
+        span for span in spans.values() if span[0] <= base[1] and span[1] >= base[0]
+    ]
     first = min(span[0] for span in together)
     for clock, span in spans.items():
         origin[clock] = first if span in together else span[0]
         if span not in together:
-            reader.say(f"The clock {clock!r} was set to 0 at its first stamp, {span[0]:.3f} s.")
-    return {n: replace(each, t=each.t - origin[each.clock]) for n, each in found.items()}
+            reader.say(
+                f"The clock {clock!r} was set to 0 at its first stamp, {span[0]:.3f} s."
+            )
+    return {
+        n: replace(each, t=each.t - origin[each.clock]) for n, each in found.items()
+    }

@@ -21,27 +21,54 @@ class UnitOfData(NamedTuple):
 
 
 def _each(si: str, **factors: float) -> dict[str, UnitOfData]:
-    return {name.replace("_per_", "/"): UnitOfData(si, factor) for name, factor in factors.items()}
+    return {
+        name.replace("_per_", "/"): UnitOfData(si, factor)
+        for name, factor in factors.items()
+    }
 
 
 UNITS = {
     **_each("m", m=1.0, dm=1e-1, cm=1e-2, mm=1e-3, um=1e-6, km=1e3, ft=0.3048),
-    "in": UnitOfData("m", 0.0254), **_each("rad", rad=1.0, mrad=1e-3, deg=TURN / 360.0, rev=TURN),
+    "in": UnitOfData("m", 0.0254),
+    **_each("rad", rad=1.0, mrad=1e-3, deg=TURN / 360.0, rev=TURN),
     **_each("s", s=1.0, ms=1e-3, us=1e-6, ns=1e-9, min=60.0, h=3600.0),
-    **_each("m/s", m_per_s=1.0, cm_per_s=1e-2, mm_per_s=1e-3, mph=0.44704, knots=1852.0 / 3600.0),
+    **_each(
+        "m/s",
+        m_per_s=1.0,
+        cm_per_s=1e-2,
+        mm_per_s=1e-3,
+        mph=0.44704,
+        knots=1852.0 / 3600.0,
+    ),
     **_each("m/s", km_per_h=1.0 / 3.6, kmh=1.0 / 3.6, kph=1.0 / 3.6, ft_per_s=0.3048),
-    **_each("rad/s", rad_per_s=1.0, deg_per_s=TURN / 360.0, rpm=TURN / 60.0, rev_per_s=TURN),
-    **_each("rad/s", mrad_per_s=1e-3), "m/s^2": UnitOfData("m/s^2", 1.0),
-    "cm/s^2": UnitOfData("m/s^2", 1e-2), "mm/s^2": UnitOfData("m/s^2", 1e-3),
-    "g": UnitOfData("m/s^2", 9.80665), "mg": UnitOfData("m/s^2", 9.80665e-3),
-    **_each("V", V=1.0, mV=1e-3), **_each("A", A=1.0, mA=1e-3), **_each("N", N=1.0),
-    "N*m": UnitOfData("N*m", 1.0), "1": UnitOfData("1", 1.0), "share": UnitOfData("1", 1.0),
-    "%": UnitOfData("1", 1e-2), "ticks": UnitOfData("ticks", 1.0),
+    **_each(
+        "rad/s", rad_per_s=1.0, deg_per_s=TURN / 360.0, rpm=TURN / 60.0, rev_per_s=TURN
+    ),
+    **_each("rad/s", mrad_per_s=1e-3),
+    "m/s^2": UnitOfData("m/s^2", 1.0),
+    "cm/s^2": UnitOfData("m/s^2", 1e-2),
+    "mm/s^2": UnitOfData("m/s^2", 1e-3),
+    "g": UnitOfData("m/s^2", 9.80665),
+    "mg": UnitOfData("m/s^2", 9.80665e-3),
+    **_each("V", V=1.0, mV=1e-3),
+    **_each("A", A=1.0, mA=1e-3),
+    **_each("N", N=1.0),
+    "N*m": UnitOfData("N*m", 1.0),
+    "1": UnitOfData("1", 1.0),
+    "share": UnitOfData("1", 1.0),
+    "%": UnitOfData("1", 1e-2),
+    "ticks": UnitOfData("ticks", 1.0),
     "ticks/s": UnitOfData("ticks/s", 1.0),
-}  # fmt: skip
+}
 SHARES = ("share", "%", "1")
 TICKS = {"ticks": "rad", "ticks/s": "rad/s"}
-RATES = {"m": "m/s", "rad": "rad/s", "ticks": "ticks/s", "m/s": "m/s^2", "rad/s": "rad/s^2"}
+RATES = {
+    "m": "m/s",
+    "rad": "rad/s",
+    "ticks": "ticks/s",
+    "m/s": "m/s^2",
+    "rad/s": "rad/s^2",
+}
 
 
 def known_unit(name: str) -> str:
@@ -115,7 +142,9 @@ class Time(Schema):
     """Stamps of rows: of a column, of two that hold seconds and nanoseconds, or at a rate."""
 
     # also `header` or `arrival` of the messages of a bag
-    from_: Reference | tuple[Reference, Reference] | None = Field(default=None, alias="from")
+    from_: Reference | tuple[Reference, Reference] | None = Field(
+        default=None, alias="from"
+    )
     unit: Annotated[str | None, _of_kind(("s",))] = None  # of the stamps; None: s
     rate: float | None = Field(default=None, gt=0.0)  # of rows without stamps [Hz]
 
@@ -134,18 +163,26 @@ class Time(Schema):
 class Value(Schema):
     """A number in each row: SI value = unit x scale x what stands there + offset."""
 
-    from_: Reference = Field(alias="from")  # column by name or number, TABLE:COLUMN or /topic:field
+    from_: Reference = Field(
+        alias="from"
+    )  # column by name or number, TABLE:COLUMN or /topic:field
     unit: str | None = None  # by default that of the stream, or SI
     maximum: float | None = None  # value in SI of a full share
     scale: float = 1.0  # -1 turns the sign
     offset: float = 0.0  # in SI
-    ticks_per_turn: float | None = Field(default=None, gt=0.0)  # of an encoder, makes ticks angles
+    ticks_per_turn: float | None = Field(
+        default=None, gt=0.0
+    )  # of an encoder, makes ticks angles
     differentiate: bool | None = None  # by default true for `ticks`, which are counters
-    wrap: float | None = Field(default=None, gt=0.0)  # where a counter overflows; found if left out
+    wrap: float | None = Field(
+        default=None, gt=0.0
+    )  # where a counter overflows; found if left out
     # other columns, flags, and the values at which this one counts; `otherwise` stands in its place
     when: dict[str, Condition] = Field(default_factory=dict)
     otherwise: float = 0.0  # in SI, where a flag is not as `when` needs it
-    time: Annotated[Time | None, _short("from")] = None  # stamps of this value; None: of its stream
+    time: Annotated[Time | None, _short("from")] = (
+        None  # stamps of this value; None: of its stream
+    )
     clock: str | None = None  # name of the clock of these stamps; None: of its stream
 
     @field_validator("unit")
@@ -162,7 +199,9 @@ class Value(Schema):
     @property
     def counts(self) -> bool:
         """True for a counter, whose rate is the value."""
-        ticks = self.unit == "ticks" or (self.unit is None and self.ticks_per_turn is not None)
+        ticks = self.unit == "ticks" or (
+            self.unit is None and self.ticks_per_turn is not None
+        )
         return ticks if self.differentiate is None else self.differentiate
 
 
@@ -172,9 +211,15 @@ AValue = Annotated[Value, _short("from")]
 class Measured(Schema):
     """Keys of all streams: table of their columns, stamps, clock."""
 
-    in_: str | None = Field(default=None, alias="in")  # file or topic of columns that name none
-    time: Annotated[Time | None, _short("from")] = None  # stamps; None: those of the whole mapping
-    clock: str | None = None  # clock of the stamps; two clocks differ by an unknown offset
+    in_: str | None = Field(
+        default=None, alias="in"
+    )  # file or topic of columns that name none
+    time: Annotated[Time | None, _short("from")] = (
+        None  # stamps; None: those of the whole mapping
+    )
+    clock: str | None = (
+        None  # clock of the stamps; two clocks differ by an unknown offset
+    )
 
 
 class PoseSource(Measured):
@@ -187,7 +232,9 @@ class PoseSource(Measured):
     quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
     # of x and y, and in the covariance; an angle if they are longitude and latitude
     unit: Annotated[str, _of_kind(("m", "rad"))] = "m"
-    heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"  # of the heading and its variance
+    heading_unit: Annotated[str, _of_kind(("rad",))] = (
+        "rad"  # of the heading and its variance
+    )
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
     # what measured it: `odometry`, which drifts, or a `tracker`, as motion capture or a localiser;
@@ -206,10 +253,15 @@ class PoseSource(Measured):
         if (self.x is None) != (self.y is None):
             raise ValueError("pose needs both x and y")
         if self.x is None and self.in_ is None:
-            raise ValueError("pose needs x and y, or `in`: a topic whose messages are poses")
+            raise ValueError(
+                "pose needs x and y, or `in`: a topic whose messages are poses"
+            )
         if self.x is not None and (self.heading is None) == (self.quaternion is None):
             raise ValueError("pose needs either heading or quaternion")
-        if isinstance(self.covariance, list) and len(self.covariance) not in COVARIANCES:
+        if (
+            isinstance(self.covariance, list)
+            and len(self.covariance) not in COVARIANCES
+        ):
             raise ValueError("covariance needs 3, 9 or 36 columns")
         return self
 
@@ -248,23 +300,43 @@ class OdometrySource(Measured):
 class Mapping(Schema):
     """A recording of any form as the streams of a Recording."""
 
-    robot: str | dict[str, Any] | None = None  # a shipped robot's name, a path, or its definition
-    in_: str | None = Field(default=None, alias="in")  # file or topic of streams that name none
-    time: Annotated[Time | None, _short("from")] = None  # stamps of all streams; None: a bag's own
-    clock: str | None = None  # clock of all streams; None: `robot`, unless a bag's headers differ
+    robot: str | dict[str, Any] | None = (
+        None  # a shipped robot's name, a path, or its definition
+    )
+    in_: str | None = Field(
+        default=None, alias="in"
+    )  # file or topic of streams that name none
+    time: Annotated[Time | None, _short("from")] = (
+        None  # stamps of all streams; None: a bag's own
+    )
+    clock: str | None = (
+        None  # clock of all streams; None: `robot`, unless a bag's headers differ
+    )
     # column whose value changes from one episode to the next; None: one drive
     episode: Reference | None = None
-    pose: Annotated[PoseSource, _short("in")]  # of the tracked body; a topic alone means its `in`
+    pose: Annotated[
+        PoseSource, _short("in")
+    ]  # of the tracked body; a topic alone means its `in`
     command: dict[str, AValue]  # by the names of the robot's commands
-    state: dict[str, AValue] = Field(default_factory=dict)  # measured states, by their names
+    state: dict[str, AValue] = Field(
+        default_factory=dict
+    )  # measured states, by their names
     wheels: WheelSource | None = None  # wheel speeds, if they were recorded
-    imu: ImuSource | None = None  # acceleration and yaw rate, or a second heading, if recorded
-    odometry: OdometrySource | None = None  # the robot's own body velocity, if it was recorded
+    imu: ImuSource | None = (
+        None  # acceleration and yaw rate, or a second heading, if recorded
+    )
+    odometry: OdometrySource | None = (
+        None  # the robot's own body velocity, if it was recorded
+    )
 
     @model_validator(mode="before")
     @classmethod
     def _names_commands(cls, given: Any) -> Any:
-        if isinstance(given, dict) and "command" in given and given["command"] in (None, {}):
+        if (
+            isinstance(given, dict)
+            and "command" in given
+            and given["command"] in (None, {})
+        ):
             raise ValueError(NO_COMMAND_NAMED)
         return given
 

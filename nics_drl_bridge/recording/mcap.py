@@ -20,9 +20,17 @@ PRIVATE = 0x80  # opcodes from here on are reserved for private records
 PREFIX = 9  # bytes of opcode and length in front of a record
 CHUNK_CRC = 24  # offset of a chunk's checksum in its content
 COMPRESSIONS = ("", "lz4", "zstd")
-INSIDE = (kinds.Schema, kinds.Channel, kinds.Message)  # records that may occur in a chunk
-MOST_UNPACKED = 256 * 2**20  # maximum size of one chunk or message, decompressed [bytes]
-MOST_PACKED_SHARE = 1000  # compression ratio of a file that decompresses to more than that
+INSIDE = (
+    kinds.Schema,
+    kinds.Channel,
+    kinds.Message,
+)  # records that may occur in a chunk
+MOST_UNPACKED = (
+    256 * 2**20
+)  # maximum size of one chunk or message, decompressed [bytes]
+MOST_PACKED_SHARE = (
+    1000  # compression ratio of a file that decompresses to more than that
+)
 _PART = 2**20
 
 
@@ -59,10 +67,14 @@ def records(data: memoryview, place: int = 0) -> Iterator[Record]:
     """Yields the records from an offset until a footer or the end; DamageError at a broken one."""
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
-    parsed = StreamReader(source, skip_magic=True, emit_chunks=True, record_size_limit=None).records
+    parsed = StreamReader(
+        source, skip_magic=True, emit_chunks=True, record_size_limit=None
+    ).records
     while place < len(data):
         start = place + PREFIX
-        op, size = struct.unpack_from("<BQ", data, place) if start <= len(data) else (0, start)
+        op, size = (
+            struct.unpack_from("<BQ", data, place) if start <= len(data) else (0, start)
+        )
         end = start + size
         content: kinds.McapRecord | None = None
         if end > len(data):
@@ -90,8 +102,12 @@ class McapSummary:
 
     schemas: dict[int, kinds.Schema] = field(default_factory=dict)  # by id
     channels: dict[int, kinds.Channel] = field(default_factory=dict)  # by id
-    counts: Counter[int] = field(default_factory=Counter)  # number of messages by channel
-    span: tuple[int, int] | None = None  # first and last time [ns]; None before the first message
+    counts: Counter[int] = field(
+        default_factory=Counter
+    )  # number of messages by channel
+    span: tuple[int, int] | None = (
+        None  # first and last time [ns]; None before the first message
+    )
 
     def see(self, record: Record) -> kinds.Message | None:
         """Registers a schema, a channel or a message; returns the message."""
@@ -104,7 +120,9 @@ class McapSummary:
             self.span = min(first, found.log_time), max(last, found.log_time)
             self.counts[found.channel_id] += 1
             return found
-        known: dict[int, Any] = self.schemas if isinstance(found, kinds.Schema) else self.channels
+        known: dict[int, Any] = (
+            self.schemas if isinstance(found, kinds.Schema) else self.channels
+        )
         if known.setdefault(found.id, found) != found:
             kind = type(found).__name__.lower()
             raise DamageError(record.offset, f"a second {kind} with the id {found.id}")
@@ -115,13 +133,17 @@ def unpacked(record: Record) -> memoryview:
     """Decompresses the records of a chunk and verifies size and checksum (DamageError)."""
     chunk: kinds.Chunk = record.content
     if chunk.compression not in COMPRESSIONS:
-        raise DamageError(record.offset, f"there is no compression {chunk.compression!r}")
+        raise DamageError(
+            record.offset, f"there is no compression {chunk.compression!r}"
+        )
     try:
         plain = chunk.data
         if chunk.compression:
             plain = unpack(bytes(plain), chunk.compression, chunk.uncompressed_size)
     except Exception as error:  # noqa: BLE001 - the library can raise anything on a damaged chunk
-        raise DamageError(record.offset, f"a chunk can't be unpacked ({error})") from None
+        raise DamageError(
+            record.offset, f"a chunk can't be unpacked ({error})"
+        ) from None
     if len(plain) != chunk.uncompressed_size:
         raise DamageError(record.offset, "a chunk is not as long as it says")
     if chunk.uncompressed_crc and crc32(plain) != chunk.uncompressed_crc:
@@ -144,8 +166,12 @@ def seal(path: Path) -> None:
             struct.pack_into("<I", data, content + CHUNK_CRC, crc32(unpacked(record)))
         elif isinstance(record.content, kinds.DataEnd):
             struct.pack_into("<I", data, content, crc32(data[: record.offset]))
-        elif isinstance(record.content, kinds.Footer) and (start := record.content.summary_start):
-            struct.pack_into("<I", data, record.end - 4, crc32(data[start : record.end - 4]))
+        elif isinstance(record.content, kinds.Footer) and (
+            start := record.content.summary_start
+        ):
+            struct.pack_into(
+                "<I", data, record.end - 4, crc32(data[start : record.end - 4])
+            )
 
 
 @dataclass
@@ -183,9 +209,16 @@ def check_mcap(path: Path) -> None:
     if not isinstance(footer, kinds.Footer) or record.end != end:
         raise DamageError(record.offset, "its end has no footer")
     summary = data[footer.summary_start : record.end - 4]
-    if footer.summary_start and not walk.data_end <= footer.summary_start <= record.offset:
+    if (
+        footer.summary_start
+        and not walk.data_end <= footer.summary_start <= record.offset
+    ):
         raise DamageError(record.offset, "the footer points to no summary")
-    if footer.summary_start and footer.summary_crc and crc32(summary) != footer.summary_crc:
+    if (
+        footer.summary_start
+        and footer.summary_crc
+        and crc32(summary) != footer.summary_crc
+    ):
         raise DamageError(record.offset, "the checksum of its summary is wrong")
     _agree(walk)
 
@@ -201,9 +234,14 @@ def _in_data(walk: _Walk, record: Record, data: memoryview) -> None:
             raise DamageError(record.offset, damage.what) from None
     elif isinstance(found, kinds.MessageIndex):
         if sorted(found.records) != sorted(walk.places.pop(found.channel_id, [])):
-            raise DamageError(record.offset, "the index of a chunk does not fit its messages")
+            raise DamageError(
+                record.offset, "the index of a chunk does not fit its messages"
+            )
     elif isinstance(found, kinds.DataEnd):
-        if found.data_section_crc and crc32(data[: record.offset]) != found.data_section_crc:
+        if (
+            found.data_section_crc
+            and crc32(data[: record.offset]) != found.data_section_crc
+        ):
             raise DamageError(record.offset, "the checksum of its data is wrong")
         walk.data_end = record.end
     elif isinstance(found, (kinds.Footer, kinds.ChunkIndex, kinds.Statistics)):
@@ -221,10 +259,14 @@ def _in_chunk(walk: _Walk, record: Record) -> None:
         message = walk.data.see(inner)
         if message is not None:
             times.append(message.log_time)
-            walk.places.setdefault(message.channel_id, []).append((message.log_time, inner.offset))
+            walk.places.setdefault(message.channel_id, []).append(
+                (message.log_time, inner.offset)
+            )
     span = record.content.message_start_time, record.content.message_end_time
     if times and (min(times), max(times)) != span:
-        raise DamageError(record.offset, "a chunk's messages are not of the time that it names")
+        raise DamageError(
+            record.offset, "a chunk's messages are not of the time that it names"
+        )
     walk.chunks.add((record.offset, record.end - record.offset, *span))
 
 
@@ -248,10 +290,14 @@ def _agree(walk: _Walk) -> None:
     for name in ("schemas", "channels"):
         ours, theirs = getattr(data, name), getattr(summary, name)
         if theirs and any(theirs.get(key) != value for key, value in ours.items()):
-            raise DamageError(walk.data_end, f"the {name} of its summary are not those of its data")
+            raise DamageError(
+                walk.data_end, f"the {name} of its summary are not those of its data"
+            )
     for channel in data.channels.values():
         if channel.schema_id and channel.schema_id not in data.schemas:
-            raise DamageError(walk.data_end, f"the channel {channel.topic!r} has no schema")
+            raise DamageError(
+                walk.data_end, f"the channel {channel.topic!r} has no schema"
+            )
     if walk.indexed and walk.indexed != walk.chunks:
         raise DamageError(walk.data_end, "the index of its chunks does not fit them")
     if walk.statistics is None:
@@ -264,14 +310,18 @@ def _agree(walk: _Walk) -> None:
         and told.chunk_count in (0, len(walk.chunks))
         and data.span in (None, (told.message_start_time, told.message_end_time))
     ):
-        raise DamageError(walk.statistics.offset, "its statistics do not fit its messages")
+        raise DamageError(
+            walk.statistics.offset, "its statistics do not fit its messages"
+        )
 
 
 def _zstd() -> Any:
     try:
         return import_module("compression.zstd")
     except ImportError:
-        return import_module("backports.zstd")  # a dependency of rosbags before Python 3.14
+        return import_module(
+            "backports.zstd"
+        )  # a dependency of rosbags before Python 3.14
 
 
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
@@ -297,7 +347,9 @@ def unpack_file(path: Path, out: Path) -> Path:
         while part := file.read(_PART):
             length += plain.write(part)
             if length > most:
-                raise ValueError(f"{path.name} unpacks to more than {MOST_PACKED_SHARE} times")
+                raise ValueError(
+                    f"{path.name} unpacks to more than {MOST_PACKED_SHARE} times"
+                )
     return out
 
 

@@ -28,7 +28,9 @@ ACKERMANN_DEFINITION = (
     "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
     "float32 acceleration\nfloat32 jerk\n"
 )
-ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+ACKERMANN_STAMPED_DEFINITION = (
+    "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+)
 LIBRARIES = ("rosbags", "mcap")
 POSITION_UNITS = ("rad", "m")  # of states that a JointState reports as positions
 HEADER = "std_msgs/msg/Header"
@@ -39,7 +41,9 @@ def check_libraries(path: Path, what: str, instead: str = "") -> None:
     """Raises RecordingError if a library that `reading` or `writing` a bag needs is missing."""
     for library in (each for each in LIBRARIES if find_spec(each) is None):
         advice = f"install it with pip install 'nics_drl_bridge[bags]'{instead}"
-        raise RecordingError(f"{path}: {what} a bag needs the library {library}; {advice}.")
+        raise RecordingError(
+            f"{path}: {what} a bag needs the library {library}; {advice}."
+        )
 
 
 def typestore() -> "Typestore":
@@ -48,7 +52,9 @@ def typestore() -> "Typestore":
 
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(ACKERMANN_DEFINITION, topic_roles.ACKERMANN))
-    store.register(get_types_from_msg(ACKERMANN_STAMPED_DEFINITION, topic_roles.ACKERMANN_STAMPED))
+    store.register(
+        get_types_from_msg(ACKERMANN_STAMPED_DEFINITION, topic_roles.ACKERMANN_STAMPED)
+    )
     return store
 
 
@@ -58,13 +64,20 @@ def with_types(connections: "Sequence[Connection]", header: bool = True) -> "Typ
     That of ROS 1 for headers decodes messages, that of ROS 2 (`header` is false) converts them.
     """
     from rosbags.interfaces import MessageDefinitionFormat
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys import (
+        Stores,
+        get_types_from_idl,
+        get_types_from_msg,
+        get_typestore,
+    )
 
     own: dict[str, Any] = {}
     store = typestore()
     for connection in connections:
         form, text = connection.msgdef
-        with suppress(Exception):  # a definition that can't be parsed leaves its type unknown
+        with suppress(
+            Exception
+        ):  # a definition that can't be parsed leaves its type unknown
             if form == MessageDefinitionFormat.MSG:
                 own |= get_types_from_msg(text, connection.msgtype)
             elif form == MessageDefinitionFormat.IDL:
@@ -72,7 +85,9 @@ def with_types(connections: "Sequence[Connection]", header: bool = True) -> "Typ
                     own |= get_types_from_idl(part) if part.strip() else {}
     if not header:
         own.pop(HEADER, None)
-    new = {name: each for name, each in own.items() if store.fielddefs.get(name) != each}
+    new = {
+        name: each for name, each in own.items() if store.fielddefs.get(name) != each
+    }
     if new.keys() & store.fielddefs.keys():  # of another release, or of ROS 1
         new, store = {**store.fielddefs, **new}, get_typestore(Stores.EMPTY)
         new = {name: each for name, each in new.items() if name not in store.fielddefs}
@@ -133,7 +148,9 @@ def whole_pose(message: Any) -> Row:
 def pose_row(message: Any) -> Row:
     """Returns position x, y [m] and heading [rad]."""
     position, q = _place(message)
-    heading = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    heading = math.atan2(
+        2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)
+    )
     return position.x, position.y, heading
 
 
@@ -161,7 +178,9 @@ class Offer:
 
     depth: int = 10  # of its history
     reliable: bool = True  # False for best effort
-    transient_local: bool = False  # late subscribers get earlier messages; False for volatile
+    transient_local: bool = (
+        False  # late subscribers get earlier messages; False for volatile
+    )
 
 
 def offers_of(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:
@@ -185,8 +204,13 @@ def profile_of(offer: Offer) -> "Qos":
     forever = rosbags.QosTime(9223372036, 854775807)
     reliability, durability = rosbags.QosReliability, rosbags.QosDurability
     return rosbags.Qos(
-        rosbags.QosHistory.KEEP_LAST, offer.depth,
+        rosbags.QosHistory.KEEP_LAST,
+        offer.depth,
         reliability.RELIABLE if offer.reliable else reliability.BEST_EFFORT,
         durability.TRANSIENT_LOCAL if offer.transient_local else durability.VOLATILE,
-        forever, forever, rosbags.QosLiveliness.AUTOMATIC, forever, False,
-    )  # fmt: skip
+        forever,
+        forever,
+        rosbags.QosLiveliness.AUTOMATIC,
+        forever,
+        False,
+    )

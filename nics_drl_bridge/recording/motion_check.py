@@ -19,7 +19,9 @@ CLEAR_CORRELATION = 0.6  # from which on a latency is told
 FEWEST = 100  # steps
 
 
-def doubts_of_commands(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterator[str]:
+def doubts_of_commands(
+    guess: CommandGuess, pose: tuple[Array, Array] | None
+) -> Iterator[str]:
     """Yields sentences on commands that do not go with the motion, or long before or after it.
 
     `pose` are its stamps (T,) [s] and poses (T, 3).
@@ -49,7 +51,9 @@ def doubts_of_commands(guess: CommandGuess, pose: tuple[Array, Array] | None) ->
             yield f"{early}, as a measurement's would; check `time:` and the command"
 
 
-def reversed_wheels(guess: CommandGuess, pose: tuple[Array, Array] | None) -> list[Candidate]:
+def reversed_wheels(
+    guess: CommandGuess, pose: tuple[Array, Array] | None
+) -> list[Candidate]:
     """Returns the measured wheel, left or right, that counts backwards, as the motion shows.
 
     Both have to turn the same way when the robot moves, and the right one faster when it turns
@@ -96,15 +100,21 @@ def _rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
     heading = np.unwrap(pose[:, 2])
     x, y, turned = (np.interp(grid, t, column) for column in (*pose[:, :2].T, heading))
     mean = np.ones(SMOOTHED) / SMOOTHED
-    dx, dy, turn = (np.convolve(np.diff(each) / STEP_S, mean, "same") for each in (x, y, turned))
+    dx, dy, turn = (
+        np.convolve(np.diff(each) / STEP_S, mean, "same") for each in (x, y, turned)
+    )
     middle = (turned[1:] + turned[:-1]) / 2.0
     ahead = dx * np.cos(middle) + dy * np.sin(middle)
     aside = -dx * np.sin(middle) + dy * np.cos(middle)
-    along = ahead if np.abs(ahead).sum() >= np.abs(aside).sum() else aside  # a turned tracker
+    along = (
+        ahead if np.abs(ahead).sum() >= np.abs(aside).sum() else aside
+    )  # a turned tracker
     return grid[:-1] + STEP_S / 2.0, along, turn
 
 
-def _likeness(candidate: Candidate, t: Array, signal: Array, lags: Array) -> Array | None:
+def _likeness(
+    candidate: Candidate, t: Array, signal: Array, lags: Array
+) -> Array | None:
     """Returns the correlation of a signal (K,) at t (K,) with a command, by lags (L,) [s]."""
     table, column = candidate.table, candidate.column
     values = table.data[column.name].astype(np.float64)
@@ -119,7 +129,11 @@ def _likeness(candidate: Candidate, t: Array, signal: Array, lags: Array) -> Arr
         row = np.searchsorted(stamps, t - lag, side="right") - 1
         known = row >= 0
         command = values[np.clip(row, 0, None)]
-        if known.sum() < FEWEST or command[known].std() < 1e-9 or signal[known].std() < 1e-9:
+        if (
+            known.sum() < FEWEST
+            or command[known].std() < 1e-9
+            or signal[known].std() < 1e-9
+        ):
             return None
         likeness.append(abs(float(np.corrcoef(command[known], signal[known])[0, 1])))
     return np.array(likeness)

@@ -14,14 +14,48 @@ from nics_drl_bridge.recording.recording import led_along
 from nics_drl_bridge.recording.survey import TableSurvey, unit_in
 
 # Words of the first coordinate, and of the second beside it.
-AXES = {"x": "y", "px": "py", "tx": "ty", "posx": "posy", "easting": "northing", "east": "north"}
+AXES = {
+    "x": "y",
+    "px": "py",
+    "tx": "ty",
+    "posx": "posy",
+    "easting": "northing",
+    "east": "north",
+}
 GLOBE = {"longitude": "latitude", "lon": "lat", "lng": "lat", "long": "lat"}
 ALL_AXES = AXES | GLOBE
-HEADINGS = ("yaw", "heading", "theta", "psi", "th", "hdg", "orientation", "angle", "phi")
+HEADINGS = (
+    "yaw",
+    "heading",
+    "theta",
+    "psi",
+    "th",
+    "hdg",
+    "orientation",
+    "angle",
+    "phi",
+)
 # Words of columns that are places of something else, and of motions, sensors and deviations.
 OTHERS = {
-    *("goal", "target", "waypoint", "waypoints", "ref", "reference", "setpoint", "desired"),
-    *("initialpose", "marker", "markers", "obstacle", "obstacles", "landmark", "landmarks"),
+    *(
+        "goal",
+        "target",
+        "waypoint",
+        "waypoints",
+        "ref",
+        "reference",
+        "setpoint",
+        "desired",
+    ),
+    *(
+        "initialpose",
+        "marker",
+        "markers",
+        "obstacle",
+        "obstacles",
+        "landmark",
+        "landmarks",
+    ),
     *(
         "person",
         "people",
@@ -36,18 +70,67 @@ OTHERS = {
     ),
 }
 NOT_PLACES = OTHERS | {
-    *("linear", "angular", "twist", "velocity", "vel", "acc", "accel", "acceleration", "speed"),
-    *("rate", "gyro", "mag", "magnetic", "magnetometer", "gravity", "force", "torque", "jerk"),
+    *(
+        "linear",
+        "angular",
+        "twist",
+        "velocity",
+        "vel",
+        "acc",
+        "accel",
+        "acceleration",
+        "speed",
+    ),
+    *(
+        "rate",
+        "gyro",
+        "mag",
+        "magnetic",
+        "magnetometer",
+        "gravity",
+        "force",
+        "torque",
+        "jerk",
+    ),
     *("steer", "steering", "wheel", "joy", "axes", "user", "pixel", "image", "camera"),
     *("laser", "scan", "lidar", "range", "beam", "info", "map"),
     *("error", "err", "std", "stddev", "sigma", "var", "variance", "cov", "covariance"),
 }
 TURNS = {"q", "quat", "quaternion", "rotation", "orientation"}
 # The source of a pose by its name: a tracker before a localiser before odometry.
-TRACKERS = {"vicon", "mocap", "vrpn", "optitrack", "qualisys", "gt", "truth", "groundtruth"}
+TRACKERS = {
+    "vicon",
+    "mocap",
+    "vrpn",
+    "optitrack",
+    "qualisys",
+    "gt",
+    "truth",
+    "groundtruth",
+}
 TRACKERS |= {"tracker"}
-LOCALISERS = {"pose", "amcl", "pf", "slam", "cartographer", "rtabmap", "filtered", "fused", "ekf"}
-SENSORS = {"odom", "odometry", "imu", "gyro", "measured", "encoder", "wheel", "feedback", "model"}
+LOCALISERS = {
+    "pose",
+    "amcl",
+    "pf",
+    "slam",
+    "cartographer",
+    "rtabmap",
+    "filtered",
+    "fused",
+    "ekf",
+}
+SENSORS = {
+    "odom",
+    "odometry",
+    "imu",
+    "gyro",
+    "measured",
+    "encoder",
+    "wheel",
+    "feedback",
+    "model",
+}
 # Types of messages that hold positions of something else, or of a goal.
 OTHER_PLACES = re.compile(
     r"^(visualization|actionlib|action|move_base|map)_msgs/"
@@ -80,7 +163,9 @@ class PoseGuess(NamedTuple):
 def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
     """Finds x, y and heading, or a quaternion: by their names, else where the motion shows them."""
     beside = len(tables) > 1  # then the names of tables tell what they hold
-    mine = [table for table in tables if not (beside and {*words_of(table.name)} & OTHERS)]
+    mine = [
+        table for table in tables if not (beside and {*words_of(table.name)} & OTHERS)
+    ]
     found = [guess for table in mine for guess in _named_poses(table)]
     if not found:
         found = [guess for table in mine for guess in _unnamed_poses(table)]
@@ -116,7 +201,9 @@ def _named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
             y = named.get(tuple(second if word == first else word for word in words))
             if first not in words or y is None or not {x, y} & moving:
                 continue
-            if {*words} & (NOT_PLACES | TURNS) or not _is_in(x, first in GLOBE, "m", "rad"):
+            if {*words} & (NOT_PLACES | TURNS) or not _is_in(
+                x, first in GLOBE, "m", "rad"
+            ):
                 continue
             turned = _turned(table, words, named)
             if turned is not None:
@@ -148,14 +235,24 @@ def _turned(
                 quaternion = tuple(named[one] for one in each)
                 if best is None or 100.0 + shared > best[0]:
                     best = 100.0 + shared, None, quaternion
-        elif words[-1] in HEADINGS and not {*words} & NOT_PLACES and _is_in(name, True, "rad"):
+        elif (
+            words[-1] in HEADINGS
+            and not {*words} & NOT_PLACES
+            and _is_in(name, True, "rad")
+        ):
             rank = shared - 0.1 * HEADINGS.index(words[-1])
             if best is None or rank > best[0]:
                 best = rank, name, ()
     if best is not None:
         return best[1], best[2]
-    z = named.get((*place[:-1], "z")) if place[-1] == "x" and "position" not in place else None
-    low, high = next(((c.low, c.high) for c in table.columns if c.name == z), (0.0, 0.0))
+    z = (
+        named.get((*place[:-1], "z"))
+        if place[-1] == "x" and "position" not in place
+        else None
+    )
+    low, high = next(
+        ((c.low, c.high) for c in table.columns if c.name == z), (0.0, 0.0)
+    )
     if (
         z is not None
         and _is_in(z, True, "rad")
@@ -171,7 +268,9 @@ def _leads(table: TableSurvey, place: tuple[str, ...], z: str) -> bool:
     """True if a path leads along what is called z, as it is then a heading and no height."""
     y = (*place[:-1], "y")
     named = {tuple(unit_in(column.name)[0]): column.name for column in table.numbers}
-    columns = [table.data[name].astype(np.float64) for name in (named[place], named[y], z)]
+    columns = [
+        table.data[name].astype(np.float64) for name in (named[place], named[y], z)
+    ]
     if len({len(each) for each in columns}) > 1:
         return False
     pose = np.stack(columns, axis=1)
@@ -179,7 +278,9 @@ def _leads(table: TableSurvey, place: tuple[str, ...], z: str) -> bool:
     if (np.abs(np.diff(pose[:, 2])) > NEARLY_A_TURN).any():
         return True  # it wraps, as only an angle does
     pose = thinned(pose)
-    return len(pose) > 2 and max(led_along(pose, 1.0), led_along(pose, -1.0)) > CONFIRMED
+    return (
+        len(pose) > 2 and max(led_along(pose, 1.0), led_along(pose, -1.0)) > CONFIRMED
+    )
 
 
 def thinned(pose: Array) -> Array:
@@ -227,12 +328,17 @@ def _with_quaternion(
     if len({len(each) for each in four}) > 1:
         return None  # of several streams
     turns = any(np.ptp(each) > 0.0 for each in four)
-    if not turns or not np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH:
+    if (
+        not turns
+        or not np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH
+    ):
         return None
     if recordings.w_first(np.stack(four, axis=1)):
         turn = [*turn[1:], turn[0]]
         four = [*four[1:], four[0]]
-    place = [name for word in ("x", "y") for name in names if unit_in(name)[0] == [word]]
+    place = [
+        name for word in ("x", "y") for name in names if unit_in(name)[0] == [word]
+    ]
     place = [name for name in place if name not in turn]
     x, y = place if len(place) == 2 else names[max(k - 3, 0) :][:2]
     if {*words_of(f"{x} {y}")} & NOT_PLACES or {x, y} & {*turn}:

@@ -16,7 +16,12 @@ from nics_drl_bridge.recording.bag_reader import load_bag
 from nics_drl_bridge.recording.bag_table import Bag
 from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
-from nics_drl_bridge.recording.recording import Recording, check, is_recording, load_recording
+from nics_drl_bridge.recording.recording import (
+    Recording,
+    check,
+    is_recording,
+    load_recording,
+)
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles, assign
@@ -25,7 +30,10 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, definition, robot_from
 
 FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
-FILES, WHEELS = ("cmd.csv", "vrpn.csv"), ("L_wheel.csv", "R_wheel.csv")  # what it has, may have
+FILES, WHEELS = (
+    ("cmd.csv", "vrpn.csv"),
+    ("L_wheel.csv", "R_wheel.csv"),
+)  # what it has, may have
 MOST_BYTES = 64 * 2**20  # of each of these; by --map tables may be larger
 
 
@@ -50,28 +58,40 @@ def _load_folder(path: Path, *_: object) -> Recording:
         mapping = mapping.model_copy(update={"wheels": None})
     for each in (path / name for name in FILES + WHEELS * wheels):
         if each.stat().st_size > MOST_BYTES:
-            fault = f"{each}: is larger than {MOST_BYTES // 2**20} MB, which few drives are"
+            fault = (
+                f"{each}: is larger than {MOST_BYTES // 2**20} MB, which few drives are"
+            )
             raise RecordingError(f"{fault}; cut it, or give --map {file}.")
     try:
         with open_source(path) as source:
             return replace(read_mapped(source, mapping), variables=())
     except RecordingError as error:
         fault = str(error).removesuffix(".")
-        raise RecordingError(f"{fault}; the mapping is {file}, --map gives another.") from None
+        raise RecordingError(
+            f"{fault}; the mapping is {file}, --map gives another."
+        ) from None
 
 
 FORMATS = (
     Format("a bag", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
-    Format(f"a folder with {' and '.join(FILES)}", lambda p: _holds(p, FILES), _load_folder),
-    Format("an .npz file", lambda p: p.suffix == ".npz", lambda path, *_: load_recording(path)),
+    Format(
+        f"a folder with {' and '.join(FILES)}", lambda p: _holds(p, FILES), _load_folder
+    ),
+    Format(
+        "an .npz file",
+        lambda p: p.suffix == ".npz",
+        lambda path, *_: load_recording(path),
+    ),
 )
 """The first that recognises a path reads it."""
 
 
 def read_recording(
-    path: str | Path, spec: RobotSpec | None = None, topics: TopicRoles | None = None,
+    path: str | Path,
+    spec: RobotSpec | None = None,
+    topics: TopicRoles | None = None,
     mapping: Mapping | str | Path | None = None,
-) -> Recording:  # fmt: skip
+) -> Recording:
     """Reads any recording by a mapping or its file, else one of `FORMATS`, a bag with its robot.
 
     RecordingError, ConfigError: it is missing or unreadable, or does not fit robot or mapping.
@@ -107,15 +127,22 @@ def why_no_mapping(path: Path) -> str:
             topics = assign(TopicRoles(), bag.types, bag.empty, bag.place)
         except RecordingError:
             return ""
-    used = " and ".join(topics[role] for role in ("cmd_vel", "pose", "odom") if role in topics)
+    used = " and ".join(
+        topics[role] for role in ("cmd_vel", "pose", "odom") if role in topics
+    )
     return f"has topics of known names and types ({used})"
 
 
 def _by_mapping(
-    path: Path, spec: RobotSpec | None, topics: TopicRoles, mapping: Mapping | str | Path
+    path: Path,
+    spec: RobotSpec | None,
+    topics: TopicRoles,
+    mapping: Mapping | str | Path,
 ) -> Recording:
     if topics != TopicRoles():
-        raise ConfigError("--topics and --topic do not go with --map; name the topics in the map.")
+        raise ConfigError(
+            "--topics and --topic do not go with --map; name the topics in the map."
+        )
     given = _loaded(mapping)
     with open_source(path, given) as source:
         recording = read_mapped(source, given)
@@ -137,7 +164,11 @@ def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
             si = unit_of(value).si
             if si and si != variable.unit != "1":
                 turns = si.startswith("ticks") and variable.unit.startswith("rad")
-                cure = "add `ticks_per_turn:`" if turns else "check its unit, or give `scale:`"
+                cure = (
+                    "add `ticks_per_turn:`"
+                    if turns
+                    else "check its unit, or give `scale:`"
+                )
                 fault = f"{stream}.{variable.name}: is in {si}, where {variable.unit} is needed"
                 raise ConfigError(f"{fault}; {cure}.")
 
@@ -147,7 +178,10 @@ def _loaded(mapping: Mapping | str | Path) -> Mapping:
 
 
 def robot_and_drive(
-    path: Path, robot: str | None, topics: TopicRoles, mapping: Mapping | str | Path | None
+    path: Path,
+    robot: str | None,
+    topics: TopicRoles,
+    mapping: Mapping | str | Path | None,
 ) -> tuple[RobotSpec, Recording]:
     """Reads a drive with its robot: the named one, else its mapping's or own, or the default."""
     if mapping is not None:
@@ -159,7 +193,9 @@ def robot_and_drive(
         return spec, arranged(drive, spec)
     if not is_recording(path):
         own: str | dict[str, Any] | None = robot
-        if not robot and _holds(path, FILES) and not is_bag(path):  # read by its shipped mapping
+        if (
+            not robot and _holds(path, FILES) and not is_bag(path)
+        ):  # read by its shipped mapping
             own = load_mapping(find_config(FOLDER, "recordings")).robot
         spec = robot_from(own or DEFAULT_ROBOT)
         return spec, read_recording(path, spec, topics)
@@ -178,7 +214,10 @@ def robot_and_drives(
     read = [robot_and_drive(path, robot, topics, mapping) for path in paths]
     first, *others = [spec for spec, _ in read]
     for path, spec in zip(paths[1:], others, strict=True):
-        if spec.variable_names != first.variable_names or spec.textbook != first.textbook:
+        if (
+            spec.variable_names != first.variable_names
+            or spec.textbook != first.textbook
+        ):
             fault = f"{path}: is a drive of {spec.name!r}, {paths[0]} of {first.name!r}"
             raise RecordingError(f"{fault}; fit only drives of one robot together.")
     if others:
@@ -204,7 +243,9 @@ def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:
     """Returns the robot of a mapping, whose commands reach as far as in its recording."""
     given = _loaded(mapping)
     if (robot := given.robot or recording.robot) is None:
-        raise ConfigError("the mapping names no robot; add `robot:` to it, or give --robot.")
+        raise ConfigError(
+            "the mapping names no robot; add `robot:` to it, or give --robot."
+        )
     return _ranged(robot, recording, recording.variables or tuple(given.command))
 
 
@@ -214,7 +255,9 @@ def _ranged(
     """Returns a robot; ranges of commands that it leaves out are those that were recorded."""
     low, high = (f(recording.command.values, axis=0).tolist() for f in (np.min, np.max))
     names = variables[-len(low) :]
-    return robot_from(robot, dict(zip(names, zip(low, high, strict=True), strict=False)))
+    return robot_from(
+        robot, dict(zip(names, zip(low, high, strict=True), strict=False))
+    )
 
 
 def arranged(recording: Recording, spec: RobotSpec) -> Recording:
@@ -223,7 +266,10 @@ def arranged(recording: Recording, spec: RobotSpec) -> Recording:
         return check(recording, spec)
     count = recording.command.values.shape[1]
     made: dict[str, Any] = {}
-    parts = {"command": (slice(-count, None), spec.command), "state": (slice(-count), spec.state)}
+    parts = {
+        "command": (slice(-count, None), spec.command),
+        "state": (slice(-count), spec.state),
+    }
     for part, (place, variables) in parts.items():
         known, names = recording.variables[place], [v.name for v in variables]
         if (stream := recording.streams.get(part)) is None:
@@ -231,7 +277,9 @@ def arranged(recording: Recording, spec: RobotSpec) -> Recording:
         if set(known) != set(names):
             fault = f"{recording.source}: the {part} is {', '.join(known)}"
             other = f"that of the robot {spec.name!r} {', '.join(names)}"
-            raise ConfigError(f"{fault}, {other}; use the robot's names in the mapping.")
+            raise ConfigError(
+                f"{fault}, {other}; use the robot's names in the mapping."
+            )
         order = [known.index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])
     return check(replace(recording, **made, variables=spec.variable_names), spec)

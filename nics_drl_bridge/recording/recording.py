@@ -22,12 +22,19 @@ from nics_drl_bridge.robot.spec import RobotSpec
 FORMAT = "nics_drl_bridge/recording/4"
 PLAIN_FORMAT = "nics_drl_bridge/recording/3"  # without deviations and repairs
 COMMENT_FORMAT = "nics_drl_bridge/recording/2"  # checksum in the comment of the archive
-UNSEALED_FORMAT = "nics_drl_bridge/recording/1"  # without checksum; all three can still be read
+UNSEALED_FORMAT = (
+    "nics_drl_bridge/recording/1"  # without checksum; all three can still be read
+)
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
 MeasuredBy = Literal["", "odometry", "tracker", "truth"]
 """What measured a pose: odometry, which drifts; motion capture or a localiser; a simulation."""
-IRREGULAR = 0.5  # share of the median by which a step differs if it is a gap or a repetition
-JITTER, ROUNDING_S = 1e-4, 1e-6  # steps that differ by less are equally long, but for rounding
+IRREGULAR = (
+    0.5  # share of the median by which a step differs if it is a gap or a repetition
+)
+JITTER, ROUNDING_S = (
+    1e-4,
+    1e-6,
+)  # steps that differ by less are equally long, but for rounding
 
 LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implausible,
 TOO_FAST = 20.0  # and so is a speed of more than this many times the greatest command
@@ -36,7 +43,9 @@ SLOWEST_SAMPLING_S = 2.0
 # Acceleration that no wheeled robot reaches for a quarter of the time [m/s^2]: one whose radius is
 # below 1 m; and any, as race cars press themselves to the ground.
 HARDEST, HARDEST_OF_CARS, SMALL_M = 14.0, 60.0, 1.0
-SLOWEST_IN_CM = 300.0  # speed from which on millimetres are likelier than centimetres [m/s]
+SLOWEST_IN_CM = (
+    300.0  # speed from which on millimetres are likelier than centimetres [m/s]
+)
 FASTEST_TURN = 15.0  # a robot that turns faster for long [rad/s] does so in degrees
 FULL_TURN_DEG = 360.0
 # A heading in degrees leads along the path to this share, better by so much than the same in
@@ -44,7 +53,10 @@ FULL_TURN_DEG = 360.0
 ALONG, LESS_ALONG, ALONG_BY_CHANCE = 0.9, 0.2, 0.05
 MIN_DIRECTIONS = 30  # a reversed axis shows in a path of more pieces than this,
 MIN_TURN = 1.0  # that turns by this [rad],
-MIRRORED, BETTER = 0.9, 0.15  # and leads along mirrored headings, by so much more than as given
+MIRRORED, BETTER = (
+    0.9,
+    0.15,
+)  # and leads along mirrored headings, by so much more than as given
 # Squares of what a level body has none of, x and y, in quaternions in another order than read.
 TILTED, LEVEL = 0.05, 0.01
 W_FIRST = "its quaternions look like w, x, y, z of a level body; list them in the order x, y, z, w"
@@ -59,7 +71,9 @@ class Stream:
     t: Array  # (T,) stamps [s], never decreasing
     values: Array  # (T, D)
     clock: str = "robot"
-    sigma: Array | None = None  # (T, D) standard deviations of the values, where they are known
+    sigma: Array | None = (
+        None  # (T, D) standard deviations of the values, where they are known
+    )
 
     @property
     def weights(self) -> Array:
@@ -68,7 +82,9 @@ class Stream:
             return np.ones_like(self.values)
         known = np.isfinite(self.sigma) & (self.sigma > 0.0)
         columns = zip(self.sigma.T, known.T, strict=True)
-        usual = [np.median(column[own]) if own.any() else 1.0 for column, own in columns]
+        usual = [
+            np.median(column[own]) if own.any() else 1.0 for column, own in columns
+        ]
         share = np.where(known, self.sigma, usual) / usual
         return np.asarray(np.clip(share**-2.0, *WEIGHTS))
 
@@ -99,14 +115,28 @@ class Recording:
     command: Stream  # (T, C) in the order of the RobotSpec
     pose: Stream  # (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame
     state: Stream | None = None  # (T, S) measured, in the order of the RobotSpec
-    wheels: Stream | None = None  # (T, 2) left and right wheel speed in the encoder's units
-    imu: Stream | None = None  # (T, 3) acceleration along x, y [m/s^2], yaw rate [rad/s]
-    odometry: Stream | None = None  # (T, 3) vx, vy [m/s], yaw rate [rad/s] of the wheels
+    wheels: Stream | None = (
+        None  # (T, 2) left and right wheel speed in the encoder's units
+    )
+    imu: Stream | None = (
+        None  # (T, 3) acceleration along x, y [m/s^2], yaw rate [rad/s]
+    )
+    odometry: Stream | None = (
+        None  # (T, 3) vx, vy [m/s], yaw rate [rad/s] of the wheels
+    )
     source: str = "recording"  # its origin, for reports and errors
-    variables: tuple[str, ...] = ()  # names of X = [state, command] of the recorded robot, if known
-    robot: dict[str, Any] | None = None  # its definition as in its YAML file, if a mapping says it
-    latency: Latency = field(default_factory=Latency)  # of scan and odometry, if it shows
-    repairs: tuple[str, ...] = ()  # a sentence on each thing that reading mended, as of its clocks
+    variables: tuple[
+        str, ...
+    ] = ()  # names of X = [state, command] of the recorded robot, if known
+    robot: dict[str, Any] | None = (
+        None  # its definition as in its YAML file, if a mapping says it
+    )
+    latency: Latency = field(
+        default_factory=Latency
+    )  # of scan and odometry, if it shows
+    repairs: tuple[
+        str, ...
+    ] = ()  # a sentence on each thing that reading mended, as of its clocks
     measured_by: MeasuredBy = ""  # what measured the pose; empty if nothing tells
     # How odometry and gyro turned, if the heading is from the gyro or confirmed by it
     gyro: Turning | None = None
@@ -131,7 +161,9 @@ class Recording:
         step = np.diff(t)
         across = np.diff(self.episode_at(t)) > 0
         usual = float(np.median(step[~across])) if not across.all() else 0.0
-        return np.asarray(t[0] + np.append(0.0, np.cumsum(np.where(across, usual, step))))
+        return np.asarray(
+            t[0] + np.append(0.0, np.cumsum(np.where(across, usual, step)))
+        )
 
     def driven_s(self, until_s: float = np.inf) -> float:
         """Returns how long the robot drove until a time from the first pose on [s], all gaps out.
@@ -167,20 +199,26 @@ class Samples:
         return Samples(self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt)
 
 
-def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
+def samples_on_one_clock(
+    t: Array, pose: Array, state: Array, command: Array
+) -> Samples:
     """Builds Samples of shared stamps [s], a row per regular step, without gaps and repetitions."""
     span = np.diff(t)
     dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
     regular = np.abs(span - dt) < IRREGULAR * dt
-    length = np.where(np.abs(span - dt) < JITTER * dt + ROUNDING_S, dt, span)[regular, None]
+    length = np.where(np.abs(span - dt) < JITTER * dt + ROUNDING_S, dt, span)[
+        regular, None
+    ]
     first, last = np.flatnonzero(regular), np.flatnonzero(regular) + 1
     twist = geometry.log(geometry.between(pose[first], pose[last])) / length
     rates = (state[last] - state[first]) / length
     return Samples(
-        t=t[first], q=np.concatenate([pose, state], axis=1)[first],
+        t=t[first],
+        q=np.concatenate([pose, state], axis=1)[first],
         x=np.concatenate([state, command], axis=1)[first],
-        dq=np.concatenate([twist, rates], axis=1), dt=dt,
-    )  # fmt: skip
+        dq=np.concatenate([twist, rates], axis=1),
+        dt=dt,
+    )
 
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
@@ -193,12 +231,16 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
         problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
         advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
         raise RecordingError(f"{problem}; {advice}: choose the robot that drove.")
-    check_streams(recording, {"command": len(spec.command), "state": len(spec.state), "wheels": 2})
+    check_streams(
+        recording, {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
+    )
     speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
     pose, radius = recording.pose, spec.footprint_radius
     if fault := implausible_pose(pose.t, pose.values, fastest, radius):
-        raise RecordingError(f"{recording.source}: pose: {fault.reason}; {fault.cause}.")
+        raise RecordingError(
+            f"{recording.source}: pose: {fault.reason}; {fault.cause}."
+        )
     return recording
 
 
@@ -235,10 +277,12 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         if stream.sigma is not None:
             arrays[f"{name}_sigma"] = stream.sigma
     meta: dict[str, Any] = {
-        "format": FORMAT, "source": recording.source,
+        "format": FORMAT,
+        "source": recording.source,
         "clocks": {name: stream.clock for name, stream in streams.items()},
-        "variables": recording.variables, "repairs": recording.repairs,
-    }  # fmt: skip
+        "variables": recording.variables,
+        "repairs": recording.repairs,
+    }
     if recording.measured_by:
         meta["measured_by"] = recording.measured_by
     if recording.robot is not None:
@@ -262,15 +306,24 @@ def load_recording(path: str | Path) -> Recording:
         version = meta["format"]
         if version in (FORMAT, PLAIN_FORMAT):
             files.check_sealed(io.BytesIO(data))
-        elif version == COMMENT_FORMAT and data[-64:] != files.sha256(data[:-64]).encode():
+        elif (
+            version == COMMENT_FORMAT
+            and data[-64:] != files.sha256(data[:-64]).encode()
+        ):
             raise ValueError("its checksum is missing or does not fit the rest")
         if version not in (FORMAT, PLAIN_FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
             advice = "record it anew or use the version of the package that wrote it"
-            raise RecordingError(f"{path}: format {version!r} is not {FORMAT!r}; {advice}.")
-        streams: Any = {n: _stream(arrays, n, clock) for n, clock in meta["clocks"].items()}
+            raise RecordingError(
+                f"{path}: format {version!r} is not {FORMAT!r}; {advice}."
+            )
+        streams: Any = {
+            n: _stream(arrays, n, clock) for n, clock in meta["clocks"].items()
+        }
         latency = Latency.model_validate(meta.get("latency", {}))
         variables, repairs = tuple(meta["variables"]), tuple(meta.get("repairs", ()))
-        found = Recording(**streams, source=str(path), variables=variables, latency=latency)
+        found = Recording(
+            **streams, source=str(path), variables=variables, latency=latency
+        )
         measured_by = meta.get("measured_by", "")
         if measured_by not in get_args(MeasuredBy):
             raise ValueError(f"measured_by is {measured_by!r}")
@@ -313,8 +366,13 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` file's content. Raises ValueError if it is damaged or too large."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > files.MOST_BYTES:
-                raise ValueError(f"unpacked it is larger than {files.MOST_BYTES // 2**20} MB")
+            if (
+                sum(member.file_size for member in archive.infolist())
+                > files.MOST_BYTES
+            ):
+                raise ValueError(
+                    f"unpacked it is larger than {files.MOST_BYTES // 2**20} MB"
+                )
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # noqa: BLE001 - damage breaks zipfile and numpy in any way
@@ -355,7 +413,9 @@ def _degrees(t: Array, pose: Array) -> Implausible | None:
         return None
     around = np.abs(np.abs(np.diff(heading)) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
     every = _spaced(t)
-    rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(t[every])
+    rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(
+        t[every]
+    )
     turns = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
     if not (around.any() or turns or _only_along(pose[every], np.pi / 180.0)):
         return None
@@ -400,7 +460,9 @@ def clockwise_line(pose: Array, least: float = MIRRORED, better: float = BETTER)
     mirrored = _course(pose, -1.0)
     if abs(mirrored) < max(least, better + led_along(pose, 1.0)):
         return ""
-    return "scale: -1" if mirrored.real > 0.0 else f"scale: -1, offset: {np.pi / 2.0:.5g}"
+    return (
+        "scale: -1" if mirrored.real > 0.0 else f"scale: -1, offset: {np.pi / 2.0:.5g}"
+    )
 
 
 def led_along(pose: Array, scale: float) -> float:
@@ -424,7 +486,9 @@ def _spaced(t: Array) -> NDArray[np.intp]:
     return np.unique(np.floor((t - t[0]) / SPEED_OVER_S), return_index=True)[1]
 
 
-def _too_fast(t: Array, pose: Array, fastest: float, hardest: float) -> Implausible | None:
+def _too_fast(
+    t: Array, pose: Array, fastest: float, hardest: float
+) -> Implausible | None:
     every = _spaced(t)
     step, took = np.diff(pose[every, :2], axis=0), np.diff(t[every])
     if not len(took):
@@ -434,11 +498,15 @@ def _too_fast(t: Array, pose: Array, fastest: float, hardest: float) -> Implausi
     cause = "positions must be in metres and stamps in seconds"
     line = "unit: mm" if speed > SLOWEST_IN_CM else "unit: cm"
     if speed > TOO_FAST * fastest:
-        reason = f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
+        reason = (
+            f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
+        )
         return Implausible(reason, cause, line)
     if np.isfinite(fastest) or len(took) < 3:
         return None
-    hard = np.percentile(np.hypot(*np.diff(velocity, axis=0).T) / np.maximum(took[1:], 1e-9), 75)
+    hard = np.percentile(
+        np.hypot(*np.diff(velocity, axis=0).T) / np.maximum(took[1:], 1e-9), 75
+    )
     if hard <= hardest:
         return None
     reason = f"moves at {speed:.3g} m/s and changes that by {hard:.3g} m/s^2"

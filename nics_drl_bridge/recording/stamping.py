@@ -22,19 +22,47 @@ RECEIVE, HEADER = "receive", "header"
 # Median delay from header to receipt on the recorder's own clock: a localiser may take its time,
 # but nothing is received before it was stamped.
 SAME_CLOCK_S = (-0.001, 1.0)
-MAX_WANDER_S = 1.0  # the delay from headers of one clock to their receipt varies by less
-STALLED = 2.0  # percentage of messages that a stalled recorder may have received even later,
+MAX_WANDER_S = (
+    1.0  # the delay from headers of one clock to their receipt varies by less
+)
+STALLED = (
+    2.0  # percentage of messages that a stalled recorder may have received even later,
+)
 MAX_STALL_S = 30.0  # but by no more than this
 MAX_LATE = 0.01  # share of messages that may arrive after one with a later stamp
-MAX_UNSTAMPED = 0.05  # share that may lack a stamp at the start: a simulation has no time yet
-ROBOT_STREAMS = ("command", "state", "wheels", "imu")  # of one computer, and so of one clock
+MAX_UNSTAMPED = (
+    0.05  # share that may lack a stamp at the start: a simulation has no time yet
+)
+ROBOT_STREAMS = (
+    "command",
+    "state",
+    "wheels",
+    "imu",
+)  # of one computer, and so of one clock
 
-SPLIT = (("s", "ns"), ("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("sec", "nsecs"))
+SPLIT = (
+    ("s", "ns"),
+    ("sec", "nanosec"),
+    ("secs", "nsecs"),
+    ("sec", "nsec"),
+    ("sec", "nsecs"),
+)
 ROWS_A_SECOND = 5  # from which on stamps in whole seconds lack the rest
-COUNTING = 16.0  # times the usual step of a counter fit between its overflows, which lose
-LOST, PARTS = 2.0, 10  # no more than this many steps; its values are in all of so many parts
-GROWN, ONE_WAY = 2000.0, 0.95  # or they go so far, which is this share of all their steps
-BACK, WITHIN = 0.2, 25.0  # a speed goes this share of its steps back at once, within so many
+COUNTING = (
+    16.0  # times the usual step of a counter fit between its overflows, which lose
+)
+LOST, PARTS = (
+    2.0,
+    10,
+)  # no more than this many steps; its values are in all of so many parts
+GROWN, ONE_WAY = (
+    2000.0,
+    0.95,
+)  # or they go so far, which is this share of all their steps
+BACK, WITHIN = (
+    0.2,
+    25.0,
+)  # a speed goes this share of its steps back at once, within so many
 TREMBLING = 4.0  # ticks of a wheel that stands
 BITS = (8, 16, 24, 31, 32)  # of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
@@ -51,7 +79,9 @@ class TopicData:
 
     topic: str
     receive_ns: Nanoseconds  # (T,) times of receipt
-    header_ns: Nanoseconds | None  # (T,) stamps of the headers; None if the type has no header
+    header_ns: (
+        Nanoseconds | None
+    )  # (T,) stamps of the headers; None if the type has no header
     values: Array  # (T, D)
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:
@@ -61,9 +91,11 @@ class TopicData:
 
 
 def streams(
-    data: Mapping[str, TopicData], stamps: Stamps, place: str,
+    data: Mapping[str, TopicData],
+    stamps: Stamps,
+    place: str,
     of_robot: Collection[str] = ROBOT_STREAMS,
-) -> dict[str, Stream]:  # fmt: skip
+) -> dict[str, Stream]:
     """Stamps each stream, from near 0 on; RecordingError: headers are missing or unusable."""
     # With `auto`, by headers if there are any. Those less than 1 s before their receipt are of the
     # recorder's clock, others of a foreign one: shifted by the median delay, they leave a small
@@ -93,11 +125,17 @@ def streams(
 
 def go_on_together(parts: Iterable[TopicData]) -> bool:
     """True if the headers of all go on without a leap, at whatever rate beside the receipt."""
-    received, stamped = zip(*((part.receive_ns, part.header_ns) for part in parts), strict=True)
+    received, stamped = zip(
+        *((part.receive_ns, part.header_ns) for part in parts), strict=True
+    )
     if any(ns is None or not ns.all() for ns in stamped):
         return False
     order = np.argsort(np.concatenate(received), kind="stable")
-    return bool((np.abs(np.diff(np.concatenate(stamped)[order])) * S_PER_NS < MAX_WANDER_S).all())
+    return bool(
+        (
+            np.abs(np.diff(np.concatenate(stamped)[order])) * S_PER_NS < MAX_WANDER_S
+        ).all()
+    )
 
 
 def _clocks(
@@ -122,7 +160,11 @@ def _clocks(
                 "header`), and record it with `ros2 bag record --use-sim-time`."
             )
         if not SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
-            alike = (c for c, d in foreign.items() if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1])
+            alike = (
+                c
+                for c, d in foreign.items()
+                if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1]
+            )
             clock = next(alike, f"{HEADER} of {topic}" if foreign else HEADER)
             clocks[name] = (clock, foreign.setdefault(clock, median))
     return clocks
@@ -138,7 +180,9 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
         return None
     if not ns.all():
         fault = f"{(ns == 0).sum()} of {len(ns)} headers have no stamp"
-        advice = "write `stamps: receive` into the topics file (`time: arrival` into a map)"
+        advice = (
+            "write `stamps: receive` into the topics file (`time: arrival` into a map)"
+        )
         raise RecordingError(f"{topic}: {fault}; {advice}.")
     return ns
 
@@ -157,7 +201,9 @@ def _in_order(part: TopicData, place: str) -> TopicData:
     if np.mean(late > 0) > MAX_LATE or late.max() * S_PER_NS > MAX_WANDER_S:
         k = int(np.argmax(late > 0))
         fault = f"the header stamps run backwards at message {k}, by {late[k] * S_PER_NS:.3f} s"
-        advice = "write `stamps: receive` into the topics file (`time: arrival` into a map)"
+        advice = (
+            "write `stamps: receive` into the topics file (`time: arrival` into a map)"
+        )
         advice += ", or cut the bag there"
         raise RecordingError(f"{place}: topic {part.topic!r}: {fault}; {advice}.")
     return part.rows(np.argsort(ns, kind="stable"))
@@ -165,7 +211,9 @@ def _in_order(part: TopicData, place: str) -> TopicData:
 
 def _by_receipt(part: TopicData, origin: int) -> Stream:
     order = np.argsort(part.receive_ns, kind="stable")
-    return Stream(_seconds(part.receive_ns[order] - origin), part.values[order], RECEIVE)
+    return Stream(
+        _seconds(part.receive_ns[order] - origin), part.values[order], RECEIVE
+    )
 
 
 def _seconds(ns: Nanoseconds) -> Array:
@@ -177,7 +225,9 @@ def joined(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
     return np.asarray(seconds + nanoseconds * S_PER_NS, dtype=np.float64)
 
 
-def overflow(values: Array, scale: tuple[float, ...], bits: tuple[int, ...]) -> float | None:
+def overflow(
+    values: Array, scale: tuple[float, ...], bits: tuple[int, ...]
+) -> float | None:
     """Returns the range of a register that overflows in values (T,), which are counts x scale.
 
     An overflow leaves a jump of more than half of the range, after which the values go on as before
@@ -190,7 +240,11 @@ def overflow(values: Array, scale: tuple[float, ...], bits: tuple[int, ...]) -> 
     span = float(np.ptp(values))
     for size in sorted(2.0**b * s for b in bits for s in scale):
         jump = np.abs(step) > size / 2.0
-        if max(span, np.abs(values).max()) > size or not jump.any() or jump.mean() > 0.5:
+        if (
+            max(span, np.abs(values).max()) > size
+            or not jump.any()
+            or jump.mean() > 0.5
+        ):
             continue
         rest = np.abs(step[jump] - np.sign(step[jump]) * size)
         if rest.max() <= USUAL * max(usual, size * 1e-9):
@@ -216,7 +270,11 @@ def counter(values: Array) -> str:
         return ""
     usual, lost = float(np.percentile(step, 95)), size - step[step > size / 2.0]
     calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
-    return f"overflows at {size:.10g}" if calm and np.histogram(values, PARTS)[0].all() else ""
+    return (
+        f"overflows at {size:.10g}"
+        if calm and np.histogram(values, PARTS)[0].all()
+        else ""
+    )
 
 
 def comes_back(values: Array) -> bool:
@@ -233,7 +291,11 @@ def rows_a_second(t: Array) -> int:
     """Returns how many stamps (T,) in whole seconds repeat, as if their rest were lost; else 0."""
     seconds = np.unique(t)
     usual = np.median(np.diff(seconds)) if len(seconds) > 1 else 0.0
-    lost = usual == 1.0 and (t == np.round(t)).all() and len(t) >= ROWS_A_SECOND * len(seconds)
+    lost = (
+        usual == 1.0
+        and (t == np.round(t)).all()
+        and len(t) >= ROWS_A_SECOND * len(seconds)
+    )
     return round(len(t) / len(seconds)) if lost else 0
 
 
@@ -245,7 +307,10 @@ def without_overflow(t: Array, name: str) -> tuple[Array, str]:
     if size is None:
         return t, ""
     made, count = unwrapped(t, size)
-    return made, f"{name}: its clock overflowed at {size:.10g} {times(count)}, and was continued."
+    return (
+        made,
+        f"{name}: its clock overflowed at {size:.10g} {times(count)}, and was continued.",
+    )
 
 
 def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
@@ -259,7 +324,9 @@ def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         notes.append(f"{name}: its rows began with the last, and were turned round.")
     if (stray := _stray(t)).any():
         where = f"(row {rows[stray][0]}: {t[stray][0]:.10g} s)"
-        notes.append(f"{name}: {stray.sum()} stamps fit none beside them {where}; left out.")
+        notes.append(
+            f"{name}: {stray.sum()} stamps fit none beside them {where}; left out."
+        )
         t, rows = t[~stray], rows[~stray]
     late = np.maximum.accumulate(t) - t
     run, longest = 0, 0
@@ -269,7 +336,9 @@ def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     if 0 < longest <= LATE_ROWS and late.max() <= LATE_S:
         order = np.argsort(t, kind="stable")
         finding = f"{int((late > 0.0).sum())} of {len(t)} rows came after later ones"
-        notes.append(f"{name}: {finding}, by up to {late.max():.3g} s, and were sorted.")
+        notes.append(
+            f"{name}: {finding}, by up to {late.max():.3g} s, and were sorted."
+        )
         t, rows = t[order], rows[order]
     step = np.diff(t)
     if (jump := (step < 0.0) | (step > LONGEST_PAUSE_S)).any() and not jump.all():
@@ -304,4 +373,6 @@ def not_repeated(t: Array, values: Array, name: str) -> tuple[NDArray[np.bool_],
     if not again.any():
         return np.ones(len(t), dtype=np.bool_), ""
     finding = f"{int(again.sum())} of {len(t)} rows repeat the row before them"
-    return np.append(True, ~again), f"{name}: {finding}, stamp and all, and were left out."
+    return np.append(
+        True, ~again
+    ), f"{name}: {finding}, stamp and all, and were left out."

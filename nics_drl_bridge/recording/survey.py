@@ -18,9 +18,22 @@ from nics_drl_bridge.recording.values import dates_of
 
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # of a table
-SHORTEST_STEP_S = 1e-4  # stamps that would be closer are not in the unit that their name says
+SHORTEST_STEP_S = (
+    1e-4  # stamps that would be closer are not in the unit that their name says
+)
 MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
-TIMES = {"time", "times", "stamp", "timestamp", "t", "s", "sec", "secs", "seconds", "elapsed"}
+TIMES = {
+    "time",
+    "times",
+    "stamp",
+    "timestamp",
+    "t",
+    "s",
+    "sec",
+    "secs",
+    "seconds",
+    "elapsed",
+}
 TIMES |= {"ms", "us", "ns", "millis", "micros", "nanos", "date", "datetime"}
 # Units as they end a name (`yaw_deg`, `v_m_s`), the longest first.
 ENDINGS: dict[tuple[str, ...], str] = {
@@ -152,7 +165,11 @@ class TableSurvey:
     @property
     def regularity(self) -> list[str]:
         """Sentences on rate, gaps, stamps that run backwards, repeated rows and missing values."""
-        return [] if self.t is None or len(self.t) < 2 else list(_regularity(self.t, self.data))
+        return (
+            []
+            if self.t is None or len(self.t) < 2
+            else list(_regularity(self.t, self.data))
+        )
 
     def reference(self, column: str, alone: bool) -> str:
         """Returns how a mapping refers to a column."""
@@ -171,12 +188,17 @@ def survey(source: Source) -> list[TableSurvey]:
     if unread is not None and not any(table.columns for table in found):
         raise unread
     # Units of stamps are such that all tables last about as long as those in seconds.
-    lasting = [float(np.ptp(each.t)) for each in found if each.t is not None and not each.unit]
+    lasting = [
+        float(np.ptp(each.t)) for each in found if each.t is not None and not each.unit
+    ]
     for table in found:
         if table.t is None or not table.unit or not lasting:
             continue
         raw = table.t / UNITS[table.unit].factor
-        ratio = {u: np.ptp(raw) * UNITS[u].factor / np.median(lasting) for u in ("ms", "us", "ns")}
+        ratio = {
+            u: np.ptp(raw) * UNITS[u].factor / np.median(lasting)
+            for u in ("ms", "us", "ns")
+        }
         table.unit = min(ratio, key=lambda unit: abs(np.log(max(ratio[unit], 1e-30))))
         table.t = raw * UNITS[table.unit].factor
     return found
@@ -223,7 +245,10 @@ def _range(column: Column) -> tuple[float, float]:
 def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     """Guesses the column of stamps: by its name, and by how steadily it rises."""
     for seconds, rest in stamping.SPLIT:
-        if all(each in data and data[each].dtype.kind not in "US" for each in (seconds, rest)):
+        if all(
+            each in data and data[each].dtype.kind not in "US"
+            for each in (seconds, rest)
+        ):
             return f"[{seconds}, {rest}]", stamping.joined(data[seconds], data[rest])
 
     def merit(name: str) -> float:
@@ -235,9 +260,15 @@ def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
         anonymous = name.isdecimal() and not counts
         return (named + 0.5 * anonymous) * float(np.mean(step > 0.0))
 
-    numbers = {name: c.astype(np.float64) for name, c in data.items() if c.dtype.kind not in "US"}
+    numbers = {
+        name: c.astype(np.float64)
+        for name, c in data.items()
+        if c.dtype.kind not in "US"
+    }
     texts = {name: dates_of(c) for name, c in data.items() if c.dtype.kind in "US"}
-    values = numbers | {name: dates for name, dates in texts.items() if dates is not None}
+    values = numbers | {
+        name: dates for name, dates in texts.items() if dates is not None
+    }
     best = max(values, key=merit, default=None)
     return (None, None) if best is None or merit(best) < 0.25 else (best, values[best])
 
@@ -252,7 +283,11 @@ def _regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:
         yield f"gaps: {gaps}, the longest of {step.max():.3g} s after {where:.1f} s"
     if back := int((step < 0.0).sum()):
         yield f"stamps that run backwards: {back}"
-    numbers = {name: c.astype(np.float64) for name, c in data.items() if c.dtype.kind not in "US"}
+    numbers = {
+        name: c.astype(np.float64)
+        for name, c in data.items()
+        if c.dtype.kind not in "US"
+    }
     whole = [c for c in numbers.values() if len(c) == len(t)]
     same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
     if again := int((step == 0.0).sum()):

@@ -10,10 +10,38 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.names import words_of
 from nics_drl_bridge.recording.survey import Survey, TableSurvey
 
-ENABLING = {"safety", "enable", "enabled", "armed", "active", "activated", "auto", "autonomous"}
+ENABLING = {
+    "safety",
+    "enable",
+    "enabled",
+    "armed",
+    "active",
+    "activated",
+    "auto",
+    "autonomous",
+}
 ENABLING |= {"autonomy", "deadman", "engaged", "engage"}
-DISABLING = {"estop", "emergency", "kill", "stop", "stopped", "disabled", "manual", "fault"}
-ON_WORDS = {"auto", "autonomous", "autonomy", "enabled", "on", "armed", "active", "offboard", "run"}
+DISABLING = {
+    "estop",
+    "emergency",
+    "kill",
+    "stop",
+    "stopped",
+    "disabled",
+    "manual",
+    "fault",
+}
+ON_WORDS = {
+    "auto",
+    "autonomous",
+    "autonomy",
+    "enabled",
+    "on",
+    "armed",
+    "active",
+    "offboard",
+    "run",
+}
 MODES = {"mode", "state", "status", "safety", "switch"} | ENABLING
 FASTER = 2.0  # the robot moves so much faster while the switch is on
 FEWEST = 20  # rows of each value of the switch, from which on the motion tells
@@ -37,7 +65,9 @@ def quoted_key(text: str) -> str:
     return f'"{text}"'
 
 
-def guess_switch(tables: Sequence[TableSurvey], pose: tuple[Array, Array] | None) -> Switch | None:
+def guess_switch(
+    tables: Sequence[TableSurvey], pose: tuple[Array, Array] | None
+) -> Switch | None:
     """Finds the only switch, by its name; `pose`, stamps (T,) and poses (T, 3), may deny it."""
     found = []
     for table in tables:
@@ -61,7 +91,9 @@ def _on_value(words: set[str], table: TableSurvey, column: Survey) -> str | None
         return on[0] if words & MODES and len(texts) == 2 and len(on) == 1 else None
     if data.dtype.kind not in "fiub":
         return None
-    values = {float(each) for each in np.unique(data[np.isfinite(data.astype(np.float64))])}
+    values = {
+        float(each) for each in np.unique(data[np.isfinite(data.astype(np.float64))])
+    }
     if values != {0.0, 1.0}:
         return None
     if words & DISABLING or {"e", "stop"} <= words:
@@ -88,7 +120,9 @@ def _is_denied(
     while_off = moved & ~is_on[1:] & ~is_on[:-1]
     if while_on.sum() < FEWEST or while_off.sum() < FEWEST:
         return False
-    speeds = [float(step[rows].sum() / span[rows].sum()) for rows in (while_on, while_off)]
+    speeds = [
+        float(step[rows].sum() / span[rows].sum()) for rows in (while_on, while_off)
+    ]
     return speeds[0] < FASTER * speeds[1]
 
 

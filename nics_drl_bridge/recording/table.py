@@ -23,7 +23,9 @@ class Table:
 
     place: str  # path, and topic, for errors
     names: tuple[str, ...]  # "" for a column without one
-    column: Callable[[str | int], Column]  # by name, or number from 0; RecordingError: no such
+    column: Callable[
+        [str | int], Column
+    ]  # by name, or number from 0; RecordingError: no such
     row: Callable[[int], str]  # names a row for errors
     notes: Sequence[str] = ()  # a sentence on each thing that reading mended
     # stamps that come with the rows, and in `values` (T, 1) these rows, if any
@@ -43,14 +45,19 @@ def table_of(
     def row(k: int) -> str:
         return f"row {k}" if lines is None else f"line {lines[k]}"
 
-    return Table(place, names, lambda which: data[_number(place, names, which)], row, notes)
+    return Table(
+        place, names, lambda which: data[_number(place, names, which)], row, notes
+    )
 
 
 class Source:
     """A recording of any format, as tables."""
 
     def __init__(self, place: str, names: Sequence[str]) -> None:
-        self.place, self.names = place, tuple(names)  # path, for errors; names of its tables
+        self.place, self.names = (
+            place,
+            tuple(names),
+        )  # path, for errors; names of its tables
         self._read: dict[str, Table] = {}
 
     @property
@@ -75,7 +82,9 @@ def _number(place: str, names: Sequence[str], which: str | int) -> int:
         if (count := Counter(names)[which]) > 1:
             numbers = [str(k) for k, name in enumerate(names) if name == which]
             advice = f"give the number of the one you mean: {' or '.join(numbers)}"
-            raise RecordingError(f"{place}: {count} columns are called {which!r}; {advice}.")
+            raise RecordingError(
+                f"{place}: {count} columns are called {which!r}; {advice}."
+            )
         return names.index(which)
     if isinstance(which, int) or which.isdecimal():
         if 0 <= int(which) < len(names):
@@ -83,7 +92,11 @@ def _number(place: str, names: Sequence[str], which: str | int) -> int:
         columns = f"its columns are 0 to {len(names) - 1}"
         raise RecordingError(f"{place}: has no column {which}; {columns}.")
     named = [name for name in names if name]
-    hint = nearest(which, named) if named else "they have no names: give its number, from 0."
+    hint = (
+        nearest(which, named)
+        if named
+        else "they have no names: give its number, from 0."
+    )
     raise RecordingError(f"{place}: has no column {which!r}; {hint}")
 
 
@@ -98,7 +111,9 @@ def numbers_of(table: Table, which: str | int) -> Array:
         except ValueError:
             fault = f"column {which!r} is {str(text)[:40]!r}, which is no number"
             advice = "mend or remove the row, or choose another column"
-            raise RecordingError(f"{table.place}: {table.row(k)}: {fault}; {advice}.") from None
+            raise RecordingError(
+                f"{table.place}: {table.row(k)}: {fault}; {advice}."
+            ) from None
     return np.array([float(text or "nan") for text in column])
 
 
@@ -106,7 +121,10 @@ def flattened(arrays: Mapping[str, Column]) -> Iterator[tuple[str, Column]]:
     """Yields columns of arrays: 1-D as they are, `name[k]` of 2-D, the fields of records."""
     for name, array in arrays.items():
         if array.dtype.names:
-            inner = {f"{name}.{field}".lstrip("."): array[field] for field in array.dtype.names}
+            inner = {
+                f"{name}.{field}".lstrip("."): array[field]
+                for field in array.dtype.names
+            }
             yield from flattened(inner)
         elif array.ndim == 1:
             yield name, array

@@ -49,7 +49,11 @@ def read_text_table(path: Path) -> Table:
     head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
     if head is None and comments:
         head = _title_in_comment(comments[-1], separator, width)
-    if head is None and width == len(TUM) and (separator is None or path.suffix == TUM_SUFFIX):
+    if (
+        head is None
+        and width == len(TUM)
+        and (separator is None or path.suffix == TUM_SUFFIX)
+    ):
         head = list(TUM) if _is_tum(columns) else None
     if head is None and (named := _labelled(columns)):
         columns, head = named
@@ -71,19 +75,27 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     try:
         text = data.decode("utf-16" if data[:2] in UTF_16 else "utf-8-sig")
     except UnicodeDecodeError:
-        text = data.decode("latin-1")  # as written by old tools: a degree sign in a header
+        text = data.decode(
+            "latin-1"
+        )  # as written by old tools: a degree sign in a header
     if "\0" in text:
         raise RecordingError(f"{path}: is not text; save it as CSV in UTF-8.")
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if (count := text.count("\n")) > MOST_ROWS:
-        raise RecordingError(f"{path}: has {count} rows; cut it to at most {MOST_ROWS}.")
+        raise RecordingError(
+            f"{path}: has {count} rows; cut it to at most {MOST_ROWS}."
+        )
     lines = [(k, line) for k, line in enumerate(text.split("\n"), 1) if line.strip()]
     for k, line in lines:
         if len(line) > LONGEST_ROW:
             fault = f"line {k} has {len(line)} characters, which no row has"
             raise RecordingError(f"{path}: {fault}; remove it.")
-    comments = [line.lstrip("#/% ") for _, line in lines if line.lstrip().startswith(COMMENTS)]
-    return [each for each in lines if not each[1].lstrip().startswith(COMMENTS)], comments
+    comments = [
+        line.lstrip("#/% ") for _, line in lines if line.lstrip().startswith(COMMENTS)
+    ]
+    return [
+        each for each in lines if not each[1].lstrip().startswith(COMMENTS)
+    ], comments
 
 
 def _split(line: str, separator: str | None) -> list[str]:
@@ -95,9 +107,14 @@ def _split(line: str, separator: str | None) -> list[str]:
     return list(map(str.strip, fields))
 
 
-def _title_in_comment(comment: str, separator: str | None, width: int) -> list[str] | None:
+def _title_in_comment(
+    comment: str, separator: str | None, width: int
+) -> list[str] | None:
     """Returns the names of the columns if a comment lists them; wide gaps may separate them."""
-    for fields in (_split(comment, separator), re.split(r"\t+|\s{2,}", comment.strip())):
+    for fields in (
+        _split(comment, separator),
+        re.split(r"\t+|\s{2,}", comment.strip()),
+    ):
         if len(fields) == width:
             return fields
     return None
@@ -131,22 +148,32 @@ def _first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
         full = [field for field in row if field]
         return 2 * sum(map(_is_value, full)) > len(full)
 
-    widths = Counter(len(row) for row in rows[:: 1 + len(rows) // MOST_SAMPLED] if numeric(row))
+    widths = Counter(
+        len(row) for row in rows[:: 1 + len(rows) // MOST_SAMPLED] if numeric(row)
+    )
     if not widths:
         advice = "give a table of numbers, a column each, with or without a header"
         raise RecordingError(f"{path}: holds no row of numbers; {advice}.")
     width = widths.most_common(1)[0][0]
-    return next(k for k, row in enumerate(rows) if len(row) == width and numeric(row)), width
+    return next(
+        k for k, row in enumerate(rows) if len(row) == width and numeric(row)
+    ), width
 
 
 def _of_one_width(
-    path: Path, rows: list[list[str]], at: NDArray[np.intp], above: list[list[str]], width: int
+    path: Path,
+    rows: list[list[str]],
+    at: NDArray[np.intp],
+    above: list[list[str]],
+    width: int,
 ) -> tuple[list[list[str]], NDArray[np.intp], list[str]]:
     """Leaves out headers that are repeated, and the few rows that were cut short."""
     file, notes = path.name, []
     new = np.array([row not in above for row in rows], dtype=np.bool_)
     if not new.all():
-        notes.append(f"{file}: {(~new).sum()} lines repeat the header, and were left out.")
+        notes.append(
+            f"{file}: {(~new).sum()} lines repeat the header, and were left out."
+        )
     fits = np.array([len(row) == width for row in rows], dtype=np.bool_)
     broken = np.flatnonzero(new & ~fits)
     if len(broken) > max(1.0, MOST_BROKEN * new.sum()):
@@ -155,7 +182,9 @@ def _of_one_width(
         raise RecordingError(f"{path}: {fault} {advice}.")
     if len(broken):
         where = ", ".join(map(str, at[broken[:5]]))
-        notes.append(f"{file}: {len(broken)} lines of another length (line {where}) were left out.")
+        notes.append(
+            f"{file}: {len(broken)} lines of another length (line {where}) were left out."
+        )
     kept = np.flatnonzero(new & fits)
     whole = [rows[k] for k in kept]
     while width > 1 and not any(row[width - 1] for row in whole):
@@ -171,7 +200,9 @@ def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
     except ValueError:
         return False
     norm = np.linalg.norm(values[4:], axis=0)
-    return bool(np.median(np.abs(norm - 1.0)) < 0.01 and np.median(np.diff(values[0])) > 0.0)
+    return bool(
+        np.median(np.abs(norm - 1.0)) < 0.01 and np.median(np.diff(values[0])) > 0.0
+    )
 
 
 def _labelled(columns: Sequence[list[str]]) -> tuple[list[list[str]], list[str]] | None:
@@ -223,14 +254,20 @@ def read_arrays(path: Path) -> Table:
         raise RecordingError(f"{path}: can't be read ({why}); {advice}.") from None
     columns = list(flattened(arrays))
     if not columns:
-        raise RecordingError(f"{path}: holds no columns; give arrays of one value or more a row.")
-    return table_of(str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns))
+        raise RecordingError(
+            f"{path}: holds no columns; give arrays of one value or more a row."
+        )
+    return table_of(
+        str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns)
+    )
 
 
 def read_parquet(path: Path) -> Table:
     """Reads a Parquet file; RecordingError if it is damaged, or pyarrow is missing."""
     if find_spec("pyarrow") is None:
-        raise RecordingError(f"{path}: Parquet needs the library pyarrow; pip install pyarrow.")
+        raise RecordingError(
+            f"{path}: Parquet needs the library pyarrow; pip install pyarrow."
+        )
     parquet = import_module("pyarrow.parquet")
     try:
         table = parquet.read_table(no_device(path))
@@ -238,14 +275,22 @@ def read_parquet(path: Path) -> Table:
     except Exception as error:  # noqa: BLE001 - damage breaks the reader in any way
         why = " ".join(str(error).split())[:200]
         raise RecordingError(f"{path}: can't be read as Parquet ({why}).") from None
-    stamps = [c.astype("datetime64[ns]").astype(str) if c.dtype.kind == "M" else c for c in columns]
-    texts = [np.array([*map(str, c)], np.str_) if c.dtype.kind == "O" else c for c in stamps]
+    stamps = [
+        c.astype("datetime64[ns]").astype(str) if c.dtype.kind == "M" else c
+        for c in columns
+    ]
+    texts = [
+        np.array([*map(str, c)], np.str_) if c.dtype.kind == "O" else c for c in stamps
+    ]
     return table_of(str(path), tuple(table.column_names), tuple(texts))
 
 
 READERS: dict[str, Callable[[Path], Table]] = {
-    ".npz": read_arrays, ".npy": read_arrays, ".parquet": read_parquet, ".pq": read_parquet,
-}  # fmt: skip
+    ".npz": read_arrays,
+    ".npy": read_arrays,
+    ".parquet": read_parquet,
+    ".pq": read_parquet,
+}
 
 
 class Files(Source):
@@ -256,9 +301,13 @@ class Files(Source):
         inside = [path] if path.is_file() else sorted(path.rglob("*"))
         some = [file for file in inside if file.suffix.lower() in known or file == path]
         if not some:
-            raise RecordingError(f"{path}: holds no file of a known format ({', '.join(known)}).")
+            raise RecordingError(
+                f"{path}: holds no file of a known format ({', '.join(known)})."
+            )
         root = path.parent if path.is_file() else path
-        self._files = {file.relative_to(root).as_posix(): file for file in some[:MOST_FILES]}
+        self._files = {
+            file.relative_to(root).as_posix(): file for file in some[:MOST_FILES]
+        }
         super().__init__(str(path), tuple(self._files))
 
     def read(self, name: str) -> Table:

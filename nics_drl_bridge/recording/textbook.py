@@ -11,23 +11,35 @@ from nics_drl_bridge.robot.spec import RobotSpec
 INTEGRATION_STEP_S = 1e-3
 
 
-def _arc(book: Textbook, state: Array, goal: Array, since: Array | float, h: float) -> Array:
+def _arc(
+    book: Textbook, state: Array, goal: Array, since: Array | float, h: float
+) -> Array:
     """Returns body twist x duration (..., 3) of a substep that begins `since` [s] after `state`."""
     # By the Magnus expansion of fourth order (Iserles, Norsett 1999).
     early, late = (
-        book.twist(book.respond(state, goal, since + (0.5 + sign * np.sqrt(3.0) / 6.0) * h))
+        book.twist(
+            book.respond(state, goal, since + (0.5 + sign * np.sqrt(3.0) / 6.0) * h)
+        )
         for sign in (-1.0, 1.0)
     )
     wa, wb = early[..., 2], late[..., 2]
-    bx, by = wb * early[..., 1] - wa * late[..., 1], wa * late[..., 0] - wb * early[..., 0]
+    bx, by = (
+        wb * early[..., 1] - wa * late[..., 1],
+        wa * late[..., 0] - wb * early[..., 0],
+    )
     bracket = np.stack([bx, by, np.zeros_like(wa)], axis=-1)
-    return np.asarray((early + late) * (h / 2.0) + bracket * (np.sqrt(3.0) / 12.0 * h * h))
+    return np.asarray(
+        (early + late) * (h / 2.0) + bracket * (np.sqrt(3.0) / 12.0 * h * h)
+    )
 
 
 def record(
-    spec: RobotSpec, rng: np.random.Generator, duration: float = 60.0, dt: float = 0.01,
+    spec: RobotSpec,
+    rng: np.random.Generator,
+    duration: float = 60.0,
+    dt: float = 0.01,
     hold: float = 0.5,
-) -> Recording:  # fmt: skip
+) -> Recording:
     """Records a textbook robot without noise; commands last `hold`, rows are `dt` apart [s]."""
     book = textbook(spec)
     inner = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))
@@ -48,7 +60,10 @@ def record(
     pose = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
-        Stream(t, np.repeat(held, per_hold, axis=0)), Stream(t, pose[::inner]),
-        Stream(t, state[::inner]) if spec.state else None, source=f"textbook {spec.name}",
-        variables=spec.variable_names, measured_by="truth",
-    )  # fmt: skip
+        Stream(t, np.repeat(held, per_hold, axis=0)),
+        Stream(t, pose[::inner]),
+        Stream(t, state[::inner]) if spec.state else None,
+        source=f"textbook {spec.name}",
+        variables=spec.variable_names,
+        measured_by="truth",
+    )

@@ -26,9 +26,11 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
 TYPES = {
     "cmd_vel": (TWIST, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN),
-    "pose": (POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, ODOMETRY), "odom": (ODOMETRY,),
-    "joint_states": (JOINTS,), "imu": (IMU,),
-}  # fmt: skip
+    "pose": (POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, ODOMETRY),
+    "odom": (ODOMETRY,),
+    "joint_states": (JOINTS,),
+    "imu": (IMU,),
+}
 """Allowed message types of each role."""
 NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}  # only if the user assigns the role
 GROUND_TRUTH = r"ground_?truth"
@@ -64,11 +66,15 @@ class TopicRoles(Schema):
     odom: str | None = None
     joint_states: str | None = None  # JointState, for measured state and wheel speeds
     imu: str | None = None  # Imu
-    frame: str | None = None  # parent of the transforms to use, for a `pose` topic with several
+    frame: str | None = (
+        None  # parent of the transforms to use, for a `pose` topic with several
+    )
     child_frame: str | None = None  # their child, the robot
     # joint of each state variable; by default guessed by the joints' names
     state: dict[str, JointSource | str] = Field(default_factory=dict)
-    wheels: tuple[str, str] | None = None  # left and right joint of wheel speeds; None: guessed
+    wheels: tuple[str, str] | None = (
+        None  # left and right joint of wheel speeds; None: guessed
+    )
     # `header` takes all times from the messages' headers, `receive` from their receipt by the bag,
     # `auto` from the header if there is one
     stamps: Stamps = "auto"
@@ -84,20 +90,30 @@ def imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
     return () if wanted in (NONE, "") else (wanted,)
 
 
-def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> TopicRoles:
+def topic_roles(
+    file: str | Path | None = None, options: Iterable[str] = ()
+) -> TopicRoles:
     """Reads roles from a YAML file and options `ROLE=TOPIC`, which override it (ConfigError)."""
     roles = load_yaml(file, TopicRoles) if file else TopicRoles()
     given: dict[str, str] = {}
     for option in options:
         role, equals, topic = (part.strip() for part in option.partition("="))
         if not equals or not topic:
-            raise ConfigError(f"--topic {option!r}: must be ROLE=TOPIC, as in cmd_vel=/cmd_vel.")
+            raise ConfigError(
+                f"--topic {option!r}: must be ROLE=TOPIC, as in cmd_vel=/cmd_vel."
+            )
         if role not in ROLES:
-            raise ConfigError(f"--topic {option!r}: unknown role {role!r}; {nearest(role, ROLES)}")
+            raise ConfigError(
+                f"--topic {option!r}: unknown role {role!r}; {nearest(role, ROLES)}"
+            )
         if role in given:
-            raise ConfigError(f"--topic {option!r}: {role} was given before; give it once.")
+            raise ConfigError(
+                f"--topic {option!r}: {role} was given before; give it once."
+            )
         given[role] = topic
-    return validate({**roles.model_dump(exclude_none=True), **given}, TopicRoles, "topics")
+    return validate(
+        {**roles.model_dump(exclude_none=True), **given}, TopicRoles, "topics"
+    )
 
 
 def assign(
@@ -134,10 +150,14 @@ class _Topics:
         if topic not in self.types or topic in self.empty:
             lack = "holds no messages of the" if topic in self.empty else "has no"
             listed = self._listed((role,))
-            raise RecordingError(f"{self.place}: {lack} topic {topic!r} ({role}); {listed}")
+            raise RecordingError(
+                f"{self.place}: {lack} topic {topic!r} ({role}); {listed}"
+            )
         if self.types[topic] not in TYPES[role]:
             fault = f"{self.place}: the topic {topic!r} is of type {self.types[topic]}"
-            raise RecordingError(f"{fault}; {role} must be one of {', '.join(TYPES[role])}.")
+            raise RecordingError(
+                f"{fault}; {role} must be one of {', '.join(TYPES[role])}."
+            )
         return topic
 
     def _guess(self, role: str) -> str | None:
@@ -145,14 +165,22 @@ class _Topics:
         fitting = self._fitting(role)
         for pattern in USUAL[role]:
             # A simulator tells the true pose as odometry; other odometry is no pose by itself.
-            never = NEVER_GUESSED.get(role, ()) if pattern != GROUND_TRUTH else (TRANSFORMS,)
+            never = (
+                NEVER_GUESSED.get(role, ())
+                if pattern != GROUND_TRUTH
+                else (TRANSFORMS,)
+            )
             full = [topic for topic in fitting if self.types[topic] not in never]
             found = [topic for topic in full if re.search(pattern, topic)]
             if len(found) > 1:
                 without = "" if role == "cmd_vel" else f", or {role}={NONE} for none"
                 several = ", ".join(f"{t} ({self.types[t]})" for t in found)
-                fault = f"{self.place}: each of several topics could be {role}: {several}"
-                raise RecordingError(f"{fault}; say which with --topic {role}={found[0]}{without}.")
+                fault = (
+                    f"{self.place}: each of several topics could be {role}: {several}"
+                )
+                raise RecordingError(
+                    f"{fault}; say which with --topic {role}={found[0]}{without}."
+                )
             if found:
                 return found[0]
         return None
@@ -162,7 +190,9 @@ class _Topics:
         kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
         advice = f"record one of type {', '.join(kinds)}"
         if roles == ("cmd_vel",):
-            advice += " with the pose, since a model learns from what was sent to the robot"
+            advice += (
+                " with the pose, since a model learns from what was sent to the robot"
+            )
         advice += ", or, if another topic holds them, name it with --map, which "
         advice += "`nics inspect BAG --map my.yaml` begins"
         fitting = [f"{role}={topic}" for role in roles for topic in self._fitting(role)]
@@ -172,7 +202,9 @@ class _Topics:
 
     def _fitting(self, *roles: str) -> list[str]:
         kinds = {kind for role in roles for kind in TYPES[role]}
-        return sorted(t for t, kind in self.types.items() if kind in kinds and t not in self.empty)
+        return sorted(
+            t for t, kind in self.types.items() if kind in kinds and t not in self.empty
+        )
 
     def _listed(self, roles: Sequence[str]) -> str:
         fitting = self._fitting(*roles)

@@ -13,7 +13,13 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.mapping import Mapping, Measured, Reference, UnitOfData, Value
+from nics_drl_bridge.recording.mapping import (
+    Mapping,
+    Measured,
+    Reference,
+    UnitOfData,
+    Value,
+)
 from nics_drl_bridge.recording.recording import Stream, likely_unit
 from nics_drl_bridge.recording.table import Column, Source, Table, numbers_of
 
@@ -55,7 +61,9 @@ class MappedReader:
         """Adds sentences, each once."""
         self.notes += [note for note in notes if note and note not in self.notes]
 
-    def place(self, reference: Reference, within: str | None = None) -> tuple[Table, Reference]:
+    def place(
+        self, reference: Reference, within: str | None = None
+    ) -> tuple[Table, Reference]:
         """Returns the table of a reference, and the column there; RecordingError: no such table."""
         names = self.source.names
         if isinstance(reference, str):
@@ -66,7 +74,11 @@ class MappedReader:
         name = None if wanted is None else _table_name(wanted, names)
         if name is not None:
             table = self._table(name)
-            if not isinstance(reference, str) or ":" not in reference or reference in table.names:
+            if (
+                not isinstance(reference, str)
+                or ":" not in reference
+                or reference in table.names
+            ):
                 return table, reference
         if isinstance(reference, str) and ":" in reference:
             wanted = reference.rpartition(":")[0]
@@ -83,7 +95,9 @@ class MappedReader:
         self.say(*table.notes)
         return table
 
-    def stamped(self, table: Table, column: Column, time: schema.Time | None) -> Stamped:
+    def stamped(
+        self, table: Table, column: Column, time: schema.Time | None
+    ) -> Stamped:
         """Returns the rows of a column in order, by their stamps."""
         time, count = time or self.mapping.time, len(column)
         if time is not None and time.rate is not None:
@@ -93,7 +107,9 @@ class MappedReader:
             self._stamped[key] = self._of_stamps(table, time)
         found = self._stamped[key]
         if found.total != count:
-            fault = f"{table.place}: {found.total} stamps can't be those of {count} values"
+            fault = (
+                f"{table.place}: {found.total} stamps can't be those of {count} values"
+            )
             raise RecordingError(f"{fault}; say which are, by `time:` beside `from:`.")
         return found
 
@@ -103,11 +119,15 @@ class MappedReader:
             given = table.stamps(which)
             if given is None:
                 example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
-                raise RecordingError(f"{table.place}: which column is the time? Say {example}.")
+                raise RecordingError(
+                    f"{table.place}: which column is the time? Say {example}."
+                )
             self.say(*table.notes)
             rows = given.values[:, 0].astype(np.intp)
             asked = getattr(self.mapping.time, "from_", None) == schema.HEADER
-            main = stamping.HEADER if asked else stamping.RECEIVE  # the mapping's own clock
+            main = (
+                stamping.HEADER if asked else stamping.RECEIVE
+            )  # the mapping's own clock
             clock = "" if given.clock == main else given.clock
             return Stamped(given.t, rows, clock, len(table.column(0)))
         raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
@@ -116,12 +136,16 @@ class MappedReader:
         if alone and (each := stamping.rows_a_second(raw[known])):
             column = time.columns[0]  # lacks the part below a second
             rest = (b for a, b in stamping.SPLIT if a == column and b in table.names)
-            line = next((f"time: [{column}, {b}]" for b in rest), f"time: {{rate: {each}}}")
+            line = next(
+                (f"time: [{column}, {b}]" for b in rest), f"time: {{rate: {each}}}"
+            )
             fault = f"{table.place}: the stamps {column!r} are whole seconds, of {each} rows each"
             fix = f"write `{line}` into the mapping, or choose another column"
             raise RecordingError(f"{fault}; {fix}.")
         if len(known) < len(raw):
-            self.say(f"{name}: {len(raw) - len(known)} rows without a stamp were left out.")
+            self.say(
+                f"{name}: {len(raw) - len(known)} rows without a stamp were left out."
+            )
         t, note = stamping.without_overflow(raw[known], name)
         self.say(note)
         if (unit := likely_unit(t)) is not None and time.unit is None:
@@ -129,7 +153,9 @@ class MappedReader:
             fault = f"{table.place}: the stamps {time.columns[0]!r} are {usual}"
             advice = f"write `time: {{from: {time.columns[0]}, unit: {unit}}}` into the mapping"
             raise RecordingError(f"{fault}; {advice} (`unit: s` if they are).")
-        t, order, note = stamping.in_order(t * schema.UNITS[time.unit or "s"].factor, name)
+        t, order, note = stamping.in_order(
+            t * schema.UNITS[time.unit or "s"].factor, name
+        )
         self.say(note)
         return Stamped(t, known[order], "", len(raw))
 
@@ -147,12 +173,21 @@ class MappedReader:
 
     def _beside(self, table: Table, reference: Reference) -> tuple[Table, Reference]:
         """Returns table and column of a reference that, without a table, is of the values'."""
-        if isinstance(reference, str) and ":" in reference and reference not in table.names:
+        if (
+            isinstance(reference, str)
+            and ":" in reference
+            and reference not in table.names
+        ):
             return self.place(reference)
         return table, reference
 
     def series(
-        self, name: str, value: Value, stream: Measured | None, held: bool, infinite: bool = False
+        self,
+        name: str,
+        value: Value,
+        stream: Measured | None,
+        held: bool,
+        infinite: bool = False,
     ) -> Series:
         """Returns a value in SI; of a counter its rate, `held` from stamp to stamp or between.
 
@@ -162,11 +197,19 @@ class MappedReader:
         table, which = self.place(value.from_, stream.in_)
         column, time = numbers_of(table, which), value.time or stream.time
         at = self.stamped(table, column, time)
-        clock = value.clock or stream.clock or self.mapping.clock or at.clock or schema.ROBOT_CLOCK
+        clock = (
+            value.clock
+            or stream.clock
+            or self.mapping.clock
+            or at.clock
+            or schema.ROBOT_CLOCK
+        )
         raw = column[at.rows]
         for k in np.flatnonzero(np.isinf(raw) & (not infinite))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
-            raise RecordingError(f"{where}: column {which!r} is infinite; mend or remove the row.")
+            raise RecordingError(
+                f"{where}: column {which!r} is infinite; mend or remove the row."
+            )
         known = np.isfinite(raw)
         if not known.any():
             fault = f"{table.place}: {which!r} holds no number"
@@ -175,7 +218,9 @@ class MappedReader:
             missing = f"{int((~known).sum())} of {len(raw)} rows have no value"
             self.say(f"{name}: {missing}, and were left out.")
         made = Series(at.t[known], raw[known], clock)
-        plain = unit_of(value).si in ("", "rad/s", "m/s", "ticks/s") and value.wrap is None
+        plain = (
+            unit_of(value).si in ("", "rad/s", "m/s", "ticks/s") and value.wrap is None
+        )
         if plain and not value.counts and (does := stamping.counter(made.values)):
             fault = f"{table.place}: {which!r} is a counter that {does}"
             advice = f"write `{{from: {which}, unit: ticks, ticks_per_turn: ...}}`"
@@ -189,7 +234,9 @@ class MappedReader:
         if value.wrap is not None or value.counts:
             raw = self._continued(name, value, raw)
         if value.counts and stamping.comes_back(raw.values):
-            fault = f"{self.source.place}: {value.from_!r} goes up and down like a speed"
+            fault = (
+                f"{self.source.place}: {value.from_!r} goes up and down like a speed"
+            )
             advice = f"write `unit: {value.unit or 'ticks'}/s` for {name}"
             raise RecordingError(f"{fault}, and is no counter: {advice}.")
         if value.counts:
@@ -210,7 +257,9 @@ class MappedReader:
             self.say(f"{name}: the counter overflowed {end}, and was continued.")
         return raw._replace(values=values)
 
-    def _where(self, value: Value, made: Series, table: Table, time: schema.Time | None) -> Series:
+    def _where(
+        self, value: Value, made: Series, table: Table, time: schema.Time | None
+    ) -> Series:
         """Puts `otherwise` where a flag is not as it must be."""
         on = np.ones(len(made.t), dtype=np.bool_)
         for reference, wanted in value.when.items():
@@ -220,8 +269,12 @@ class MappedReader:
             row = np.searchsorted(at.t, made.t, side="right") - 1
             on &= _equals(column, wanted)[at.rows][np.clip(row, 0, None)] & (row >= 0)
         if not on.any():
-            wanted = " and ".join(f"{name} is {each!r}" for name, each in value.when.items())
-            fault = f"{table.place}: {value.from_!r} never counts: there is no row in which"
+            wanted = " and ".join(
+                f"{name} is {each!r}" for name, each in value.when.items()
+            )
+            fault = (
+                f"{table.place}: {value.from_!r} never counts: there is no row in which"
+            )
             raise RecordingError(f"{fault} {wanted}; check `when:`.")
         return made._replace(values=np.where(on, made.values, value.otherwise))
 
@@ -229,13 +282,19 @@ class MappedReader:
 def unit_of(value: Value) -> UnitOfData:
     """Returns the unit in SI and the factor of a value, of a counter those of its rate."""
     unit = value.unit or ("ticks" if value.ticks_per_turn else None)
-    si, factor = schema.to_si(unit, value.ticks_per_turn) if unit else UnitOfData("", 1.0)
+    si, factor = (
+        schema.to_si(unit, value.ticks_per_turn) if unit else UnitOfData("", 1.0)
+    )
     return UnitOfData(schema.RATES.get(si, si) if value.counts else si, factor)
 
 
 def _table_name(wanted: str, names: Sequence[str]) -> str | None:
     """Returns a table by its name, by its name without suffix, or by a topic without slash."""
-    alike = (name for name in names if name.rpartition(".")[0] == wanted or name == f"/{wanted}")
+    alike = (
+        name
+        for name in names
+        if name.rpartition(".")[0] == wanted or name == f"/{wanted}"
+    )
     return wanted if wanted in names else next(alike, None)
 
 
@@ -248,7 +307,9 @@ def dates_of(column: Column) -> Array | None:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:
         return None
-    return stamping.joined(ns // NS_PER_S, ns % NS_PER_S)  # exact to a quarter of a microsecond
+    return stamping.joined(
+        ns // NS_PER_S, ns % NS_PER_S
+    )  # exact to a quarter of a microsecond
 
 
 def _rate(raw: Series, held: bool) -> Series:
@@ -282,16 +343,23 @@ def together(name: str, parts: Sequence[Series], held: bool) -> Stream:
         raise ConfigError(f"{fault}; a stream needs one clock.")
     t, columns = parts[0].t, [part.values for part in parts]
     if not all(np.array_equal(t, part.t) for part in parts):
-        start, stop = max(part.t[0] for part in parts), min(part.t[-1] for part in parts)
+        start, stop = (
+            max(part.t[0] for part in parts),
+            min(part.t[-1] for part in parts),
+        )
         if held:
             t = np.unique(np.concatenate([part.t for part in parts]))
             t = t[t >= start]
         else:
             t = t[(t >= start) & (t <= stop)]
         if not len(t):
-            raise RecordingError(f"{name}: its values are of times that do not overlap.")
+            raise RecordingError(
+                f"{name}: its values are of times that do not overlap."
+            )
         columns = [
-            p.values[np.searchsorted(p.t, t, side="right") - 1] if held else np.interp(t, *p[:2])
+            p.values[np.searchsorted(p.t, t, side="right") - 1]
+            if held
+            else np.interp(t, *p[:2])
             for p in parts
         ]
     return Stream(t, np.stack(columns, axis=1), clocks[0])

@@ -36,10 +36,14 @@ Storage = Literal["mcap", "sqlite3"]
 
 NPZ = ".npz"
 START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' clock
-APART_NS = 3600 * NS_PER_S  # by which other clocks lag behind: no delay, to whoever reads them
+APART_NS = (
+    3600 * NS_PER_S
+)  # by which other clocks lag behind: no delay, to whoever reads them
 FRAMES = ("odom", "base_link")
 NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its text
-CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers a whole chunk
+CHUNK_BYTES = (
+    1 << 16
+)  # damage costs a whole chunk, since each checksum covers a whole chunk
 
 
 def check_out(path: str | Path) -> Path:
@@ -49,7 +53,9 @@ def check_out(path: str | Path) -> Path:
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")
     if path.suffix not in (NPZ, ""):
         advice = f"name a file *{NPZ}, or the folder of a rosbag2 without suffix"
-        raise ConfigError(f"{path}: unknown kind of recording {path.suffix!r}; {advice}.")
+        raise ConfigError(
+            f"{path}: unknown kind of recording {path.suffix!r}; {advice}."
+        )
     if path.suffix != NPZ:
         msgs.check_libraries(path, "writing", f", or name a file *{NPZ}")
     return path
@@ -81,34 +87,48 @@ def write_bag(
                 stamps = stamps - APART_NS
             for k, values in enumerate(stream.values):
                 message = make(messages.header(int(stamps[k])), values)
-                sink.write(topic, int(receive[k]), bytes(store.serialize_cdr(message, kind)))
+                sink.write(
+                    topic, int(receive[k]), bytes(store.serialize_cdr(message, kind))
+                )
 
 
 def _topics(
     recording: Recording, spec: RobotSpec, messages: "_Messages"
 ) -> Iterator[tuple[str, str, Stream, Make]]:
-    beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
+    beside = (
+        recording.odometry is not None
+        or recording.pose.clock != recording.command.clock
+    )
     joints, names, still = recording.wheels, list(msgs.WHEELS), np.zeros(2, dtype=bool)
     if recording.state is not None:
         joints, names = recording.state, [v.name for v in spec.state]
         still = np.array([v.unit in msgs.POSITION_UNITS for v in spec.state])
     topics: list[tuple[str, str, Stream | None, Make]] = [
         (
-            "/cmd_vel", topic_roles.TWIST, recording.command,
+            "/cmd_vel",
+            topic_roles.TWIST,
+            recording.command,
             lambda _, row: messages.twist(spec.to_cmd_vel(row)),
         ),
-        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped) if beside
+        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
+        if beside
         else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
         (
-            "/odom", topic_roles.ODOMETRY, recording.odometry,
+            "/odom",
+            topic_roles.ODOMETRY,
+            recording.odometry,
             lambda header, row: messages.odometry(header, row, pose_known=False),
         ),
         (
-            "/joint_states", topic_roles.JOINTS, joints,
-            lambda header, row: messages.joints(header, names, row * still, row * ~still),
+            "/joint_states",
+            topic_roles.JOINTS,
+            joints,
+            lambda header, row: messages.joints(
+                header, names, row * still, row * ~still
+            ),
         ),
         ("/imu", topic_roles.IMU, recording.imu, messages.imu),
-    ]  # fmt: skip
+    ]
     for topic, kind, stream, make in topics:
         if stream is not None:
             yield topic, kind, stream, make
@@ -123,7 +143,9 @@ class _Messages:
         return self._types[f"{package}/msg/{name}"](*values)
 
     def header(self, stamp_ns: int) -> Any:
-        stamp = self._new("builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
+        stamp = self._new(
+            "builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S
+        )
         return self._new("std_msgs/Header", stamp, FRAMES[0])
 
     def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
@@ -137,7 +159,9 @@ class _Messages:
         x, y, heading = (float(value) for value in row)
         z, w = float(np.sin(heading / 2.0)), float(np.cos(heading / 2.0))
         turned = self._new("geometry_msgs/Quaternion", 0.0, 0.0, z, w)
-        return self._new("geometry_msgs/Pose", self._new("geometry_msgs/Point", x, y, 0.0), turned)
+        return self._new(
+            "geometry_msgs/Pose", self._new("geometry_msgs/Point", x, y, 0.0), turned
+        )
 
     def pose_stamped(self, header: Any, row: Array) -> Any:
         return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
@@ -146,18 +170,31 @@ class _Messages:
         """Makes an odometry message of which only the pose or only the twist was recorded."""
         pose, twist = (row, np.zeros(3)) if pose_known else (np.zeros(3), row)
         covariance = np.append(0.0 if pose_known else -1.0, np.zeros(35))
-        where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), covariance)
-        speed = self._new("geometry_msgs/TwistWithCovariance", self.twist(twist), np.zeros(36))
+        where = self._new(
+            "geometry_msgs/PoseWithCovariance", self._pose(pose), covariance
+        )
+        speed = self._new(
+            "geometry_msgs/TwistWithCovariance", self.twist(twist), np.zeros(36)
+        )
         return self._new("nav_msgs/Odometry", header, FRAMES[1], where, speed)
 
-    def joints(self, header: Any, names: list[str], position: Array, velocity: Array) -> Any:
-        return self._new("sensor_msgs/JointState", header, names, position, velocity, np.zeros(0))
+    def joints(
+        self, header: Any, names: list[str], position: Array, velocity: Array
+    ) -> Any:
+        return self._new(
+            "sensor_msgs/JointState", header, names, position, velocity, np.zeros(0)
+        )
 
     def imu(self, header: Any, row: Array) -> Any:
         ax, ay, w = (float(value) for value in row)
-        level, absent = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.full(9, -1.0)
+        level, absent = (
+            self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
+            np.full(9, -1.0),
+        )
         rates, pulls, measured = self._vector(z=w), self._vector(ax, ay), np.zeros(9)
-        return self._new("sensor_msgs/Imu", header, level, absent, rates, measured, pulls, measured)
+        return self._new(
+            "sensor_msgs/Imu", header, level, absent, rates, measured, pulls, measured
+        )
 
 
 class BagSink:
@@ -167,12 +204,18 @@ class BagSink:
         self._writer, self.store = writer, msgs.typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
-        self.fault: BaseException | None = None  # the first one of the file or the database
+        self.fault: BaseException | None = (
+            None  # the first one of the file or the database
+        )
 
     def add_topic(
-        self, topic: str, kind: str, offers: Sequence[msgs.Offer] = (),
-        texts: Mapping[str, str] | None = None, definition: str | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        topic: str,
+        kind: str,
+        offers: Sequence[msgs.Offer] = (),
+        texts: Mapping[str, str] | None = None,
+        definition: str | None = None,
+    ) -> None:
         """Adds a topic of a type such as `nav_msgs/msg/Odometry`; unknown ones need definitions."""
         from rosbags.typesys import get_types_from_msg
 
@@ -180,11 +223,17 @@ class BagSink:
         for name, text in (texts or {}).items() if kind not in fields else ():
             if name not in fields:
                 self.store.register(get_types_from_msg(text, name))
-        given = {} if kind in fields else {"msgdef": definition or "", "rihs01": NO_HASH}
+        given = (
+            {} if kind in fields else {"msgdef": definition or "", "rihs01": NO_HASH}
+        )
         profiles = [msgs.profile_of(offer) for offer in offers]
         with self._noting_faults():
             self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self.store, **given, offered_qos_profiles=profiles
+                topic,
+                kind,
+                typestore=self.store,
+                **given,
+                offered_qos_profiles=profiles,
             )
         self.counts[topic] = 0
 
@@ -194,7 +243,10 @@ class BagSink:
         with self._noting_faults():
             self._writer.write(self._connections[topic], receive_ns, data)
             self.counts[topic] += 1
-            if hasattr(storage, "close_chunk") and storage.chunk.bio.tell() > CHUNK_BYTES:
+            if (
+                hasattr(storage, "close_chunk")
+                and storage.chunk.bio.tell() > CHUNK_BYTES
+            ):
                 storage.close_chunk()
 
     def flush(self) -> None:
@@ -219,7 +271,9 @@ class BagSink:
 
 
 @contextmanager
-def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) -> Iterator[BagSink]:
+def bag_sink(
+    path: str | Path, storage: Storage = "mcap", keep: bool = False
+) -> Iterator[BagSink]:
     """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
 
     Until then it is in a hidden folder `.NAME.*` beside it. If the storage fails, as on a full
@@ -234,7 +288,9 @@ def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) ->
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     if path.exists():
-        raise RecordingError(f"{path}: is there already; give the name of a new folder.")
+        raise RecordingError(
+            f"{path}: is there already; give the name of a new folder."
+        )
     check_above(path)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -253,7 +309,9 @@ def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) ->
             except BaseException as error:
                 keepable = keep and sink.fault is None and any(sink.counts.values())
                 if not keepable:
-                    with suppress(Exception):  # the writer takes back what was not flushed
+                    with suppress(
+                        Exception
+                    ):  # the writer takes back what was not flushed
                         sink.flush()
                     raise
                 raised = error
@@ -301,5 +359,7 @@ def _finish(unfinished: Path, path: Path, storage: Storage) -> None:
         seal(unfinished / f"{path.name}.mcap")
     sync_folder(unfinished)
     if path.exists():
-        raise RecordingError(f"{path}: was made meanwhile; give the name of a new folder.")
+        raise RecordingError(
+            f"{path}: was made meanwhile; give the name of a new folder."
+        )
     os.rename(unfinished, path)

@@ -27,16 +27,29 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Mismatch = doctor_facts.Mismatch
 Findings = Iterator[Mismatch]
 
-LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3  # a drive with less motion does not determine scales
+LEAST_PATH_M, LEAST_TURN_RAD = (
+    0.3,
+    0.3,
+)  # a drive with less motion does not determine scales
 TOLERANCE = 1.4  # differences of the pose and the twist must agree within this factor
 # Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
 # robot follows with delay and within its limits.
 ALIKE, LEAST_ALIKE = 0.8, 0.3
-JUMP, JUMP_M = 5.0, 0.2  # a step is a jump beyond this multiple of the top speed's, and this length
+JUMP, JUMP_M = (
+    5.0,
+    0.2,
+)  # a step is a jump beyond this multiple of the top speed's, and this length
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
-SHORT_WINDOW_S = 2.0  # over which turns are compared if the robot was heard for a few seconds only
-UNITS = ((1000.0, "mm/s"), (100.0, "cm/s"), (3.6, "km/h"), (180.0 / np.pi, "degrees per second"))
+SHORT_WINDOW_S = (
+    2.0  # over which turns are compared if the robot was heard for a few seconds only
+)
+UNITS = (
+    (1000.0, "mm/s"),
+    (100.0, "cm/s"),
+    (3.6, "km/h"),
+    (180.0 / np.pi, "degrees per second"),
+)
 RATE_TOLERANCE = 0.2
 # Stamps are from the future if this much after their arrival; too old for the command gate if this
 # much before it; and so far before it that the clocks must differ.
@@ -44,10 +57,15 @@ FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
-ODD_SHARE = 0.01  # a value in more than this share of the beams is intended by the lidar
+ODD_SHARE = (
+    0.01  # a value in more than this share of the beams is intended by the lidar
+)
 
 error, warning = partial(Mismatch, "error"), partial(Mismatch, "warning")
-no_match, layout_error = partial(error, "quality of service"), partial(error, "beam layout", SCAN)
+no_match, layout_error = (
+    partial(error, "quality of service"),
+    partial(error, "beam layout", SCAN),
+)
 odometry_error = partial(error, "odometry", ODOM)
 odometry_warning = partial(warning, "odometry", ODOM)
 gyro_warning = partial(warning, "gyro", GYRO)
@@ -57,8 +75,18 @@ def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
     """Runs all checks and returns their findings, errors first."""
     expected = doctor_facts.seen(facts, expected)
     checks = (
-        presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion, turning,
-    )  # fmt: skip
+        presence,
+        quality,
+        speakers,
+        frames,
+        rates,
+        latency,
+        clock,
+        layout,
+        ranges,
+        motion,
+        turning,
+    )
     found = [finding for check in checks for finding in check(facts, expected)]
     named = [replace(finding, where=facts.names[finding.where]) for finding in found]
     return sorted(named, key=lambda finding: finding.severity)
@@ -74,16 +102,30 @@ def presence(facts: Facts, _: Expected) -> Findings:
             yield error("type", role, f"is of {' and '.join(types)}", fix)
         elif role == CMD_VEL:
             if facts.live and (there is None or not there.asks):
-                fix = "start the base, or correct its namespace or the name of its topic"
+                fix = (
+                    "start the base, or correct its namespace or the name of its topic"
+                )
                 yield error("missing topic", role, "nobody listens to it", fix)
         elif role not in facts.heard:
-            what = "there is no such topic" if there is None else "nothing was heard on it"
-            near = [topic for topic, ends in facts.topics.items() if KINDS[role][0] in ends.types]
-            hint = f"; {', '.join(near)} is of its type: remap it" if near and not there else ""
+            what = (
+                "there is no such topic" if there is None else "nothing was heard on it"
+            )
+            near = [
+                topic
+                for topic, ends in facts.topics.items()
+                if KINDS[role][0] in ends.types
+            ]
+            hint = (
+                f"; {', '.join(near)} is of its type: remap it"
+                if near and not there
+                else ""
+            )
             fix = f"start its driver, or correct namespace or ROS_DOMAIN_ID{hint}"
             yield error("missing topic", role, what, fix)
         if doctor_facts.TWIST_STAMPED_TYPE in types and not facts.live:
-            fix = "set `enable_stamped_cmd_vel` where the package's nodes are to take it"
+            fix = (
+                "set `enable_stamped_cmd_vel` where the package's nodes are to take it"
+            )
             yield warning("type", role, "is a TwistStamped, not a Twist", fix)
 
 
@@ -137,9 +179,15 @@ def rates(facts: Facts, expected: Expected) -> Findings:
         rate = _rate(facts, role)
         if rate is None:
             continue
-        slow, fast = rate < (1 - RATE_TOLERANCE) * wanted, rate > (1 + RATE_TOLERANCE) * wanted
+        slow, fast = (
+            rate < (1 - RATE_TOLERANCE) * wanted,
+            rate > (1 + RATE_TOLERANCE) * wanted,
+        )
         if slow or (fast and role == SCAN):
-            least, finding = "at least " if role == ODOM else "", error if slow else warning
+            least, finding = (
+                "at least " if role == ODOM else "",
+                error if slow else warning,
+            )
             fix = "set the driver's rate; on a slow network look for losses (best effort, Wi-Fi)"
             if role == SCAN:
                 fix += f", or set `rate: {rate:.3g}` in the lidar and generate the model anew"
@@ -169,7 +217,9 @@ def latency(facts: Facts, _: Expected) -> Findings:
             continue
         if back := int((np.diff(stamps) < 0).sum()):
             what = f"{back} stamps are before the one before them"
-            fix = "look for a second publisher, or for a clock that is set while it runs"
+            fix = (
+                "look for a second publisher, or for a clock that is set while it runs"
+            )
             yield error("stamp", role, what, fix)
         age = float(np.median(_here(facts, heard.arrivals_ns) - stamps)) * S_PER_NS
         if -FUTURE_S <= age <= LATE_S:
@@ -178,7 +228,9 @@ def latency(facts: Facts, _: Expected) -> Findings:
         fix = "stamp when it is measured, and look for queues, load and network on the way"
         if abs(age) > OFFSET_S or age < 0:
             fix = "synchronise the clocks (NTP, chrony), or set use_sim_time on all nodes or none"
-        yield error("stamp", role, f"stamps lie {abs(age):.3f} s {side} their arrival", fix)
+        yield error(
+            "stamp", role, f"stamps lie {abs(age):.3f} s {side} their arrival", fix
+        )
 
 
 def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
@@ -230,7 +282,9 @@ def turning(facts: Facts, expected: Expected) -> Findings:
             yield gyro_warning(what, fix)
         return
     if not facts.yaw_rates:
-        yield gyro_warning("says that it measures no yaw rate", "choose another topic by --imu")
+        yield gyro_warning(
+            "says that it measures no yaw rate", "choose another topic by --imu"
+        )
         return
     found = _compared_turns(facts)
     if found is None:
@@ -262,7 +316,9 @@ def _compared_turns(facts: Facts) -> Turning | None:
     if not facts.poses or len(stamps) != len(facts.poses):
         return None
     origin = stamps[0]
-    odom_t, places = np.unique((np.array(stamps) - origin) * S_PER_NS, return_index=True)
+    odom_t, places = np.unique(
+        (np.array(stamps) - origin) * S_PER_NS, return_index=True
+    )
     poses = np.array(facts.poses)[places]
     gyro_t = np.array([(stamp - origin) * S_PER_NS for stamp, _ in facts.yaw_rates])
     gyro_t, rows = np.unique(gyro_t, return_index=True)
@@ -277,7 +333,9 @@ def _compared_turns(facts: Facts) -> Turning | None:
 
 
 def _odometry(facts: Facts, robot: RobotSpec) -> Findings:
-    poses, twists, length = (np.array(n) for n in (facts.poses, facts.twists, facts.lengths))
+    poses, twists, length = (
+        np.array(n) for n in (facts.poses, facts.twists, facts.lengths)
+    )
     if not len(poses):
         return
     if not (np.isfinite(poses).all() and np.isfinite(twists).all()):
@@ -285,7 +343,9 @@ def _odometry(facts: Facts, robot: RobotSpec) -> Findings:
         return
     if off := int((np.abs(length - 1.0) > QUATERNION_TOLERANCE).sum()):
         what = f"{off} quaternions are not of length 1 but of up to {length.max():.3g}"
-        yield odometry_error(what, "send a quaternion, not a heading in its z, nor zeros")
+        yield odometry_error(
+            what, "send a quaternion, not a heading in its z, nor zeros"
+        )
         return
     if facts.uncovered:
         what = f"{facts.uncovered} of {len(poses)} messages have a covariance of zeros"
@@ -322,13 +382,22 @@ def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Finding
     if far[keep].sum() > LEAST_PATH_M or np.abs(moves[keep, 0]).sum() > 1.0:
         yield from _compared("linear.x", ahead[keep], moves[keep, 0], UNITS[:3], "m/s")
     if np.abs(turn[keep]).sum() > LEAST_TURN_RAD or np.abs(moves[keep, 2]).sum() > 2.0:
-        yield from _compared("angular.z", turn[keep], moves[keep, 2], UNITS[3:], "rad/s")
+        yield from _compared(
+            "angular.z", turn[keep], moves[keep, 2], UNITS[3:], "rad/s"
+        )
 
 
 def _compared(
-    field: str, real: Array, claimed: Array, units: Sequence[tuple[float, str]], good: str
+    field: str,
+    real: Array,
+    claimed: Array,
+    units: Sequence[tuple[float, str]],
+    good: str,
 ) -> Findings:
-    ratio, size = _slope(real, claimed), float(np.sqrt((real @ real) * (claimed @ claimed)))
+    ratio, size = (
+        _slope(real, claimed),
+        float(np.sqrt((real @ real) * (claimed @ claimed))),
+    )
     if _alike(ratio):
         return
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
@@ -345,7 +414,9 @@ def _compared(
             what, fix = f"{what}: {name}", f"let the twist be in {good}"
             break
         if _alike(ratio * factor):
-            what = f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
+            what = (
+                f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
+            )
             fix = "let the pose be in metres and radians"
             break
     yield odometry_error(what, fix)
@@ -364,7 +435,9 @@ def _scale(facts: Facts) -> float | None:
     heard, odometry = facts.heard.get(CMD_VEL), facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
         return None
-    place = np.searchsorted(heard.arrivals_ns, odometry.arrivals_ns[:-1], side="right") - 1
+    place = (
+        np.searchsorted(heard.arrivals_ns, odometry.arrivals_ns[:-1], side="right") - 1
+    )
     # A car turns the other way in reverse.
     forward = (place >= 0) & (np.array(facts.twists)[:-1, 0] >= 0.0)
     turn = np.asarray(wrap_angle(np.diff(np.array(facts.poses)[:, 2])))[forward]
@@ -379,11 +452,16 @@ def layout(facts: Facts, expected: Expected) -> Findings:
     """Checks number and directions of the beams, and the limits of their ranges."""
     if len(facts.layouts) > 1:
         counts = ", ".join(map(str, sorted({one.beams for one in facts.layouts})))
-        fix = "use the driver's mode of fixed angles (as `angle_compensate`), or resample"
+        fix = (
+            "use the driver's mode of fixed angles (as `angle_compensate`), or resample"
+        )
         yield layout_error(f"its header changes; numbers of beams are {counts}", fix)
     for have in facts.layouts[:1]:
         header = have.header
-        if abs(have.last - header.angle_max) > ANGLE_TOLERANCE * abs(header.angle_increment) + 1e-9:
+        if (
+            abs(have.last - header.angle_max)
+            > ANGLE_TOLERANCE * abs(header.angle_increment) + 1e-9
+        ):
             what = f"angle_max is {header.angle_max:.5f}, but its beams end at {have.last:.5f} rad"
             yield warning("beam layout", SCAN, what, "correct the driver's header")
         if have.in_degrees:
@@ -403,7 +481,9 @@ def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
     want, header = expected.lidar.header, have.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
     if have.beams != expected.lidar.beams:
-        yield layout_error(f"has {have.beams} beams, expected {expected.lidar.beams}", fix)
+        yield layout_error(
+            f"has {have.beams} beams, expected {expected.lidar.beams}", fix
+        )
     off = max(abs(header.angle_min - want.angle_min), abs(have.last - want.angle_max))
     if header.angle_increment < 0.0:
         if expected.scan is None and not have.in_degrees:
@@ -440,15 +520,20 @@ def ranges(facts: Facts, expected: Expected) -> Findings:
         fix = "set the driver's limit, or range_max of the lidar, and generate the model anew"
         yield warning("range convention", SCAN, what, fix)
     hits = {
-        "zero": values == 0.0, "nan": np.isnan(values),
+        "zero": values == 0.0,
+        "nan": np.isnan(values),
         "range_max": np.abs(values - spec.range_max) < 1e-4 * spec.range_max,
         "inf": values == np.inf,
-    }  # fmt: skip
+    }
     for word, hit in hits.items():
         if hit.mean() > ODD_SHARE and word != spec.no_return:
             share = f"{100 * hit.mean():.0f} % of the ranges are {word}"
             fix = f"set `no_return: {word}` in the lidar and generate the model anew"
-            yield convention(f"{share}, but no return is expected as {spec.no_return}", fix)
+            yield convention(
+                f"{share}, but no return is expected as {spec.no_return}", fix
+            )
     if np.isfinite(values[values < 0.0]).any():
-        fix = "correct the driver: too close is -inf (REP-117), nothing else is negative"
+        fix = (
+            "correct the driver: too close is -inf (REP-117), nothing else is negative"
+        )
         yield convention("holds negative ranges", fix)

@@ -83,15 +83,25 @@ class Facts:
     heard: dict[str, TopicFacts] = field(default_factory=dict)  # by role
     end_ns: int = 0  # end of listening, on the clock of arrivals [ns]
     layouts: list[Layout] = field(default_factory=list)  # distinct layouts of the scans
-    ranges: list[NDArray[np.float32]] = field(default_factory=list)  # of up to 200 scans [m]
-    poses: list[Row] = field(default_factory=list)  # of odometry: x, y [m], heading [rad]
-    twists: list[Row] = field(default_factory=list)  # of odometry: vx, vy [m/s], wz [rad/s]
+    ranges: list[NDArray[np.float32]] = field(
+        default_factory=list
+    )  # of up to 200 scans [m]
+    poses: list[Row] = field(
+        default_factory=list
+    )  # of odometry: x, y [m], heading [rad]
+    twists: list[Row] = field(
+        default_factory=list
+    )  # of odometry: vx, vy [m/s], wz [rad/s]
     lengths: list[float] = field(default_factory=list)  # of odometry's quaternions
-    uncovered: int = 0  # number of odometry messages whose covariance of pose or twist is all zeros
+    uncovered: int = (
+        0  # number of odometry messages whose covariance of pose or twist is all zeros
+    )
     commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
     clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
     gyro: GyroReader = field(default_factory=GyroReader)
-    yaw_rates: list[tuple[int, float]] = field(default_factory=list)  # of the gyro: stamp [ns]
+    yaw_rates: list[tuple[int, float]] = field(
+        default_factory=list
+    )  # of the gyro: stamp [ns]
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
         """Records a message from ROS or from a bag, which have the same fields."""
@@ -101,7 +111,9 @@ class Facts:
             heard.stamps_ns.append(messages.stamp(message))
             heard.frames.add(str(message.header.frame_id))
         if role == SCAN:
-            fields = {name: float(getattr(message, name)) for name in ScanHeader._fields}
+            fields = {
+                name: float(getattr(message, name)) for name in ScanHeader._fields
+            }
             header = ScanHeader(**fields | {"time_increment": 0.0, "scan_time": 0.0})
             layout = Layout(len(message.ranges), header)
             if layout not in self.layouts:
@@ -121,7 +133,9 @@ class Facts:
             if (measured := self.gyro.read(message)) is not None:
                 self.yaw_rates.append((messages.stamp(message), measured[0]))
         else:
-            self.clock_ns.append(int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec))
+            self.clock_ns.append(
+                int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec)
+            )
 
 
 def names_in(namespace: str, imu: str = "auto") -> dict[str, str]:
@@ -133,7 +147,9 @@ def names_in(namespace: str, imu: str = "auto") -> dict[str, str]:
     return names
 
 
-def name_of_gyro(names: Mapping[str, str], imu: str, types: Mapping[str, Sequence[str]]) -> str:
+def name_of_gyro(
+    names: Mapping[str, str], imu: str, types: Mapping[str, Sequence[str]]
+) -> str:
     """Returns the topic of the gyro: the wanted one, or that which is there, by its type."""
     usual = names[GYRO]
     if imu != "auto" or IMU in types.get(usual, ()):
@@ -154,7 +170,9 @@ def facts_of_bag(path: str | Path, namespace: str = "", imu: str = "auto") -> Fa
             facts.names[GYRO] = name_of_gyro(facts.names, imu, types)
         facts.end_ns = bag.span_ns[1]
         for topic, kind in bag.types.items():
-            facts.topics[topic] = Endpoints(tuple(kind.split(" and ")), bag.offers(topic))
+            facts.topics[topic] = Endpoints(
+                tuple(kind.split(" and ")), bag.offers(topic)
+            )
         for role, topic in facts.names.items():
             if bag.types.get(topic) in KINDS[role]:
                 for message in bag.messages(topic):
@@ -180,11 +198,15 @@ class Expected:
     robot: RobotSpec
     lidar: LidarSpec
     period_s: float  # between commands
-    scan: ScanLayout | None = None  # that any lidar may fill; None: the beams of exactly this one
+    scan: ScanLayout | None = (
+        None  # that any lidar may fill; None: the beams of exactly this one
+    )
     gyro: bool = False  # the model was made with one
 
 
-def expected_of(source: SimulatorModel | Contract, scan: ScanLayout | None = None) -> Expected:
+def expected_of(
+    source: SimulatorModel | Contract, scan: ScanLayout | None = None
+) -> Expected:
     """Expectations of a model, or of a policy file with the sectors of its scan."""
     gyro = getattr(source, "gyro", False)
     return Expected(source.robot, source.lidar, source.control_period, scan, gyro)

@@ -7,7 +7,12 @@ from nics_drl_bridge.files import write_text
 from nics_drl_bridge.identify.acceptance import Verdict, usual
 from nics_drl_bridge.identify.conclusion import OF_PATH, Conclusion, conclude, end_of
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.report import COMPARED, HEADS, equations_with_errors, judgement_rows
+from nics_drl_bridge.identify.report import (
+    COMPARED,
+    HEADS,
+    equations_with_errors,
+    judgement_rows,
+)
 from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -19,7 +24,11 @@ Tile = tuple[str, str, bool]
 def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and false if it is doubtful."""
     for at in usual(identified.judgement):
-        beside = {"": at.model, "fitted textbook ": at.textbook, "constant twist ": at.kept_twist}
+        beside = {
+            "": at.model,
+            "fitted textbook ": at.textbook,
+            "constant twist ": at.kept_twist,
+        }
         told = [name + end_of(each, at.path_m) for name, each in beside.items() if each]
         figure, *others = (text.removesuffix(OF_PATH) for text in told)
         off = f"{OF_PATH} off".lstrip() if told[0] != figure else "off"
@@ -28,13 +37,21 @@ def fit_tile(identified: Identified) -> Tile:
     return "untested", "on unseen data, as the drive is too short", False
 
 
-def verdict_blocks(tiles: Sequence[Tile], conclusion: Conclusion, *commands: str) -> Blocks:
+def verdict_blocks(
+    tiles: Sequence[Tile], conclusion: Conclusion, *commands: str
+) -> Blocks:
     """Figures in large type, doubts, what could not be learnt, and what to do next."""
-    blocks = [html.paragraph(f"This model is: {conclusion.verdict}."), html.tiles(tiles)]
+    blocks = [
+        html.paragraph(f"This model is: {conclusion.verdict}."),
+        html.tiles(tiles),
+    ]
     if conclusion.doubts:
         blocks.append(html.bullets(conclusion.doubts))
     if conclusion.gaps:
-        blocks += [html.paragraph("What the drive could not teach:"), html.bullets(conclusion.gaps)]
+        blocks += [
+            html.paragraph("What the drive could not teach:"),
+            html.bullets(conclusion.gaps),
+        ]
     elif conclusion.verdict is Verdict.GOOD:
         blocks.append(html.paragraph("The drive taught everything the model needs."))
     blocks.append(html.paragraph(conclusion.advice))
@@ -45,7 +62,9 @@ def path_blocks(identified: Identified) -> Blocks:
     """Predicted paths beside the measured ones, and errors beside those of the yardsticks."""
     if identified.held_out is None or not identified.judgement:
         return [html.paragraph("The drive is too short to hold data out.")]
-    drawn = [(each, "") for each in fit_pictures.unseen_paths(identified.trial, PATHS_SHOWN)]
+    drawn = [
+        (each, "") for each in fit_pictures.unseen_paths(identified.trial, PATHS_SHOWN)
+    ]
     caption = "Mean prediction errors on unseen data: those of a good model lie below the others."
     if any(at.band_m for at in identified.judgement):
         caption += " Bars: distances within which 95 % of its predictions should end."
@@ -61,7 +80,9 @@ def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks
     """The equations, and folded all figures and pictures of fit and calibration."""
     fit = fit_pictures.fit_pictures(spec, identified, paths=False)
     drawn = {**fit, **fit_pictures.calibration_pictures(spec, identified)}
-    pictures = [html.picture(png, fit_pictures.CAPTIONS[name]) for name, png in drawn.items()]
+    pictures = [
+        html.picture(png, fit_pictures.CAPTIONS[name]) for name, png in drawn.items()
+    ]
     equations = "\n".join(equations_with_errors(identified.model))
     return [
         html.code(equations),
@@ -75,14 +96,26 @@ def write_fit_page(
 ) -> None:
     """Writes the page of a fit to a recording from a source, with the fit report as text."""
     conclusion, folder = conclude(identified), file.parent
-    spec = identified.drive.spec  # of a textbook that was written, which may have another state
+    spec = (
+        identified.drive.spec
+    )  # of a textbook that was written, which may have another state
     tile, model = fit_tile(identified), identified.model
-    terms = str(model.terms_kept), f"terms of a model with a step of {model.dt:g} s", True
+    terms = (
+        str(model.terms_kept),
+        f"terms of a model with a step of {model.dt:g} s",
+        True,
+    )
     assumed = len(model.assumed)
-    gaps = str(len(conclusion.gaps)), "gaps in what the drive taught", not conclusion.gaps
+    gaps = (
+        str(len(conclusion.gaps)),
+        "gaps in what the drive taught",
+        not conclusion.gaps,
+    )
     figures = [tile, gaps, terms]
     if assumed:
-        figures.append((str(assumed), "of the terms are assumed from the textbook", False))
+        figures.append(
+            (str(assumed), "of the terms are assumed from the textbook", False)
+        )
     train = f"nics train --robot {folder} --world arena --seeds 0 --out runs/first"
     commands = (train,) if conclusion.ready else ()
     sections = [

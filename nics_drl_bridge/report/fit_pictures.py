@@ -20,7 +20,12 @@ from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
 from nics_drl_bridge.identify.report import CalibratedValue, estimates
-from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, nominal_lags
+from nics_drl_bridge.identify.signals import (
+    DIFFERENCE,
+    held,
+    moved_commands,
+    nominal_lags,
+)
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import delays as delays_of
@@ -56,9 +61,13 @@ CAPTIONS = {
 }
 
 
-def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) -> tuple[Path, ...]:
+def write_pictures(
+    spec: RobotSpec, identified: Identified, folder: str | Path
+) -> tuple[Path, ...]:
     """Writes the pictures of a fit and of its calibration as PNG files, and returns these."""
-    spec = identified.drive.spec  # of a textbook that was written, which may have another state
+    spec = (
+        identified.drive.spec
+    )  # of a textbook that was written, which may have another state
     drawn = {**fit_pictures(spec, identified), **calibration_pictures(spec, identified)}
     files = {Path(folder) / f"{name}.png": picture for name, picture in drawn.items()}
     for file, picture in files.items():
@@ -66,14 +75,21 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
     return tuple(files)
 
 
-def fit_pictures(spec: RobotSpec, identified: Identified, paths: bool = True) -> dict[str, bytes]:
+def fit_pictures(
+    spec: RobotSpec, identified: Identified, paths: bool = True
+) -> dict[str, bytes]:
     """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
-    by_motion = identified.findings.width is not None or bool(identified.findings.replaced)
+    by_motion = identified.findings.width is not None or bool(
+        identified.findings.replaced
+    )
     # then pruning did not choose its terms
     pictures = {} if by_motion else {"accuracy": accuracy(identified)}
     if paths and identified.held_out is not None:
         pictures["paths"] = held_out_paths(identified.trial)
-    if identified.unseen is not None and np.abs(identified.unseen.dq).max() > LEAST_RATE:
+    if (
+        identified.unseen is not None
+        and np.abs(identified.unseen.dq).max() > LEAST_RATE
+    ):
         pictures["residuals"] = residuals(identified.trial, identified.unseen)
     if (np.ptp(identified.recording.command.values, axis=0) > 0.0).any():
         pictures["alignment"] = alignment(spec, identified)
@@ -86,15 +102,18 @@ def accuracy(identified: Identified) -> bytes:
     circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
     for n, curve in enumerate(identified.fit.curves):
         share = np.maximum(curve.share, LEAST_SHARE)
-        line = axes.plot(share, marker=MARKERS[n % len(MARKERS)], markersize=4, label=curve.dof)[0]
+        line = axes.plot(
+            share, marker=MARKERS[n % len(MARKERS)], markersize=4, label=curve.dof
+        )[0]
         axes.plot(curve.kept, share[curve.kept], "o", color=line.get_color(), **circle)
     axes.plot([], [], "o", color=DARK, label="kept", **circle)
     axes.set_yscale("log")
     longest = max((len(curve.error) for curve in identified.fit.curves), default=2)
     axes.set(
         xlabel="number of terms, largest standardised coefficient first (Eq. 2)",
-        ylabel="cross-validated error / size of the rates", xlim=(-0.3, longest - 0.7),
-    )  # fmt: skip
+        ylabel="cross-validated error / size of the rates",
+        xlim=(-0.3, longest - 0.7),
+    )
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
     return png(figure)
@@ -122,20 +141,32 @@ def unseen_paths(identified: Identified, most: int) -> list[bytes]:
 
 def _unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
     """Returns measured and predicted paths, and the distance between their ends [m]."""
-    drive, calibration, pose = identified.drive, identified.calibration, identified.recording.pose
+    drive, calibration, pose = (
+        identified.drive,
+        identified.calibration,
+        identified.recording.pose,
+    )
     free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
     span = identified.train_until_s, drive.duration_s
     chosen = windows(drive, calibration, *span, HORIZON_S, free / PATHS)
     paths = []
     for n, path in enumerate(_predicted(identified, chosen)[:PATHS]):
         during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
-        paths.append((pose.values[during], path, float(np.hypot(*(path[-1] - chosen.end[n])[:2]))))
+        paths.append(
+            (
+                pose.values[during],
+                path,
+                float(np.hypot(*(path[-1] - chosen.end[n])[:2])),
+            )
+        )
     return paths
 
 
 def _unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
     truth, path, apart = paths
-    axes.plot(*truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured")
+    axes.plot(
+        *truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured"
+    )
     axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
     axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
     axes.set_aspect("equal", adjustable="datalim")
@@ -148,17 +179,35 @@ def yardsticks(identified: Identified) -> bytes:
     figure, (axes,) = panels(1, 1, (5.0, 3.6))
     judgement = identified.judgement
     for name, label, colour, line in (
-        ("model", "model", MODEL, "o-"), ("textbook", "fitted textbook", MEASURED, "s--"),
+        ("model", "model", MODEL, "o-"),
+        ("textbook", "fitted textbook", MEASURED, "s--"),
         ("kept_twist", "constant twist", OTHER, "^:"),
-    ):  # fmt: skip
-        known = [(at.horizon_s, each) for at in judgement if (each := getattr(at, name))]
+    ):
+        known = [
+            (at.horizon_s, each) for at in judgement if (each := getattr(at, name))
+        ]
         if known:
             error = [max(each.position_m, LEAST_SHARE) for _, each in known]
-            axes.plot([s for s, _ in known], error, line, color=colour, markersize=5, label=label)
+            axes.plot(
+                [s for s, _ in known],
+                error,
+                line,
+                color=colour,
+                markersize=5,
+                label=label,
+            )
     band = [(at.horizon_s, at.band_m) for at in judgement if at.band_m]
     if band:
-        axes.plot(*zip(*band, strict=True), "_", color=DARK, markersize=14, label="95 % within")
-    axes.set(xscale="log", yscale="log", xlabel="horizon [s]", ylabel="error of position [m]")
+        axes.plot(
+            *zip(*band, strict=True),
+            "_",
+            color=DARK,
+            markersize=14,
+            label="95 % within",
+        )
+    axes.set(
+        xscale="log", yscale="log", xlabel="horizon [s]", ylabel="error of position [m]"
+    )
     ticks = [at.horizon_s for at in judgement]
     axes.set_xticks(ticks, [f"{s:g}" for s in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
@@ -175,8 +224,12 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
     figure, grid = panels(len(moving), 1, (9.0, 1.7 * len(moving) + 0.6), sharex=True)
     for d, axes in zip(map(int, moving), grid, strict=True):
         rest = unseen.dq[:, d] - predicted[:, d]
-        axes.plot(t[shown], unseen.dq[shown, d], color=MEASURED, linewidth=2.5, alpha=0.55)
-        axes.plot(t[shown], predicted[shown, d], color=MODEL, linestyle="--", linewidth=1.2)
+        axes.plot(
+            t[shown], unseen.dq[shown, d], color=MEASURED, linewidth=2.5, alpha=0.55
+        )
+        axes.plot(
+            t[shown], predicted[shown, d], color=MODEL, linestyle="--", linewidth=1.2
+        )
         axes.plot(t[shown], rest[shown], color=OTHER, linewidth=0.8)
         axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]")
     grid[-1].set_xlabel("time since the end of the training part [s]")
@@ -197,7 +250,10 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
     for axes, c in zip(grid, moved, strict=True):
         name, unit = spec.command[c].name, spec.command[c].unit
         acts = latency + float(delays_of([name], calibration.inputs)[0])
-        for late, style, label in ((0.0, ":", "as stamped"), (acts, "-", "as it takes effect")):
+        for late, style, label in (
+            (0.0, ":", "as stamped"),
+            (acts, "-", "as it takes effect"),
+        ):
             value = held(command, spec, t - late, t - late + samples.dt)[:, c]
             axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
         axes.set_ylabel(f"{name} [{unit}]", color=MODEL)
@@ -210,7 +266,11 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
 
 
 def _response(
-    axes: Axes, samples: Samples, shown: NDArray[np.bool_], variable: int, identified: Identified
+    axes: Axes,
+    samples: Samples,
+    shown: NDArray[np.bool_],
+    variable: int,
+    identified: Identified,
 ) -> None:
     twist, wanted = samples.dq[:, :3], samples.x[:, variable]
     with np.errstate(all="ignore"):
@@ -219,25 +279,39 @@ def _response(
     other = axes.twinx()
     other.grid(visible=False)
     other.plot(
-        samples.t[shown] - samples.t[0] - SETTLED_S, twist[shown, d],
-        color=MEASURED, linewidth=2.5, alpha=0.55,
-    )  # fmt: skip
+        samples.t[shown] - samples.t[0] - SETTLED_S,
+        twist[shown, d],
+        color=MEASURED,
+        linewidth=2.5,
+        alpha=0.55,
+    )
     model = identified.model
     other.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", color=MEASURED)
 
 
 def _predicted(identified: Identified, chosen: Windows) -> Array:
     shares = np.linspace(0.02, 1.0, POINTS)
-    ends = [chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares]
-    model, calibration, drive = identified.model, identified.calibration, identified.drive
-    poses = [predict(model, calibration, drive, replace(chosen, end_t=end)) for end in ends]
+    ends = [
+        chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares
+    ]
+    model, calibration, drive = (
+        identified.model,
+        identified.calibration,
+        identified.drive,
+    )
+    poses = [
+        predict(model, calibration, drive, replace(chosen, end_t=end)) for end in ends
+    ]
     return np.stack([chosen.start, *poses], axis=1)
 
 
 def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """The pictures of a calibration by name, as far as the recording shows them, each a PNG."""
     found = estimates(identified)
-    drawn = {each.__name__: each(identified, found) for each in (timing, bursts, mounting, wheels)}
+    drawn = {
+        each.__name__: each(identified, found)
+        for each in (timing, bursts, mounting, wheels)
+    }
     drawn |= {"inputs": inputs(spec, identified), "noise": noise(identified)}
     return {name: picture for name, picture in drawn.items() if picture is not None}
 
@@ -255,7 +329,9 @@ def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
         span, label = 2.0 * sigma, "two standard uncertainties"
         axes.axvspan(value - span, value + span, color=MODEL, alpha=0.25, label=label)
         axes.axvline(value, color=MODEL, linestyle="--", label="estimate")
-        axes.set(xlabel=f"{estimate.name} [s]", ylabel="unexplained / spread of the signal")
+        axes.set(
+            xlabel=f"{estimate.name} [s]", ylabel="unexplained / spread of the signal"
+        )
         _finish(axes, estimate.text)
     return png(figure)
 
@@ -270,12 +346,16 @@ def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
     figure, (axes, intervals) = panels(1, 2, (9.0, 3.8))
     number = np.arange(len(t))[shown]
     axes.plot(t[shown] - t[0], number, ".", color=OTHER, label="as they arrived")
-    axes.plot(spread[shown] - t[0], number, "-", color=MODEL, label="spread over the period")
+    axes.plot(
+        spread[shown] - t[0], number, "-", color=MODEL, label="spread over the period"
+    )
     axes.set(xlabel="stamp [s]", ylabel="pose number")
     _finish(axes, f"{found['burst_period_s'].text}, {groups.size:.0f} poses in each")
     edges = list(np.linspace(0.0, 1.5 * groups.period_s, 60))
     intervals.hist(np.diff(t), edges, color=OTHER, label="as they arrived")
-    intervals.hist(np.diff(spread), edges, color=MODEL, alpha=0.7, label="spread over the period")
+    intervals.hist(
+        np.diff(spread), edges, color=MODEL, alpha=0.7, label="spread over the period"
+    )
     intervals.set(xlabel="time between two poses [s]", ylabel="number")
     _finish(intervals, "intervals")
     return png(figure)
@@ -297,7 +377,10 @@ def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes
     figure, grid = panels(1, count, (5.2 * count, 4.4))
     _points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
     grid[0].set_aspect("equal", adjustable="datalim")
-    grid[0].set(xlabel="velocity along x of its own frame [m/s]", ylabel="velocity along y [m/s]")
+    grid[0].set(
+        xlabel="velocity along x of its own frame [m/s]",
+        ylabel="velocity along y [m/s]",
+    )
     _finish(grid[0], rotation.text)
     for axes in grid[1:]:
         _points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
@@ -319,10 +402,21 @@ def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
         return None
     turn, along = drive.twists.twist[:, 2], clocks.speed_along(drive, calibration)
     rows: tuple[tuple[str, str, str, Array, Array], ...] = (
-        ("wheel_scale", "mean of both wheels [unit]", "speed [m/s]", units.mean(axis=1), along),
-        ("turn_scale", "right less left wheel [unit]", "yaw rate [rad/s]",
-         units[:, 1] - units[:, 0], turn),
-    )  # fmt: skip
+        (
+            "wheel_scale",
+            "mean of both wheels [unit]",
+            "speed [m/s]",
+            units.mean(axis=1),
+            along,
+        ),
+        (
+            "turn_scale",
+            "right less left wheel [unit]",
+            "yaw rate [rad/s]",
+            units[:, 1] - units[:, 0],
+            turn,
+        ),
+    )
     figure, grid = panels(1, 2, (10.0, 4.0))
     for axes, (name, x_label, y_label, x, y) in zip(grid, rows, strict=True):
         axes.plot(x, y, ".", markersize=4, color=MEASURED, label="measured")
@@ -349,33 +443,52 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     names = [command.name for command in spec.command]
     for axes, curve in zip(grid, curves, strict=False):
         place = names.index(curve.command)
-        sent, unit = identified.recording.command.values[:, place], spec.command[place].unit
+        sent, unit = (
+            identified.recording.command.values[:, place],
+            spec.command[place].unit,
+        )
         command = np.linspace(sent.min(), sent.max(), CURVE_POINTS)
         axes.plot(command, command, ":", color=OTHER, label="as commanded")
         axes.plot(command, curve.of(command), color=MODEL, label="in effect")
         sigma = identified.calibration.uncertainty.get(f"{curve.command}.dead", 0.0)
         for edge in (-curve.dead, curve.dead) if sigma else ():
-            axes.axvspan(edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25)
+            axes.axvspan(
+                edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25
+            )
         rug: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "alpha": 0.05}
-        axes.plot(sent, np.full(len(sent), 0.03), "|", color=MEASURED, markersize=9, **rug)
-        axes.set(xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]")
+        axes.plot(
+            sent, np.full(len(sent), 0.03), "|", color=MEASURED, markersize=9, **rug
+        )
+        axes.set(
+            xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]"
+        )
         _finish(axes, curve.equation.replace("-+", "∓"))
     return png(figure)
 
 
 def _restraint(axes: Axes, identified: Identified, dof: str) -> None:
     """Draws the rates of a state as measured, and as limits, drag and friction let them be."""
-    model, samples, d = identified.model, identified.samples, identified.model.dofs.index(dof)
+    model, samples, d = (
+        identified.model,
+        identified.samples,
+        identified.model.dofs.index(dof),
+    )
     some = slice(None, None, max(1, len(samples.t) // MOST_POINTS))
     asked = taylor.evaluate(samples.x[some], model.powers) @ model.coefficients[d]
-    axes.plot(asked, samples.dq[some, d], ".", markersize=3, color=MEASURED, label="measured")
+    axes.plot(
+        asked, samples.dq[some, d], ".", markersize=3, color=MEASURED, label="measured"
+    )
     held = model.rates(samples.x[some])[:, d]
     axes.plot(asked, held, ".", markersize=3, color=MODEL, label="model")
     for word, edge in zip(("fall", "rise"), model.limits[d - 3].tolist(), strict=True):
-        sigma = identified.calibration.uncertainty.get(f"{model.variables[d - 3]}.{word}", 0.0)
+        sigma = identified.calibration.uncertainty.get(
+            f"{model.variables[d - 3]}.{word}", 0.0
+        )
         if np.isfinite(edge):
             axes.axhline(edge, color=MODEL, linestyle="--")
-            axes.axhspan(edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25)
+            axes.axhspan(
+                edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25
+            )
     unit = model.dof_units[d]
     axes.set(xlabel=f"{dof} by its terms [{unit}]", ylabel=f"{dof} [{unit}]")
     _finish(axes, dof + model.restraint(dof))
@@ -389,8 +502,15 @@ def _finish(axes: Axes, title: str) -> None:
 def noise(identified: Identified) -> bytes | None:
     """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
     levels, histograms = identified.noise, []
-    drive, calibration, model = identified.drive, identified.calibration, identified.model
-    if drive.bursts is None and len(pose := pose_residual(drive.recording.pose)) > DIFFERENCE:
+    drive, calibration, model = (
+        identified.drive,
+        identified.calibration,
+        identified.model,
+    )
+    if (
+        drive.bursts is None
+        and len(pose := pose_residual(drive.recording.pose)) > DIFFERENCE
+    ):
         histograms += [("pose position", levels.pose_position, pose[:, :2].ravel())]
         histograms += [("pose heading", levels.pose_heading, pose[:, 2])]
     odometry = odometry_residual(drive, calibration, model, identified.samples)
@@ -399,7 +519,11 @@ def noise(identified: Identified) -> bytes | None:
         histograms += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
     histograms = [one for one in histograms if one[1].measured and one[1].std > 0.0]
     grown = drift_growth(drive, calibration, model)
-    drifts = grown is not None and levels.position_drift.measured and bool(grown[1].max() > 1e-9)
+    drifts = (
+        grown is not None
+        and levels.position_drift.measured
+        and bool(grown[1].max() > 1e-9)
+    )
     if not histograms and not drifts:
         return None
     count = len(histograms) + 2 * drifts
@@ -408,8 +532,16 @@ def noise(identified: Identified) -> bytes | None:
     figure, grid = panels(rows, columns, (4.3 * columns, 3.4 * rows))
     for axes, (name, level, rest) in zip(grid, histograms, strict=False):
         edges = np.linspace(-REACH * level.std, REACH * level.std, BINS + 1)
-        axes.hist(rest - np.median(rest), list(edges), density=True, color=MEASURED, alpha=0.55)
-        normal = np.exp(-0.5 * (edges / level.std) ** 2) / (level.std * np.sqrt(2.0 * np.pi))
+        axes.hist(
+            rest - np.median(rest),
+            list(edges),
+            density=True,
+            color=MEASURED,
+            alpha=0.55,
+        )
+        normal = np.exp(-0.5 * (edges / level.std) ** 2) / (
+            level.std * np.sqrt(2.0 * np.pi)
+        )
         axes.plot(edges, normal, "--", color=MODEL)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
@@ -422,9 +554,24 @@ def noise(identified: Identified) -> bytes | None:
     return png(figure)
 
 
-def _growth(axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str) -> None:
-    axes.plot(horizon, error, "o-", color=MEASURED, markersize=4, label="error of the prediction")
-    axes.plot(horizon, level.std * np.sqrt(horizon), "--", color=MODEL, label="the drift alone")
+def _growth(
+    axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str
+) -> None:
+    axes.plot(
+        horizon,
+        error,
+        "o-",
+        color=MEASURED,
+        markersize=4,
+        label="error of the prediction",
+    )
+    axes.plot(
+        horizon,
+        level.std * np.sqrt(horizon),
+        "--",
+        color=MODEL,
+        label="the drift alone",
+    )
     axes.set(xlabel="horizon [s]", ylabel=f"root mean square [{unit}]")
     _finish(axes, f"drift of the {name}\n{_value(level)}")
 
@@ -448,7 +595,11 @@ def timing_curves(drive: Drive, calibration: Calibration) -> tuple[ShiftCurve, .
     if not moved_commands(drive.recording.command).any():
         return ()
     names = ("clock_offset_s", "command_latency_s")
-    found = (_curve(drive, calibration, name) for name in names if name in calibration.uncertainty)
+    found = (
+        _curve(drive, calibration, name)
+        for name in names
+        if name in calibration.uncertainty
+    )
     return tuple(curve for curve in found if curve is not None)
 
 
@@ -456,7 +607,10 @@ def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | No
     recording, spec, twists = drive.recording, drive.spec, drive.twists
     state, wheels, command = recording.state, recording.wheels, recording.command
     value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, TRIALS)
-    signal, of_clock = (twists.start, twists.end, twists.twist), name == "clock_offset_s"
+    signal, of_clock = (
+        (twists.start, twists.end, twists.twist),
+        name == "clock_offset_s",
+    )
     if state is not None and of_clock:
         by_shift = clocks.residual_by_shift(state, signal)
         rest = [by_shift(np.array([-d])) for d in value]
@@ -467,10 +621,16 @@ def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | No
         if not of_clock and recording.pose.clock != command.clock:
             if wheels is None:
                 return None
-            signal = (wheels.t - float(np.median(np.diff(wheels.t))), wheels.t, wheels.values)
+            signal = (
+                wheels.t - float(np.median(np.diff(wheels.t))),
+                wheels.t,
+                wheels.values,
+            )
         lags = np.array([r.lag_s for r in calibration.responses])
         lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
-        if not len(lags):  # nothing lags behind: the fit found the latency by predictions
+        if not len(
+            lags
+        ):  # nothing lags behind: the fit found the latency by predictions
             return None
         left = clocks.response_residual(command, spec, signal)
         delays = calibration.command_latency_s - value if of_clock else value

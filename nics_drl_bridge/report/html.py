@@ -44,7 +44,9 @@ WIDE = 700  # width of a picture [pixels] above which a phone scrolls it sideway
 
 def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]) -> str:
     """Builds a page of sections, each a heading and HTML blocks, below a lead sentence."""
-    body = "".join(f"<h2>{escape(heading)}</h2>{''.join(blocks)}" for heading, blocks in sections)
+    body = "".join(
+        f"<h2>{escape(heading)}</h2>{''.join(blocks)}" for heading, blocks in sections
+    )
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -102,7 +104,11 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Rows of text under a heading row."""
 
     def cells(kind: str, row: Sequence[str]) -> str:
-        return "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
+        return (
+            "<tr>"
+            + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row)
+            + "</tr>"
+        )
 
     body = "".join(cells("td", row) for row in rows)
     head_row = f"<thead>{cells('th', head)}</thead>"

@@ -9,13 +9,25 @@ dead zone and slip are for a recording to show.
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot import kinds
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
-from nics_drl_bridge.robot.template import SHARES, STEERED, STEERED_LAGS, Template, names_of, usual
+from nics_drl_bridge.robot.template import (
+    SHARES,
+    STEERED,
+    STEERED_LAGS,
+    Template,
+    names_of,
+    usual,
+)
 
 LENGTHS = {"wheelbase": 1.3}
 TEMPLATE = Template((STEERED,), POSE_RATES, (), STEERED_LAGS, LENGTHS)
 THROTTLE = (usual("throttle", "1", SHARES), usual("steering", "1", SHARES))
 # The lag of the speed is that of rolling on, so that it is long.
-GAINS = {"speed_gain": 3.0, "greatest_steering": 0.4, "speed_lag": 0.5, "steering_lag": 0.1}
+GAINS = {
+    "speed_gain": 3.0,
+    "greatest_steering": 0.4,
+    "speed_lag": 0.5,
+    "steering_lag": 0.1,
+}
 
 
 def kinematics(spec: RobotSpec) -> kinds.Textbook:
@@ -33,7 +45,9 @@ def by_throttle(spec: RobotSpec) -> kinds.Textbook:
 def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
     """Returns `track` and `wheel_radius` [m]; by default shares of the wheelbase."""
     base = parameters["wheelbase"]
-    return parameters.get("track", 0.8 * base), parameters.get("wheel_radius", 0.18 * base)
+    return parameters.get("track", 0.8 * base), parameters.get(
+        "wheel_radius", 0.18 * base
+    )
 
 
 def drawing(spec: RobotSpec) -> kinds.Drawing:
@@ -41,11 +55,22 @@ def drawing(spec: RobotSpec) -> kinds.Drawing:
     wheelbase, angle = spec.parameters["wheelbase"], kinds.steering_angle(spec)
     track, radius = track_and_radius(spec.parameters)
     wheels = []
-    for side, y, suffix in (("left", 0.5 * track, ""), ("right", -0.5 * track, "_right")):
-        pivot = kinds.Pivot(f"{side}_knuckle", angle.name + suffix, angle) if angle else None
+    for side, y, suffix in (
+        ("left", 0.5 * track, ""),
+        ("right", -0.5 * track, "_right"),
+    ):
+        pivot = (
+            kinds.Pivot(f"{side}_knuckle", angle.name + suffix, angle)
+            if angle
+            else None
+        )
         wheels.append(kinds.Wheel(f"rear_{side}_wheel", (0.0, y), radius))
-        wheels.append(kinds.Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot))
-    return kinds.Drawing((1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius), tuple(wheels))
+        wheels.append(
+            kinds.Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot)
+        )
+    return kinds.Drawing(
+        (1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius), tuple(wheels)
+    )
 
 
 KIND = kinds.RobotKind(kinematics, drawing, TEMPLATE)

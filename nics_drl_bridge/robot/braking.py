@@ -21,17 +21,27 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import BEYOND, TaylorModel
 
-LONGEST_STOP_S = 60.0  # a robot that still moves after this time cannot be shown to stop [s]
+LONGEST_STOP_S = (
+    60.0  # a robot that still moves after this time cannot be shown to stop [s]
+)
 LONGEST_START_S = 30.0  # after which a held command has led to its steady motion [s]
-CREEP = 0.05  # a robot that moves no faster than this stands [m/s, of its whole footprint]
+CREEP = (
+    0.05  # a robot that moves no faster than this stands [m/s, of its whole footprint]
+)
 BIAS = 0.05  # share of its greatest speed at which a model may creep at rest, by a bias of its fit
 BIAS_STEERED = 0.15  # likewise with steered wheels: a polynomial is less exact there
 FIXED = 1e-9  # a state that changes by less in a step has settled, as a share of the greatest
-DEVIATIONS = 2.0  # standard errors of the model's coefficients by which it may respond slower
+DEVIATIONS = (
+    2.0  # standard errors of the model's coefficients by which it may respond slower
+)
 SLOWEST = 0.5  # least factor on the response of a model by its standard errors
-SLACK_M = 0.15  # length beside which a stopping distance need not be bounded tightly [m]
+SLACK_M = (
+    0.15  # length beside which a stopping distance need not be bounded tightly [m]
+)
 STRAIGHT = 0.1  # a motion turns if its turn moves the footprint by more than this share
-MINOR = 0.1  # a lesser component of a twist counts from this share of the greatest one on
+MINOR = (
+    0.1  # a lesser component of a twist counts from this share of the greatest one on
+)
 ALIKE = 0.1  # components whose braking times differ by less stop together
 LEVERS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)
 """That are tried, in footprint radii."""
@@ -62,7 +72,9 @@ class Drift:
 
     least: float = 1.0  # factor
     greatest: float = 1.0  # factor
-    share: float = 1.0  # greatest share of the greatest component that a lesser one comes to
+    share: float = (
+        1.0  # greatest share of the greatest component that a lesser one comes to
+    )
 
     @property
     def is_none(self) -> bool:
@@ -82,9 +94,13 @@ class OwnTurn:
     """
 
     reaction_s: float  # until the braking of the turn counts, lags included
-    deceleration: float  # of the turn that follows; infinite if the lags are all [rad/s^2]
+    deceleration: (
+        float  # of the turn that follows; infinite if the lags are all [rad/s^2]
+    )
     least_turn: float = 1.0  # share of this bound by which the robot turns at least
-    least_path: float = 1.0  # share of the bound of its path that the robot moves at least
+    least_path: float = (
+        1.0  # share of the bound of its path that the robot moves at least
+    )
 
     def mean_time_s(self, rate: Array) -> Array:
         """Returns the times (...) at full turn rates (...) in which the robot turns as far."""
@@ -99,8 +115,12 @@ class Braking:
     twist for the reaction time, and then braked evenly by the deceleration.
     """
 
-    reaction_s: float  # from the command to stop until the braking counts, lags included
-    deceleration: float  # of the braking that follows; infinite if the lags are all [m/s^2]
+    reaction_s: (
+        float  # from the command to stop until the braking counts, lags included
+    )
+    deceleration: (
+        float  # of the braking that follows; infinite if the lags are all [m/s^2]
+    )
     # by which a turn rate adds to the speed in the pace [m]: wheels that turn the robot brake both
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes
@@ -118,7 +138,9 @@ class Braking:
         """Returns the times to rest (...) from twists (..., 3)."""
         times = self.reaction_s + self.pace(twist) / self.deceleration
         if self.turn is not None:
-            turning = self.turn.reaction_s + np.abs(twist[..., 2]) / self.turn.deceleration
+            turning = (
+                self.turn.reaction_s + np.abs(twist[..., 2]) / self.turn.deceleration
+            )
             times = np.maximum(times, np.where(twist[..., 2] == 0.0, 0.0, turning))
         return np.asarray(times)
 
@@ -146,9 +168,12 @@ class Stops(NamedTuple):
 
 
 def braking_of(
-    robot: RobotSpec, model: TaylorModel, low: Array | None = None, high: Array | None = None,
+    robot: RobotSpec,
+    model: TaylorModel,
+    low: Array | None = None,
+    high: Array | None = None,
     ramp: Array | None = None,
-) -> Braking:  # fmt: skip
+) -> Braking:
     """Returns the bound of all stops of a model; it is computed once for each model.
 
     Args:
@@ -179,15 +204,21 @@ def _key(robot: RobotSpec, model: TaylorModel, *arrays: Array) -> tuple[Any, ...
     return (robot.model_dump_json(), *content, *(each.tobytes() for each in arrays))
 
 
-def _bound(robot: RobotSpec, model: TaylorModel, low: Array, high: Array, ramp: Array) -> Braking:
+def _bound(
+    robot: RobotSpec, model: TaylorModel, low: Array, high: Array, ramp: Array
+) -> Braking:
     commands = motions(low, high)
     slower = slowest_of(model)
     variants = (model,) if slower is None else (model, slower)
-    ramped = _together([simulate_stops(robot, each, commands, ramp) for each in variants])
+    ramped = _together(
+        [simulate_stops(robot, each, commands, ramp) for each in variants]
+    )
     at_once = np.full_like(ramp, np.inf)
     sudden = ramped
     if np.isfinite(ramp).any():
-        sudden = _together([simulate_stops(robot, each, commands, at_once) for each in variants])
+        sudden = _together(
+            [simulate_stops(robot, each, commands, at_once) for each in variants]
+        )
     for stops in (ramped, sudden):
         _require_rest(robot, stops)
     radius = robot.footprint_radius
@@ -196,7 +227,10 @@ def _bound(robot: RobotSpec, model: TaylorModel, low: Array, high: Array, ramp: 
     if robot.steers or (shared.lever_m == 0.0 and shared.drift.is_none):
         return shared
     apart = fit_apart(_together([ramped, sudden]), radius)
-    if apart is None or _slack(apart, ramped, radius) > _slack(shared, ramped, radius) - NEGLIGIBLE:
+    if (
+        apart is None
+        or _slack(apart, ramped, radius) > _slack(shared, ramped, radius) - NEGLIGIBLE
+    ):
         return shared
     return apart
 
@@ -210,7 +244,12 @@ def motions(low: Array, high: Array) -> Array:
         mixed = np.array(list(product(levels, repeat=count)))
     else:
         mixed = _pairs(count)
-    alone = [sign * share * row for row in np.eye(count) for share in ALONE for sign in (-1, 1)]
+    alone = [
+        sign * share * row
+        for row in np.eye(count)
+        for share in ALONE
+        for sign in (-1, 1)
+    ]
     chosen = np.concatenate([mixed, alone])
     return np.clip(np.where(chosen < 0.0, -chosen * low, chosen * high), low, high)
 
@@ -249,13 +288,19 @@ def slowest_of(model: TaylorModel) -> TaylorModel | None:
     return replace(model, coefficients=model.coefficients * factors[:, None])
 
 
-def simulate_stops(robot: RobotSpec, model: TaylorModel, commands: Array, ramp: Array) -> Stops:
+def simulate_stops(
+    robot: RobotSpec, model: TaylorModel, commands: Array, ramp: Array
+) -> Stops:
     """Stops the steady motions of commands (K, C), with steering angles held and released."""
-    with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is refused later
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # a model that diverges is refused later
         state = _steady(robot, model, commands)
         rest = np.clip(0.0, robot.command_low, robot.command_high)
         angles = np.array([each.unit == "rad" for each in robot.command])
-        stops = [_stop(robot, model, state, commands, np.where(angles, commands, rest), ramp)]
+        stops = [
+            _stop(robot, model, state, commands, np.where(angles, commands, rest), ramp)
+        ]
         if angles.any():
             released = np.broadcast_to(rest, commands.shape)
             stops.append(_stop(robot, model, state, commands, released, ramp))
@@ -290,7 +335,9 @@ def _range_of_states(robot: RobotSpec, model: TaylorModel) -> tuple[Array, Array
     least = np.array([variable.min for variable in robot.state])
     most = np.array([variable.max for variable in robot.state])
     if robot.takes_cmd_vel:  # the commands bound its speeds
-        return np.minimum(least, model.low[:count]), np.maximum(most, model.high[:count])
+        return np.minimum(least, model.low[:count]), np.maximum(
+            most, model.high[:count]
+        )
     # A throttle that is held may lead to speeds that the robot never had.
     margin = BEYOND * (model.high[:count] - model.low[:count])
     low = np.maximum(least, model.low[:count] - margin)
@@ -306,7 +353,12 @@ def _is_settled(before: Array, after: Array) -> bool:
 
 
 def _stop(
-    robot: RobotSpec, model: TaylorModel, state: Array, commands: Array, rest: Array, ramp: Array
+    robot: RobotSpec,
+    model: TaylorModel,
+    state: Array,
+    commands: Array,
+    rest: Array,
+    ramp: Array,
 ) -> Stops:
     """Simulates stops: each command goes to rest (K, C) by its ramp, after its own delay."""
     dt = model.dt
@@ -316,14 +368,18 @@ def _stop(
     low, high = model.state_box
     idle = _idle_twist(robot, model, rest)
     idle_speed = np.hypot(idle[:, 0], idle[:, 1])
-    holds = (rest == commands) & np.array([each.unit == "rad" for each in robot.command])
+    holds = (rest == commands) & np.array(
+        [each.unit == "rad" for each in robot.command]
+    )
     path = np.zeros(count)
     travel = np.zeros((count, 3))
     first = np.zeros((count, 3))
     twist = first
     for step in range(round((LONGEST_STOP_S + delays.max(initial=0.0)) / dt)):
         since_told = (step + 0.5) * dt - delays  # in the middle of this step
-        changed = np.where(since_told > 0.0, ramp * np.maximum(since_told, dt / 2.0), 0.0)
+        changed = np.where(
+            since_told > 0.0, ramp * np.maximum(since_told, dt / 2.0), 0.0
+        )
         moved = np.sign(gap) * np.minimum(np.abs(gap), changed)
         x = np.concatenate([state, model.in_effect(commands + moved)], axis=-1)
         rates = model.rates(x)
@@ -384,14 +440,20 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
     if not counts.any():
         return Braking(0.0, math.inf)
     twist = stops.twist[counts]
-    speed, turn, whole, distance = (each[counts] for each in (speed, turn, whole, distance))
+    speed, turn, whole, distance = (
+        each[counts] for each in (speed, turn, whole, distance)
+    )
     straight = radius * turn <= STRAIGHT * speed
     if not straight.any():
         straight = np.ones_like(straight)
     worst = _envelope(whole[straight], distance[straight])
     sideways = np.abs(twist[:, :2]).min(axis=1) > MINOR * speed
     orders = ORDERS if sideways.any() else (2.0,)
-    tried = [Braking(0.0, 1.0, share * radius, order=order) for share in LEVERS for order in orders]
+    tried = [
+        Braking(0.0, 1.0, share * radius, order=order)
+        for share in LEVERS
+        for order in orders
+    ]
     found = []
     for each in tried:
         pace = each.pace(twist)
@@ -412,7 +474,9 @@ def _rounded(bound: Braking, reaction: float, inverse: float) -> Braking:
     deceleration = 0.5 / inverse
     digit = 10.0 ** (math.floor(math.log10(deceleration)) - 2)
     deceleration = math.floor(deceleration / digit + 1e-3) * digit
-    return replace(bound, reaction_s=reaction, deceleration=float(f"{deceleration:.3g}"))
+    return replace(
+        bound, reaction_s=reaction, deceleration=float(f"{deceleration:.3g}")
+    )
 
 
 def _envelope(speed: Array, distance: Array) -> Array:
@@ -424,7 +488,11 @@ def _envelope(speed: Array, distance: Array) -> Array:
 
 
 def _tightest(
-    whole: Array, pace: Array, distance: Array, straight: NDArray[np.bool_], worst: Array
+    whole: Array,
+    pace: Array,
+    distance: Array,
+    straight: NDArray[np.bool_],
+    worst: Array,
 ) -> tuple[float, float, float]:
     """Returns slack, reaction time [s] and half the inverse of the deceleration [s^2/m].
 
@@ -464,7 +532,9 @@ def fit_apart(stops: Stops, radius: float) -> Braking | None:
     for order in ORDERS if sideways[moves].any() else (2.0,):
         speed = np.hypot(speeds[:, 0], speeds[:, 1])
         pace = Braking(0.0, 1.0, order=order).pace(stops.twist)
-        found.append((order, *_bound_alone(speed[moves], pace[moves], stops.path[moves])))
+        found.append(
+            (order, *_bound_alone(speed[moves], pace[moves], stops.path[moves]))
+        )
     order, _, reaction, inverse = min(found, key=lambda row: row[1])
     bound = _rounded(Braking(0.0, 1.0, order=order), reaction, inverse)
     turned = stops.travel[:, 2]
@@ -480,7 +550,9 @@ def fit_apart(stops: Stops, radius: float) -> Braking | None:
     if mixed.any():
         least_path = _least_share(stops.path[mixed], most_path[mixed])
         least_turn = _least_share(turned[mixed], most_turn[mixed])
-        least_path, least_turn = np.clip([least_path, least_turn], LEAST_SHARE, 1.0).tolist()
+        least_path, least_turn = np.clip(
+            [least_path, least_turn], LEAST_SHARE, 1.0
+        ).tolist()
         own = replace(own, least_turn=least_turn, least_path=least_path)
     return replace(bound, turn=own)
 
@@ -491,7 +563,9 @@ def _least_share(distance: Array, most: Array) -> float:
     return float(shares.min())
 
 
-def _bound_alone(speed: Array, pace: Array, distance: Array) -> tuple[float, float, float]:
+def _bound_alone(
+    speed: Array, pace: Array, distance: Array
+) -> tuple[float, float, float]:
     """Returns what `_tightest` does of a component by itself, which counts at all speeds."""
     return _tightest(speed, pace, distance, np.ones(len(speed), np.bool_), distance)
 

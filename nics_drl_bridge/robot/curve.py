@@ -23,7 +23,9 @@ class InputCurve(Schema):
     # smaller and greater commands do no more than these, in its unit; 0 never does anything
     least: End = -np.inf
     most: End = np.inf
-    back: float = Field(default=1.0, ge=0.0)  # gain of negative commands; that of positive ones: 1
+    back: float = Field(
+        default=1.0, ge=0.0
+    )  # gain of negative commands; that of positive ones: 1
     # after the latency of all commands [s]
     delay: float = Field(default=0.0, ge=0.0, le=LONGEST_DELAY_S)
 
@@ -44,7 +46,9 @@ class InputCurve(Schema):
 
     def of(self, command: ArrayLike) -> Array:
         """Returns the commands in effect (...): beyond the dead zone, in proportion."""
-        held = np.clip(np.asarray(command, np.float64), min(self.least, 0.0), max(self.most, 0.0))
+        held = np.clip(
+            np.asarray(command, np.float64), min(self.least, 0.0), max(self.most, 0.0)
+        )
         beyond = np.sign(held) * np.maximum(np.abs(held) - self.dead, 0.0)
         return np.where(beyond < 0.0, self.back * beyond, beyond)
 
@@ -61,10 +65,14 @@ def ends(least: float, most: float, name: str = "") -> str:
     """Returns those of two ends that are finite, as text: `, throttle at most 0.8`."""
     both = (("at least", least), ("at most", most))
     named = f"{name} " if name else ""
-    return "".join(f", {named}{word} {end:.4g}" for word, end in both if np.isfinite(end))
+    return "".join(
+        f", {named}{word} {end:.4g}" for word, end in both if np.isfinite(end)
+    )
 
 
-def bent(command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...]) -> Array:
+def bent(
+    command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...]
+) -> Array:
     """Returns the commands in effect (..., C) of commands with C names."""
     values = np.array(command, dtype=np.float64)
     for curve in curves:

@@ -26,7 +26,9 @@ def drawing(spec: RobotSpec) -> Drawing:
     """A disc between two wheels."""
     track, radius = spec.parameters["track"], spec.parameters["wheel_radius"]
     places = ((0.0, 0.5 * track), (0.0, -0.5 * track))
-    return Drawing(0.4 * track, (0.0, radius), wheels_at(spec, places, radius, names_of(WHEELS)))
+    return Drawing(
+        0.4 * track, (0.0, radius), wheels_at(spec, places, radius, names_of(WHEELS))
+    )
 
 
 KIND = RobotKind(kinematics, drawing, Template((TWIST,), MOVES, (), LAGS, LENGTHS))

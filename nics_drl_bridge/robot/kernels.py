@@ -19,7 +19,9 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 # Of sin(t) / t and (1 - cos(t)) / t: to 1e-14 for a turn below 0.1 rad, 1e-8 below WIDE_TURN.
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
-WIDE_TURN = 0.5  # For larger turns per step sine and cosine are used, not the series [rad]
+WIDE_TURN = (
+    0.5  # For larger turns per step sine and cosine are used, not the series [rad]
+)
 GREATEST_ORDER = 4
 DEAD, LEAST, MOST, BACK = 0, 1, 2, 3  # columns of `Terms.curves`, as in `InputCurve`
 
@@ -29,7 +31,9 @@ class Terms(NamedTuple):
 
     dof: NDArray[np.int64]  # (T,) degree of freedom of each
     coefficient: Array  # (T,), or (T, n) of n robots
-    factors: NDArray[np.int64]  # (T, order) indices into `x`; unused ones of its last entry, 1
+    factors: NDArray[
+        np.int64
+    ]  # (T, order) indices into `x`; unused ones of its last entry, 1
     degree: NDArray[np.int64]  # (T,) number of factors
     low: Array  # (S,) least and greatest state, at which it is held
     high: Array
@@ -38,7 +42,9 @@ class Terms(NamedTuple):
     friction: Array  # (S,) by which a state is drawn to zero [unit / s]
     drag: Array  # (S,) times the square of a state, likewise [1 / (unit s)]
     curves: Array  # (C, 4) of the commands
-    late: NDArray[np.int64]  # (C,) delays of the commands after their common latency [steps]
+    late: NDArray[
+        np.int64
+    ]  # (C,) delays of the commands after their common latency [steps]
     emf: Array  # (S, C) times a state and the size of a command in effect; (0, 0) if all are 0
 
 
@@ -70,11 +76,19 @@ def term_arrays(model: TaylorModel) -> Terms:
     coefficients = model.coefficients[dofs, places]
     fall, rise = np.ascontiguousarray(model.limits.T)
     return Terms(
-        dofs.astype(np.int64), coefficients, factors, count, *model.state_box, fall, rise,
-        np.asarray(model.friction, np.float64), np.asarray(model.drag, np.float64),
-        _curve_rows(model), np.round(model.delays / model.dt).astype(np.int64),
+        dofs.astype(np.int64),
+        coefficients,
+        factors,
+        count,
+        *model.state_box,
+        fall,
+        rise,
+        np.asarray(model.friction, np.float64),
+        np.asarray(model.drag, np.float64),
+        _curve_rows(model),
+        np.round(model.delays / model.dt).astype(np.int64),
         model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
-    )  # fmt: skip
+    )
 
 
 def _curve_rows(model: TaylorModel) -> Array:
@@ -114,8 +128,13 @@ def put_command(x, command, terms):  # type: ignore[no-untyped-def]
 def bounds_of(terms, i):  # type: ignore[no-untyped-def]
     """Returns the bounds of state variable i."""
     return Bounds(
-        terms.low[i], terms.high[i], terms.fall[i], terms.rise[i], terms.friction[i], terms.drag[i]
-    )  # fmt: skip
+        terms.low[i],
+        terms.high[i],
+        terms.fall[i],
+        terms.rise[i],
+        terms.friction[i],
+        terms.drag[i],
+    )
 
 
 @kernel
@@ -137,9 +156,20 @@ def next_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
 def with_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
     """Returns terms with other coefficients, those of a robot or of several."""
     return Terms(
-        terms.dof, coefficient, terms.factors, terms.degree, terms.low, terms.high, terms.fall,
-        terms.rise, terms.friction, terms.drag, terms.curves, terms.late, terms.emf,
-    )  # fmt: skip
+        terms.dof,
+        coefficient,
+        terms.factors,
+        terms.degree,
+        terms.low,
+        terms.high,
+        terms.fall,
+        terms.rise,
+        terms.friction,
+        terms.drag,
+        terms.curves,
+        terms.late,
+        terms.emf,
+    )
 
 
 @kernel
@@ -208,7 +238,9 @@ def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
     """Moves a pose (3,) in place along the exact arc of a body twist (3,)."""
     turn = twist[2] * dt
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    pose[0], pose[1], _, _ = move(pose[0], pose[1], c, s, twist[0], twist[1], turn, dt, series)
+    pose[0], pose[1], _, _ = move(
+        pose[0], pose[1], c, s, twist[0], twist[1], turn, dt, series
+    )
     pose[2] = wrap(pose[2] + turn)
 
 
@@ -266,7 +298,14 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
-    px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
+    px, py, pc, ps, heading, length = (
+        pose[0],
+        pose[1],
+        pose[2],
+        pose[3],
+        pose[4],
+        pose[5],
+    )
     vx, vy, wz = dq[0], dq[1], dq[2]
     wide = np.int32(0)
     for i in range(px.shape[0]):
@@ -285,7 +324,14 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
-    px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
+    px, py, pc, ps, heading, length = (
+        pose[0],
+        pose[1],
+        pose[2],
+        pose[3],
+        pose[4],
+        pose[5],
+    )
     vx, vy, wz = dq[0], dq[1], dq[2]
     for i in range(px.shape[0]):
         turn = wz[i] * dt

@@ -19,11 +19,19 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, Bicycle
 from nics_drl_bridge.robot import spec as specs
-from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable, find_kind, kind_names
+from nics_drl_bridge.robot.spec import (
+    POSE_RATES,
+    RobotSpec,
+    StateVariable,
+    find_kind,
+    kind_names,
+)
 from nics_drl_bridge.robot.template import Template
 
 BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
-MISSPELT = 0.8  # least likeness of a misspelt parameter; other parameters' are less alike
+MISSPELT = (
+    0.8  # least likeness of a misspelt parameter; other parameters' are less alike
+)
 MOST_VARIED = 6
 AT_ONCE_S = 1e-9  # lag of a robot whose commands are what its wheels do
 T = TypeVar("T")
@@ -33,11 +41,17 @@ T = TypeVar("T")
 class Textbook:
     """Textbook kinematics of a robot."""
 
-    twist: Callable[[Array], Array]  # gives the body twist (..., 3) for a state (..., S)
-    target: Callable[[Array], Array]  # gives the state (..., S) that a command (..., C) requests
+    twist: Callable[
+        [Array], Array
+    ]  # gives the body twist (..., 3) for a state (..., S)
+    target: Callable[
+        [Array], Array
+    ]  # gives the state (..., S) that a command (..., C) requests
     lag: Array  # (S,) time constants of first-order actuators [s]
     rate: Array  # (S,) of rate-limited actuators [its unit/s]; inf for first-order ones
-    structure: dict[str, tuple[str, ...]]  # possible products of states, by component of the twist
+    structure: dict[
+        str, tuple[str, ...]
+    ]  # possible products of states, by component of the twist
     # gives the command (..., C), maybe out of range, that leads to a twist (..., 3), if known
     command: Callable[[Array], Array] | None = None
 
@@ -48,7 +62,9 @@ class Textbook:
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
         """Returns the exact state (..., S) at time t [s] on its way from `state` to `goal`."""
         gap = state - goal
-        ramp = np.sign(gap) * np.maximum(np.abs(gap) - np.where(self.limited, self.rate, 0) * t, 0)
+        ramp = np.sign(gap) * np.maximum(
+            np.abs(gap) - np.where(self.limited, self.rate, 0) * t, 0
+        )
         return goal + np.where(self.limited, ramp, gap * np.exp(-t / self.lag))
 
     @property
@@ -92,10 +108,15 @@ def disc(spec: RobotSpec) -> Drawing:
 
 
 def wheels_at(
-    spec: RobotSpec, places: Sequence[tuple[float, float]], radius: float, names: tuple[str, ...]
+    spec: RobotSpec,
+    places: Sequence[tuple[float, float]],
+    radius: float,
+    names: tuple[str, ...],
 ) -> tuple[Wheel, ...]:
     """Returns wheels at places; those of a state of as many wheels turn by its variables."""
-    if turns := bool(spec.state) and all(v.unit == "rad/s" and v.twist is None for v in spec.state):
+    if turns := bool(spec.state) and all(
+        v.unit == "rad/s" and v.twist is None for v in spec.state
+    ):
         names = tuple(v.name for v in spec.state)
     both = zip(names, places, strict=True)
     return tuple(Wheel(name, place, radius, turns=turns) for name, place in both)
@@ -106,20 +127,29 @@ def places_of_four(parameters: Mapping[str, float]) -> dict[str, tuple[float, fl
 
     They stand at `half_length` and `half_width`, each half a `track` where it is not given.
     """
-    x, y = (parameters[k] if k in parameters else 0.5 * parameters["track"]
-            for k in ("half_length", "half_width"))  # fmt: skip
-    return {f"{end}_{side}": (s * x, t * y) for end, s in (("front", 1.0), ("rear", -1.0))
-            for side, t in (("left", 1.0), ("right", -1.0))}  # fmt: skip
+    x, y = (
+        parameters[k] if k in parameters else 0.5 * parameters["track"]
+        for k in ("half_length", "half_width")
+    )
+    return {
+        f"{end}_{side}": (s * x, t * y)
+        for end, s in (("front", 1.0), ("rear", -1.0))
+        for side, t in (("left", 1.0), ("right", -1.0))
+    }
 
 
 @dataclass(frozen=True)
 class RobotKind:
     """A kind of robot. Its functions raise KeyError for a parameter that the spec lacks."""
 
-    kinematics: Callable[[RobotSpec], Textbook] | None  # of its actuators; None: not known
+    kinematics: (
+        Callable[[RobotSpec], Textbook] | None
+    )  # of its actuators; None: not known
     drawing: Callable[[RobotSpec], Drawing]
     template: Template = field(default_factory=Template)
-    sideways: bool = False  # True if it is driven sideways by commands other than a twist's
+    sideways: bool = (
+        False  # True if it is driven sideways by commands other than a twist's
+    )
     slips: bool = False  # True if it moves otherwise than the twist that is commanded
     front_drive: bool = False  # True if the speed is that of the steered wheel
 
@@ -129,11 +159,15 @@ def textbook(spec: RobotSpec) -> Textbook:
     book = actuated(spec)
     if spec.state and all(v.twist is not None for v in spec.state):
         return _through_lags(spec, book)
-    if not spec.state and not _made(spec, lambda kind: kind.template.moves or kind.template.state):
+    if not spec.state and not _made(
+        spec, lambda kind: kind.template.moves or kind.template.state
+    ):
         return replace(book, lag=np.full(len(book.lag), AT_ONCE_S))
     if len(spec.state) != len(book.lag):
         have = ", ".join(v.name for v in spec.state) or "none"
-        needed = f"the {spec.textbook} kinematics need a state of {len(book.lag)} actuators"
+        needed = (
+            f"the {spec.textbook} kinematics need a state of {len(book.lag)} actuators"
+        )
         fix = "correct `state:`, or leave it to the kind"
         raise ConfigError(f"robot {spec.name!r}: {needed}, not {have}; {fix}.")
     return book
@@ -163,8 +197,14 @@ def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
     dofs = [POSE_RATES.index(v.twist) for v in spec.state if v.twist is not None]
     if book.limited.any():
         fault = "a rate limit of an actuator needs the actuators as state"
-        raise ConfigError(f"robot {spec.name!r}: {fault}; give lags, or correct `state:`.")
-    named = zip(spec.state, [float(book.lag[-1 if dof == 2 else 0]) for dof in dofs], strict=True)
+        raise ConfigError(
+            f"robot {spec.name!r}: {fault}; give lags, or correct `state:`."
+        )
+    named = zip(
+        spec.state,
+        [float(book.lag[-1 if dof == 2 else 0]) for dof in dofs],
+        strict=True,
+    )
     lag = np.array([spec.parameters.get(f"{v.name}_lag", one) for v, one in named])
 
     def twist(state: Array) -> Array:
@@ -187,12 +227,17 @@ def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
     robot, kind = f"robot {spec.name!r}", find_kind(require_textbook(spec))
     if kind is None:
         known = ", ".join(kind_names())
-        raise ConfigError(f"{robot}: `textbook:` must be one of {known}, not {spec.textbook!r}.")
+        raise ConfigError(
+            f"{robot}: `textbook:` must be one of {known}, not {spec.textbook!r}."
+        )
     try:
         return make(kind)
     except KeyError as error:
         needed = f"the {spec.textbook} kinematics need the parameter {error}"
-        usual = {*kind.template.parameters, *kind.template.lengths}  # no slips of the pen
+        usual = {
+            *kind.template.parameters,
+            *kind.template.lengths,
+        }  # no slips of the pen
         own = [name for name in spec.parameters if name not in usual]
         near = difflib.get_close_matches(str(error.args[0]), own, n=1, cutoff=MISSPELT)
         fix = f"is {near[0]!r} it?" if near else "add it under `parameters:`."
@@ -233,7 +278,9 @@ def command_for(spec: RobotSpec, twist: ArrayLike) -> Array:
         book = actuated(spec)
         if book.command is None:
             fault = f"which command leads to a twist is not known of a {spec.textbook}"
-            raise ConfigError(f"robot {spec.name!r}: {fault}; use continuous actions, no planner.")
+            raise ConfigError(
+                f"robot {spec.name!r}: {fault}; use continuous actions, no planner."
+            )
         command = book.command(twist)
     return np.clip(command, spec.command_low, spec.command_high)
 
@@ -258,7 +305,11 @@ def overdriven(spec: RobotSpec) -> str | None:
     asked = textbook(spec).target(_corners(spec))
     for values, one in zip(asked.T, spec.state, strict=True):
         worst = float(values[np.abs(values).argmax()])
-        if not one.min - BEYOND * abs(one.min) <= worst <= one.max + BEYOND * abs(one.max):
+        if (
+            not one.min - BEYOND * abs(one.min)
+            <= worst
+            <= one.max + BEYOND * abs(one.max)
+        ):
             limits = f"beyond its limits {one.min:g} and {one.max:g}"
             fix = "narrow the commands, or widen the limits of the state"
             return f"the commands ask for {one.name} at {worst:.3g} {one.unit}, {limits}; {fix}."
@@ -280,7 +331,10 @@ def slips(spec: RobotSpec) -> bool:
 
 
 def steered(
-    spec: RobotSpec, geometry: Bicycle, names: tuple[str, ...], gain: tuple[float, float] = (1, 1)
+    spec: RobotSpec,
+    geometry: Bicycle,
+    names: tuple[str, ...],
+    gain: tuple[float, float] = (1, 1),
 ) -> Textbook:
     """Builds the kinematics of a robot that is driven by a speed and a steering angle.
 
@@ -290,17 +344,20 @@ def steered(
     v, phi = _states(spec)
     command = _commands(spec, ("linear.x", "angular.z"), names, 2)
     order = np.argsort([v, phi])
-    speed, angle = (spec.state[i].name if _own_state(spec) else names[i] for i in (v, phi))
+    speed, angle = (
+        spec.state[i].name if _own_state(spec) else names[i] for i in (v, phi)
+    )
     lag, rate = _actuators(spec.parameters, ("speed", "steering"))
     return Textbook(
         twist=lambda state: geometry.twist(state[..., v], state[..., phi]),
         target=lambda given: (given[..., command] * gain)[..., order],
-        lag=lag[order], rate=rate[order],
+        lag=lag[order],
+        rate=rate[order],
         structure={"vx": (speed,), "vy": (), "wz": (f"{speed}*{angle}",)},
         command=lambda twist: _placed(
             spec, command, np.stack(geometry.command(twist), axis=-1) / gain
         ),
-    )  # fmt: skip
+    )
 
 
 def steering_angle(spec: RobotSpec) -> StateVariable | None:
@@ -309,9 +366,13 @@ def steering_angle(spec: RobotSpec) -> StateVariable | None:
 
 
 def wheeled(
-    spec: RobotSpec, inverse: Array, forward: Array, moves: tuple[str, ...],
-    wheels: tuple[str, ...], slip: float = 1.0,
-) -> Textbook:  # fmt: skip
+    spec: RobotSpec,
+    inverse: Array,
+    forward: Array,
+    moves: tuple[str, ...],
+    wheels: tuple[str, ...],
+    slip: float = 1.0,
+) -> Textbook:
     """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its actuators.
 
     `inverse` (W, M) gives wheel speeds per component of the twist that the wheels can move, by name
@@ -332,10 +393,15 @@ def wheeled(
     names = tuple(v.name for v in spec.state) if _own_state(spec) else wheels
     lag, rate = _actuators(spec.parameters, ("wheel",) * len(inverse))
     return Textbook(
-        twist=lambda state: state @ out.T, target=lambda given: given[..., command] @ into.T,
-        lag=lag, rate=rate, structure={dof: names if dof in moves else () for dof in POSE_RATES},
-        command=lambda twist: _placed(spec, command, (twist / slipping)[..., dofs] @ undone.T),
-    )  # fmt: skip
+        twist=lambda state: state @ out.T,
+        target=lambda given: given[..., command] @ into.T,
+        lag=lag,
+        rate=rate,
+        structure={dof: names if dof in moves else () for dof in POSE_RATES},
+        command=lambda twist: _placed(
+            spec, command, (twist / slipping)[..., dofs] @ undone.T
+        ),
+    )
 
 
 def _own_state(spec: RobotSpec) -> bool:
@@ -344,12 +410,17 @@ def _own_state(spec: RobotSpec) -> bool:
 
 
 def _commands(
-    spec: RobotSpec, fields: tuple[specs.CmdVelField, ...], names: tuple[str, ...], count: int
+    spec: RobotSpec,
+    fields: tuple[specs.CmdVelField, ...],
+    names: tuple[str, ...],
+    count: int,
 ) -> list[int]:
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
         if len(have) != count:
-            raise _unfit(spec, f"need {count} commands, not {len(have)}; correct `command:`.")
+            raise _unfit(
+                spec, f"need {count} commands, not {len(have)}; correct `command:`."
+            )
         called = [c.name for c in spec.command]
         if names and set(names) == set(called):
             return [called.index(name) for name in names]
@@ -377,7 +448,9 @@ def _states(spec: RobotSpec) -> tuple[int, int]:
     have = [v.unit for v in spec.state]
     if sorted(have) != ["m/s", "rad"]:
         given = ", ".join(have) or "nothing"
-        raise _unfit(spec, f"need a state in m/s and rad, not in {given}; correct `state:`.")
+        raise _unfit(
+            spec, f"need a state in m/s and rad, not in {given}; correct `state:`."
+        )
     return have.index("m/s"), have.index("rad")
 
 

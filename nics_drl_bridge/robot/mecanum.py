@@ -8,20 +8,31 @@ import numpy as np
 
 from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheeled, wheels_at
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
-from nics_drl_bridge.robot.template import FOUR_WHEELS, LAGS, SIDEWAYS, TWIST, Template, names_of
+from nics_drl_bridge.robot.template import (
+    FOUR_WHEELS,
+    LAGS,
+    SIDEWAYS,
+    TWIST,
+    Template,
+    names_of,
+)
 
 TEMPLATE = Template(
-    commands=((TWIST[0], SIDEWAYS, TWIST[1]), FOUR_WHEELS), moves=POSE_RATES,
+    commands=((TWIST[0], SIDEWAYS, TWIST[1]), FOUR_WHEELS),
+    moves=POSE_RATES,
     lengths={"half_length": 0.6, "half_width": 0.6, "wheel_radius": 0.3},
     parameters=LAGS,
-)  # fmt: skip
+)
 
 
 def kinematics(spec: RobotSpec) -> Textbook:
     """The least-squares twist of four wheels for three degrees of freedom."""
     p = spec.parameters
     arm = p["half_length"] + p["half_width"]
-    inverse = np.array([[1, -1, -arm], [1, 1, arm], [1, 1, -arm], [1, -1, arm]]) / p["wheel_radius"]
+    inverse = (
+        np.array([[1, -1, -arm], [1, 1, arm], [1, 1, -arm], [1, -1, arm]])
+        / p["wheel_radius"]
+    )
     forward = np.asarray(np.linalg.pinv(inverse), dtype=np.float64)
     return wheeled(spec, inverse, forward, POSE_RATES, names_of(FOUR_WHEELS))
 

@@ -10,7 +10,9 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MEASURED: Literal["measured"] = "measured"
-ASSUMED_STATE_DRIFT = 0.1  # of an unmeasured state within a second, as a share of its range
+ASSUMED_STATE_DRIFT = (
+    0.1  # of an unmeasured state within a second, as a share of its range
+)
 
 
 class Level(Schema):
@@ -72,12 +74,16 @@ class Noise(Schema):
 
     def simulated_drift(self, spec: RobotSpec) -> NDArray[np.float64]:
         """Returns the drift (3 + S,) that the simulator draws: measured levels, else zero."""
-        return np.array([level.std if level.measured else 0.0 for level in self._drift(spec)])
+        return np.array(
+            [level.std if level.measured else 0.0 for level in self._drift(spec)]
+        )
 
     def _drift(self, spec: RobotSpec) -> list[Level]:
         levels = [self.position_drift, self.position_drift, self.heading_drift]
         for v in spec.state:
-            unknown = assumed(ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
+            unknown = assumed(
+                ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)"
+            )
             levels.append(self.state_drift.get(v.name, unknown))
         return levels
 
@@ -85,10 +91,16 @@ class Noise(Schema):
         """Returns one human-readable line per level."""
         named = {name: getattr(self, name) for name in type(self).model_fields}
         levels = {n: level for n, level in named.items() if isinstance(level, Level)}
-        levels |= {f"state_drift of {name}": level for name, level in self.state_drift.items()}
+        levels |= {
+            f"state_drift of {name}": level for name, level in self.state_drift.items()
+        }
         return [
             f"{name.replace('_', ' '):<28} {level.std:.3g} {level.unit}"
-            + (f" (+- {level.uncertainty:.1g})" if level.uncertainty is not None else "")
+            + (
+                f" (+- {level.uncertainty:.1g})"
+                if level.uncertainty is not None
+                else ""
+            )
             + ("" if level.measured else ", assumed")
             for name, level in levels.items()
         ]

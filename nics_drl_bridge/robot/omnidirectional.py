@@ -15,4 +15,6 @@ def kinematics(spec: RobotSpec) -> Textbook:
     return wheeled(spec, np.eye(3), np.eye(3), POSE_RATES, POSE_RATES)
 
 
-KIND = RobotKind(kinematics, disc, Template((COMMANDS,), POSE_RATES, (), LAGS), sideways=True)
+KIND = RobotKind(
+    kinematics, disc, Template((COMMANDS,), POSE_RATES, (), LAGS), sideways=True
+)

@@ -7,14 +7,22 @@ which its drive makes wheel speeds of a turn rate (Mandow et al. 2007). Its four
 """
 
 from nics_drl_bridge.robot import differential
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel, places_of_four
+from nics_drl_bridge.robot.kinds import (
+    Drawing,
+    RobotKind,
+    Textbook,
+    Wheel,
+    places_of_four,
+)
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template
 
 TEMPLATE = Template(
-    commands=(TWIST, WHEELS), moves=POSE_RATES, parameters=LAGS,
+    commands=(TWIST, WHEELS),
+    moves=POSE_RATES,
+    parameters=LAGS,
     lengths={"track": 1.3, "effective_track": 2.0, "wheel_radius": 0.3},
-)  # fmt: skip
+)
 
 
 def kinematics(spec: RobotSpec) -> Textbook:

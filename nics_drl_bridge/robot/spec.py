@@ -21,7 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_serializer, model_validator
 
 from nics_drl_bridge import extensions, geometry
-from nics_drl_bridge.config import Mount, Schema, find_config, parse_yaml, read_text, validate
+from nics_drl_bridge.config import (
+    Mount,
+    Schema,
+    find_config,
+    parse_yaml,
+    read_text,
+    validate,
+)
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.template import Ranges
@@ -34,13 +41,26 @@ POSE_UNITS = ("m/s", "m/s", "rad/s")
 DOF_UNITS = dict(zip(POSE_RATES, POSE_UNITS, strict=True))
 TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 # SI units of a state or a command; 1 for a ratio or a count.
-Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
+Unit = Literal[
+    "m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"
+]
 MOST_CORNERS, MOST_VARIABLES = 512, 32  # of a footprint; of a state or a command
-LARGEST = 10.0  # reach of a footprint [m]: none of a robot or a car, but many in centimetres
-LENGTHS = {"wheelbase", "track", "effective_track", "wheel_radius", "half_length", "half_width"}
+LARGEST = (
+    10.0  # reach of a footprint [m]: none of a robot or a car, but many in centimetres
+)
+LENGTHS = {
+    "wheelbase",
+    "track",
+    "effective_track",
+    "wheel_radius",
+    "half_length",
+    "half_width",
+}
 LONGEST = 20.0  # of these parameters, in reaches of the footprint
 FARTHEST_STEERED = 3.2  # angle of a wheel [rad]
-SHARPEST = 0.2  # Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
+SHARPEST = (
+    0.2  # Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
+)
 FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
 
@@ -70,7 +90,9 @@ def _own_kinds(module: str) -> dict[str, Any]:
 class Variable(Schema):
     """A component of the state or of the command."""
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")  # unique; small letters, digits and _
+    name: str = Field(
+        pattern=r"^[a-z][a-z0-9_]*$"
+    )  # unique; small letters, digits and _
     unit: Unit  # of its values, in SI; 1 is a ratio or a count
     min: float = Field(ge=-FASTEST, le=FASTEST)  # least value, in this unit
     max: float = Field(ge=-FASTEST, le=FASTEST)  # greatest value, in this unit
@@ -98,7 +120,9 @@ class StateVariable(Variable):
 class CommandVariable(Variable):
     """A component of the command, with its field of `cmd_vel` if that drives the robot."""
 
-    cmd_vel: CmdVelField | None = None  # field of `cmd_vel` that carries it; None: in process only
+    cmd_vel: CmdVelField | None = (
+        None  # field of `cmd_vel` that carries it; None: in process only
+    )
 
     @property
     def turns(self) -> bool:
@@ -123,8 +147,12 @@ class RobotSpec(Schema):
     description: str = ""  # one sentence for people who read the file
     # its kind: textbook kinematics, to make recordings, or to assume what a drive did not show
     textbook: str | None = None
-    parameters: dict[str, float] = Field(default_factory=dict)  # [m, s], see the module of its kind
-    assumed: tuple[str, ...] = ()  # parameters that its kind guessed, lengths by the footprint
+    parameters: dict[str, float] = Field(
+        default_factory=dict
+    )  # [m, s], see the module of its kind
+    assumed: tuple[
+        str, ...
+    ] = ()  # parameters that its kind guessed, lengths by the footprint
     # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
     # steering angle [rad] itself
     angular_is: Literal["turn_rate", "steering"] = "turn_rate"
@@ -141,7 +169,9 @@ class RobotSpec(Schema):
     # what follows commands with a lag, or is measured, in the order of every state vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
     # what drives it, in the order of every command vector
-    command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
+    command: tuple[CommandVariable, ...] = Field(
+        min_length=1, max_length=MOST_VARIABLES
+    )
 
     @field_validator("textbook")
     @classmethod
@@ -156,22 +186,32 @@ class RobotSpec(Schema):
         return _circumscribed(data) if isinstance(data, dict) else data
 
     @model_serializer(mode="wrap")
-    def _without_none(self, dump: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _without_none(
+        self, dump: pydantic.SerializerFunctionWrapHandler
+    ) -> dict[str, Any]:
         # Models and policies are known by what is written: a key that says nothing is left out.
         data: dict[str, Any] = dump(self)
-        silent = [name for name in ("lidar", "lidar_mount") if getattr(self, name) is None]
+        silent = [
+            name for name in ("lidar", "lidar_mount") if getattr(self, name) is None
+        ]
         return {key: value for key, value in data.items() if key not in silent}
 
     @model_validator(mode="after")
     def _consistent(self) -> "RobotSpec":
         if any(part in self.name for part in ("/", "\\", "..")):
-            raise ValueError(f"name {self.name!r}: files are named so; leave out .., / and \\")
+            raise ValueError(
+                f"name {self.name!r}: files are named so; leave out .., / and \\"
+            )
         if not self.footprint_radius <= LARGEST:
             told = f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
-            raise ValueError(f"{told}, at most {LARGEST:g} m can be; lengths are in metres")
+            raise ValueError(
+                f"{told}, at most {LARGEST:g} m can be; lengths are in metres"
+            )
         if self.footprint is not None:
             if geometry.edges_cross(np.array(self.footprint)):
-                raise ValueError("edges of footprint cross or touch; list its corners in order")
+                raise ValueError(
+                    "edges of footprint cross or touch; list its corners in order"
+                )
             reach, radius = _reach(self.footprint), self.footprint_radius
             if not math.isclose(reach, radius, rel_tol=1e-6):
                 raise ValueError(
@@ -189,7 +229,9 @@ class RobotSpec(Schema):
             raise ValueError("every state and command variable needs a name of its own")
         for name, follows in ((v.name, v.follows) for v in self.state):
             if follows is not None and follows not in [c.name for c in self.command]:
-                raise ValueError(f"state {name!r} follows {follows!r}, which is no command")
+                raise ValueError(
+                    f"state {name!r} follows {follows!r}, which is no command"
+                )
         fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
         if len(set(fields)) != len(fields):
             raise ValueError("two commands share one field of cmd_vel")
@@ -210,12 +252,18 @@ class RobotSpec(Schema):
         room so has this one, but for the margin.
         """
         if self.footprint is None:
-            return self.model_copy(update={"footprint_radius": self.footprint_radius + margin})
+            return self.model_copy(
+                update={"footprint_radius": self.footprint_radius + margin}
+            )
         corners = np.array(self.footprint)
         following = np.roll(corners, -1, axis=0)
         x, y = (following - corners).T
-        left = np.sign(np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]))
-        after = left * np.stack([y, -x], axis=-1) / np.hypot(x, y)[:, None]  # out of each edge
+        left = np.sign(
+            np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0])
+        )
+        after = (
+            left * np.stack([y, -x], axis=-1) / np.hypot(x, y)[:, None]
+        )  # out of each edge
         before = np.roll(after, 1, axis=0)
         bend = 1.0 + np.sum(before * after, axis=-1, keepdims=True)
         moved = corners + margin * (before + after) / np.maximum(bend, SHARPEST)
@@ -267,14 +315,19 @@ class RobotSpec(Schema):
     @property
     def knows_wheelbase(self) -> bool:
         """True if its wheelbase is given, not only assumed."""
-        return self.parameters.get("wheelbase", 0.0) > 0.0 and "wheelbase" not in self.assumed
+        return (
+            self.parameters.get("wheelbase", 0.0) > 0.0
+            and "wheelbase" not in self.assumed
+        )
 
     @property
     def wheelbase(self) -> float:
         """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
         if not self.knows_wheelbase:
             fix = "add `wheelbase:` [m] to the `parameters:` of its YAML file."
-            raise ConfigError(f"robot {self.name!r} steers, and its wheelbase is not known; {fix}")
+            raise ConfigError(
+                f"robot {self.name!r} steers, and its wheelbase is not known; {fix}"
+            )
         return self.parameters["wheelbase"]
 
     @cached_property
@@ -294,7 +347,11 @@ class RobotSpec(Schema):
                 reason = f"the command {command.name!r} names no field of cmd_vel"
                 fix = "add `cmd_vel:` to it, or drive it in process, without ROS 2"
                 raise ConfigError(f"robot {self.name!r}: {reason}; {fix}.")
-        fields = [CMD_VEL_FIELDS.index(c.cmd_vel) for c in self.command if c.cmd_vel is not None]
+        fields = [
+            CMD_VEL_FIELDS.index(c.cmd_vel)
+            for c in self.command
+            if c.cmd_vel is not None
+        ]
         return np.array(fields, dtype=np.intp)
 
     @property
@@ -328,7 +385,9 @@ class RobotSpec(Schema):
             return self.of_fields(twist)
         speed, angle = self.bicycle.command(twist)
         command = self.of_fields(np.stack([speed, twist[..., 1], angle], axis=-1))
-        limits = np.array([(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command])
+        limits = np.array(
+            [(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command]
+        )
         return np.asarray(np.clip(command, *limits.T))
 
     def through_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
@@ -360,7 +419,9 @@ def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
     outline = data.get("footprint")
     if outline is None or "footprint_radius" in data:
         return data
-    with suppress(OverflowError, TypeError, ValueError):  # the field's own check reports it
+    with suppress(
+        OverflowError, TypeError, ValueError
+    ):  # the field's own check reports it
         if len(outline) <= MOST_CORNERS:
             data = data | {"footprint_radius": _reach(outline)}
     return data
@@ -375,7 +436,9 @@ def load_robot(name: str | Path) -> RobotSpec:
     return robot_from(name)
 
 
-def robot_from(given: str | Path | Mapping[str, Any], ranges: Ranges | None = None) -> RobotSpec:
+def robot_from(
+    given: str | Path | Mapping[str, Any], ranges: Ranges | None = None
+) -> RobotSpec:
     """Makes a robot of a shipped one's name, the path of a YAML file, or the content of such a one.
 
     With a `kind` instead of `textbook`, all that the kind knows may be left out: names, units and
@@ -383,13 +446,21 @@ def robot_from(given: str | Path | Mapping[str, Any], ranges: Ranges | None = No
     name, are theirs unless given. Raises ConfigError.
     """
     data = definition(given)
-    source = "robot" if isinstance(given, Mapping) else str(find_config(given, "robots"))
+    source = (
+        "robot" if isinstance(given, Mapping) else str(find_config(given, "robots"))
+    )
     if "kind" in data:
         data = _of_kind(data, ranges or {}, source)
     spec = validate(data, RobotSpec, source)
     for c in spec.command:
-        end = max(c.min, c.max, key=abs)  # one that was recorded is judged with its mapping
-        if c.steers and abs(end) > FARTHEST_STEERED and end not in (ranges or {}).get(c.name, ()):
+        end = max(
+            c.min, c.max, key=abs
+        )  # one that was recorded is judged with its mapping
+        if (
+            c.steers
+            and abs(end) > FARTHEST_STEERED
+            and end not in (ranges or {}).get(c.name, ())
+        ):
             fault = f"key 'command': {c.name} reaches {end:g} rad, and no wheel steers so far"
             raise ConfigError(f"{source}: {fault}; angles are in radians.")
     return spec
@@ -409,6 +480,8 @@ def _of_kind(data: dict[str, Any], ranges: Ranges, source: str) -> dict[str, Any
         hint = nearest(str(data["kind"]), kind_names())
         raise ConfigError(f"{source}: key 'kind': there is no {data['kind']!r}; {hint}")
     if "textbook" in data:
-        raise ConfigError(f"{source}: has a `kind` and a `textbook`; remove one of them.")
+        raise ConfigError(
+            f"{source}: has a `kind` and a `textbook`; remove one of them."
+        )
     filled: dict[str, Any] = kind.template.filled(_circumscribed(data), ranges)
     return filled

@@ -28,21 +28,31 @@ class TaylorModel:
     """
 
     variables: tuple[str, ...]  # V names of X = [state, command]
-    dofs: tuple[str, ...]  # D = 3 + S names of dQ/dt: vx, vy, wz, then the state's rates
+    dofs: tuple[
+        str, ...
+    ]  # D = 3 + S names of dQ/dt: vx, vy, wz, then the state's rates
     dof_units: tuple[str, ...]
-    powers: NDArray[np.int64]  # (K, V) exponents of the terms that any degree of freedom keeps
+    powers: NDArray[
+        np.int64
+    ]  # (K, V) exponents of the terms that any degree of freedom keeps
     coefficients: Array  # (D, K); zero where a degree of freedom does not keep a term
     dt: float  # the step for which the rates are valid [s]; the simulator's step
     low: Array  # `low`, `high`: (V,) the box of X that the recording covered
     high: Array
-    assumed: tuple[tuple[str, str], ...] = ()  # terms (dof, term) of the textbook, not of the drive
+    assumed: tuple[
+        tuple[str, str], ...
+    ] = ()  # terms (dof, term) of the textbook, not of the drive
     # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if none is known
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: "Quality | None" = None
     bounded: bool = False  # True if the state is held in the recording's box, widened
     inputs: tuple[InputCurve, ...] = ()  # of the commands that have one
-    friction: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [unit of the state / s]
-    drag: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [1 / (unit of the state s)]
+    friction: Array = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (S,) [unit of the state / s]
+    drag: Array = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (S,) [1 / (unit of the state s)]
     # (S, C) by which each command in effect, of either sign, brakes [1 / (its unit s)]
     back_emf: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # (S, 2) greatest fall and rise of each state's rate [unit of the state / s]
@@ -56,7 +66,9 @@ class TaylorModel:
             none = np.zeros((self.state_size, len(self.variables) - self.state_size))
             object.__setattr__(self, "back_emf", none)
         if not self.limits.size:
-            object.__setattr__(self, "limits", np.tile([-np.inf, np.inf], (self.state_size, 1)))
+            object.__setattr__(
+                self, "limits", np.tile([-np.inf, np.inf], (self.state_size, 1))
+            )
 
     @property
     def state_size(self) -> int:
@@ -96,7 +108,9 @@ class TaylorModel:
         """Place (S,) of the command that moves each state most, over the box of X."""
         reach = np.maximum(np.abs(self.low), np.abs(self.high))
         size = np.abs(self.coefficients[3:]) * np.prod(reach**self.powers, axis=1)
-        return np.asarray(np.argmax(size @ (self.powers[:, self.state_size :] > 0), axis=1))
+        return np.asarray(
+            np.argmax(size @ (self.powers[:, self.state_size :] > 0), axis=1)
+        )
 
     def in_effect(self, command: ArrayLike) -> Array:
         """Returns what commands (..., C) come to after their delays, by the input curves."""
@@ -125,10 +139,15 @@ class TaylorModel:
         stick = self.dt * self.friction
         return np.asarray(np.maximum(moved - stick, np.minimum(moved + stick, 0.0)))
 
-    def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
+    def step(
+        self, pose: ArrayLike, state: ArrayLike, command: ArrayLike
+    ) -> tuple[Array, Array]:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
-        dq = self._free_rates(np.concatenate([state, self.in_effect(command)], axis=-1)) * self.dt
+        dq = (
+            self._free_rates(np.concatenate([state, self.in_effect(command)], axis=-1))
+            * self.dt
+        )
         moved = np.clip(self._moved(state, dq[..., 3:]), *self.state_box)
         return geometry.compose(pose, geometry.exp(dq[..., :3])), moved
 
@@ -154,7 +173,9 @@ class TaylorModel:
         if d < 0:
             return ""
         friction, drag, name = self.friction[d], self.drag[d], self.variables[d]
-        emf = zip(self.back_emf[d].tolist(), self.shown_names[self.state_size :], strict=True)
+        emf = zip(
+            self.back_emf[d].tolist(), self.shown_names[self.state_size :], strict=True
+        )
         less = "".join(f", less {k:.4g}*{name}*|{command}|" for k, command in emf if k)
         less += f", less {drag:.4g}*{name}*|{name}|" if drag else ""
         less += f", less dry friction of {friction:.4g}" if friction else ""
@@ -167,7 +188,9 @@ class TaylorModel:
         known &= np.isfinite(self.std_errors) if self.std_errors.size else False
         names = self.term_names
         return {
-            dof: {names[k]: float(self.std_errors[d, k]) for k in np.flatnonzero(known[d])}
+            dof: {
+                names[k]: float(self.std_errors[d, k]) for k in np.flatnonzero(known[d])
+            }
             for d, dof in enumerate(self.dofs)
             if known[d].any()
         }
@@ -177,7 +200,10 @@ class TaylorModel:
         if not errors:
             return replace(self, std_errors=np.zeros((0, 0)))
         names = self.term_names
-        rows = [[errors.get(dof, {}).get(name, np.nan) for name in names] for dof in self.dofs]
+        rows = [
+            [errors.get(dof, {}).get(name, np.nan) for name in names]
+            for dof in self.dofs
+        ]
         known = np.array(rows, dtype=np.float64).reshape(self.coefficients.shape)
         return replace(self, std_errors=np.where(self.coefficients != 0.0, known, 0.0))
 
@@ -192,7 +218,9 @@ class TaylorModel:
                 for k in np.flatnonzero(self.coefficients[d])
             ]
             text = " + ".join(terms).replace("+ -", "- ")
-            lines.append(f"{dof} = {text or '0'}{self.restraint(dof)}  [{self.dof_units[d]}]")
+            lines.append(
+                f"{dof} = {text or '0'}{self.restraint(dof)}  [{self.dof_units[d]}]"
+            )
         return lines
 
     @property
@@ -204,25 +232,42 @@ class TaylorModel:
             for dof, row in zip(self.dofs, self.coefficients, strict=True)
         }
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
-        states, limits = self.variables[: self.state_size], map(tuple, self.limits.tolist())
+        states, limits = (
+            self.variables[: self.state_size],
+            map(tuple, self.limits.tolist()),
+        )
         friction, drag = (
-            {s: each for s, each in zip(states, values.tolist(), strict=True) if each > 0.0}
+            {
+                s: each
+                for s, each in zip(states, values.tolist(), strict=True)
+                if each > 0.0
+            }
             for values in (self.friction, self.drag)
         )
         commands = self.variables[len(states) :]
         emf = {
-            s: named for s, row in zip(states, self.back_emf.tolist(), strict=True)
+            s: named
+            for s, row in zip(states, self.back_emf.tolist(), strict=True)
             if (named := {c: k for c, k in zip(commands, row, strict=True) if k > 0.0})
-        }  # fmt: skip
-        limited = {s: k for s, k in zip(states, limits, strict=True) if np.isfinite(k).any()}
+        }
+        limited = {
+            s: k for s, k in zip(states, limits, strict=True) if np.isfinite(k).any()
+        }
         return NamedTaylorModel.model_construct(
-            dt=self.dt, units=dict(zip(self.dofs, self.dof_units, strict=True)), terms=terms,
-            valid=dict(zip(self.variables, box, strict=True)), assumed=self.assumed,
+            dt=self.dt,
+            units=dict(zip(self.dofs, self.dof_units, strict=True)),
+            terms=terms,
+            valid=dict(zip(self.variables, box, strict=True)),
+            assumed=self.assumed,
             standard_errors=self.named_errors if self.std_errors.size else None,
-            quality=self.quality, bounded=self.bounded, inputs=self.inputs,
-            friction=friction or None, drag=drag or None, limits=limited or None,
+            quality=self.quality,
+            bounded=self.bounded,
+            inputs=self.inputs,
+            friction=friction or None,
+            drag=drag or None,
+            limits=limited or None,
             back_emf=emf or None,
-        )  # fmt: skip
+        )
 
 
 def exponents(variables: int, order: int) -> NDArray[np.int64]:
@@ -250,7 +295,9 @@ def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def term_name(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
     """Returns a term as text: `1`, `speed*steering`, `speed^2`."""
-    factors = [names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)]
+    factors = [
+        names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)
+    ]
     return "*".join(factors) or "1"
 
 
@@ -294,7 +341,9 @@ class HorizonErrors:
     path_m: float  # mean length of the measured path
     model: EndErrors
     kept_twist: EndErrors  # of a robot that keeps the twist of the start
-    textbook: EndErrors | None = None  # of the textbook, fitted to the same part; None: not fitted
+    textbook: EndErrors | None = (
+        None  # of the textbook, fitted to the same part; None: not fitted
+    )
     band_m: float | None = None  # distance within which 95 % of the ends are expected
     coverage: float | None = None  # share of the ends within it
     # Noise of the differences between the model's errors and those of the yardsticks [m]
@@ -342,7 +391,9 @@ class NamedTaylorModel(Schema):
     inputs: tuple[InputCurve, ...] = ()
     friction: dict[str, NonNegativeFloat] | None = None  # by state
     drag: dict[str, NonNegativeFloat] | None = None  # by state
-    back_emf: dict[str, dict[str, NonNegativeFloat]] | None = None  # by state and command
+    back_emf: dict[str, dict[str, NonNegativeFloat]] | None = (
+        None  # by state and command
+    )
     limits: dict[str, tuple[Fall, Rise]] | None = None  # by state
 
     def model(self) -> TaylorModel:
@@ -353,7 +404,9 @@ class NamedTaylorModel(Schema):
             units = tuple(self.units[dof] for dof in dofs)
             parsed = {name: parse_term(name, variables) for name in every}
         except KeyError as error:
-            raise ModelError(f"kinematics: {error} has no unit; generate the model anew.") from None
+            raise ModelError(
+                f"kinematics: {error} has no unit; generate the model anew."
+            ) from None
         except (OverflowError, ValueError) as error:
             raise ModelError(f"kinematics: {error}; generate the model anew.") from None
         names = sorted(parsed, key=lambda name: canonical(parsed[name]))
@@ -365,23 +418,36 @@ class NamedTaylorModel(Schema):
         commands, emf = variables[len(states) :], self.back_emf or {}
         self._check_stages(states, commands)
         return TaylorModel(
-            variables, dofs, units, powers.reshape(len(names), len(variables)),
-            np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)), self.dt, low, high,
-            self.assumed, quality=self.quality, bounded=self.bounded, inputs=self.inputs,
+            variables,
+            dofs,
+            units,
+            powers.reshape(len(names), len(variables)),
+            np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)),
+            self.dt,
+            low,
+            high,
+            self.assumed,
+            quality=self.quality,
+            bounded=self.bounded,
+            inputs=self.inputs,
             friction=np.array([friction.get(name, 0.0) for name in states]),
             drag=np.array([drag.get(name, 0.0) for name in states]),
             limits=np.array([limits.get(name, (-np.inf, np.inf)) for name in states]),
-            back_emf=np.array([[emf.get(s, {}).get(c, 0.0) for c in commands] for s in states]),
-        ).with_errors(self.standard_errors or {})  # fmt: skip
+            back_emf=np.array(
+                [[emf.get(s, {}).get(c, 0.0) for c in commands] for s in states]
+            ),
+        ).with_errors(self.standard_errors or {})
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
         curved = [curve.command for curve in self.inputs]
         by_state = {"friction": self.friction, "drag": self.drag, "limits": self.limits}
         emf = self.back_emf or {}
         keys = (
-            ("inputs", curved, commands), *((k, v, states) for k, v in by_state.items()),
-            ("back_emf", emf, states), *(("back_emf", row, commands) for row in emf.values()),
-        )  # fmt: skip
+            ("inputs", curved, commands),
+            *((k, v, states) for k, v in by_state.items()),
+            ("back_emf", emf, states),
+            *(("back_emf", row, commands) for row in emf.values()),
+        )
         for key, names, known in keys:
             for name in names or ():
                 if name not in known:

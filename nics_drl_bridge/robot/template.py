@@ -13,11 +13,15 @@ Ranges = Mapping[str, tuple[float, float]]
 # command tells in its own unit may come to a multiple of that.
 TWIST_RANGES = {"vx": ("m/s", 10.0), "vy": ("m/s", 10.0), "wz": ("rad/s", 10.0)}
 BEYOND = 2.0
-MISSPELT = 0.85  # least likeness of a misspelt parameter: "steering_rate" is no "steering_lag"
+MISSPELT = (
+    0.85  # least likeness of a misspelt parameter: "steering_rate" is no "steering_lag"
+)
 SHARES = 1.0  # range of a command without a unit, in both directions
 
 
-def usual(name: str, unit: str, reach: float, field: str | None = None) -> dict[str, Any]:
+def usual(
+    name: str, unit: str, reach: float, field: str | None = None
+) -> dict[str, Any]:
     """Returns a command as a template has it."""
     data = {"name": name, "unit": unit, "min": -reach, "max": reach}
     return data if field is None else data | {"cmd_vel": field}
@@ -61,7 +65,9 @@ class Template:
     moves: tuple[str, ...] = ()  # components of the body twist that are its state, or
     state: tuple[Given, ...] = ()  # a state that follows the commands
     parameters: Mapping[str, float] = field(default_factory=dict)
-    lengths: Mapping[str, float] = field(default_factory=dict)  # in radii of the footprint
+    lengths: Mapping[str, float] = field(
+        default_factory=dict
+    )  # in radii of the footprint
     # its commands by words that others have for them, from which `nics inspect` guesses the kind
     words: Mapping[str, str] = field(default_factory=dict)
 
@@ -75,13 +81,18 @@ class Template:
             data["state"] = self._state(given.get("state"), command)
         own, radius = given.get("parameters", {}), given.get("footprint_radius")
         if isinstance(own, Mapping) and isinstance(radius, int | float):
-            sizes = {name: round(share * radius, 4) for name, share in self.lengths.items()}
+            sizes = {
+                name: round(share * radius, 4) for name, share in self.lengths.items()
+            }
             usual = {**sizes, **self.parameters}
             for name in own:  # one of the user's own may have any other name
                 if get_close_matches(str(name), usual.keys() - own.keys(), 1, MISSPELT):
                     fault = f"unknown parameter {name!r}; {nearest(name, usual)}"
                     raise ConfigError(f"robot {data['name']!r}: {fault}")
-            data["parameters"], data["assumed"] = {**usual, **own}, sorted(set(usual) - set(own))
+            data["parameters"], data["assumed"] = (
+                {**usual, **own},
+                sorted(set(usual) - set(own)),
+            )
         return data
 
     def _command(self, given: Given, ranges: Ranges) -> Any:
@@ -89,24 +100,33 @@ class Template:
         if own is not None and not _mappings(own):
             return own  # the check of the whole file reports it
         names = [one.get("name") for one in own] if own is not None else list(ranges)
-        way = max(self.commands, key=lambda way: _alike(way, names, own or ()), default=())
+        way = max(
+            self.commands, key=lambda way: _alike(way, names, own or ()), default=()
+        )
         known = {one["name"]: one for one in way}
         known |= {name.removesuffix("_command"): one for name, one in known.items()}
         these = len(way) == len(names) and all(known.get(name) in way for name in names)
         if own is None and way and ranges and not these:
             usual = _list(name for name in known if not name.endswith("_command"))
             fault = f"commands of the kind {kind!r} are {usual}, not {_list(names)}"
-            fix = "name them so, or list them in that order under `command:` of the robot"
+            fix = (
+                "name them so, or list them in that order under `command:` of the robot"
+            )
             raise ConfigError(f"robot {given.get('name', kind)!r}: {fault}; {fix}.")
         if own is None:
             own = [{"name": name} for name in (names or names_of(way))]
         if not own:
             fix = "name them under `command:` of the robot, or give a recording"
-            raise ConfigError(f"the commands of a robot of the kind {kind!r} are not known; {fix}.")
+            raise ConfigError(
+                f"the commands of a robot of the kind {kind!r} are not known; {fix}."
+            )
         places = [known.get(one.get("name")) for one in own]
         if None in places and len(own) == len(way):
             places = list(way)  # names of the user's own, in the usual order
-        return [_whole(place or {}, one, ranges) for place, one in zip(places, own, strict=True)]
+        return [
+            _whole(place or {}, one, ranges)
+            for place, one in zip(places, own, strict=True)
+        ]
 
     def _state(self, own: Any, command: Sequence[Given]) -> Any:
         """Returns the state: the user's own in so far as it is given, the usual one if None."""
@@ -114,20 +134,31 @@ class Template:
         usual = [dict(one) for one in self.state]
         for one in usual:  # it follows a command, by whatever name
             place = one.pop("cmd_vel")
-            one["follows"] = {c.get("cmd_vel"): c.get("name") for c in command}.get(place)
-            one["name"] = f"actual_{one['name']}" if one["name"] in taken else one["name"]
-        usual += [{"name": f"body_{d}" if d in taken else d, "twist": d} for d in self.moves]
+            one["follows"] = {c.get("cmd_vel"): c.get("name") for c in command}.get(
+                place
+            )
+            one["name"] = (
+                f"actual_{one['name']}" if one["name"] in taken else one["name"]
+            )
+        usual += [
+            {"name": f"body_{d}" if d in taken else d, "twist": d} for d in self.moves
+        ]
         if own is not None and not _mappings(own):
             return own
         known = {one["name"]: one for one in usual}
-        chosen = usual if own is None else [{**known.get(c.get("name"), {}), **c} for c in own]
+        chosen = (
+            usual
+            if own is None
+            else [{**known.get(c.get("name"), {}), **c} for c in own]
+        )
         return [_ranged(one, command) for one in chosen]
 
 
 def _mappings(own: Any) -> bool:
     """True for mappings whose names, units and places are words."""
     return isinstance(own, list | tuple) and all(
-        isinstance(one, Mapping) and not any(isinstance(v, list | dict) for v in one.values())
+        isinstance(one, Mapping)
+        and not any(isinstance(v, list | dict) for v in one.values())
         for one in own
     )
 
@@ -149,7 +180,10 @@ def _whole(template: Given, own: Given, ranges: Ranges) -> dict[str, Any]:
         data = {"min": -SHARES, "max": SHARES, **data}
     low, high = ranges.get(data.get("name", ""), (0.0, 0.0))
     if low < high or low:  # at rest, a command is 0
-        data |= {"min": own.get("min", min(low, 0.0)), "max": own.get("max", max(high, 0.0))}
+        data |= {
+            "min": own.get("min", min(low, 0.0)),
+            "max": own.get("max", max(high, 0.0)),
+        }
     return data
 
 

@@ -6,13 +6,21 @@ Its commands are the front wheel's speed along its own direction [m/s] and steer
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot import kinds
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, STEERED_STATE, Template, names_of
+from nics_drl_bridge.robot.template import (
+    STEERED,
+    STEERED_LAGS,
+    STEERED_STATE,
+    Template,
+    names_of,
+)
 
 TEMPLATE = Template(
-    commands=(STEERED,), state=STEERED_STATE, parameters=STEERED_LAGS,
+    commands=(STEERED,),
+    state=STEERED_STATE,
+    parameters=STEERED_LAGS,
     lengths={"wheelbase": 1.0, "track": 0.8, "wheel_radius": 0.2},
     words={"traction": "speed_command", "steering": "steering_command"},
-)  # fmt: skip
+)
 
 
 def kinematics(spec: RobotSpec) -> kinds.Textbook:
@@ -31,7 +39,9 @@ def drawing(spec: RobotSpec) -> kinds.Drawing:
         kinds.Wheel("rear_right_wheel", (0.0, -0.5 * track), radius),
         kinds.Wheel("front_wheel", (wheelbase, 0.0), radius, pivot=fork),
     )
-    return kinds.Drawing((wheelbase, 0.7 * track), (0.4 * wheelbase, 1.5 * radius), wheels)
+    return kinds.Drawing(
+        (wheelbase, 0.7 * track), (0.4 * wheelbase, 1.5 * radius), wheels
+    )
 
 
 KIND = kinds.RobotKind(kinematics, drawing, TEMPLATE, front_drive=True)

@@ -14,9 +14,12 @@ BODY_HEIGHT = 0.04
 
 
 def urdf_of(
-    spec: RobotSpec, mount: Place = (0.0, 0.0, 0.0), laser: str = "laser", base: str = "base_link",
+    spec: RobotSpec,
+    mount: Place = (0.0, 0.0, 0.0),
+    laser: str = "laser",
+    base: str = "base_link",
     further: Mapping[str, Place] | None = None,
-) -> str:  # fmt: skip
+) -> str:
     """Returns the text of a robot's URDF.
 
     `base_link` and wheels stand on the ground; `laser` is at the height of `base_link`, as the
@@ -35,11 +38,15 @@ def urdf_of(
     else:
         looks = drawing(spec)
         body = looks.body if isinstance(looks.body, tuple) else (looks.body,)
-        _visual(link, "body", (*body, BODY_HEIGHT), (looks.centre[0], 0.0, looks.centre[1]))
+        _visual(
+            link, "body", (*body, BODY_HEIGHT), (looks.centre[0], 0.0, looks.centre[1])
+        )
         for wheel in looks.wheels:
             _wheel(robot, base, wheel)
     for frame, (x, y, yaw) in {laser: mount, **(further or {})}.items():
-        _visual(_add(robot, "link", name=frame), "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
+        _visual(
+            _add(robot, "link", name=frame), "laser", (0.02, 0.03), (0.0, 0.0, 0.07)
+        )
         joint = "laser_mount" if frame == laser else f"{frame}_mount"
         _joint(robot, joint, "fixed", (base, frame), (x, y, 0.0), yaw=yaw)
     ElementTree.indent(robot)
@@ -51,7 +58,9 @@ def _collision(parent: Element, spec: RobotSpec) -> None:
     if spec.footprint is None:
         _geometry(parent, (spec.footprint_radius, BODY_HEIGHT), (0.0, 0.0, BODY_HEIGHT))
         return
-    (back, front), (right, left) = ((min(of), max(of)) for of in zip(*spec.footprint, strict=True))
+    (back, front), (right, left) = (
+        (min(of), max(of)) for of in zip(*spec.footprint, strict=True)
+    )
     middle = (0.5 * (back + front), 0.5 * (right + left), BODY_HEIGHT)
     _geometry(parent, (front - back, left - right, BODY_HEIGHT), middle)
 
@@ -87,7 +96,12 @@ def _numbers(*values: float) -> str:
 
 
 def _joint(
-    robot: Element, name: str, kind: str, links: tuple[str, str], place: Place, yaw: float = 0.0
+    robot: Element,
+    name: str,
+    kind: str,
+    links: tuple[str, str],
+    place: Place,
+    yaw: float = 0.0,
 ) -> Element:
     joint = _add(robot, "joint", name=name, type=kind)
     _add(joint, "origin", xyz=_numbers(*place), rpy=_numbers(0.0, 0.0, yaw))
@@ -104,7 +118,9 @@ def _visual(
     _add(visual, "material", name=material)
 
 
-def _geometry(parent: Element, size: tuple[float, ...], at: Place, roll: float = 0.0) -> None:
+def _geometry(
+    parent: Element, size: tuple[float, ...], at: Place, roll: float = 0.0
+) -> None:
     _add(parent, "origin", xyz=_numbers(*at), rpy=_numbers(roll, 0.0, 0.0))
     shape = _add(parent, "geometry")
     if len(size) == 3:

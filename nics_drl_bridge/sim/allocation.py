@@ -27,8 +27,12 @@ from nics_drl_bridge.sim.world import World
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
-CROWD = 4096  # Least number of pairs of a robot and a body for sorting bodies into cells
-FEWEST_OF_A_CROWD = 8  # Least number of robots: for fewer, testing all bodies takes less time
+CROWD = (
+    4096  # Least number of pairs of a robot and a body for sorting bodies into cells
+)
+FEWEST_OF_A_CROWD = (
+    8  # Least number of robots: for fewer, testing all bodies takes less time
+)
 STANDING = 32  # Least number of obstacles, all of which stand, for sorting them into cells once
 
 
@@ -59,19 +63,26 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     longest = sizes.longest_delay + int(terms.late.max(initial=0))
     rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, longest))
     return arrays.State(
-        pose=np.zeros((*shape, 3)), state=np.zeros((*shape, len(model.robot.state))),
+        pose=np.zeros((*shape, 3)),
+        state=np.zeros((*shape, len(model.robot.state))),
         history=np.zeros((*shape, sent, len(model.robot.command))),
-        bodies=np.zeros((sizes.worlds, bodies, BODY)), odom=np.zeros((*shape, 3)),
+        bodies=np.zeros((sizes.worlds, bodies, BODY)),
+        odom=np.zeros((*shape, 3)),
         twist=np.zeros((*shape, 3)),
         ranges=np.full((*shape, model.lidar.beams), np.inf, np.float32),
-        collided=np.zeros(shape, np.uint8), steps=np.zeros(sizes.worlds, np.int64),
-        seeds=np.zeros(sizes.worlds, np.int64), member=np.zeros(sizes.worlds, np.int64),
+        collided=np.zeros(shape, np.uint8),
+        steps=np.zeros(sizes.worlds, np.int64),
+        seeds=np.zeros(sizes.worlds, np.int64),
+        member=np.zeros(sizes.worlds, np.int64),
         faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
         coefficient=np.tile(terms.coefficient, (*shape, 1)),
-        delay=np.full(shape, delay, np.int64), age=np.zeros(shape, np.int64),
-        noise=np.tile(noise, (*shape, 1)), velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
-        past=np.zeros((*shape, rows, PAST)), marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
-    )  # fmt: skip
+        delay=np.full(shape, delay, np.int64),
+        age=np.zeros(shape, np.int64),
+        noise=np.tile(noise, (*shape, 1)),
+        velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
+        past=np.zeros((*shape, rows, PAST)),
+        marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
+    )
 
 
 def split(worlds: int, threads: int) -> tuple[slice, ...]:
@@ -81,9 +92,12 @@ def split(worlds: int, threads: int) -> tuple[slice, ...]:
 
 
 def members_of(
-    worlds: Sequence[World], motions: Sequence[Sequence[Motion | None]], outlines: OutlineArrays,
-    sizes: Sizes, member: NDArray[np.int64],
-) -> arrays.Members:  # fmt: skip
+    worlds: Sequence[World],
+    motions: Sequence[Sequence[Motion | None]],
+    outlines: OutlineArrays,
+    sizes: Sizes,
+    member: NDArray[np.int64],
+) -> arrays.Members:
     """Stacks P worlds, of up to K obstacles that move by `motions` (P, K), for N copies.
 
     `member` (N,) is read as the kernels run.
@@ -95,9 +109,17 @@ def members_of(
     plans, waypoints = _plans(motions if moves else [() for _ in worlds])
     field = np.array([world.extent for world in worlds])
     return arrays.Members(
-        stack_fixtures([world.all_walls() for world in worlds], grids, member), distances, places,
-        outlines, sizes.crowded, stands, moves, plans, waypoints, field,
-    )  # fmt: skip
+        stack_fixtures([world.all_walls() for world in worlds], grids, member),
+        distances,
+        places,
+        outlines,
+        sizes.crowded,
+        stands,
+        moves,
+        plans,
+        waypoints,
+        field,
+    )
 
 
 def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
@@ -108,7 +130,12 @@ def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
         if grid is None:
             found.append(None)
         else:
-            about = grid.cells.shape, grid.resolution, grid.origin, sha256(grid.cells.tobytes())
+            about = (
+                grid.cells.shape,
+                grid.resolution,
+                grid.origin,
+                sha256(grid.cells.tobytes()),
+            )
             found.append(once.setdefault(about, grid))
     return found
 
@@ -117,7 +144,9 @@ def map_field(grid: GridMap | None) -> arrays.MapField:
     """Returns a static map as the kernels take it."""
     if grid is None:
         return arrays.NO_FIELD
-    return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist())
+    return arrays.MapField(
+        np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist()
+    )
 
 
 def cells_of(sizes: Sizes, members: arrays.Members) -> BodyCells:
@@ -126,7 +155,9 @@ def cells_of(sizes: Sizes, members: arrays.Members) -> BodyCells:
     return body_cells(worlds, sizes.robots + sizes.obstacles, members.standing)
 
 
-def _plans(motions: Sequence[Sequence[Motion | None]]) -> tuple[arrays.Array, arrays.Array]:
+def _plans(
+    motions: Sequence[Sequence[Motion | None]],
+) -> tuple[arrays.Array, arrays.Array]:
     each = [plan_arrays(one) for one in motions]
     plans = np.zeros((len(each), max(map(len, motions)), PLAN))
     first = 0
@@ -138,12 +169,19 @@ def _plans(motions: Sequence[Sequence[Motion | None]]) -> tuple[arrays.Array, ar
 
 
 def part_of(
-    state: arrays.State, members: arrays.Members, model: SimulatorModel, scanner: Scanner,
-    sizes: Sizes, cells: BodyCells, part: slice,
-) -> arrays.Part:  # fmt: skip
+    state: arrays.State,
+    members: arrays.Members,
+    model: SimulatorModel,
+    scanner: Scanner,
+    sizes: Sizes,
+    cells: BodyCells,
+    part: slice,
+) -> arrays.Part:
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     dt, substeps, _ = model.timing
-    motion = arrays.Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
+    motion = arrays.Dynamics(
+        term_arrays(model.kinematics), SERIES, float(dt), int(substeps)
+    )
     own = _scratch(model, scanner, sizes, cells, part.stop - part.start)
     return arrays.Part(state, members, scanner.arguments, motion, own)
 
@@ -160,26 +198,43 @@ def _scratch(
     commands = len(kinematics.variables) - kinematics.state_size
     return arrays.Scratch(
         lanes=arrays.Lanes(
-            pose=np.zeros((6, lanes)), x=np.ones((len(kinematics.variables) + 1, lanes)),
-            dq=np.zeros((len(kinematics.dofs), lanes)), late=np.zeros((commands, lanes), np.int64),
+            pose=np.zeros((6, lanes)),
+            x=np.ones((len(kinematics.variables) + 1, lanes)),
+            dq=np.zeros((len(kinematics.dofs), lanes)),
+            late=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
         single=arrays.Single(
-            x=x, dq=dq, trial=np.zeros(BODY), spare=np.zeros((corners, 2)),
-            start=np.zeros((count, 3)), began=np.zeros((count, 3)),
-            flights=np.zeros((bodies, FLIGHT)), events=np.zeros((robots, EVENT)),
+            x=x,
+            dq=dq,
+            trial=np.zeros(BODY),
+            spare=np.zeros((corners, 2)),
+            start=np.zeros((count, 3)),
+            began=np.zeros((count, 3)),
+            flights=np.zeros((bodies, FLIGHT)),
+            events=np.zeros((robots, EVENT)),
         ),
         nearby=arrays.Nearby(
-            near=np.zeros((robots, 1 + SEVERAL), np.int64), meets=np.zeros(robots, np.int64),
-            way=np.zeros(robots), reach=np.zeros(bodies), speeds=np.zeros((robots, 2)),
+            near=np.zeros((robots, 1 + SEVERAL), np.int64),
+            meets=np.zeros(robots, np.int64),
+            way=np.zeros(robots),
+            reach=np.zeros(bodies),
+            speeds=np.zeros((robots, 2)),
         ),
-        cells=cells._replace(then=cells.then.copy() if cells.ordered else cells.then,
-                             found=cells.found.copy()),
+        cells=cells._replace(
+            then=cells.then.copy() if cells.ordered else cells.then,
+            found=cells.found.copy(),
+        ),
         scans=arrays.Scans(
-            before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
-            seen=np.zeros((bodies + 1, BODY)), spot=np.zeros((1, 1, 3)),
-            slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
-            drive=np.zeros(3), none=np.zeros(1, np.int64), every=body_cells(0, bodies + 1),
+            before=np.zeros((lanes, 3)),
+            waiting=np.zeros(worlds, np.int64),
+            seen=np.zeros((bodies + 1, BODY)),
+            spot=np.zeros((1, 1, 3)),
+            slices=np.zeros((SLICES, 3)),
+            part=np.zeros((1, 1, model.lidar.beams), np.float32),
+            drive=np.zeros(3),
+            none=np.zeros(1, np.int64),
+            every=body_cells(0, bodies + 1),
             lookup=scan_kernels.scan_lanes(),
         ),
-    )  # fmt: skip
+    )

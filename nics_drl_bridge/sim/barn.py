@@ -37,10 +37,14 @@ def barn_world(number: int) -> World:
     cells = np.unpackbits(packed, count=ROWS * COLUMNS).reshape(ROWS, COLUMNS)
     poses = [(x, y, 0.0) for x, y in _centres(np.argwhere(cells), CORNER).tolist()]
     return World(
-        name=f"barn_{number:03d}", bounds=BOUNDS, clearance=0.0, goal_distance=(9.0, 11.0),
+        name=f"barn_{number:03d}",
+        bounds=BOUNDS,
+        clearance=0.0,
+        goal_distance=(9.0, 11.0),
         obstacles=(Obstacles(shapes=(Circle(radius=RADIUS),), at=tuple(poses)),),
-        starts=Starts(at=(START,)), goals=Goals(at=(GOAL,)),
-    )  # fmt: skip
+        starts=Starts(at=(START,)),
+        goals=Goals(at=(GOAL,)),
+    )
 
 
 def barn_path(number: int) -> NDArray[np.float64]:

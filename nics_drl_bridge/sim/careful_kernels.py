@@ -16,9 +16,25 @@ from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN
 from nics_drl_bridge.robot import kernels as robot
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
-from nics_drl_bridge.sim.impact_kernels import AFTER, DEPTH, STOP, TIME, TURN, VX, VY, Moving
+from nics_drl_bridge.sim.impact_kernels import (
+    AFTER,
+    DEPTH,
+    STOP,
+    TIME,
+    TURN,
+    VX,
+    VY,
+    Moving,
+)
 from nics_drl_bridge.sim.sensing_kernels import drift_of
-from nics_drl_bridge.sim.state import Array, Dynamics, Nearby, Single, State, Surroundings
+from nics_drl_bridge.sim.state import (
+    Array,
+    Dynamics,
+    Nearby,
+    Single,
+    State,
+    Surroundings,
+)
 
 SHARE = 1e-3  # A body that contributes less than this share of the closing speed is not stopped
 SMALL = 0.1  # Step, in radii, by which an overlapping robot is moved to test whether it gets out
@@ -26,7 +42,9 @@ MOST_MOVES = 1000
 
 
 @kernel
-def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Single) -> None:
+def rates_at(
+    n: int, m: int, j: int, state: State, motion: Dynamics, single: Single
+) -> None:
     """Writes to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     size, sent = state.state.shape[2], state.history.shape[2]
     for s in range(size):
@@ -35,14 +53,26 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
         delay = state.delay[n, m] + motion.terms.late[c]
         row = robot.delayed(j, delay, motion.substeps, sent)
         single.x[size + c] = state.history[n, m, row, c]
-    robot.rates(single.dq, single.x, robot.with_coefficients(motion.terms, state.coefficient[n, m]))
+    robot.rates(
+        single.dq,
+        single.x,
+        robot.with_coefficients(motion.terms, state.coefficient[n, m]),
+    )
 
 
 @kernel
 def _fly(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
     turn = flight[TURN] * time
     body[X], body[Y], body[COS], body[SIN] = robot.move(
-        base[X], base[Y], base[COS], base[SIN], flight[VX], flight[VY], turn, time, series
+        base[X],
+        base[Y],
+        base[COS],
+        base[SIN],
+        flight[VX],
+        flight[VY],
+        turn,
+        time,
+        series,
     )
     body[HEADING] = base[HEADING] + turn
     body[RADIUS], body[SHAPE] = base[RADIUS], base[SHAPE]
@@ -50,9 +80,14 @@ def _fly(body: Array, base: Array, flight: Array, time: float, series: Array) ->
 
 @kernel
 def _first_touch(
-    m: int, begin: float, until: float, scene: Surroundings, nearby: Nearby, events: Array,
+    m: int,
+    begin: float,
+    until: float,
+    scene: Surroundings,
+    nearby: Nearby,
+    events: Array,
     moving: Moving,
-) -> None:  # fmt: skip
+) -> None:
     near, world, meets = nearby.near, moving.world, nearby.meets[m]
     event, me = events[m], moving.first + m
     event[TIME] = until
@@ -62,7 +97,9 @@ def _first_touch(
             k = near[m, 1 + i] if listed else i
             if k != me and world[k, RADIUS] > 0.0:
                 impact.touch_body(event, me, k, begin, moving)
-    for w in range(scene.walls.shape[0] if meets & contacts.WALLS and event[DEPTH] >= 0.0 else 0):
+    for w in range(
+        scene.walls.shape[0] if meets & contacts.WALLS and event[DEPTH] >= 0.0 else 0
+    ):
         wall = scene.walls[w]
         side = impact.Edge(wall[0], wall[1], wall[2], wall[3])
         impact.touch_edge(event, me, -1, side, 0.0, begin, moving)
@@ -72,17 +109,29 @@ def _first_touch(
 
 @kernel
 def _leave(
-    m: int, until: float, scene: Surroundings, nearby: Nearby, single: Single, moving: Moving
+    m: int,
+    until: float,
+    scene: Surroundings,
+    nearby: Nearby,
+    single: Single,
+    moving: Moving,
 ) -> None:
     world, events, me = moving.world, single.events, moving.first + m
     flight = moving.flights[me]
-    path = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, RADIUS]
-    moves = int(min(max(math.ceil(path * until / (SMALL * world[me, RADIUS])), 1), MOST_MOVES))
+    path = (
+        math.sqrt(flight[VX] ** 2 + flight[VY] ** 2)
+        + abs(flight[TURN]) * world[me, RADIUS]
+    )
+    moves = int(
+        min(max(math.ceil(path * until / (SMALL * world[me, RADIUS])), 1), MOST_MOVES)
+    )
     flight[STOP], events[m, AFTER] = 0.0, events[m, DEPTH]
     for i in range(1, moves + 1):
         time = until if i == moves else until * i / moves
         _fly(single.trial, world[me], flight, time, moving.series)
-        depth, _ = contacts.contact(single.trial, m, world, scene, nearby, single.spare, 0.0)
+        depth, _ = contacts.contact(
+            single.trial, m, world, scene, nearby, single.spare, 0.0
+        )
         if depth < events[m, AFTER]:
             break
         events[m, AFTER], flight[STOP] = depth, time
@@ -99,11 +148,22 @@ def _within(p: int, b: int, until: float, moving: Moving) -> bool:
 
 @kernel
 def _hold(
-    m: int, nx: float, ny: float, px: float, py: float, time: float, events: Array, moving: Moving
+    m: int,
+    nx: float,
+    ny: float,
+    px: float,
+    py: float,
+    time: float,
+    events: Array,
+    moving: Moving,
 ) -> None:
     """Lets robot m, whose point (px, py) approaches something against n, come no nearer."""
     flight, event = moving.flights[moving.first + m], events[m]
-    slides = event[impact.PRESSED] != 0.0 and event[DEPTH] >= 0.0 and (nx != 0.0 or ny != 0.0)
+    slides = (
+        event[impact.PRESSED] != 0.0
+        and event[DEPTH] >= 0.0
+        and (nx != 0.0 or ny != 0.0)
+    )
     if slides and flight[impact.HOLDS] < impact.MOST_HOLDS:
         impact.hold(moving.first + m, nx, ny, px, py, time, moving)
     else:
@@ -112,10 +172,20 @@ def _hold(
 
 @kernel
 def _settle(
-    until: float, scene: Surroundings, nearby: Nearby, events: Array, touched: Array, moving: Moving
+    until: float,
+    scene: Surroundings,
+    nearby: Nearby,
+    events: Array,
+    touched: Array,
+    moving: Moving,
 ) -> None:
     """Stops bodies at their contacts within a substep, in order of time; marks `touched` (M,)."""
-    flights, first, meets, robots = moving.flights, moving.first, nearby.meets, events.shape[0]
+    flights, first, meets, robots = (
+        moving.flights,
+        moving.first,
+        nearby.meets,
+        events.shape[0],
+    )
     for m in range(robots):
         events[m, TIME] = until
         if meets[m] != contacts.FREE:
@@ -154,9 +224,14 @@ def _settle(
 
 @kernel
 def _arrive(
-    n: int, any_moves: bool, motion: Dynamics, state: State, nearby: Nearby, single: Single,
+    n: int,
+    any_moves: bool,
+    motion: Dynamics,
+    state: State,
+    nearby: Nearby,
+    single: Single,
     moving: Moving,
-) -> None:  # fmt: skip
+) -> None:
     bodies, velocity, start = state.bodies[n], state.velocity[n], single.start
     for m in range(nearby.meets.shape[0]):
         if nearby.meets[m] != contacts.FREE:
@@ -181,9 +256,14 @@ def _arrive(
 
 @kernel
 def move_carefully(
-    n: int, any_moves: bool, state: State, scene: Surroundings, motion: Dynamics, nearby: Nearby,
+    n: int,
+    any_moves: bool,
+    state: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    nearby: Nearby,
     single: Single,
-) -> None:  # fmt: skip
+) -> None:
     """Moves the robots of one world that may meet something by one period, up to their contacts.
 
     A robot in contact is marked and stops for the rest of the substep. In the next ones it slides
@@ -194,7 +274,9 @@ def move_carefully(
     """
     events, touched, dt = single.events, state.collided[n], motion.dt
     first, meets = state.velocity.shape[1], nearby.meets
-    moving = Moving(state.bodies[n], single.flights, first, scene.outlines, motion.series)
+    moving = Moving(
+        state.bodies[n], single.flights, first, scene.outlines, motion.series
+    )
     for m in range(meets.shape[0]):
         single.flights[first + m, :] = 0.0
         if meets[m] != contacts.FREE:
@@ -202,7 +284,9 @@ def move_carefully(
             _check_overlap(m, scene, nearby, single, touched, moving)
     for j in range(motion.substeps):
         if any_moves:
-            contacts.move_obstacles(state.bodies, single.start, state.velocity, n, j * dt)
+            contacts.move_obstacles(
+                state.bodies, single.start, state.velocity, n, j * dt
+            )
         for k in range(first):
             for i in range(3):
                 single.flights[k, VX + i] = state.velocity[n, k, i]
@@ -211,7 +295,12 @@ def move_carefully(
             if meets[m] != contacts.FREE:
                 rates_at(n, m, j, state, motion, single)
                 flight, dq = single.flights[first + m], single.dq
-                flight[VX], flight[VY], flight[TURN], flight[STOP] = dq[0], dq[1], dq[2], dt
+                flight[VX], flight[VY], flight[TURN], flight[STOP] = (
+                    dq[0],
+                    dq[1],
+                    dq[2],
+                    dt,
+                )
                 flight[impact.FROM] = flight[impact.HOLDS] = 0.0
                 for s in range(state.state.shape[2]):
                     now, bounds = state.state[n, m, s], robot.bounds_of(motion.terms, s)
@@ -232,14 +321,21 @@ def move_carefully(
 
 @kernel
 def _check_overlap(
-    m: int, scene: Surroundings, nearby: Nearby, single: Single, touched: Array, moving: Moving
+    m: int,
+    scene: Surroundings,
+    nearby: Nearby,
+    single: Single,
+    touched: Array,
+    moving: Moving,
 ) -> None:
     events, body = single.events, moving.world[moving.first + m]
     depth, whom = contacts.contact(
         body, m, moving.world, scene, nearby, single.spare, 4.0 * impact.SLACK
     )
     events[m, impact.PRESSED] = depth <= 2.0 * impact.SLACK
-    events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= impact.NOTHING else 0.0
+    events[m, DEPTH] = (
+        min(depth, -np.finfo(np.float64).tiny) if depth <= impact.NOTHING else 0.0
+    )
     if depth < 0.0:
         touched[m] = 1
         if whom >= moving.first:
@@ -248,7 +344,12 @@ def _check_overlap(
 
 @kernel
 def _average_velocities(n: int, period: float, state: State, single: Single) -> None:
-    bodies, velocity, start, began = state.bodies, state.velocity, single.start, single.began
+    bodies, velocity, start, began = (
+        state.bodies,
+        state.velocity,
+        single.start,
+        single.began,
+    )
     for k in range(velocity.shape[1]):
         stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]
         if stopped or start[k, 2] != began[k, 2]:
@@ -259,7 +360,12 @@ def _average_velocities(n: int, period: float, state: State, single: Single) -> 
 
 @kernel
 def drift_carefully(
-    n: int, state: State, scene: Surroundings, motion: Dynamics, nearby: Nearby, single: Single
+    n: int,
+    state: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    nearby: Nearby,
+    single: Single,
 ) -> None:
     """Lets the robots of one world drift, one after the other, up to their contacts."""
     pose, collided, meets = state.pose, state.collided, nearby.meets
@@ -287,9 +393,20 @@ def drift_carefully(
                 if events[m, impact.WITH] >= first:
                     collided[n, int(events[m, impact.WITH]) - first] = 1
         x, y, _, _ = robot.move(
-            pose[n, m, 0], pose[n, m, 1], math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2]),
-            ahead, aside, turn * stop, stop, motion.series,
-        )  # fmt: skip
-        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, robot.wrap(pose[n, m, 2] + turn * stop)
+            pose[n, m, 0],
+            pose[n, m, 1],
+            math.cos(pose[n, m, 2]),
+            math.sin(pose[n, m, 2]),
+            ahead,
+            aside,
+            turn * stop,
+            stop,
+            motion.series,
+        )
+        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = (
+            x,
+            y,
+            robot.wrap(pose[n, m, 2] + turn * stop),
+        )
         if meets[m] != contacts.FREE:
             contacts.put_body(state.bodies, n, first + m, pose[n, m])

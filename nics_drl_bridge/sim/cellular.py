@@ -29,14 +29,25 @@ class Cellular(Schema):
 
     kind: Literal["cellular"] = "cellular"  # which kind of generator this is
     worlds: int = Field(ge=1, le=10_000)  # how many of them are made
-    seed: int = Field(default=0, ge=0)  # of the generator; another one makes other worlds
+    seed: int = Field(
+        default=0, ge=0
+    )  # of the generator; another one makes other worlds
     columns: int = Field(default=30, ge=4)  # of cells across the field
     rows: int = Field(default=30, ge=4)  # along it
-    cell: float = Field(default=0.15, ge=0.01, le=10.0)  # side, and diameter of a cylinder [m]
-    fill: tuple[float, float] = (0.1, 0.35)  # share of the cells that are filled at first
+    cell: float = Field(
+        default=0.15, ge=0.01, le=10.0
+    )  # side, and diameter of a cylinder [m]
+    fill: tuple[float, float] = (
+        0.1,
+        0.35,
+    )  # share of the cells that are filled at first
     smoothing: tuple[int, int] = (2, 4)  # passes of the automaton
-    margin: float = Field(default=4.0, ge=0.5, le=100.0)  # free space before and behind [m]
-    passage: float = Field(default=0.5, ge=0.0, le=100.0)  # width that the way through has [m]
+    margin: float = Field(
+        default=4.0, ge=0.5, le=100.0
+    )  # free space before and behind [m]
+    passage: float = Field(
+        default=0.5, ge=0.0, le=100.0
+    )  # width that the way through has [m]
 
     @model_validator(mode="after")
     def _consistent(self) -> "Cellular":
@@ -45,7 +56,9 @@ class Cellular(Schema):
         if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:
             raise ValueError("fill must be [least, greatest], from 0 to below 1")
         if self.passage > self.margin:
-            raise ValueError("passage may be as wide as margin, in whose middle the robot starts")
+            raise ValueError(
+                "passage may be as wide as margin, in whose middle the robot starts"
+            )
         if not 0 <= self.smoothing[0] <= self.smoothing[1] <= 100:
             raise ValueError("smoothing must be [least, greatest], from 0 to 100")
         return self
@@ -83,7 +96,9 @@ def _field(given: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
 
 def _has_way(filled: NDArray[np.bool_], given: Cellular) -> bool:
     """True if a disc of the passage's width gets from before the field to behind it."""
-    ahead = FINE * (1 + math.ceil(given.passage / 2.0 / given.cell))  # beyond, all is free
+    ahead = FINE * (
+        1 + math.ceil(given.passage / 2.0 / given.cell)
+    )  # beyond, all is free
     free = np.ones((FINE * given.rows + 2 * ahead, FINE * given.columns + 2), np.bool_)
     free[:, [0, -1]] = False  # the walls at both sides
     free[ahead:-ahead, 1:-1] = ~np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)
@@ -99,12 +114,23 @@ def _world(filled: NDArray[np.bool_], given: Cellular, number: int) -> World:
     wide, deep = given.columns * given.cell, given.rows * given.cell
     long, middle = deep + 2.0 * given.margin, wide / 2.0
     poses = [(px, py, 0.0) for px, py in np.round(np.stack([x, y], axis=1), 6).tolist()]
-    one = Obstacles(shapes=(Circle(radius=given.cell / 2.0),), at=tuple(poses)) if poses else None
+    one = (
+        Obstacles(shapes=(Circle(radius=given.cell / 2.0),), at=tuple(poses))
+        if poses
+        else None
+    )
     start, goal = given.margin / 2.0, long - given.margin / 2.0
     return World(
-        name=f"cellular_{given.seed}_{number}", bounds=(0.0, 0.0, wide, long), clearance=0.0,
-        walls=((0.0, 0.0, 0.0, given.margin + deep), (wide, 0.0, wide, given.margin + deep),
-               (0.0, 0.0, wide, 0.0)),
-        obstacles=(one,) if one else (), goal_distance=(0.0, 2.0 * long),
-        starts=Starts(at=((middle, start, math.pi / 2.0),)), goals=Goals(at=((middle, goal),)),
-    )  # fmt: skip
+        name=f"cellular_{given.seed}_{number}",
+        bounds=(0.0, 0.0, wide, long),
+        clearance=0.0,
+        walls=(
+            (0.0, 0.0, 0.0, given.margin + deep),
+            (wide, 0.0, wide, given.margin + deep),
+            (0.0, 0.0, wide, 0.0),
+        ),
+        obstacles=(one,) if one else (),
+        goal_distance=(0.0, 2.0 * long),
+        starts=Starts(at=((middle, start, math.pi / 2.0),)),
+        goals=Goals(at=((middle, goal),)),
+    )

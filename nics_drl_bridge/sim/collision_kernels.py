@@ -16,7 +16,9 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.sim.state import Array
 
-TOUCHING = 1e-12  # Outlines this near touch; their depth then decides about an overlap [m]
+TOUCHING = (
+    1e-12  # Outlines this near touch; their depth then decides about an overlap [m]
+)
 ON_EDGE = 1e-9  # Tolerance beyond the ends of an edge for intersections, as a share of its length
 FLOAT32 = 1e-6  # Relative rounding error of the distances of a map
 
@@ -69,9 +71,9 @@ def _side(ax, ay, bx, by, x, y):  # type: ignore[no-untyped-def]
 @kernel
 def cross(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
     """True if the segments from a to b and from p to q cross."""
-    return (_side(ax, ay, bx, by, px, py) > 0.0) != (_side(ax, ay, bx, by, qx, qy) > 0.0) and (
-        _side(px, py, qx, qy, ax, ay) > 0.0
-    ) != (_side(px, py, qx, qy, bx, by) > 0.0)
+    return (_side(ax, ay, bx, by, px, py) > 0.0) != (
+        _side(ax, ay, bx, by, qx, qy) > 0.0
+    ) and (_side(px, py, qx, qy, ax, ay) > 0.0) != (_side(px, py, qx, qy, bx, by) > 0.0)
 
 
 @kernel
@@ -80,9 +82,11 @@ def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped
     if cross(ax, ay, bx, by, px, py, qx, qy):
         return -1.0
     return min(
-        segment_distance2(ax, ay, px, py, qx, qy), segment_distance2(bx, by, px, py, qx, qy),
-        segment_distance2(px, py, ax, ay, bx, by), segment_distance2(qx, qy, ax, ay, bx, by),
-    )  # fmt: skip
+        segment_distance2(ax, ay, px, py, qx, qy),
+        segment_distance2(bx, by, px, py, qx, qy),
+        segment_distance2(px, py, ax, ay, bx, by),
+        segment_distance2(qx, qy, ax, ay, bx, by),
+    )
 
 
 @kernel
@@ -162,15 +166,21 @@ def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
         ax, ay = bx, by
     overlapping = crossing or touching
     if not overlapping and q.end - q.begin > 2:
-        overlapping = outline_point(p.corners[p.begin, 0], p.corners[p.begin, 1], q) < 0.0
+        overlapping = (
+            outline_point(p.corners[p.begin, 0], p.corners[p.begin, 1], q) < 0.0
+        )
     if not overlapping and p.end - p.begin > 2:
-        overlapping = outline_point(q.corners[q.begin, 0], q.corners[q.begin, 1], p) < 0.0
+        overlapping = (
+            outline_point(q.corners[q.begin, 0], q.corners[q.begin, 1], p) < 0.0
+        )
     if not overlapping:
         return math.sqrt(least)
     depth = max(_deepest(p, q), _deepest(q, p))
     if depth > 0.0:
         return -depth
-    return -TOUCHING if crossing and (q.end - q.begin > 2 or p.end - p.begin > 2) else 0.0
+    return (
+        -TOUCHING if crossing and (q.end - q.begin > 2 or p.end - p.begin > 2) else 0.0
+    )
 
 
 @kernel
@@ -197,7 +207,9 @@ def body_gap(body, other, outlines, limit, spare):  # type: ignore[no-untyped-de
         px, py = mine.corners[mine.begin + v, 0], mine.corners[mine.begin + v, 1]
         spare[v, 0], spare[v, 1] = x + cos * px - sin * py, y + sin * px + cos * py
     placed = Outline(spare, 0, mine.end - mine.begin)
-    return min(_outline_gap(placed, x, y, body[RADIUS], outline, max(limit, 0.0)), limit)
+    return min(
+        _outline_gap(placed, x, y, body[RADIUS], outline, max(limit, 0.0)), limit
+    )
 
 
 @kernel
@@ -212,10 +224,15 @@ def wall_gap(body, wall, outlines, limit, spare):  # type: ignore[no-untyped-def
         return min(math.sqrt(distance2) - body[RADIUS], limit)
     for v in range(2):
         dx, dy = wall[2 * v] - body[X], wall[2 * v + 1] - body[Y]
-        spare[v, 0], spare[v, 1] = body[COS] * dx + body[SIN] * dy, body[COS] * dy - body[SIN] * dx
+        spare[v, 0], spare[v, 1] = (
+            body[COS] * dx + body[SIN] * dy,
+            body[COS] * dy - body[SIN] * dx,
+        )
     x, y = 0.5 * (spare[0, 0] + spare[1, 0]), 0.5 * (spare[0, 1] + spare[1, 1])
     reach = math.hypot(spare[0, 0] - x, spare[0, 1] - y)
-    return min(_outline_gap(Outline(spare, 0, 2), x, y, reach, outline, max(limit, 0.0)), limit)
+    return min(
+        _outline_gap(Outline(spare, 0, 2), x, y, reach, outline, max(limit, 0.0)), limit
+    )
 
 
 @kernel
@@ -258,7 +275,12 @@ def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
     rows, columns = grid.distances.shape
     low_i, high_i = math.floor((y - far) / grid.cell), math.floor((y + far) / grid.cell)
     low_j, high_j = math.floor((x - far) / grid.cell), math.floor((x + far) / grid.cell)
-    return max(low_i, 0), min(high_i, rows - 1) + 1, max(low_j, 0), min(high_j, columns - 1) + 1
+    return (
+        max(low_i, 0),
+        min(high_i, rows - 1) + 1,
+        max(low_j, 0),
+        min(high_j, columns - 1) + 1,
+    )
 
 
 @kernel
@@ -273,7 +295,9 @@ def _bounds(x, y, grid):  # type: ignore[no-untyped-def]
     within = math.hypot(px - (j + 0.5) * size, py - (i + 0.5) * size)
     outside = math.hypot(x - px, y - py)
     middle = grid.distances[i, j]
-    return middle * (1.0 - FLOAT32) - within, middle * (1.0 + FLOAT32) + within + outside
+    return middle * (1.0 - FLOAT32) - within, middle * (
+        1.0 + FLOAT32
+    ) + within + outside
 
 
 @kernel
@@ -313,7 +337,10 @@ def map_gap(body, grid, outlines, limit, spare):  # type: ignore[no-untyped-def]
                 across = (j + ((v + 1) // 2) % 2) * size - x
                 up = (i + v // 2) * size - y
                 spare[v, 0], spare[v, 1] = c * across + s * up, c * up - s * across
-            mx, my = 0.5 * (spare[0, 0] + spare[2, 0]), 0.5 * (spare[0, 1] + spare[2, 1])
+            mx, my = (
+                0.5 * (spare[0, 0] + spare[2, 0]),
+                0.5 * (spare[0, 1] + spare[2, 1]),
+            )
             square, reach = Outline(spare, 0, 4), 0.75 * size
             gap = _outline_gap(square, mx, my, reach, outline, max(least, 0.0))
             least = min(least, gap)

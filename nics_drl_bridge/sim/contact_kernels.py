@@ -15,15 +15,22 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Nearby, State, Surroundings
 
 FREE, BODIES, WALLS, MAP = 0, 1, 2, 4  # Bit flags of what a robot may meet
-SEVERAL = 32  # Most bodies that are listed near a robot; if there are more, all are tested
+SEVERAL = (
+    32  # Most bodies that are listed near a robot; if there are more, all are tested
+)
 
 
 @kernel
 def reaches(
     n: int, state: State, scene: Surroundings, nearby: Nearby, period: float
-) -> tuple[float, bool]:  # fmt: skip
+) -> tuple[float, bool]:
     """Writes how far what may move reaches in a period [s]; longest path, if an obstacle moves."""
-    reach, way, bodies, velocity = nearby.reach, nearby.way, state.bodies, state.velocity
+    reach, way, bodies, velocity = (
+        nearby.reach,
+        nearby.way,
+        state.bodies,
+        state.velocity,
+    )
     longest, moving = 0.0, False
     obstacles = velocity.shape[1]
     for k in range(0 if scene.standing else obstacles):
@@ -59,7 +66,9 @@ def find_near(
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
     for w in range(walls.shape[0]):
-        d2 = collision.segment_distance2(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
+        d2 = collision.segment_distance2(
+            x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
+        )
         if d2 <= own * own:
             meets |= WALLS
             break
@@ -70,9 +79,14 @@ def find_near(
 
 @kernel
 def contact(
-    body: Array, m: int, world: Array, scene: Surroundings, nearby: Nearby, spare: Array,
+    body: Array,
+    m: int,
+    world: Array,
+    scene: Surroundings,
+    nearby: Nearby,
+    spare: Array,
     limit: float,
-) -> tuple[float, int]:  # fmt: skip
+) -> tuple[float, int]:
     """Clearance [m], up to `limit`, of robot m placed as `body` (7,), and nearest body or -1."""
     outlines, near, least, whom = scene.outlines, nearby.near, limit, -1
     if nearby.meets[m] & BODIES:
@@ -98,7 +112,9 @@ def contact(
 
 
 @kernel
-def move_obstacles(bodies: Array, start: Array, velocity: Array, n: int, time: float) -> None:
+def move_obstacles(
+    bodies: Array, start: Array, velocity: Array, n: int, time: float
+) -> None:
     """Moves the obstacles of world n to `time` [s] after their poses `start` (K, 3)."""
     for k in range(velocity.shape[1]):
         bodies[n, k, X] = start[k, 0] + velocity[n, k, 0] * time

@@ -39,10 +39,14 @@ class Sensed:
 class DeviceWorld:
     """Keeps the next command of each of M robots, and the covariance of its odometry."""
 
-    def __init__(self, simulator: FastSimulator, model: SimulatorModel, robots: int) -> None:
+    def __init__(
+        self, simulator: FastSimulator, model: SimulatorModel, robots: int
+    ) -> None:
         self.simulator, self._period = simulator, model.control_period
         # Completes a scene that was drawn; the starts (1, M, 3) of its robots, if they were given.
-        self.arrange: Callable[[Scenes, Array | None], Array | None] = lambda _, starts: starts
+        self.arrange: Callable[[Scenes, Array | None], Array | None] = (
+            lambda _, starts: starts
+        )
         self._given = robots
         self._added = step_covariance(model.noise.odometry, self._period)
         self.commands: Array = np.zeros((robots, len(model.robot.command)))
@@ -72,7 +76,9 @@ class DeviceWorld:
             for x, y, _ in starts.reshape(-1, 3).tolist() if starts is not None else ():
                 if room_at(world, x, y) < 0.0:
                     fault = f"({x:g}, {y:g}) m lies outside the world"
-                    raise ConfigError(f"episode_start: {fault} {world.name!r}; move it inside.")
+                    raise ConfigError(
+                        f"episode_start: {fault} {world.name!r}; move it inside."
+                    )
             return self.arrange(scenes, placed)
 
         self.simulator.reset([seed], starts=arranged)
@@ -109,15 +115,25 @@ class DeviceWorld:
     def sensed(self, robot: int) -> Sensed:
         """Returns the present values of one robot; the next step may overwrite them."""
         data = self.simulator.data
-        readings = {name: each[0, robot] for name, each in self.simulator.readings.items()}
+        readings = {
+            name: each[0, robot] for name, each in self.simulator.readings.items()
+        }
         return Sensed(
-            data.odom[0, robot], self._covariance[robot], data.twist[0, robot],
-            data.state[0, robot], data.ranges[0, robot], data.pose[0, robot],
-            self._before[robot], self._period, readings,
-        )  # fmt: skip
+            data.odom[0, robot],
+            self._covariance[robot],
+            data.twist[0, robot],
+            data.state[0, robot],
+            data.ranges[0, robot],
+            data.pose[0, robot],
+            self._before[robot],
+            self._period,
+            readings,
+        )
 
 
-LEAST_VARIANCE = 1e-9  # Of odometry without noise: in ROS, a covariance of zeros means unknown
+LEAST_VARIANCE = (
+    1e-9  # Of odometry without noise: in ROS, a covariance of zeros means unknown
+)
 
 
 def variances(std: tuple[float, float]) -> Array:
@@ -131,14 +147,18 @@ def step_covariance(std: tuple[float, float], period: float) -> Array:
     return np.diag(np.maximum(variances(std) * period * period, LEAST_VARIANCE))
 
 
-def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
+def propagate(
+    covariance: Array, before: ArrayLike, after: ArrayLike, added: Array
+) -> Array:
     """Propagates the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
     A heading error rotates the motion that follows: P' = F P F^T + Q, F the new pose's derivative
     to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q `added`.
     """
     out = np.array(covariance, np.float64)
-    poses = (np.asarray(each, np.float64).reshape(len(out), 3) for each in (before, after))
+    poses = (
+        np.asarray(each, np.float64).reshape(len(out), 3) for each in (before, after)
+    )
     step_kernels.propagate(out, *poses, added)
     return out
 
@@ -170,7 +190,9 @@ class DrivenSimulator(FastSimulator):
         """Commands (M, C) in force `time` [s] after the beginning, by the drawn latency alone."""
         dt, _, own = self.model.timing
         late = (self.data.delay[0] - own) * dt - time
-        rows = np.ceil(np.maximum(late, 0.0) / self.model.control_period - 1e-6).astype(np.int64)
+        rows = np.ceil(np.maximum(late, 0.0) / self.model.control_period - 1e-6).astype(
+            np.int64
+        )
         return np.asarray(self.data.history[0, np.arange(len(rows)), rows])
 
     def move_obstacles(self, time: float) -> Array:
@@ -180,9 +202,14 @@ class DrivenSimulator(FastSimulator):
         return data.bodies[0, : data.velocity.shape[1]]
 
     def end_period(
-        self, pose: Array, twist: Array, state: Array, wheels: Array, counted: Array,
+        self,
+        pose: Array,
+        twist: Array,
+        state: Array,
+        wheels: Array,
+        counted: Array,
         touched: NDArray[np.bool_],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Takes over the motion of the robots in the period, and measures what they sense.
 
         True poses, body twists and states (M, ...) at its end; pose and body twist (M, 3) there by

@@ -46,8 +46,12 @@ class Entity:
     name: str
     robot: int = -1  # index of the robot; -1 for shapes
     slots: tuple[int, ...] = ()  # indices of the bodies of its shapes
-    parts: tuple[Placed, ...] = ()  # its shapes and their poses in the entity's own frame
-    start: Array | None = None  # (3,) where it was spawned; None for what the world came with
+    parts: tuple[
+        Placed, ...
+    ] = ()  # its shapes and their poses in the entity's own frame
+    start: Array | None = (
+        None  # (3,) where it was spawned; None for what the world came with
+    )
     motion: Motion | None = None
 
 
@@ -69,7 +73,9 @@ class Entities:
     def __post_init__(self) -> None:
         self._own = self.device.simulator.sampler.count
         self._launched, self._spare = list(self.robots), list[Shape]()
-        self._table: Array = np.zeros((self._own, 7))  # the bodies, in the order of slots
+        self._table: Array = np.zeros(
+            (self._own, 7)
+        )  # the bodies, in the order of slots
         self.device.arrange = self._arrange
 
     @property
@@ -83,7 +89,9 @@ class Entities:
         bodies[sorted(self.removed), RADIUS] = 0.0
         found = scenes.starts.copy()
         if starts is not None:
-            own = [self.robots.index(name) for name in self._launched]  # that are still there
+            own = [
+                self.robots.index(name) for name in self._launched
+            ]  # that are still there
             found[:, : len(own)] = starts[:, own]
         for entity in self.spawned.values():
             if entity.robot >= 0:
@@ -96,7 +104,9 @@ class Entities:
     def _put(self, bodies: Array, entity: Entity, pose: Array | None) -> None:
         first = len(self.simulator.sampler.shapes) - len(self._spare)
         for slot, (shape, part) in zip(entity.slots, entity.parts, strict=True):
-            index = first + slot - self._own if slot >= self._own else bodies[slot, SHAPE]
+            index = (
+                first + slot - self._own if slot >= self._own else bodies[slot, SHAPE]
+            )
             at = geometry.compose(np.asarray(pose), np.asarray(part))
             bodies[slot] = place(at, shape.radius, index)
 
@@ -119,7 +129,9 @@ class Entities:
         """Returns the entity of a name. Raises UnknownEntityError."""
         known = {entity.name: entity for entity in self}
         if name not in known:
-            raise UnknownEntityError(f"there is no entity {name!r}; {nearest(name, known)}")
+            raise UnknownEntityError(
+                f"there is no entity {name!r}; {nearest(name, known)}"
+            )
         return known[name]
 
     def pose(self, entity: Entity) -> Array:
@@ -146,7 +158,10 @@ class Entities:
         """Returns the convex hulls (V, 2) of an entity's shapes in its own frame [m]."""
         if entity.robot >= 0:
             return [hull_of(self.simulator.footprint)]
-        return [geometry.rotate(hull_of(shape), part[2]) + part[:2] for shape, part in entity.parts]
+        return [
+            geometry.rotate(hull_of(shape), part[2]) + part[:2]
+            for shape, part in entity.parts
+        ]
 
     def require_inside(self, pose: Array) -> None:
         """Raises OutsideError for a pose (3,) outside the world."""
@@ -162,7 +177,12 @@ class Entities:
         Raises StillError for a twist of what stands still, ConfigError for one beyond a robot's
         reach, OutsideError for a pose outside.
         """
-        if twist is not None and twist.any() and entity.robot < 0 and entity.motion is None:
+        if (
+            twist is not None
+            and twist.any()
+            and entity.robot < 0
+            and entity.motion is None
+        ):
             fix = "set its pose alone, or a twist of zeros"
             raise StillError(f"{entity.name!r} stands still and takes no twist; {fix}.")
         if pose is not None:
@@ -186,7 +206,10 @@ class Entities:
             ahead, aside = geometry.rotate(twist[:2], -at[2])
             spec = simulator.model.robot
             command = spec.from_cmd_vel([ahead, aside, twist[2]])
-            if (np.abs(command) > REACH * np.maximum(-spec.command_low, spec.command_high)).any():
+            if (
+                np.abs(command)
+                > REACH * np.maximum(-spec.command_low, spec.command_high)
+            ).any():
                 told = f"the twist is more than {REACH:g} times what {spec.name!r} can be commanded"
                 raise ConfigError(f"{told}; give a slower one.")
             state = textbook(spec).target(command)
@@ -216,7 +239,11 @@ class Entities:
         used = {slot for entity in self.spawned.values() for slot in entity.slots}
         spare, slots = list(self._spare), list[int]()
         for shape, _ in parts:
-            free = (k for k, one in enumerate(spare) if one == shape and self._own + k not in used)
+            free = (
+                k
+                for k, one in enumerate(spare)
+                if one == shape and self._own + k not in used
+            )
             k = next(free, len(spare))
             if k == len(spare):
                 spare.append(shape)
@@ -224,7 +251,9 @@ class Entities:
             slots.append(self._own + k)
         if len(spare) > len(self._spare):
             self._remake(spare, list(range(len(self.robot_names))))
-        entity = Entity(name, slots=tuple(slots), parts=tuple(parts), start=np.array(pose))
+        entity = Entity(
+            name, slots=tuple(slots), parts=tuple(parts), start=np.array(pose)
+        )
         self.spawned[name] = entity
         bodies = self.bodies().copy()
         self._put(bodies, entity, pose)
@@ -244,14 +273,18 @@ class Entities:
     @property
     def robot_names(self) -> list[str]:
         """Names of all robots, by their numbers."""
-        found = {each.robot: each.name for each in self.spawned.values() if each.robot >= 0}
+        found = {
+            each.robot: each.name for each in self.spawned.values() if each.robot >= 0
+        }
         return [*self._launched, *(found[m] for m in sorted(found))]
 
     def delete(self, entity: Entity) -> None:
         """Removes an entity. Raises ConfigError for the last robot."""
         kept = [m for m in range(self.device.robots) if m != entity.robot]
         if not kept:
-            raise ConfigError(f"{entity.name!r} is the last robot, which a simulator needs.")
+            raise ConfigError(
+                f"{entity.name!r} is the last robot, which a simulator needs."
+            )
         self.spawned.pop(entity.name, None)
         if entity.robot < 0:
             self.removed |= {slot for slot in entity.slots if slot < self._own}
@@ -274,7 +307,9 @@ class Entities:
             self._launched = list(self.robots)
         self.removed.clear()
 
-    def _remake(self, spare: Sequence[Shape], robots: Sequence[int], count: int = 0) -> None:
+    def _remake(
+        self, spare: Sequence[Shape], robots: Sequence[int], count: int = 0
+    ) -> None:
         """Makes a simulator for robots of these numbers here, and so many in all; goes on in it."""
         old, bodies = self.simulator, self.bodies().copy()
         # An own world, as the simulator of the present one goes on if this one can't be made.
@@ -306,7 +341,9 @@ def overlap(one: Array, other: Array) -> bool:
         if len(corners) == 2:  # a segment: also along itself
             axes = np.concatenate([axes[:1], edges[:1]])
         mine, theirs = one @ axes.T, other @ axes.T
-        apart = (mine.max(axis=0) < theirs.min(axis=0)) | (theirs.max(axis=0) < mine.min(axis=0))
+        apart = (mine.max(axis=0) < theirs.min(axis=0)) | (
+            theirs.max(axis=0) < mine.min(axis=0)
+        )
         if apart.any():
             return False
     return True

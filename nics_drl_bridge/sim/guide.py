@@ -13,7 +13,10 @@ from nics_drl_bridge.sim.guide_kernels import GuideGrid
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
 from nics_drl_bridge.sim.state import State
 
-CELL, MOST_CELLS = 0.15, 10_000  # side of a cell [m]; in fields with more cells it is larger
+CELL, MOST_CELLS = (
+    0.15,
+    10_000,
+)  # side of a cell [m]; in fields with more cells it is larger
 
 
 class Guide:
@@ -25,17 +28,24 @@ class Guide:
         worlds: N, number of copies.
     """
 
-    def __init__(self, sampler: SetSampler, footprint: Circle | Polygon, worlds: int) -> None:
+    def __init__(
+        self, sampler: SetSampler, footprint: Circle | Polygon, worlds: int
+    ) -> None:
         members = [each.world for each in sampler.samplers]
         extents = np.array([member.extent for member in members])
         spans = extents[:, 2:] - extents[:, :2]
         cells = np.maximum(CELL, np.sqrt(spans.prod(axis=1) / MOST_CELLS))
-        sizes = np.maximum(np.ceil(spans / cells[:, None])[:, ::-1], 2.0).astype(np.int64)
+        sizes = np.maximum(np.ceil(spans / cells[:, None])[:, ::-1], 2.0).astype(
+            np.int64
+        )
         walls = np.full((len(members), *sizes.max(axis=0)), np.inf, np.float32)
         stands = np.zeros((len(members), sampler.count), np.bool_)
         for p, each in enumerate(sampler.samplers):
             kernels.walls_of(
-                walls[p, : sizes[p, 0], : sizes[p, 1]], extents[p], cells[p], each.plan.space.cells
+                walls[p, : sizes[p, 0], : sizes[p, 1]],
+                extents[p],
+                cells[p],
+                each.plan.space.cells,
             )
             stands[p, : each.count] = [motion is None for motion in each.motions]
         frames = np.column_stack([extents[:, :2], cells])
@@ -43,9 +53,14 @@ class Guide:
         if isinstance(footprint, Polygon):
             inner = abs(float(depths(np.zeros((1, 2)), np.array(footprint.outline))[0]))
         self._grid = GuideGrid(
-            walls, frames, sizes, stands, sampler.samplers[0].plan.outlines, inner,
+            walls,
+            frames,
+            sizes,
+            stands,
+            sampler.samplers[0].plan.outlines,
+            inner,
             footprint.radius,
-        )  # fmt: skip
+        )
         self.fields = np.zeros((worlds, sampler.robots, *walls.shape[1:]), np.float32)
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
@@ -59,7 +74,9 @@ class Guide:
         Where there is no room for one it stays as drawn. Call `begin` before.
         """
         starts, member = scenes.starts.copy(), np.asarray(scenes.member, np.int64)
-        kernels.nearer(starts, worlds, member, scenes.bodies, share, self.fields, self._grid)
+        kernels.nearer(
+            starts, worlds, member, scenes.bodies, share, self.fields, self._grid
+        )
         return starts
 
     def lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:

@@ -18,7 +18,9 @@ from nics_drl_bridge.sim import scene_kernels
 from nics_drl_bridge.sim.state import Array, Integers
 
 ROOM = 0.1  # space that a start needs beside the robot's circle [m]
-COMFORT = 0.3  # space beside the robot's circle from which on a way is no longer tight [m]
+COMFORT = (
+    0.3  # space beside the robot's circle from which on a way is no longer tight [m]
+)
 TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
 """Cost of a metre where the circle just fits, where only the outline does, and where nothing does;
 in between it is interpolated."""
@@ -48,7 +50,10 @@ def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
         for j in range(out.shape[1]):
             x, y = extent[0] + (j + 0.5) * cell, extent[1] + (i + 0.5) * cell
             row, column, _ = scene_kernels.cell_of(x, y, cells)
-            inside = 0 <= row < cells.distances.shape[0] and 0 <= column < cells.distances.shape[1]
+            inside = (
+                0 <= row < cells.distances.shape[0]
+                and 0 <= column < cells.distances.shape[1]
+            )
             out[i, j] = cells.distances[row, column] if inside else np.float32(0.0)
 
 
@@ -112,7 +117,9 @@ def _cost(space, grid):  # type: ignore[no-untyped-def]
     if beside >= 0.0:
         return TIGHT + (1.0 - TIGHT) * beside / COMFORT
     if space > grid.inner:
-        return SQUEEZED + (TIGHT - SQUEEZED) * (space - grid.inner) / (grid.outer - grid.inner)
+        return SQUEEZED + (TIGHT - SQUEEZED) * (space - grid.inner) / (
+            grid.outer - grid.inner
+        )
     return BLOCKED
 
 
@@ -154,7 +161,9 @@ def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
             way = least + price
             if abs(apart) < price:
                 way = np.float32(0.5) * (
-                    beside + above + math.sqrt(np.float32(2.0) * price * price - apart * apart)
+                    beside
+                    + above
+                    + math.sqrt(np.float32(2.0) * price * price - apart * apart)
                 )
             if way < ways[i, j]:
                 most = max(most, min(ways[i, j] - way, np.float32(1e3)))
@@ -179,7 +188,9 @@ def nearer(out, worlds, member, bodies, share, fields, grid):  # type: ignore[no
             j = min(max(int((out[n, m, 0] - x) / cell), 0), wide[1] - 1)
             i, j = _descend(i, j, share * ways[i, j], ways)
             at_x, at_y = x + (j + 0.5) * cell, y + (i + 0.5) * cell
-            if grid.walls[p, i, j] >= grid.outer + ROOM and _is_clear(at_x, at_y, bodies[n], grid):
+            if grid.walls[p, i, j] >= grid.outer + ROOM and _is_clear(
+                at_x, at_y, bodies[n], grid
+            ):
                 out[n, m, 0], out[n, m, 1] = at_x, at_y
 
 

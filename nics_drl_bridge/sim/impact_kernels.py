@@ -16,7 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, OutlineArrays, X, Y
+from nics_drl_bridge.lidar.exact_kernels import (
+    COS,
+    HEADING,
+    RADIUS,
+    SIN,
+    OutlineArrays,
+    X,
+    Y,
+)
 from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, MapField
@@ -32,8 +40,21 @@ MOST_HOLDS = 8  # Of a robot in a substep; then it stops: it is wedged in
 FLIGHT = FIRST_HOLD + MOST_HOLDS * HOLD
 SWEEPS = 30  # Through the holds, to find the speeds with which they agree
 (
-    TIME, WITH, OWN, OTHERS, NX, NY, OWN_X, OWN_Y, OTHERS_X, OTHERS_Y, DEPTH, AFTER, PRESSED, EVENT,
-) = range(14)  # fmt: skip
+    TIME,
+    WITH,
+    OWN,
+    OTHERS,
+    NX,
+    NY,
+    OWN_X,
+    OWN_Y,
+    OTHERS_X,
+    OTHERS_Y,
+    DEPTH,
+    AFTER,
+    PRESSED,
+    EVENT,
+) = range(14)
 """Columns of `events`: time of a robot's first contact [s]; the other body; the rates of its own
 and of the other's nearest point along the direction (NX, NY) from the other to it, 0 if there is
 none, negative if approaching [m/s]; these points [m]; the clearance, negative where it overlaps
@@ -41,7 +62,9 @@ something, before and after the substep [m]; and 1 if it touched something befor
 SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
 NOTHING = 1e-12  # Distances up to this count as zero [m]
 PARTING = 1e-5  # Speed at which what is turned aside parts, so that roundings don't add up [m/s]
-MOST_LOOKS = 2000  # After so many a pair counts as touching: only absurdly fast turns need more
+MOST_LOOKS = (
+    2000  # After so many a pair counts as touching: only absurdly fast turns need more
+)
 
 
 class Moving(NamedTuple):
@@ -128,7 +151,11 @@ def _between(p: Edge, q: Edge) -> tuple[float, float]:
         return nx, ny
     if collision.cross(p.ax, p.ay, p.bx, p.by, q.ax, q.ay, q.bx, q.by):
         return 0.0, 0.0
-    for x, y, edge, sign in ((p.bx, p.by, q, 1.0), (q.ax, q.ay, p, -1.0), (q.bx, q.by, p, -1.0)):
+    for x, y, edge, sign in (
+        (p.bx, p.by, q, 1.0),
+        (q.ax, q.ay, p, -1.0),
+        (q.bx, q.by, p, -1.0),
+    ):
         ox, oy = collision.from_segment(x, y, edge.ax, edge.ay, edge.bx, edge.by)
         if ox * ox + oy * oy < nx * nx + ny * ny:
             nx, ny = sign * ox, sign * oy
@@ -147,7 +174,12 @@ def _root(gap: float, rate: float, bend: float) -> float:
 @kernel
 def _in_map(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
     ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
-    return Edge(x + c * ax - s * ay, y + s * ax + c * ay, x + c * bx - s * by, y + s * bx + c * by)
+    return Edge(
+        x + c * ax - s * ay,
+        y + s * ax + c * ay,
+        x + c * bx - s * by,
+        y + s * bx + c * by,
+    )
 
 
 @kernel
@@ -164,7 +196,9 @@ def _next_stop(b: int, time: float, until: float, flights: Array) -> float:
 @kernel
 def _rate(nx: float, ny: float, body: Placed, x: float, y: float) -> float:
     # A turn moves a point (x, y) from the origin along n by turn * (x ny - y nx).
-    return nx * (body.vx - body.turn * (y - body.y)) + ny * (body.vy + body.turn * (x - body.x))
+    return nx * (body.vx - body.turn * (y - body.y)) + ny * (
+        body.vy + body.turn * (x - body.x)
+    )
 
 
 @kernel
@@ -174,7 +208,10 @@ def _free_time(
     """Time in which edges `gap` [m] apart along n (q to p) cannot meet, with its corners' rates."""
     far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
     near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
-    rate_p, rate_p2 = _rate(nx, ny, p, p.edge.ax, p.edge.ay), _rate(nx, ny, p, p.edge.bx, p.edge.by)
+    rate_p, rate_p2 = (
+        _rate(nx, ny, p, p.edge.ax, p.edge.ay),
+        _rate(nx, ny, p, p.edge.bx, p.edge.by),
+    )
     rate_q = -_rate(nx, ny, q, q.edge.ax, q.edge.ay)
     rate_q2 = -_rate(nx, ny, q, q.edge.bx, q.edge.by)
     front, beyond = min(far, far2), max(near, near2)
@@ -202,14 +239,23 @@ def _corner(nx: float, ny: float, body: Placed, rate: float) -> tuple[float, flo
     first = _rate(nx, ny, body, edge.ax, edge.ay) == rate
     second = _rate(nx, ny, body, edge.bx, edge.by) == rate
     nearer = nx * edge.bx + ny * edge.by < nx * edge.ax + ny * edge.ay
-    return (edge.bx, edge.by) if second and (nearer or not first) else (edge.ax, edge.ay)
+    return (
+        (edge.bx, edge.by) if second and (nearer or not first) else (edge.ax, edge.ay)
+    )
 
 
 @kernel
 def touch(
-    event: Array, a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
-    begin: float, moving: Moving,
-) -> None:  # fmt: skip
+    event: Array,
+    a: int,
+    edge: Edge,
+    round_a: float,
+    b: int,
+    other: Edge,
+    round_b: float,
+    begin: float,
+    moving: Moving,
+) -> None:
     """Makes `event` (EVENT,) the first contact of an edge of body a with one of body b, if earlier.
 
     The edges are in the bodies' frames, with a radius [m] around each.
@@ -235,7 +281,12 @@ def touch(
         least = 0.5 * gap if gap > 0.5 * SLACK else NOTHING
         if gap <= SLACK and -(own + others) * rest >= least:
             if time < until:
-                event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, own, others
+                event[TIME], event[WITH], event[OWN], event[OTHERS] = (
+                    time,
+                    b,
+                    own,
+                    others,
+                )
                 _note(event, nx, ny, p, q)
             return
         time += free
@@ -247,7 +298,7 @@ def touch(
 @kernel
 def hold(
     b: int, nx: float, ny: float, px: float, py: float, time: float, moving: Moving
-) -> None:  # fmt: skip
+) -> None:
     """Lets the point (px, py) of a robot approach nothing against n from a time on.
 
     Of all motions that its holds allow, it makes the one nearest to its wish by the energy of a
@@ -299,7 +350,13 @@ def _edge_of(v: int, outline: collision.Outline) -> Edge:
 
 @kernel
 def touch_edge(
-    event: Array, a: int, b: int, other: Edge, round_b: float, begin: float, moving: Moving
+    event: Array,
+    a: int,
+    b: int,
+    other: Edge,
+    round_b: float,
+    begin: float,
+    moving: Moving,
 ) -> None:
     """Makes `event` (EVENT,) a's first contact from `begin` on with an edge, in b's frame."""
     world, flights = moving.world, moving.flights
@@ -307,11 +364,16 @@ def touch_edge(
     ox, oy, oc, os = pose_at(b, begin, moving)
     there = _in_map(other, ox, oy, oc, os)
     spin = abs(flights[b, TURN]) if b >= 0 and begin < flights[b, STOP] else 0.0
-    speed = speed_at(a, begin, flights) + speed_at(b, begin, flights) + spin * _reach(other)
+    speed = (
+        speed_at(a, begin, flights) + speed_at(b, begin, flights) + spin * _reach(other)
+    )
     far = world[a, RADIUS] + round_b + speed * (event[TIME] - begin)
     if speed == 0.0 and (begin >= flights[a, STOP] or flights[a, TURN] == 0.0):
         return
-    if collision.segment_distance2(x, y, there.ax, there.ay, there.bx, there.by) > far * far:
+    if (
+        collision.segment_distance2(x, y, there.ax, there.ay, there.bx, there.by)
+        > far * far
+    ):
         return
     outline = collision.outline_of(world[a], moving.outlines)
     round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
@@ -343,7 +405,9 @@ def _solid(distances: Array, i: int, j: int) -> bool:
 
 
 @kernel
-def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving) -> None:
+def touch_map(
+    event: Array, a: int, grid: MapField, begin: float, moving: Moving
+) -> None:
     """Does the same as `touch_edge` for the sides of the solid cells of a map."""
     distances, world, size = grid.distances, moving.world, grid.cell
     if distances.size == 0:
@@ -361,9 +425,16 @@ def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving
                 continue
             # Each side from a corner (u, v), with the way to the cell beyond: between two solid
             # cells nothing meets it.
-            for up, right, u, v in ((1, 0, 0, 1), (0, 1, 1, 1), (-1, 0, 1, 0), (0, -1, 0, 0)):
+            for up, right, u, v in (
+                (1, 0, 0, 1),
+                (0, 1, 1, 1),
+                (-1, 0, 1, 0),
+                (0, -1, 0, 0),
+            ):
                 if not _solid(distances, i + up, j + right):
                     near_x, near_y = (j + u) * size, (i + v) * size
-                    side = Edge(near_x, near_y, (j + u + up) * size, (i + v - right) * size)
+                    side = Edge(
+                        near_x, near_y, (j + u + up) * size, (i + v - right) * size
+                    )
                     edge = _in_map(side, grid.x, grid.y, grid.cos, grid.sin)
                     touch_edge(event, a, -1, edge, 0.0, begin, moving)

@@ -28,12 +28,16 @@ class ModelFile(Schema):
     description: str = ""
     tags: tuple[str, ...] = ()
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_PARTS)
-    at: tuple[Pose, ...] = ()  # of each shape in the entity [m, m, rad]; at its origin by default
+    at: tuple[
+        Pose, ...
+    ] = ()  # of each shape in the entity [m, m, rad]; at its origin by default
 
     @model_validator(mode="after")
     def _one_each(self) -> "ModelFile":
         if self.at and len(self.at) != len(self.shapes):
-            raise ValueError(f"at must hold {len(self.shapes)} poses, one of each shape")
+            raise ValueError(
+                f"at must hold {len(self.shapes)} poses, one of each shape"
+            )
         return self
 
 
@@ -53,7 +57,9 @@ def model_of_yaml(text: str, source: str = TEXT) -> Model:
         content = {"shapes": [content]}
     file = validate(content, ModelFile, source)
     at = file.at or ((0.0, 0.0, 0.0),) * len(file.shapes)
-    return Model(file.name, file.description, file.tags, tuple(zip(file.shapes, at, strict=True)))
+    return Model(
+        file.name, file.description, file.tags, tuple(zip(file.shapes, at, strict=True))
+    )
 
 
 def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
@@ -66,7 +72,9 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
         root = root_of(file)  # refuses XML entities that grow
     models = root.findall("model")
     if len(models) != 1 or root.find("world") is not None:
-        raise ConfigError(f"{source}: holds {len(models)} models; give one <model>, no <world>.")
+        raise ConfigError(
+            f"{source}: holds {len(models)} models; give one <model>, no <world>."
+        )
     if (pose := models[0].find("pose")) is not None:
         models[0].remove(pose)  # it is spawned where the request says
     with file_of(ElementTree.tostring(root, encoding="unicode"), source) as file:

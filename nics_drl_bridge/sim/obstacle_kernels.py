@@ -25,13 +25,17 @@ LOOK = 1.0  # A wandering obstacle looks ahead by the distance of this time [s],
 MARGIN = 0.1  # Free space that it keeps at its sides [m]
 TRIES = 8  # Directions that it tries in one period
 MOST_CORNERS = 32  # Greatest number of waypoints that a patrol passes in a period
-NEAREST = 1e-3  # Least distance for which a force is computed [m]: at 0 it has no direction
+NEAREST = (
+    1e-3  # Least distance for which a force is computed [m]: at 0 it has no direction
+)
 FAR = 8.0  # Forces beyond this many ranges are neglected
 STRONGEST = 5.0  # Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded
 ARRIVED = 0.3  # A goal is reached within this distance [m]
 ROOM = 0.2  # Free space around a walker at a new goal [m]
 LEAST_WALK = 1.0  # Least distance of a new goal [m], if such a goal is found
-PATIENCE = 5.0  # A goal is given up after twice the time of the straight path plus this [s]
+PATIENCE = (
+    5.0  # A goal is given up after twice the time of the straight path plus this [s]
+)
 CANDIDATES = 16
 
 
@@ -58,18 +62,27 @@ def begin(n: int, state: State, plans: Array) -> None:
 
 
 @kernel
-def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Array) -> None:
+def steer(
+    n: int, state: State, scene: Surroundings, period: float, speeds: Array
+) -> None:
     """Sets the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
 
     An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
     """
-    velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
+    velocity, seed, step, movers = (
+        state.velocity[n],
+        state.seeds[n],
+        state.steps[n],
+        scene.movers,
+    )
     count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
     traffic = at.Traffic(
         bodies, count, speeds, plans, scene.walls, movers.field, scene.grid, period
     )
     draws = (step + 1) * MOST
-    for k in range(count):  # walkers first: they react to the velocities of the last period
+    for k in range(
+        count
+    ):  # walkers first: they react to the velocities of the last period
         velocity[k, :] = 0.0
         if plans[k, at.KIND] == at.PEDESTRIAN and bodies[k, RADIUS] > 0.0:
             velocity[k, 0], velocity[k, 1] = _walk(
@@ -99,7 +112,9 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
 def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-untyped-def]
     for part in (0.5, 1.0):
         way = part * reach
-        free, _, _ = at.clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, traffic)
+        free, _, _ = at.clearance(
+            x + way * math.cos(angle), y + way * math.sin(angle), k, traffic
+        )
         if free < room and free < here:
             return True
     return False
@@ -120,7 +135,9 @@ def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
                 break
         mark[at.AIM] = aim
     turn = wrap(aim - mark[at.DIRECTION])
-    mark[at.DIRECTION] = wrap(mark[at.DIRECTION] + min(max(turn, -TURN * period), TURN * period))
+    mark[at.DIRECTION] = wrap(
+        mark[at.DIRECTION] + min(max(turn, -TURN * period), TURN * period)
+    )
     # It slows down in turns, so that it does not move far off its intended direction.
     way = speed * period * max(math.cos(aim - mark[at.DIRECTION]), 0.0)
     return way * math.cos(mark[at.DIRECTION]), way * math.sin(mark[at.DIRECTION])
@@ -172,7 +189,13 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 
 @kernel
 def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
-    bodies, first, row, ax, ay = traffic.bodies, traffic.first, traffic.plans[k], 0.0, 0.0
+    bodies, first, row, ax, ay = (
+        traffic.bodies,
+        traffic.first,
+        traffic.plans[k],
+        0.0,
+        0.0,
+    )
     for j in range(bodies.shape[0]):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
@@ -183,14 +206,24 @@ def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
             vx, vy = traffic.speeds[j - first, 0], traffic.speeds[j - first, 1]
         vx, vy = vx - marks[k, at.VX], vy - marks[k, at.VY]
         near = bodies[k, RADIUS] + bodies[j, RADIUS]
-        far = near + FAR * row[at.RANGE] + math.sqrt(vx * vx + vy * vy) * row[at.FORESIGHT]
+        far = (
+            near
+            + FAR * row[at.RANGE]
+            + math.sqrt(vx * vx + vy * vy) * row[at.FORESIGHT]
+        )
         away2 = rx * rx + ry * ry
         if away2 > far * far or away2 == 0.0:
             continue
         away = math.sqrt(away2)
         share = max(away - near, NEAREST) / away
         fx, fy = repulsion(
-            rx * share, ry * share, vx, vy, row[at.FORESIGHT], row[at.REPULSION], row[at.RANGE]
+            rx * share,
+            ry * share,
+            vx,
+            vy,
+            row[at.FORESIGHT],
+            row[at.REPULSION],
+            row[at.RANGE],
         )
         # Less (8) from outside the angle of sight of a walker that looks along e.
         seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
@@ -201,7 +234,13 @@ def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
 
 @kernel
 def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
-    body, row, walls, ax, ay = traffic.bodies[k], traffic.plans[k], traffic.walls, 0.0, 0.0
+    body, row, walls, ax, ay = (
+        traffic.bodies[k],
+        traffic.plans[k],
+        traffic.walls,
+        0.0,
+        0.0,
+    )
     x, y, radius, reach = body[X], body[Y], body[RADIUS], row[at.WALL_RANGE]
     far = radius + FAR * reach
     for w in range(walls.shape[0]):
@@ -210,12 +249,18 @@ def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
         away2 = ox * ox + oy * oy
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
-            size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
+            size = (
+                row[at.WALL_REPULSION]
+                / reach
+                * math.exp(-max(away - radius, 0.0) / reach)
+            )
             ax, ay = ax + size * ox / away, ay + size * oy / away
     away = at.map_distance(x, y, traffic.grid)
     if away < far:
         nx, ny = at.map_direction(x, y, traffic.grid)
-        size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
+        size = (
+            row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
+        )
         ax, ay = ax - size * nx, ay - size * ny
     return ax, ay
 
@@ -242,7 +287,12 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
 @kernel
 def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
     """Returns the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
-    mark, row, body, period = marks[k], traffic.plans[k], traffic.bodies[k], traffic.period
+    mark, row, body, period = (
+        marks[k],
+        traffic.plans[k],
+        traffic.bodies[k],
+        traffic.period,
+    )
     x, y = body[X], body[Y]
     away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
     if step >= mark[at.UNTIL] or away < ARRIVED:
@@ -256,8 +306,12 @@ def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-de
     ax += bx + (mark[at.SPEED] * ex - mark[at.VX]) / row[at.RELAXATION]
     ay += by + (mark[at.SPEED] * ey - mark[at.VY]) / row[at.RELAXATION]
     if row[at.FLUCTUATION] > 0.0:
-        ax += row[at.FLUCTUATION] * random.normal(seed, random.MOTION_STREAM, counter // 2)
-        ay += row[at.FLUCTUATION] * random.normal(seed, random.MOTION_STREAM, counter // 2 + 1)
+        ax += row[at.FLUCTUATION] * random.normal(
+            seed, random.MOTION_STREAM, counter // 2
+        )
+        ay += row[at.FLUCTUATION] * random.normal(
+            seed, random.MOTION_STREAM, counter // 2 + 1
+        )
     size = math.hypot(ax, ay)
     share = period * min(1.0, STRONGEST / size) if size > 0.0 else 0.0
     vx, vy = mark[at.VX] + share * ax, mark[at.VY] + share * ay

@@ -14,13 +14,19 @@ from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import separation_kernels as at
 
 __all__ = ["Motion", "Patrol", "Pedestrian", "Wander", "plan_arrays"]
-FASTEST = 10.0  # Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
-STRONGEST = 1e3  # Upper bound on the parameters of the social force model, each in its unit
+FASTEST = (
+    10.0  # Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
+)
+STRONGEST = (
+    1e3  # Upper bound on the parameters of the social force model, each in its unit
+)
 
 
 def _fast(speed: tuple[float, float]) -> tuple[float, float]:
     if not 0.0 < speed[0] <= speed[1] <= FASTEST:
-        raise ValueError(f"speed must be [least, greatest], above 0 and at most {FASTEST:g} m/s")
+        raise ValueError(
+            f"speed must be [least, greatest], above 0 and at most {FASTEST:g} m/s"
+        )
     return speed
 
 
@@ -41,9 +47,13 @@ class Patrol(Schema):
 
     kind: Literal["patrol"] = "patrol"  # which kind of motion this is
     # x, y in `map` [m]
-    waypoints: tuple[tuple[Coordinate, Coordinate], ...] = Field(min_length=2, max_length=1000)
+    waypoints: tuple[tuple[Coordinate, Coordinate], ...] = Field(
+        min_length=2, max_length=1000
+    )
     speed: float = Field(gt=0.0, le=FASTEST)  # [m/s]
-    loop: bool = True  # continue from the last waypoint to the first; otherwise back and forth
+    loop: bool = (
+        True  # continue from the last waypoint to the first; otherwise back and forth
+    )
     pause: float = Field(default=0.0, ge=0.0, le=1e6)  # at each waypoint [s]
 
     @model_validator(mode="after")
@@ -64,22 +74,35 @@ class Pedestrian(Schema):
     """
 
     kind: Literal["pedestrian"] = "pedestrian"  # which kind of motion this is
-    speed: Speed = (1.08, 1.6)  # range of the desired one, per episode; its end is a limit [m/s]
-    relaxation: float = Field(default=0.5, ge=0.1, le=10.0)  # tau, to the desired velocity [s]
+    speed: Speed = (
+        1.08,
+        1.6,
+    )  # range of the desired one, per episode; its end is a limit [m/s]
+    relaxation: float = Field(
+        default=0.5, ge=0.1, le=10.0
+    )  # tau, to the desired velocity [s]
     repulsion: Strength = 2.1  # V0 [m^2/s^2] of walkers, obstacles and robots
     range: Distance = 0.3  # sigma [m]
     wall_repulsion: Strength = 10.0  # U0 [m^2/s^2]
     wall_range: Distance = 0.2  # R [m]
-    foresight: Strength = 1.0  # delta t, the time by which the others' motion is extrapolated [s]
-    view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)  # 2 phi [rad]
-    behind: float = Field(default=0.5, ge=0.0, le=1.0)  # c, weight of forces from out of sight
+    foresight: Strength = (
+        1.0  # delta t, the time by which the others' motion is extrapolated [s]
+    )
+    view: float = Field(
+        default=math.radians(200.0), ge=0.0, le=2.0 * math.pi
+    )  # 2 phi [rad]
+    behind: float = Field(
+        default=0.5, ge=0.0, le=1.0
+    )  # c, weight of forces from out of sight
     fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
 
 
 Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]
 
 
-def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> tuple[Array, Array]:
+def plan_arrays(
+    motions: Sequence[Wander | Patrol | Pedestrian | None],
+) -> tuple[Array, Array]:
     """Returns the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
     rows, waypoints = np.zeros((len(motions), at.PLAN)), np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):
@@ -89,13 +112,23 @@ def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> tuple
         if isinstance(motion, Wander):
             row[at.KIND] = at.WANDER
         elif isinstance(motion, Patrol):
-            row[at.KIND], row[at.LOOP], row[at.PAUSE] = at.PATROL, motion.loop, motion.pause
+            row[at.KIND], row[at.LOOP], row[at.PAUSE] = (
+                at.PATROL,
+                motion.loop,
+                motion.pause,
+            )
             row[at.FIRST], row[at.COUNT] = len(waypoints), len(motion.waypoints)
             waypoints = np.concatenate([waypoints, motion.waypoints])
         else:
-            row[at.RELAXATION], row[at.FLUCTUATION] = motion.relaxation, motion.fluctuation
+            row[at.RELAXATION], row[at.FLUCTUATION] = (
+                motion.relaxation,
+                motion.fluctuation,
+            )
             row[at.REPULSION], row[at.RANGE] = motion.repulsion, motion.range
-            row[at.WALL_REPULSION], row[at.WALL_RANGE] = motion.wall_repulsion, motion.wall_range
+            row[at.WALL_REPULSION], row[at.WALL_RANGE] = (
+                motion.wall_repulsion,
+                motion.wall_range,
+            )
             row[at.FORESIGHT], row[at.BEHIND] = motion.foresight, motion.behind
             row[at.KIND], row[at.VIEW] = at.PEDESTRIAN, math.cos(motion.view / 2.0)
     return rows, waypoints

@@ -17,7 +17,10 @@ from nics_drl_bridge.sim.scenes import SetSampler
 from nics_drl_bridge.sim.world import World
 
 Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
-CELL, MOST_CELLS = 0.01, 1_000_000  # side of a cell [m]; in fields with more cells it is larger
+CELL, MOST_CELLS = (
+    0.01,
+    1_000_000,
+)  # side of a cell [m]; in fields with more cells it is larger
 SAMPLES = 8  # of an edge, in a cell
 ROUNDING = 1e-6  # share of a cell by which a field may exceed whole cells
 
@@ -25,7 +28,9 @@ ROUNDING = 1e-6  # share of a cell by which a field may exceed whole cells
 def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
     """Returns the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
     own = sampler.samplers[member].motions
-    both = zip_longest(bodies, own[: len(bodies)])  # what is no part of the world stands
+    both = zip_longest(
+        bodies, own[: len(bodies)]
+    )  # what is no part of the world stands
     return [
         (sampler.shapes[int(body[SHAPE])], body[:3])
         for body, motion in both
@@ -33,7 +38,9 @@ def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
     ]
 
 
-def occupancy(world: World, obstacles: Sequence[Placed] = (), cell: float = CELL) -> GridMap:
+def occupancy(
+    world: World, obstacles: Sequence[Placed] = (), cell: float = CELL
+) -> GridMap:
     """Returns the map of a world: its own map, walls, and the given obstacles.
 
     A cell is occupied if its centre is in something solid, or a wall runs through it; a field with
@@ -60,7 +67,9 @@ def occupancy(world: World, obstacles: Sequence[Placed] = (), cell: float = CELL
     return made
 
 
-def _frame_of(world: World, cell: float) -> tuple[Any, NDArray[np.int_], tuple[int, int], float]:
+def _frame_of(
+    world: World, cell: float
+) -> tuple[Any, NDArray[np.int_], tuple[int, int], float]:
     """Frame (3,) of the rows, first column and row, their numbers, and the side of a cell [m]."""
     grid, ends = world.grid, world.all_walls().reshape(-1, 2)
     if world.size is not None or world.bounds is not None:
@@ -114,10 +123,14 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
     inside = _inside(shape, rotate(middles - pose[:2], -pose[2]))
     box[inside] = OCCUPIED
     if len(shape.outline):
-        edge = _along(np.concatenate([shape.outline, shape.outline[:1]]), made.resolution)
+        edge = _along(
+            np.concatenate([shape.outline, shape.outline[:1]]), made.resolution
+        )
         at = made.world_to_cell(pose[:2] + rotate(edge, pose[2])) - low
         kept = ((at >= 0) & (at < box.shape)).all(axis=-1)
-        thin = at[kept][~ndimage.maximum_filter(inside, 3)[at[kept][:, 0], at[kept][:, 1]]]
+        thin = at[kept][
+            ~ndimage.maximum_filter(inside, 3)[at[kept][:, 0], at[kept][:, 1]]
+        ]
         box[thin[:, 0], thin[:, 1]] = OCCUPIED
 
 
@@ -129,5 +142,7 @@ def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
     corners = shape.outline if len(shape.outline) > 2 else np.zeros((0, 2))
     for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y1 != y2:  # a ray along x crosses an odd number of edges
-            within ^= ((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
+            within ^= ((y1 > y) != (y2 > y)) & (
+                x < x1 + (y - y1) * (x2 - x1) / (y2 - y1)
+            )
     return within

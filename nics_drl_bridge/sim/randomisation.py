@@ -36,16 +36,26 @@ SCALED = {  # columns that a factor scales, and the levels that may be given ins
 }
 CORNERS = 256  # Number of mixtures of least and greatest factors that are checked for stability
 FAULT_COLUMNS = (  # see `lidar.fault_kernels`
-    "noise_std", "noise_proportional", "dropout", "dropout_far", "too_close", "quantisation",
+    "noise_std",
+    "noise_proportional",
+    "dropout",
+    "dropout_far",
+    "too_close",
+    "quantisation",
     "skew",
-)  # fmt: skip
-CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {  # faults drawn from words: column, values
-    "skew": (fault_kernels.SKEW, SKEW), "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE)
-}  # fmt: skip
+)
+CHOICES: dict[
+    str, tuple[int, Mapping[Any, int]]
+] = {  # faults drawn from words: column, values
+    "skew": (fault_kernels.SKEW, SKEW),
+    "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE),
+}
 KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP = range(4)
 CHOICES_GROUP, SCENE_GROUP, RESPONSE_GROUP = range(4, 7)
 GROUPS = 8
-PLACES = 1 << 20  # More than a group has columns; the counters of two groups never collide
+PLACES = (
+    1 << 20
+)  # More than a group has columns; the counters of two groups never collide
 UNIT = (np.zeros(1), np.ones(1))
 
 
@@ -68,8 +78,12 @@ class KinematicRanges(Schema):
     """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
 
     scale: Factor = AS_IT_IS  # for every coefficient
-    response: Factor = AS_IT_IS  # on all time constants of the state alike, one for each robot
-    dofs: dict[str, Factor] = Field(default_factory=dict)  # overrides it, by name of a rate (`wz`)
+    response: Factor = (
+        AS_IT_IS  # on all time constants of the state alike, one for each robot
+    )
+    dofs: dict[str, Factor] = Field(
+        default_factory=dict
+    )  # overrides it, by name of a rate (`wz`)
     # overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`
     terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
 
@@ -78,7 +92,9 @@ class OdometryRanges(Schema):
     """Errors of odometry and motion: factors on the model's levels, or levels instead."""
 
     noise: Factor | None = None  # factor on the noise of the measured twist
-    drift: Factor | None = None  # on the motion that the model does not explain, if measured
+    drift: Factor | None = (
+        None  # on the motion that the model does not explain, if measured
+    )
     odom_linear: Level | None = None  # noise of velocity [m/s]
     odom_angular: Level | None = None  # of yaw rate [rad/s]
     position_drift: Level | None = None  # of x and y [m/sqrt(s)]
@@ -88,8 +104,13 @@ class OdometryRanges(Schema):
     def _once(self) -> "OdometryRanges":
         for factor, (_, levels) in SCALED.items():
             for level in levels:
-                if getattr(self, factor) is not None and getattr(self, level) is not None:
-                    raise ValueError(f"give either the factor {factor} or the level {level}")
+                if (
+                    getattr(self, factor) is not None
+                    and getattr(self, level) is not None
+                ):
+                    raise ValueError(
+                        f"give either the factor {factor} or the level {level}"
+                    )
         return self
 
 
@@ -101,14 +122,20 @@ class LidarRanges(Schema):
     quantisation: Level | None = None  # returns are multiples of it [m]
     dropout: Level | None = None  # probability that a return is lost
     dropout_far: Level | None = None  # added to it at range_max
-    skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)  # words to draw from
-    too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)  # words to draw from
+    skew: tuple[Skew, ...] | None = Field(
+        default=None, min_length=1
+    )  # words to draw from
+    too_close: tuple[TooClose, ...] | None = Field(
+        default=None, min_length=1
+    )  # words to draw from
 
     @model_validator(mode="after")
     def _probable(self) -> "LidarRanges":
         likely = [name for name in ("dropout", "dropout_far") if getattr(self, name)]
         if sum(getattr(self, name)[1] for name in likely) > 1.0:
-            raise ValueError("the greatest dropout and dropout_far must add up to at most 1")
+            raise ValueError(
+                "the greatest dropout and dropout_far must add up to at most 1"
+            )
         return self
 
 
@@ -117,12 +144,16 @@ class ObstacleRanges(Schema):
 
     count: tuple[int, int] | None = None  # [least, greatest], instead of the world's
     size: Factor = AS_IT_IS  # factor on the size of every obstacle, one per episode
-    rungs: int = Field(default=5, ge=2, le=100)  # number of sizes, evenly spaced: each is baked
+    rungs: int = Field(
+        default=5, ge=2, le=100
+    )  # number of sizes, evenly spaced: each is baked
 
     @model_validator(mode="after")
     def _countable(self) -> "ObstacleRanges":
         if self.count and not 0 <= self.count[0] <= self.count[1] <= MOST_OBSTACLES:
-            raise ValueError(f"count must be [least, greatest] from 0 to {MOST_OBSTACLES}")
+            raise ValueError(
+                f"count must be [least, greatest] from 0 to {MOST_OBSTACLES}"
+            )
         return self
 
 
@@ -130,9 +161,14 @@ class Randomisation(Schema):
     """Ranges that are drawn from in every episode; all else stays as in model and world."""
 
     name: str  # used in messages
-    kinematics: KinematicRanges = KinematicRanges()  # factors on the motion of the model
+    kinematics: KinematicRanges = (
+        KinematicRanges()
+    )  # factors on the motion of the model
     action_latency: Latency = (0.0, 0.0)  # in addition to the model's [control periods]
-    observation_latency: Latency = (0.0, 0.0)  # age of scan and odometry [control periods]
+    observation_latency: Latency = (
+        0.0,
+        0.0,
+    )  # age of scan and odometry [control periods]
     odometry: OdometryRanges = OdometryRanges()  # errors of odometry and of motion
     lidar: LidarRanges = LidarRanges()  # noise and faults of the lidar
     obstacles: ObstacleRanges = ObstacleRanges()  # number and size of the obstacles
@@ -141,13 +177,17 @@ class Randomisation(Schema):
     def sizes(self) -> tuple[float, ...]:
         """The factors on the obstacles' size that may be drawn, ascending."""
         low, high = self.obstacles.size
-        return tuple(np.linspace(low, high, self.obstacles.rungs if high > low else 1).tolist())
+        return tuple(
+            np.linspace(low, high, self.obstacles.rungs if high > low else 1).tolist()
+        )
 
     def alone(self) -> "dict[str, Randomisation]":
         """Each of the given ranges without the others, by the name of its field."""
         given = {name: getattr(self, name) for name in type(self).model_fields}
         names = (name for name in given if name in self.model_fields_set - {"name"})
-        return {name: Randomisation(**{"name": name, name: given[name]}) for name in names}
+        return {
+            name: Randomisation(**{"name": name, name: given[name]}) for name in names
+        }
 
     @property
     def fingerprint(self) -> str:
@@ -168,17 +208,23 @@ Label = tuple[str, str, int | None]
 class Draws:
     """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's."""
 
-    coefficient: Array  # (n, M, T) kept terms, in the order of `robot.kernels.term_arrays`
+    coefficient: (
+        Array  # (n, M, T) kept terms, in the order of `robot.kernels.term_arrays`
+    )
     response: Array  # (n, M) factor on the time constants, which is in `coefficient`
     delay: Integers  # (n, M) from a command to its effect, including the model's [substeps]
     age: Integers  # (n, M) of scan and odometry when they are observed [substeps]
     noise: Array  # (n, M, 2 + 3 + S) see `State.noise`
     faults: Array  # (n, M, P) of each lidar, columns as in `lidar.fault_kernels`
     count: Integers | None  # (n,) obstacles in the scene; None leaves it to the world
-    size: Integers | None  # (n,) index into `Randomisation.sizes`; None where there is only one
+    size: (
+        Integers | None
+    )  # (n,) index into `Randomisation.sizes`; None where there is only one
     scale: Array | None  # (n,) that size
     latency: Array  # (n, M, 2) `delay` and `age` in seconds
-    labels: tuple[Label, ...]  # of the drawn numbers that may differ from episode to episode
+    labels: tuple[
+        Label, ...
+    ]  # of the drawn numbers that may differ from episode to episode
 
     def named(self) -> dict[str, NDArray[np.generic]]:
         """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
@@ -196,10 +242,14 @@ class Sampler:
     ) -> None:
         self.randomisation, self._robots = randomisation, robots
         where = f"randomisation {randomisation.name!r}"
-        self._coefficient = _coefficients(randomisation.kinematics, model.kinematics, where)
+        self._coefficient = _coefficients(
+            randomisation.kinematics, model.kinematics, where
+        )
         fastest, slowest = randomisation.kinematics.response
         self._response = np.array([fastest]), np.array([slowest])
-        self._rates = np.nonzero(model.kinematics.coefficients)[0] >= 3  # (T,) terms of the state's
+        self._rates = (
+            np.nonzero(model.kinematics.coefficients)[0] >= 3
+        )  # (T,) terms of the state's
         self._timing, self._step = _latencies(randomisation, model), model.timing[0]
         self._noise = _levels(randomisation, model, where)
         self._faults = _faults(randomisation, model.lidar, where)
@@ -210,7 +260,10 @@ class Sampler:
         }
         # Bounds such that flooring makes all numbers, and all sizes, equally likely.
         least, most = randomisation.obstacles.count or (0, 0)
-        self._scene = np.array([least, 0.0]), np.array([most + 1.0, len(randomisation.sizes)])
+        self._scene = (
+            np.array([least, 0.0]),
+            np.array([most + 1.0, len(randomisation.sizes)]),
+        )
         self._sizes = np.array(randomisation.sizes)
         # The greatest of a command, and of an observation [substeps].
         self.longest_delay, self.longest_age = (int(most) for most in self._timing[1])
@@ -219,8 +272,12 @@ class Sampler:
     def draw(self, seeds: ArrayLike) -> Draws:
         """Draws the numbers of the episodes of some seeds (n,)."""
         chosen, robots = checked_seeds(seeds), self._robots
-        timing = np.floor(_between(self._timing, chosen, robots, LATENCY_GROUP)).astype(np.int64)
-        scene = np.floor(_between(self._scene, chosen, 1, SCENE_GROUP)[:, 0]).astype(np.int64)
+        timing = np.floor(_between(self._timing, chosen, robots, LATENCY_GROUP)).astype(
+            np.int64
+        )
+        scene = np.floor(_between(self._scene, chosen, 1, SCENE_GROUP)[:, 0]).astype(
+            np.int64
+        )
         noise = _between(self._noise, chosen, robots, ODOMETRY_GROUP)
         faults = _between(self._faults, chosen, robots, LIDAR_GROUP)
         noise[..., 3] = noise[..., 2]
@@ -230,21 +287,34 @@ class Sampler:
         for column, values in self._choices.items():
             drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
             faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
-        counts, sizes = self.randomisation.obstacles.count is not None, len(self._sizes) > 1
+        counts, sizes = (
+            self.randomisation.obstacles.count is not None,
+            len(self._sizes) > 1,
+        )
         return Draws(
-            coefficient, response[..., 0],
-            timing[..., 0].copy(), timing[..., 1].copy(), noise, faults,
-            scene[:, 0] if counts else None, scene[:, 1] if sizes else None,
-            self._sizes[scene[:, 1]] if sizes else None, np.multiply(timing, self._step),
+            coefficient,
+            response[..., 0],
+            timing[..., 0].copy(),
+            timing[..., 1].copy(),
+            noise,
+            faults,
+            scene[:, 0] if counts else None,
+            scene[:, 1] if sizes else None,
+            self._sizes[scene[:, 1]] if sizes else None,
+            np.multiply(timing, self._step),
             self._labels,
-        )  # fmt: skip
+        )
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
         kept, terms = zip(*np.nonzero(model.kinematics.coefficients), strict=True), []
         for d, k in kept:
-            terms.append(f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}")
+            terms.append(
+                f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}"
+            )
         noise = [name and f"odometry.{name}" for name in NOISE_NAMES]
-        noise += [f"odometry.state_drift.{variable.name}" for variable in model.robot.state]
+        noise += [
+            f"odometry.state_drift.{variable.name}" for variable in model.robot.state
+        ]
         for field, names, (low, high) in (
             ("coefficient", terms, self._coefficient),
             ("latency", ["action_latency_s", "observation_latency_s"], self._timing),
@@ -263,10 +333,16 @@ class Sampler:
             yield "obstacles.size", "scale", None
 
 
-def _between(bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0) -> Array:
+def _between(
+    bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0
+) -> Array:
     """Draws (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
     drawn = np.empty((len(seeds), robots, len(bounds[0])))
-    first, stride, stream = group * PLACES + column, GROUPS * PLACES, random.RANDOMISATION_STREAM
+    first, stride, stream = (
+        group * PLACES + column,
+        GROUPS * PLACES,
+        random.RANDOMISATION_STREAM,
+    )
     random.uniform_between(drawn, *bounds, seeds, stream, first, stride)
     return drawn
 
@@ -277,11 +353,16 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
         place = f"{where}: key 'kinematics.{key}'"
         for dof in named:
             if dof not in model.dofs:
-                raise ConfigError(f"{place}: unknown rate {dof!r}; {nearest(dof, model.dofs)}")
+                raise ConfigError(
+                    f"{place}: unknown rate {dof!r}; {nearest(dof, model.dofs)}"
+                )
     for dof, span in ranges.dofs.items():
         spans[model.dofs.index(dof)] = span
     for dof, terms in ranges.terms.items():
-        d, place = model.dofs.index(dof), f"{where}: key 'kinematics.terms', rate {dof!r}"
+        d, place = (
+            model.dofs.index(dof),
+            f"{where}: key 'kinematics.terms', rate {dof!r}",
+        )
         for term, span in terms.items():
             spans[d, _term(d, term, model, place)] = span
     if ranges.response != AS_IT_IS and not model.state_size:
@@ -298,7 +379,9 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
 def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
     known = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
     with suppress(ValueError, KeyError):
-        return known[taylor.term_name(taylor.parse_term(name, model.variables), model.variables)]
+        return known[
+            taylor.term_name(taylor.parse_term(name, model.variables), model.variables)
+        ]
     hint = nearest(name, known) if known else "it has none at all: remove it."
     raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")
 
@@ -306,7 +389,11 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
     if not (size := model.state_size):
         return
-    linear, low, high = np.zeros((size, size)), np.ones((size, size)), np.ones((size, size))
+    linear, low, high = (
+        np.zeros((size, size)),
+        np.ones((size, size)),
+        np.ones((size, size)),
+    )
     for k in np.flatnonzero(model.powers.sum(axis=1) == 1):
         if (v := int(np.argmax(model.powers[k]))) < size:
             linear[:, v] = model.coefficients[3:, k]
@@ -325,7 +412,9 @@ def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
 def _latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
     """Bounds (2,) of delay and age, such that flooring the draws rounds them [substeps]."""
     _, substeps, delay = model.timing
-    spans = np.array([ranges.action_latency, ranges.observation_latency]) * substeps + 0.5
+    spans = (
+        np.array([ranges.action_latency, ranges.observation_latency]) * substeps + 0.5
+    )
     spans[0] += delay
     same = np.floor(spans[:, 0]) == np.floor(spans[:, 1])
     spans[same] = np.floor(spans[same])  # equal bounds: nothing is drawn
@@ -352,10 +441,16 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
 
 def _faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
     bounds = []
-    spans = {name: span for name, span in ranges.lidar if span is not None and name not in CHOICES}
+    spans = {
+        name: span
+        for name, span in ranges.lidar
+        if span is not None and name not in CHOICES
+    }
     for end in range(2):
         numbers = {name: span[end] for name, span in spans.items()}
-        spec = lidar.model_dump() | {"noise_std": numbers.pop("noise_std", lidar.noise_std)}
+        spec = lidar.model_dump() | {
+            "noise_std": numbers.pop("noise_std", lidar.noise_std)
+        }
         spec["faults"] |= numbers
         bounds.append(validate(spec, LidarSpec, f"{where} of the lidar {lidar.name!r}"))
     return bounds[0].fault_parameters, bounds[1].fault_parameters

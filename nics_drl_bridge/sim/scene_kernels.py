@@ -23,10 +23,14 @@ from nics_drl_bridge.sim.state import Array, Integers, MapField
 
 TRIES = 2000
 RESTARTS = 50
-DETOURS = 4  # Pairs of start and goal without a path after which the obstacles are redrawn
+DETOURS = (
+    4  # Pairs of start and goal without a path after which the obstacles are redrawn
+)
 MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
 DRAWN, NO_OBSTACLES, NO_ROBOTS = 0, 1, 2
-LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)  # columns of a group
+LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(
+    8
+)  # columns of a group
 X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
 """Columns of a place: a region [m], headings [rad], cumulative share of the places up to it."""
 
@@ -35,7 +39,9 @@ class FreeSpace(NamedTuple):
     """All that stands in every scene, and where robots fit between it."""
 
     cells: MapField  # distances to the nearest wall or solid cell of the map
-    area: NDArray[np.int32]  # (rows, columns) number of the connected free space; 0 for none
+    area: NDArray[
+        np.int32
+    ]  # (rows, columns) number of the connected free space; 0 for none
     bounds: Array  # (4,) least x, y and greatest x, y of the field [m]
     walls: Array  # (W, 4)
     grid: MapField  # the static map
@@ -95,7 +101,10 @@ def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
 def place_in(row, column, cells):  # type: ignore[no-untyped-def]
     """Returns x, y [m] of a place in the grid, given as fractional row and column."""
     u, v = column * cells.cell, row * cells.cell
-    return cells.x + cells.cos * u - cells.sin * v, cells.y + cells.sin * u + cells.cos * v
+    return (
+        cells.x + cells.cos * u - cells.sin * v,
+        cells.y + cells.sin * u + cells.cos * v,
+    )
 
 
 @kernel
@@ -126,7 +135,11 @@ def _within(x, y, space):  # type: ignore[no-untyped-def]
     if not inside:
         return False, 0.0, 0.0
     middle = distances[i, j]
-    return True, middle * (1.0 - collision.FLOAT32) - off, middle * (1.0 + collision.FLOAT32) + off
+    return (
+        True,
+        middle * (1.0 - collision.FLOAT32) - off,
+        middle * (1.0 + collision.FLOAT32) + off,
+    )
 
 
 @kernel
@@ -152,7 +165,11 @@ def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
 
 @kernel
 def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-def]
-    dx, dy, far = body[X] - other[X], body[Y] - other[Y], body[RADIUS] + other[RADIUS] + room
+    dx, dy, far = (
+        body[X] - other[X],
+        body[Y] - other[Y],
+        body[RADIUS] + other[RADIUS] + room,
+    )
     if dx * dx + dy * dy >= far * far:
         return True
     if collision.is_round(body, outlines) and collision.is_round(other, outlines):
@@ -165,20 +182,24 @@ def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-unt
     disc = scratch.disc
     disc[X], disc[Y] = x, y
     near = scratch.cells.found
-    for i in range(cell_kernels.around_added(0, x, y, disc[RADIUS] + room, scratch.cells)):
+    for i in range(
+        cell_kernels.around_added(0, x, y, disc[RADIUS] + room, scratch.cells)
+    ):
         k = near[i]
         counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
         counts = counts and bodies[k, RADIUS] > 0.0
-        if counts and not _clear_of(disc, bodies[k], room, plan.outlines, scratch.spare):
+        if counts and not _clear_of(
+            disc, bodies[k], room, plan.outlines, scratch.spare
+        ):
             return False
     return True
 
 
 @kernel
 def _is_free(x, y, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    return _is_clear(x, y, plan.clearance, True, plan, bodies, scratch) and _clear_of_walls(
-        scratch.disc, plan.clearance, plan, scratch.spare
-    )
+    return _is_clear(
+        x, y, plan.clearance, True, plan, bodies, scratch
+    ) and _clear_of_walls(scratch.disc, plan.clearance, plan, scratch.spare)
 
 
 @kernel
@@ -188,7 +209,11 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
     Searches from both ends, each towards the other first: where there is no path, one end is often
     enclosed and its search ends soon. The cells of both points count as free.
     """
-    cells, label, room = plan.space.cells, plan.space.area, plan.space.room - plan.footprint
+    cells, label, room = (
+        plan.space.cells,
+        plan.space.area,
+        plan.space.room - plan.footprint,
+    )
     seen, stack, latest = scratch.seen, scratch.stack, scratch.latest
     rows, columns = label.shape
     i, j, _ = cell_of(x, y, cells)
@@ -219,7 +244,11 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
             new = row * columns + column
             if seen[new] == latest[0] + 1 - side:
                 return True
-            if label[row, column] != area or seen[new] == latest[0] + side or seen[new] == blocked:
+            if (
+                label[row, column] != area
+                or seen[new] == latest[0] + side
+                or seen[new] == blocked
+            ):
                 continue
             cx, cy = place_in(row + 0.5, column + 0.5, cells)
             free = _is_clear(cx, cy, room, False, plan, bodies, scratch)
@@ -233,10 +262,14 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
 def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
     """Draws a point in one of the chosen cells, given by row-major indices; takes 3 counters."""
     cell = int(uniform_of(source, counter) * chosen.shape[0])
-    if chosen.shape[0] < cells.distances.size:  # of all cells, a look-up would only miss the cache
+    if (
+        chosen.shape[0] < cells.distances.size
+    ):  # of all cells, a look-up would only miss the cache
         cell = chosen[cell]
     i, j = cell // cells.distances.shape[1], cell % cells.distances.shape[1]
-    return place_in(i + uniform_of(source, counter + 1), j + uniform_of(source, counter + 2), cells)
+    return place_in(
+        i + uniform_of(source, counter + 1), j + uniform_of(source, counter + 2), cells
+    )
 
 
 @kernel
@@ -260,7 +293,9 @@ def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-unty
         if groups[g, FIXED] == 0.0:
             if wanted >= 0:  # each group gets its share
                 most, after = min(wanted, total), before + greatest
-                count = (most * after + total // 2) // total - (most * before + total // 2) // total
+                count = (most * after + total // 2) // total - (
+                    most * before + total // 2
+                ) // total
             before += greatest
         first, shapes = int(groups[g, FIRST_SHAPE]), int(groups[g, SHAPES])
         for number in range(greatest):
@@ -275,7 +310,12 @@ def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-unty
 
 @kernel
 def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    space, outlines, gaps, trial = plan.space, plan.outlines, scratch.gaps, scratch.trial
+    space, outlines, gaps, trial = (
+        plan.space,
+        plan.outlines,
+        scratch.gaps,
+        scratch.trial,
+    )
     cells, widest = scratch.cells, MARGIN
     cell_kernels.clear(0, cells)
     for k in range(bodies.shape[0]):
@@ -314,10 +354,14 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
 def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
     trial, gaps, near = scratch.trial, scratch.gaps, scratch.cells.found
     reach = trial[RADIUS] + widest
-    for i in range(cell_kernels.around_added(0, trial[X], trial[Y], reach, scratch.cells)):
+    for i in range(
+        cell_kernels.around_added(0, trial[X], trial[Y], reach, scratch.cells)
+    ):
         other = bodies[near[i]]
         gap = max(gaps[k], gaps[near[i]])
-        if other[RADIUS] > 0.0 and not _clear_of(trial, other, gap, plan.outlines, scratch.spare):
+        if other[RADIUS] > 0.0 and not _clear_of(
+            trial, other, gap, plan.outlines, scratch.spare
+        ):
             return False
     return True
 
@@ -369,14 +413,20 @@ def _place_robots(source, counter, plan, bodies, starts, goals, scratch):  # typ
         for _ in range(TRIES):
             x, y, heading = _spot(source, counter, plan.starts, plan.space)
             counter += 4
-            if area_of(x, y, plan.space) == 0 or not _is_free(x, y, plan, bodies, scratch):
+            if area_of(x, y, plan.space) == 0 or not _is_free(
+                x, y, plan, bodies, scratch
+            ):
                 continue
             gx, gy = _goal_of(source, counter, x, y, plan)
             counter += 4
             distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
             fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
             fits = fits and area_of(gx, gy, plan.space) == area_of(x, y, plan.space)
-            fits = fits and _apart(x, y, starts, m, between) and _apart(gx, gy, goals, m, between)
+            fits = (
+                fits
+                and _apart(x, y, starts, m, between)
+                and _apart(gx, gy, goals, m, between)
+            )
             if not (fits and _is_free(gx, gy, plan, bodies, scratch)):
                 continue
             if not _is_joined(x, y, gx, gy, plan, bodies, scratch):
@@ -415,7 +465,9 @@ def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  
 @kernel
 def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     count, s, cells = plan.group.shape[0], scratch, scratch.cells
-    found = cells.found[:count]  # the scratch may be for the most obstacles of several worlds
+    found = cells.found[
+        :count
+    ]  # the scratch may be for the most obstacles of several worlds
     cells = BodyCells(cells.first, cells.then, cells.ordered, cells.frame, found)
     scratch = SceneScratch(
         s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.spare, cells
@@ -425,13 +477,23 @@ def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: 
     s.disc[RADIUS] = plan.footprint
     for n in range(seeds.shape[0]):
         state, source = NO_OBSTACLES, random.source(seeds[n], random.SCENE_STREAM)
-        counter = _choose(source, wanted[n], sizes[n], plan, bodies[n, :count], scratch.active)
+        counter = _choose(
+            source, wanted[n], sizes[n], plan, bodies[n, :count], scratch.active
+        )
         for _ in range(RESTARTS):
-            counter, placed = _place_obstacles(source, counter, plan, bodies[n, :count], scratch)
+            counter, placed = _place_obstacles(
+                source, counter, plan, bodies[n, :count], scratch
+            )
             if placed:
                 state = NO_ROBOTS
                 counter, placed = _place_robots(
-                    source, counter, plan, bodies[n, :count], starts[n], goals[n], scratch
+                    source,
+                    counter,
+                    plan,
+                    bodies[n, :count],
+                    starts[n],
+                    goals[n],
+                    scratch,
                 )
             if placed:
                 state = DRAWN

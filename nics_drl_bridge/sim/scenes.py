@@ -15,7 +15,15 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.cell_kernels import FEWEST, body_cells
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
-from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlines, Shape, describe
+from nics_drl_bridge.lidar.shapes import (
+    BODY,
+    LARGEST,
+    SMALLEST,
+    Circle,
+    Outlines,
+    Shape,
+    describe,
+)
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.obstacles import Motion
@@ -56,7 +64,9 @@ class Scenes(Scene):
         return len(self.bodies)
 
     def __getitem__(self, row: int) -> Scene:
-        return Scene(self.bodies[row], self.starts[row], self.goals[row], int(self.member[row]))
+        return Scene(
+            self.bodies[row], self.starts[row], self.goals[row], int(self.member[row])
+        )
 
     def __iter__(self) -> Iterator[Scene]:
         return (self[row] for row in range(len(self)))
@@ -89,16 +99,25 @@ class SceneSampler:
     """
 
     def __init__(
-        self, world: World, footprint_radius: float, robots: int = 1,
-        sizes: Sequence[float] = (1.0,), most: int | None = None, known: Catalogue | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        world: World,
+        footprint_radius: float,
+        robots: int = 1,
+        sizes: Sequence[float] = (1.0,),
+        most: int | None = None,
+        known: Catalogue | None = None,
+    ) -> None:
         self.world = world = world if most is None else _with_room(world, most)
         self.robots, self._sizes = robots, len(sizes)
         known = known or Catalogue.of(world, sizes)
         self.shapes = known.shapes
-        slots = [g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])]
+        slots = [
+            g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])
+        ]
         self.count = len(slots)  # K, the greatest number of obstacles
-        self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
+        self.motions: tuple[Motion | None, ...] = tuple(
+            world.obstacles[g].motion for g in slots
+        )
         self.plan = _plan(world, footprint_radius, slots, known)
         # Greatest number of cells, obstacles and corners; threads draw with a scratch memory each.
         corners = max(int(np.diff(self.plan.outlines.first).max()), 4)
@@ -113,7 +132,10 @@ class SceneSampler:
         return {name: value for name, value in vars(self).items() if name != "_packed"}
 
     def draw(
-        self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None
+        self,
+        seeds: ArrayLike,
+        count: ArrayLike | None = None,
+        size: ArrayLike | None = None,
     ) -> Scenes:
         """Draws the scenes of seeds (n,); identical in every process and batch.
 
@@ -131,10 +153,18 @@ class SceneSampler:
         """Returns seeds, numbers of obstacles (-1 for the world's own) and sizes; see `draw`."""
         numbers = checked_seeds(seeds)
         n = len(numbers)
-        wanted = np.full(n, -1) if count is None else np.maximum(np.asarray(count, np.int64), 0)
-        sizes = np.zeros(n, np.int64) if size is None else np.asarray(size, dtype=np.int64)
+        wanted = (
+            np.full(n, -1)
+            if count is None
+            else np.maximum(np.asarray(count, np.int64), 0)
+        )
+        sizes = (
+            np.zeros(n, np.int64) if size is None else np.asarray(size, dtype=np.int64)
+        )
         if wanted.shape != (n,) or sizes.shape != (n,):
-            raise ConfigError(f"count {wanted.shape} and size {sizes.shape} must be ({n},).")
+            raise ConfigError(
+                f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
+            )
         if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
             raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
         return numbers, wanted, sizes
@@ -149,7 +179,9 @@ class SceneSampler:
             scratch = _scratch(*self.room)
         numbers, wanted, sizes = (each[rows] for each in draws)
         into = scenes.bodies[rows], scenes.starts[rows], scenes.goals[rows]
-        drawn, why = kernels.draw_scenes(self._packed, numbers, wanted, sizes, *into, scratch)
+        drawn, why = kernels.draw_scenes(
+            self._packed, numbers, wanted, sizes, *into, scratch
+        )
         self.scratches.append(scratch)
         if drawn < len(numbers):
             raise self._no_room(int(numbers[drawn]), why)
@@ -176,13 +208,20 @@ class SetSampler:
     """
 
     def __init__(
-        self, world: AnyWorld, footprint_radius: float, robots: int = 1,
-        sizes: Sequence[float] = (1.0,), most: int | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        world: AnyWorld,
+        footprint_radius: float,
+        robots: int = 1,
+        sizes: Sequence[float] = (1.0,),
+        most: int | None = None,
+    ) -> None:
         known = Catalogue.of(world, sizes)
         given = footprint_radius, robots, sizes, most, known
         self.samplers = [SceneSampler(member, *given) for member in world.members]
-        scratches, rooms = self.samplers[0].scratches, [each.room for each in self.samplers]
+        scratches, rooms = (
+            self.samplers[0].scratches,
+            [each.room for each in self.samplers],
+        )
         room = tuple(max(each) for each in zip(*rooms, strict=True))
         for each in self.samplers:
             each.room, each.scratches = room, scratches
@@ -197,7 +236,10 @@ class SetSampler:
         return [(*own, *(None,) * (self.count - len(own))) for own in each]
 
     def draw(
-        self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None
+        self,
+        seeds: ArrayLike,
+        count: ArrayLike | None = None,
+        size: ArrayLike | None = None,
     ) -> Scenes:
         """Draws the scenes of seeds (n,), see `SceneSampler.draw`; K is the most of all members."""
         draws = self.samplers[0].draws(seeds, count, size)
@@ -218,7 +260,9 @@ def member_of(world: AnyWorld, seed: int) -> int:
     return int(chosen[0])
 
 
-def sample_scene(world: AnyWorld, footprint: float, seed: int, robots: int = 1) -> Scene:
+def sample_scene(
+    world: AnyWorld, footprint: float, seed: int, robots: int = 1
+) -> Scene:
     """Draws the scene of a seed for M robots of a radius [m]; identical in every process."""
     return _sampler(world, footprint, robots).draw([seed])[0]
 
@@ -259,7 +303,9 @@ def _with_room(world: World, most: int) -> World:
     return world.model_copy(update={"obstacles": tuple(groups)})
 
 
-def _plan(world: World, footprint: float, slots: Sequence[int], known: Catalogue) -> ScenePlan:
+def _plan(
+    world: World, footprint: float, slots: Sequence[int], known: Catalogue
+) -> ScenePlan:
     check_places(world)
     drawn = any(group.count for group in world.obstacles)
     alike = f"{drawn} {world.model_dump_json(exclude={'name', 'obstacles'})}"
@@ -271,7 +317,14 @@ def _plan(world: World, footprint: float, slots: Sequence[int], known: Catalogue
     poses = np.zeros((len(slots), 3))
     for g, group in enumerate(world.obstacles):
         fixed, moving = float(bool(group.at)), float(group.motion is not None)
-        groups[g] = *group.counts, group.gap, len(choices), len(group.shapes), fixed, moving
+        groups[g] = (
+            *group.counts,
+            group.gap,
+            len(choices),
+            len(group.shapes),
+            fixed,
+            moving,
+        )
         choices += [known.place[shape] for shape in group.shapes]
         if group.at:
             poses[np.flatnonzero(np.equal(slots, g))] = group.at
@@ -279,12 +332,23 @@ def _plan(world: World, footprint: float, slots: Sequence[int], known: Catalogue
     ring = math.pi * (greatest * greatest - least * least)
     around = world.goals is None and ring < len(space.for_robots) * space.cells.cell**2
     return ScenePlan(
-        space, outlines.arguments, outlines.radii, groups, np.array(slots, dtype=np.int64),
+        space,
+        outlines.arguments,
+        outlines.radii,
+        groups,
+        np.array(slots, dtype=np.int64),
         np.array(choices, dtype=np.int64),
-        np.arange(len(known.shapes)).reshape(-1, max(len(known.place), 1)), poses,
-        _places(world.starts), _places(world.goals), float(footprint), world.clearance, least,
-        greatest, around, _square_over(space.cells),
-    )  # fmt: skip
+        np.arange(len(known.shapes)).reshape(-1, max(len(known.place), 1)),
+        poses,
+        _places(world.starts),
+        _places(world.goals),
+        float(footprint),
+        world.clearance,
+        least,
+        greatest,
+        around,
+        _square_over(space.cells),
+    )
 
 
 def _places(places: Starts | Goals | None) -> Array:
@@ -303,17 +367,25 @@ def _places(places: Starts | Goals | None) -> Array:
 
 def _scratch(cells: int, count: int, corners: int) -> SceneScratch:
     return SceneScratch(
-        np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
-        np.zeros(count, np.bool_), np.zeros(count), np.zeros(BODY), np.zeros(BODY),
-        np.zeros((corners, 2)), body_cells(1 if count >= FEWEST else 0, count),
-    )  # fmt: skip
+        np.zeros(cells, np.int64),
+        np.zeros((2, cells), np.int64),
+        np.zeros(1, np.int64),
+        np.zeros(count, np.bool_),
+        np.zeros(count),
+        np.zeros(BODY),
+        np.zeros(BODY),
+        np.zeros((corners, 2)),
+        body_cells(1 if count >= FEWEST else 0, count),
+    )
 
 
 def _square_over(field: MapField) -> Array:
     """Least x, least y and side (3,) of a square that covers a field [m]."""
     rows, columns = field.distances.shape
     place = kernels.place_in.py_func  # type: ignore[attr-defined]
-    x, y = place(np.array([0, 0, rows, rows]), np.array([0, columns, 0, columns]), field)
+    x, y = place(
+        np.array([0, 0, rows, rows]), np.array([0, columns, 0, columns]), field
+    )
     return np.array([x.min(), y.min(), max(np.ptp(x), np.ptp(y))])
 
 
@@ -345,7 +417,9 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     nothing = np.zeros(0, np.int32)
     given = world.starts is not None and world.goals is not None
     for_robots = nothing if given else np.flatnonzero(area).astype(np.int32)
-    anywhere = np.flatnonzero(cells.distances > 0.0).astype(np.int32) if drawn else nothing
+    anywhere = (
+        np.flatnonzero(cells.distances > 0.0).astype(np.int32) if drawn else nothing
+    )
     return FreeSpace(cells, area, bounds, walls, grid, for_robots, anywhere, room)
 
 
@@ -356,7 +430,9 @@ def _closed(grid: GridMap) -> MapField:
     heading = grid.origin[2]
     whole = GridMap(closed, grid.resolution, (x, y, heading), unknown_stops=True)
     distances, cosine, sine = whole.distance_field, math.cos(heading), math.sin(heading)
-    return MapField(np.ascontiguousarray(distances), x, y, cosine, sine, float(grid.resolution))
+    return MapField(
+        np.ascontiguousarray(distances), x, y, cosine, sine, float(grid.resolution)
+    )
 
 
 def _cells_of(world: World) -> MapField:
@@ -372,7 +448,9 @@ def _centres(cells: MapField) -> Array:
     return np.array(kernels.place_in.py_func(rows, columns, cells))  # type: ignore[attr-defined]
 
 
-def _large_enough(area: NDArray[np.int32], cell: float, least: float) -> NDArray[np.int32]:
+def _large_enough(
+    area: NDArray[np.int32], cell: float, least: float
+) -> NDArray[np.int32]:
     keep = [0]
     for number, parts in enumerate(ndimage.find_objects(area), 1):
         span = cell * math.hypot(*(part.stop - part.start for part in parts))
@@ -381,7 +459,11 @@ def _large_enough(area: NDArray[np.int32], cell: float, least: float) -> NDArray
 
 
 def _check(
-    world: World, key: str, places: Starts | Goals | None, area: NDArray[np.int32], cells: MapField
+    world: World,
+    key: str,
+    places: Starts | Goals | None,
+    area: NDArray[np.int32],
+    cells: MapField,
 ) -> None:
     if places is None:
         return

@@ -34,7 +34,10 @@ OLDEST, NEWEST = (1, 4), (1, 12)  # versions of SDF
 PATHS = "GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH"
 ABSENT = "which is neither"
 HARMLESS = "sun", "ground_plane"  # included by most worlds, and nothing to run into
-MOVING = {"actor": "an actor, which moves by a script", "population": "a population of models"}
+MOVING = {
+    "actor": "an actor, which moves by a script",
+    "population": "a population of models",
+}
 POSE = {"relative_to", "frame", "degrees", "rotation_format"}  # attributes
 NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
 
@@ -49,9 +52,12 @@ class AssetsError(ConfigError):
 
 
 def read_sdf(
-    path: str | Path, height: float, without: tuple[str, ...] = (), skip_unknown: bool = False,
+    path: str | Path,
+    height: float,
+    without: tuple[str, ...] = (),
+    skip_unknown: bool = False,
     may_be_empty: bool = False,
-) -> Standing:  # fmt: skip
+) -> Standing:
     """Reads what stands in a Gazebo world at a height [m] above z = 0.
 
     Args:
@@ -82,12 +88,18 @@ def read_sdf(
                 fix = "leave some out by --without MODEL, or split the world"
                 raise ConfigError(f"{path}: {reason}; {fix}.")
     except RecursionError:
-        raise ConfigError(f"{path}: is nested too deeply; flatten its models.") from None
-    left_out = tuple(f"model {name!r} has {', '.join(what)}" for name, what in unknown.items())
+        raise ConfigError(
+            f"{path}: is nested too deeply; flatten its models."
+        ) from None
+    left_out = tuple(
+        f"model {name!r} has {', '.join(what)}" for name, what in unknown.items()
+    )
     if left_out and not skip_unknown:
         more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
-        raise AssetsError(f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.")
+        raise AssetsError(
+            f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}."
+        )
     shapes = seen - sum(map(len, unknown.values()))
     if left_out and not shapes and not may_be_empty:
         reason = f"holds nothing but what is no shape of a world ({left_out[0]})"
@@ -109,7 +121,9 @@ def _section_of(body: "_Body", height: float) -> Placed | None:
     try:
         return sections.section(solid, body.pose, height)
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+        problem = error.errors(include_url=False)[0]["msg"].removeprefix(
+            "Value error, "
+        )
         reason = f"its shape at a height of {height:g} m is none of a world ({problem})"
         raise ConfigError(f"{body.where}: {reason}; change it.") from None
 
@@ -127,21 +141,36 @@ class _Order:
     def count(self, file: Path) -> None:
         self._models += 1
         if self._models > MOST_MODELS:
-            raise ConfigError(f"{file}: holds more than {MOST_MODELS} models; split the world.")
+            raise ConfigError(
+                f"{file}: holds more than {MOST_MODELS} models; split the world."
+            )
 
 
 class _Scope:
     """A world or a model: its frames by their names, and what is in it."""
 
     def __init__(
-        self, element: Element, file: Path, name: str, order: _Order, include: Element | None = None
+        self,
+        element: Element,
+        file: Path,
+        name: str,
+        order: _Order,
+        include: Element | None = None,
     ) -> None:
         self.element, self.file, self.name, self._order = element, file, name, order
-        self.pose, self.placement = element.find("pose"), element.get("placement_frame", "")
+        self.pose, self.placement = (
+            element.find("pose"),
+            element.get("placement_frame", ""),
+        )
         if include is not None and include.find("pose") is not None:
-            self.pose, self.placement = include.find("pose"), _text(include, "placement_frame")
+            self.pose, self.placement = (
+                include.find("pose"),
+                _text(include, "placement_frame"),
+            )
         self.models: list[_Scope] = []
-        self.strange: list[tuple[str, str]] = []  # name of a model, and why it can't be read
+        self.strange: list[
+            tuple[str, str]
+        ] = []  # name of a model, and why it can't be read
         states = element.iterfind("state/model")
         self._state = {one.get("name", ""): one.find("pose") for one in states}
         self._named: dict[str, Element | _Scope] = {}
@@ -156,7 +185,9 @@ class _Scope:
 
     def _add(self, child: Element) -> None:
         name = child.get("name", "") or _text(child, "name")
-        if child.tag == "link" or (child.tag in ("frame", "joint") and name not in self._named):
+        if child.tag == "link" or (
+            child.tag in ("frame", "joint") and name not in self._named
+        ):
             self._named[name] = child
         elif child.tag == "model":
             self._add_model(child, self.file, name)
@@ -189,28 +220,43 @@ class _Scope:
         if name in ("", "world", "__model__"):
             return np.eye(4)
         found, (first, _, rest) = self._named.get(name), name.partition("::")
-        if found is None and rest and isinstance(inner := self._named.get(first), _Scope):
+        if (
+            found is None
+            and rest
+            and isinstance(inner := self._named.get(first), _Scope)
+        ):
             return self.frame(first) @ inner.frame(rest)
         if found is None:
             near = nearest(name, self._named) if self._named else "there are none here."
             raise ConfigError(f"{self.where}: there is no frame {name!r}; {near}")
         if name in self._open:
-            reason = f"the pose of {name!r} is relative to itself; give it another frame"
+            reason = (
+                f"the pose of {name!r} is relative to itself; give it another frame"
+            )
             raise ConfigError(f"{self.where}: {reason}.")
         self._open.add(name)
         if isinstance(found, _Scope):
             pose = self.of_model(found)
         else:
-            bases = {"joint": _text(found, "child"), "frame": found.get("attached_to", "")}
+            bases = {
+                "joint": _text(found, "child"),
+                "frame": found.get("attached_to", ""),
+            }
             pose = self.posed(found.find("pose"), bases.get(found.tag, ""))
         self._open.remove(name)
         return pose
 
     def posed(
-        self, pose: Element | None, base: str = "", start: Array | None = None, where: str = ""
+        self,
+        pose: Element | None,
+        base: str = "",
+        start: Array | None = None,
+        where: str = "",
     ) -> Array:
         """(4, 4) of a `<pose>` in this scope; by default from `start`, or from the frame `base`."""
-        given = "" if pose is None else pose.get("relative_to") or pose.get("frame") or ""
+        given = (
+            "" if pose is None else pose.get("relative_to") or pose.get("frame") or ""
+        )
         if start is None or given:
             start = self.frame(given or base)
         return start @ _matrix(pose, where or self.where)
@@ -236,11 +282,15 @@ class _Body(NamedTuple):
         """Returns the body; None for the ground. Raises ShapelessError, ConfigError for sizes."""
         if isinstance(self.geometry, str):
             raise ShapelessError(self.geometry)
-        shape = next((child for child in self.geometry if ":" not in child.tag), Element("empty"))
+        shape = next(
+            (child for child in self.geometry if ":" not in child.tag), Element("empty")
+        )
         if shape.tag == "empty":
             return None
         if shape.tag == "plane":
-            normal = self.pose[:3, :3] @ _floats(shape.findtext("normal", "0 0 1"), 3, self.where)
+            normal = self.pose[:3, :3] @ _floats(
+                shape.findtext("normal", "0 0 1"), 3, self.where
+            )
             if abs(normal[2]) < math.cos(sections.TILT) * np.linalg.norm(normal):
                 raise ShapelessError("a plane that is not level")
             return None
@@ -250,7 +300,9 @@ class _Body(NamedTuple):
             return sections.Sphere(*self._lengths(shape, "radius"))
         if shape.tag in ("cylinder", "capsule"):
             kind = sections.Cylinder if shape.tag == "cylinder" else sections.Capsule
-            return kind(*self._lengths(shape, "radius"), *self._lengths(shape, "length"))
+            return kind(
+                *self._lengths(shape, "radius"), *self._lengths(shape, "length")
+            )
         if shape.tag == "polyline" and len(self.geometry.findall("polyline")) == 1:
             return self._prism(shape)
         what = "polyline with holes" if shape.tag == "polyline" else shape.tag
@@ -263,7 +315,9 @@ class _Body(NamedTuple):
         if len(points) > 1 and points[0] == points[-1]:
             points.pop()
         if len(set(points)) < 3:
-            raise ConfigError(f"{self.where}: <polyline> needs three different points; add some.")
+            raise ConfigError(
+                f"{self.where}: <polyline> needs three different points; add some."
+            )
         if len(points) > MOST_CORNERS:
             most = f"has {len(points)} points, a shape at most {MOST_CORNERS}"
             raise ConfigError(f"{self.where}: <polyline> {most}; coarsen it.")
@@ -276,7 +330,9 @@ class _Body(NamedTuple):
             raise ConfigError(f"{where} is missing; add it.")
         lengths = _floats(text, count, where)
         if not all(SMALLEST <= length <= LARGEST for length in lengths):
-            raise ConfigError(f"{where} must be above 0 and at most {LARGEST:g} m, not {text!r}.")
+            raise ConfigError(
+                f"{where} must be above 0 and at most {LARGEST:g} m, not {text!r}."
+            )
         return lengths
 
 
@@ -304,20 +360,29 @@ def _matrix(pose: Element | None, where: str) -> Array:
     unknown = [name for name in pose.attrib if name not in POSE and ":" not in name]
     if unknown:
         hint = nearest(unknown[0], POSE)
-        raise ConfigError(f"{where}: unknown attribute {unknown[0]!r} of a <pose>; {hint}")
-    form, degrees = pose.get("rotation_format", "euler_rpy"), pose.get("degrees", "false")
+        raise ConfigError(
+            f"{where}: unknown attribute {unknown[0]!r} of a <pose>; {hint}"
+        )
+    form, degrees = (
+        pose.get("rotation_format", "euler_rpy"),
+        pose.get("degrees", "false"),
+    )
     for name, given, known in (
         ("rotation_format", form, list(NUMBERS)),
         ("degrees", degrees, ["true", "false", "1", "0"]),
     ):
         if given not in known:
             hint = nearest(given, known)
-            raise ConfigError(f"{where}: attribute {name}={given!r} of a <pose>; {hint}")
+            raise ConfigError(
+                f"{where}: attribute {name}={given!r} of a <pose>; {hint}"
+            )
     numbers = _floats(pose.text or "", NUMBERS[form], f"{where}: <pose>")
     matrix[:3, 3] = numbers[:3]
     if form == "quat_xyzw":
         if not any(numbers[3:]):
-            raise ConfigError(f"{where}: the quaternion of a <pose> is 0; give a rotation.")
+            raise ConfigError(
+                f"{where}: the quaternion of a <pose> is 0; give a rotation."
+            )
         matrix[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
     elif any(numbers[3:]):
         turned = Rotation.from_euler("xyz", numbers[3:], degrees in ("true", "1"))
@@ -382,12 +447,16 @@ def root_of(path: Path) -> Element:
     """Returns the root of an SDF file, with tags as they stand there. Raises ConfigError."""
     root = _tree(path)
     if root.tag != "sdf":
-        raise ConfigError(f"{path}: is no SDF but <{root.tag}>; give a .world or .sdf file.")
+        raise ConfigError(
+            f"{path}: is no SDF but <{root.tag}>; give a .world or .sdf file."
+        )
     version = root.get("version", "")
     if not OLDEST <= _version(version) <= NEWEST:
         known = " to ".join(".".join(map(str, one)) for one in (OLDEST, NEWEST))
         fix = "convert it by `gz sdf -p`"
-        raise ConfigError(f"{path}: SDF version {version!r} is not read, {known} are; {fix}.")
+        raise ConfigError(
+            f"{path}: SDF version {version!r} is not read, {known} are; {fix}."
+        )
     return root
 
 
@@ -404,7 +473,9 @@ def _tree(path: Path) -> Element:
 
     def refuse(*_: Any) -> None:
         reason = "declares a document type, whose entities may grow without end"
-        raise ConfigError(f"{path}, line {parser.CurrentLineNumber}: {reason}; remove <!DOCTYPE>.")
+        raise ConfigError(
+            f"{path}, line {parser.CurrentLineNumber}: {reason}; remove <!DOCTYPE>."
+        )
 
     parser.StartDoctypeDeclHandler = refuse
     parser.StartElementHandler = builder.start

@@ -9,7 +9,14 @@ import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.shapes import SMALLEST, Circle, Polygon, Rectangle, Shape, convex_hull
+from nics_drl_bridge.lidar.shapes import (
+    SMALLEST,
+    Circle,
+    Polygon,
+    Rectangle,
+    Shape,
+    convex_hull,
+)
 from nics_drl_bridge.sim.world import Obstacles, Region
 
 TILT = 1e-3  # up to this angle [rad] a body counts as upright: a millimetre in a metre
@@ -71,7 +78,9 @@ class Standing(NamedTuple):
         groups: dict[Shape, list[tuple[float, float, float]]] = {}
         for shape, pose in self.placed:
             groups.setdefault(shape, []).append(pose)
-        return tuple(Obstacles(shapes=(shape,), at=tuple(at)) for shape, at in groups.items())
+        return tuple(
+            Obstacles(shapes=(shape,), at=tuple(at)) for shape, at in groups.items()
+        )
 
     def bounds(self, *places: tuple[float, ...]) -> Region:
         """Returns the least field that holds all shapes, and 1 m around places x, y, ... [m]."""
@@ -79,7 +88,9 @@ class Standing(NamedTuple):
         corners = [around + place[:2] for place in places]
         for shape, pose in self.placed:
             outline = geometry.rotate(shape.outline, pose[2])
-            corners.append((outline if len(outline) else shape.radius / AROUND * around) + pose[:2])
+            corners.append(
+                (outline if len(outline) else shape.radius / AROUND * around) + pose[:2]
+            )
         points = np.concatenate(corners)
         x1, y1 = (np.floor(points.min(axis=0) * 1e3) / 1e3).tolist()
         x2, y2 = (np.ceil(points.max(axis=0) * 1e3) / 1e3).tolist()
@@ -137,7 +148,11 @@ def _of_cylinder(body: Cylinder, pose: Array, up: float) -> _Cut:
     if abs(pose[2, 2]) >= math.sin(TILT):
         raise ShapelessError("a cylinder that leans")
     width2 = body.radius**2 - up**2
-    return None if width2 <= 0.0 else _rectangle(pose, 2, (body.length, 2.0 * math.sqrt(width2)))
+    return (
+        None
+        if width2 <= 0.0
+        else _rectangle(pose, 2, (body.length, 2.0 * math.sqrt(width2)))
+    )
 
 
 def _of_capsule(body: Capsule, pose: Array, up: float) -> _Cut:
@@ -166,7 +181,9 @@ def _of_leaning_box(box: Box, pose: Array, up: float) -> _Cut:
             continue  # no edge
         below, above = corners[a, 2] - up, corners[b, 2] - up
         if below * above < 0.0:
-            cuts.append(corners[a] + below / (below - above) * (corners[b] - corners[a]))
+            cuts.append(
+                corners[a] + below / (below - above) * (corners[b] - corners[a])
+            )
     hull = convex_hull(np.array(cuts)[:, :2]) if cuts else np.zeros((0, 2))
     if len(hull) < 3 or np.ptp(hull, axis=0).min() < SMALLEST:
         return None
@@ -179,14 +196,24 @@ def _of_prism(prism: Prism, pose: Array, up: float) -> _Cut:
     upwards = float(np.sign(pose[2, 2]))
     if not 0.0 < up * upwards < prism.height:
         return None
-    return _polygon(np.array(prism.points) * (1.0, upwards)), pose[0, 3], pose[1, 3], _turn(pose, 0)
+    return (
+        _polygon(np.array(prism.points) * (1.0, upwards)),
+        pose[0, 3],
+        pose[1, 3],
+        _turn(pose, 0),
+    )
 
 
 def _polygon(points: Array) -> Polygon:
-    return Polygon(points=tuple((float(x), float(y)) for x, y in np.round(points, DIGITS)))
+    return Polygon(
+        points=tuple((float(x), float(y)) for x, y in np.round(points, DIGITS))
+    )
 
 
 _CUTS: dict[type[Solid], Callable[..., _Cut]] = {
-    Box: _of_box, Cylinder: _of_cylinder, Capsule: _of_capsule, Prism: _of_prism,
+    Box: _of_box,
+    Cylinder: _of_cylinder,
+    Capsule: _of_capsule,
+    Prism: _of_prism,
     Sphere: lambda sphere, pose, up: _disc(pose, sphere.radius**2 - up**2),
-}  # fmt: skip
+}

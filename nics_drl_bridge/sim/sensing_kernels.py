@@ -25,7 +25,10 @@ def begin(n: int, m: int, state: State) -> None:
     past, pose, odom, twist = state.past, state.pose, state.odom, state.twist
     for i in range(3):
         past[n, m, 0, POSE + i], past[n, m, 0, TWIST + i] = pose[n, m, i], 0.0
-        past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = odom[n, m, i], twist[n, m, i]
+        past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = (
+            odom[n, m, i],
+            twist[n, m, i],
+        )
 
 
 @kernel
@@ -41,7 +44,11 @@ def at_lag(
     """Returns three columns of `past`, `lag` substeps before the end of period `steps`."""
     rows = past.shape[2]
     new, share = (steps - lag // substeps) % rows, (lag % substeps) / substeps
-    x, y, z = past[n, m, new, column], past[n, m, new, column + 1], past[n, m, new, column + 2]
+    x, y, z = (
+        past[n, m, new, column],
+        past[n, m, new, column + 1],
+        past[n, m, new, column + 2],
+    )
     if share > 0.0:
         old = (steps - lag // substeps - 1) % rows
         x += share * (past[n, m, old, column] - x)
@@ -63,7 +70,13 @@ def _odometry_noise(n: int, m: int, axis: int, state: State) -> float:
 
 @kernel
 def measure(
-    n: int, m: int, state: State, pose: Array, before: Array, now: Array, motion: Dynamics
+    n: int,
+    m: int,
+    state: State,
+    pose: Array,
+    before: Array,
+    now: Array,
+    motion: Dynamics,
 ) -> None:
     """Measures a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
 
@@ -79,7 +92,11 @@ def measure(
     ahead, aside, turned = c * dx + s * dy, c * dy - s * dx, pose[n, m, 2] - before[2]
     x, y, heading = last[ODOM], last[ODOM + 1], last[ODOM + 2]
     c, s = math.cos(heading), math.sin(heading)
-    x, y, heading = x + (c * ahead - s * aside), y + (s * ahead + c * aside), heading + turned
+    x, y, heading = (
+        x + (c * ahead - s * aside),
+        y + (s * ahead + c * aside),
+        heading + turned,
+    )
     if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
         period, c, s = motion.dt * substeps, math.cos(heading), math.sin(heading)
         turn = noise_turn * period
@@ -98,7 +115,9 @@ def measure(
         return
     lag = lag_of(state.age[n, m], steps, rows, substeps)
     odom[0], odom[1], odom[2] = at_lag(state.past, n, m, ODOM, lag, steps, substeps)
-    twist[0], twist[1], twist[2] = at_lag(state.past, n, m, MEASURED, lag, steps, substeps)
+    twist[0], twist[1], twist[2] = at_lag(
+        state.past, n, m, MEASURED, lag, steps, substeps
+    )
 
 
 @kernel
@@ -110,7 +129,10 @@ def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float,
     ahead = aside = turn = 0.0
     for i in range(count):
         if std[n, m, 2 + i] > 0.0:
-            share = random.uniform(state.seeds[n], random.DRIFT_STREAM, counter * count + i) - 0.5
+            share = (
+                random.uniform(state.seeds[n], random.DRIFT_STREAM, counter * count + i)
+                - 0.5
+            )
             draw = scale * std[n, m, 2 + i] * share
             if i == 0:
                 ahead = draw
@@ -125,13 +147,22 @@ def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float,
 
 @kernel(inline=True)
 def scan_or_wait(
-    n: int, waiting: int, state: State, members: Members, lidar: LidarArrays, motion: Dynamics,
+    n: int,
+    waiting: int,
+    state: State,
+    members: Members,
+    lidar: LidarArrays,
+    motion: Dynamics,
     scratch: Scratch,
-) -> int:  # fmt: skip
+) -> int:
     """Scans world n, unless `scan_together` can; returns how many worlds now wait for it."""
     alone = False
     for m in range(state.age.shape[1]):  # a scan that is not of a robot's present pose
-        alone = alone or state.age[n, m] > 0 or state.faults[n, m, fault_kernels.SKEW] != 0.0
+        alone = (
+            alone
+            or state.age[n, m] > 0
+            or state.faults[n, m, fault_kernels.SKEW] != 0.0
+        )
     if alone:
         for m in range(state.pose.shape[1]):
             _scan_alone(n, m, state, members, lidar, motion, scratch)
@@ -148,9 +179,16 @@ def scan_together(
     scans = scratch.scans
     chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
     scan_kernels.scan_worlds(
-        state.ranges, state.pose, chosen, state.bodies, first, members.fixtures, lidar,
-        scratch.cells, scans.lookup,
-    )  # fmt: skip
+        state.ranges,
+        state.pose,
+        chosen,
+        state.bodies,
+        first,
+        members.fixtures,
+        lidar,
+        scratch.cells,
+        scans.lookup,
+    )
 
 
 @kernel
@@ -167,12 +205,22 @@ def distort(low: int, high: int, state: State, lidar: LidarArrays) -> None:
 
 @kernel
 def _scan_alone(
-    n: int, m: int, state: State, members: Members, lidar: LidarArrays, motion: Dynamics,
+    n: int,
+    m: int,
+    state: State,
+    members: Members,
+    lidar: LidarArrays,
+    motion: Dynamics,
     scratch: Scratch,
-) -> None:  # fmt: skip
+) -> None:
     scans, beams = scratch.scans, state.ranges.shape[2]
     spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
-    past, steps, substeps, here = state.past, state.steps[n], motion.substeps, spot[0, 0]
+    past, steps, substeps, here = (
+        state.past,
+        state.steps[n],
+        motion.substeps,
+        spot[0, 0],
+    )
     lag = lag_of(state.age[n, m], steps, past.shape[2], substeps)
     here[0], here[1], here[2] = at_lag(past, n, m, POSE, lag, steps, substeps)
     drive[0], drive[1], drive[2] = at_lag(past, n, m, TWIST, lag, steps, substeps)
@@ -181,34 +229,55 @@ def _scan_alone(
         reach += math.hypot(drive[0], drive[1]) * lidar.sweep_time
     count = _gather(n, m, lag, reach, state, members, motion, scratch)
     seen, every = scans.seen[:count].reshape((1, count, 7)), scans.every
-    every = BodyCells(every.first, every.then, every.ordered, every.frame, every.found[:count])
+    every = BodyCells(
+        every.first, every.then, every.ordered, every.frame, every.found[:count]
+    )
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
     around = fixtures_around(n, members.fixtures)
     groups = 1 if skew == 0.0 else scans.slices.shape[0]
     if groups > 1:
-        fault_kernels.slice_poses(scans.slices, spot[0, 0], drive, lidar.sweep_time, skew)
-    for g in range(groups):  # large functions are called below: compiling them once is enough
+        fault_kernels.slice_poses(
+            scans.slices, spot[0, 0], drive, lidar.sweep_time, skew
+        )
+    for g in range(
+        groups
+    ):  # large functions are called below: compiling them once is enough
         out = scan if groups == 1 else scans.part
         for i in range(3 if groups > 1 else 0):
             spot[0, 0, i] = scans.slices[g, i]
         scan_kernels.scan_worlds(
             out, spot, scans.none, seen, -1, around, lidar, every, scans.lookup
         )
-        for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
+        for i in range(
+            g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0
+        ):
             scan[0, 0, i] = scans.part[0, 0, i]
 
 
 @kernel
 def _gather(
-    n: int, m: int, lag: int, reach: float, state: State, members: Members, motion: Dynamics,
+    n: int,
+    m: int,
+    lag: int,
+    reach: float,
+    state: State,
+    members: Members,
+    motion: Dynamics,
     scratch: Scratch,
-) -> int:  # fmt: skip
+) -> int:
     """Copies the bodies around `spot`, as they were `lag` substeps ago; returns their number."""
-    scans, cells, bodies, velocity = scratch.scans, scratch.cells, state.bodies, state.velocity
+    scans, cells, bodies, velocity = (
+        scratch.scans,
+        scratch.cells,
+        state.bodies,
+        state.velocity,
+    )
     spot = scans.spot[0, 0]
     first, several = velocity.shape[1], bodies.shape[1]
-    in_cells = members.standing or (members.crowded and lag == 0)  # those of a crowd are of now
+    in_cells = members.standing or (
+        members.crowded and lag == 0
+    )  # those of a crowd are of now
     if in_cells:
         several = around(n, spot[0], spot[1], reach, cells)
     count, ago = 0, lag * motion.dt

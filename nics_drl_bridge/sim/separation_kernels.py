@@ -18,16 +18,32 @@ from nics_drl_bridge.sim.state import Array, MapField
 
 # A row of a plan (K, P): the motion of an obstacle.
 (
-    KIND, SPEED_LOW, SPEED_HIGH, FIRST, COUNT, LOOP, PAUSE,
-    RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
-    FLUCTUATION, PLAN,
-) = range(17)  # fmt: skip
+    KIND,
+    SPEED_LOW,
+    SPEED_HIGH,
+    FIRST,
+    COUNT,
+    LOOP,
+    PAUSE,
+    RELAXATION,
+    REPULSION,
+    RANGE,
+    WALL_REPULSION,
+    WALL_RANGE,
+    FORESIGHT,
+    VIEW,
+    BEHIND,
+    FLUCTUATION,
+    PLAN,
+) = range(17)
 STILL, WANDER, PATROL, PEDESTRIAN = range(4)  # values of the column KIND
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
 ROBOT_GAP = 0.1  # Which an obstacle keeps to a robot, as people do [m]; less may look like a touch
-PASSES = 3  # Number of times a displacement is bent before the remaining excess is shortened
+PASSES = (
+    3  # Number of times a displacement is bent before the remaining excess is shortened
+)
 FINEST = 0.25  # Least step along a path through a static map, in cells
 HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
 
@@ -93,7 +109,11 @@ def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
             nx, ny = ox / least, oy / least
     for j in range(bodies.shape[0]):
         if j != k and bodies[j, RADIUS] > 0.0:
-            ox, oy, reach = bodies[j, X] - x, bodies[j, Y] - y, least + bodies[j, RADIUS]
+            ox, oy, reach = (
+                bodies[j, X] - x,
+                bodies[j, Y] - y,
+                least + bodies[j, RADIUS],
+            )
             away2 = ox * ox + oy * oy
             if reach > 0.0 and 0.0 < away2 < reach * reach:
                 away = math.sqrt(away2)
@@ -119,7 +139,12 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
-    bodies, first, speeds, period = traffic.bodies, traffic.first, traffic.speeds, traffic.period
+    bodies, first, speeds, period = (
+        traffic.bodies,
+        traffic.first,
+        traffic.speeds,
+        traffic.period,
+    )
     x, y, radius = bodies[k, X], bodies[k, Y], bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
     for j in range(bodies.shape[0]):
@@ -148,11 +173,19 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
-    x, y, radius, walls, field = body[X], body[Y], body[RADIUS], traffic.walls, traffic.field
+    x, y, radius, walls, field = (
+        body[X],
+        body[Y],
+        body[RADIUS],
+        traffic.walls,
+        traffic.field,
+    )
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side, bound in ((-1.0, 0), (1.0, 2)):
         dx, dy = _hold(dx, dy, side, 0.0, side * field[bound] - radius - side * x, bend)
-        dx, dy = _hold(dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend)
+        dx, dy = _hold(
+            dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend
+        )
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
         ox, oy = px - x, py - y
@@ -175,7 +208,11 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
         return _hold(dx, dy, nx, ny, here, True)
     if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
         # In contact with the map it may only move to where there is no less room.
-        return (dx, dy) if map_distance(x + dx, y + dy, grid) - radius >= here else (0.0, 0.0)
+        return (
+            (dx, dy)
+            if map_distance(x + dx, y + dy, grid) - radius >= here
+            else (0.0, 0.0)
+        )
     free, way, room, finest = 0.0, 0.0, here, FINEST * grid.cell / length
     while way < 1.0:
         way = min(way + max(room / length, finest), 1.0)

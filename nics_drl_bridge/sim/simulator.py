@@ -21,7 +21,12 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import allocation, step_kernels
 from nics_drl_bridge.sim.packing_kernels import pack
-from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
+from nics_drl_bridge.sim.randomisation import (
+    Draws,
+    Randomisation,
+    Sampler,
+    load_randomisation,
+)
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
 from nics_drl_bridge.sim.state import Members
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -31,15 +36,32 @@ Indices = NDArray[np.int64]
 R = TypeVar("R")
 # Poses of robots (n, M, 3), or a function that tells them for scenes; None: as the scenes have them
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
-MOST_ROBOTS = 1_000  # Greatest number of robots in one world; each is tested against every other
-MOST_NUMBERS = 2**30  # Most values in all worlds, some GB: beams of robots, states of obstacles
+MOST_ROBOTS = (
+    1_000  # Greatest number of robots in one world; each is tested against every other
+)
+MOST_NUMBERS = (
+    2**30
+)  # Most values in all worlds, some GB: beams of robots, states of obstacles
 PER_BODY = 64
-TOLERANCE = 0.05  # Beyond the range of commands that was recorded, as a share of their limits
+TOLERANCE = (
+    0.05  # Beyond the range of commands that was recorded, as a share of their limits
+)
 # Arrays of the state with a row for each robot.
 OF_ROBOT = (
-    "pose", "state", "history", "odom", "twist", "ranges", "collided", "faults", "coefficient",
-    "delay", "age", "noise", "past",
-)  # fmt: skip
+    "pose",
+    "state",
+    "history",
+    "odom",
+    "twist",
+    "ranges",
+    "collided",
+    "faults",
+    "coefficient",
+    "delay",
+    "age",
+    "noise",
+    "past",
+)
 EVERY = 16  # Commands are checked in the first step after a reset and then at this interval [steps]
 
 
@@ -58,7 +80,10 @@ class CommandBox:
     def __init__(
         self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
     ) -> None:
-        first, margin = len(robot.state), TOLERANCE * (robot.command_high - robot.command_low)
+        first, margin = (
+            len(robot.state),
+            TOLERANCE * (robot.command_high - robot.command_low),
+        )
         self._tell, self._names = tell, robot.variable_names[first:]
         edges = np.stack([model.low[first:], model.high[first:]])
         for curve in model.inputs:  # the model's box is of commands in effect
@@ -88,8 +113,12 @@ class CommandBox:
             self._armed, i = False, int(np.argmax(outside))
             value = least[i] if least[i] < self._low[i] else most[i]
             fitted = f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only"
-            found = f"{self._names[i]} is {value:.4g}, but the model was fitted to {fitted}"
-            self._tell(f"{found}: its motion there is extrapolated; record a drive that covers it.")
+            found = (
+                f"{self._names[i]} is {value:.4g}, but the model was fitted to {fitted}"
+            )
+            self._tell(
+                f"{found}: its motion there is extrapolated; record a drive that covers it."
+            )
 
 
 def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
@@ -107,9 +136,13 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
         raise ConfigError(f"the robot {robot.name!r} {drives} of world; {fix}")
 
 
-def _check_memory(model: SimulatorModel, world: AnyWorld, worlds: int, robots: int) -> None:
+def _check_memory(
+    model: SimulatorModel, world: AnyWorld, worlds: int, robots: int
+) -> None:
     """Raises ConfigError for more copies of a world than fit in memory, before any allocation."""
-    obstacles = max(sum(group.counts[1] for group in one.obstacles) for one in world.members)
+    obstacles = max(
+        sum(group.counts[1] for group in one.obstacles) for one in world.members
+    )
     each = robots * (model.lidar.beams + PER_BODY) + obstacles * PER_BODY
     if robots > MOST_ROBOTS or worlds * each > MOST_NUMBERS:
         raise ConfigError(
@@ -122,13 +155,22 @@ class EpisodeSampler:
     """Draws the scenes of episodes, and the numbers of a randomisation, if there is one."""
 
     def __init__(
-        self, model: SimulatorModel, world: AnyWorld, robots: int = 1,
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        robots: int = 1,
         randomisation: Randomisation | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         given = randomisation
         sizes = (1.0,) if given is None else given.sizes
-        most = None if given is None or given.obstacles.count is None else given.obstacles.count[1]
-        self.scenes = SetSampler(world, model.robot.footprint_radius, robots, sizes, most)
+        most = (
+            None
+            if given is None or given.obstacles.count is None
+            else given.obstacles.count[1]
+        )
+        self.scenes = SetSampler(
+            world, model.robot.footprint_radius, robots, sizes, most
+        )
         self.draws = None if given is None else Sampler(given, model, robots)
 
     def draw(self, seeds: ArrayLike) -> tuple[Scenes, Draws | None]:
@@ -152,13 +194,24 @@ class FastSimulator:
     """
 
     def __init__(
-        self, model: SimulatorModel, world: AnyWorld, worlds: int = 1, robots: int = 1,
-        renderer: Renderer = "auto", threads: int = 1,
-        randomisation: str | Randomisation | None = None, longest_delay: int | None = None,
-        longest_age: int = 0, tell: Callable[[str], None] = warn,
-    ) -> None:  # fmt: skip
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        worlds: int = 1,
+        robots: int = 1,
+        renderer: Renderer = "auto",
+        threads: int = 1,
+        randomisation: str | Randomisation | None = None,
+        longest_delay: int | None = None,
+        longest_age: int = 0,
+        tell: Callable[[str], None] = warn,
+    ) -> None:
         delay = model.timing[2] if longest_delay is None else longest_delay
-        if min(worlds, robots, threads) < 1 or delay < model.timing[2] or longest_age < 0:
+        if (
+            min(worlds, robots, threads) < 1
+            or delay < model.timing[2]
+            or longest_age < 0
+        ):
             raise ConfigError(
                 f"a simulator needs at least 1 world, robot and thread, not {worlds}, {robots} and "
                 f"{threads}; a longest_delay of at least the model's {model.timing[2]} substeps "
@@ -182,11 +235,15 @@ class FastSimulator:
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
-        self._sizes = allocation.Sizes(worlds, robots, self.sampler.count, delay, longest_age)
+        self._sizes = allocation.Sizes(
+            worlds, robots, self.sampler.count, delay, longest_age
+        )
         self.data = allocation.allocate(model, self._sizes)
         # Name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
         self.readings = unread(model.sensors, worlds, robots)
-        self.parts = allocation.split(worlds, threads)  # the worlds that each thread steps
+        self.parts = allocation.split(
+            worlds, threads
+        )  # the worlds that each thread steps
         known = model.kinematics, model.robot, tell
         self._boxes = {part.start: CommandBox(*known) for part in self.parts}
 
@@ -194,7 +251,9 @@ class FastSimulator:
     def _members(self) -> Members:
         members, motions = self.world.members, self.sampler.motions
         outlines = self._scanner.table.outlines.arguments
-        return allocation.members_of(members, motions, outlines, self._sizes, self.data.member)
+        return allocation.members_of(
+            members, motions, outlines, self._sizes, self.data.member
+        )
 
     @property
     def moves(self) -> bool:
@@ -230,7 +289,9 @@ class FastSimulator:
         self.data.bodies[0, self.sampler.count + robot] = body
         self.sort_bodies()
 
-    def take_over(self, other: "FastSimulator", robots: Indices, obstacles: Indices) -> None:
+    def take_over(
+        self, other: "FastSimulator", robots: Indices, obstacles: Indices
+    ) -> None:
         """Goes on with the episode of another simulator of this model, in its first world.
 
         `robots` are indices of the other's robots, which become the first ones here, `obstacles`
@@ -244,19 +305,26 @@ class FastSimulator:
         kept = obstacles >= 0
         for name in ("velocity", "marks"):
             getattr(mine, name)[0, kept] = getattr(theirs, name)[0, obstacles[kept]]
-        for m, (pose, state) in enumerate(zip(mine.pose[0].copy(), mine.state[0], strict=True)):
+        for m, (pose, state) in enumerate(
+            zip(mine.pose[0].copy(), mine.state[0], strict=True)
+        ):
             self.put_robot(m, pose, state)
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("_members", "packed", "_renders")
-        return {name: value for name, value in vars(self).items() if name not in rebuilt}
+        return {
+            name: value for name, value in vars(self).items() if name not in rebuilt
+        }
 
     @cached_property
     def _renders(self) -> dict[str, Render]:
         around = SensedWorlds(
-            self.data, self._scanner.table.shapes, self.sampler.count, self._members.fixtures,
+            self.data,
+            self._scanner.table.shapes,
+            self.sampler.count,
+            self._members.fixtures,
             self._scanner.renderer,
-        )  # fmt: skip
+        )
         return {sensor.name: sensor.renderer(around) for sensor in self.model.sensors}
 
     def sense(self, worlds: Indices) -> None:
@@ -265,9 +333,11 @@ class FastSimulator:
             render(self.readings[name], worlds)
 
     def reset(
-        self, seeds: ArrayLike, worlds: ArrayLike | None = None,
+        self,
+        seeds: ArrayLike,
+        worlds: ArrayLike | None = None,
         starts: Starts = None,
-    ) -> Scenes:  # fmt: skip
+    ) -> Scenes:
         """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
         They may follow from the scenes that were drawn, by a function.
@@ -276,13 +346,19 @@ class FastSimulator:
         call it in parallel for different parts. Raises ConfigError if seeds, starts or a scene do
         not fit.
         """
-        chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
+        chosen = (
+            np.arange(len(self.data.steps))
+            if worlds is None
+            else np.asarray(worlds, np.int64)
+        )
         scenes, draws = self.episodes.draw(seeds)
         given = starts(scenes) if callable(starts) else starts
         begin = scenes.starts if given is None else np.asarray(given, dtype=np.float64)
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
             needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
-            raise ConfigError(f"{len(scenes)} seeds and starts {begin.shape} must be of {needed}")
+            raise ConfigError(
+                f"{len(scenes)} seeds and starts {begin.shape} must be of {needed}"
+            )
         self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin, draws)
         for part in self.parts:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
@@ -292,7 +368,9 @@ class FastSimulator:
                 self.sense(of_part)
         if self.sampler.count < allocation.STANDING:
             return scenes
-        return Scenes(self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member)
+        return Scenes(
+            self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member
+        )
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
         """Returns the scenes that `reset` would begin with for seeds (n,)."""
@@ -312,7 +390,12 @@ class FastSimulator:
         return bodies
 
     def _place(
-        self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array, draws: Draws | None
+        self,
+        chosen: Indices,
+        seeds: Indices,
+        scenes: Scenes,
+        starts: Array,
+        draws: Draws | None,
     ) -> None:
         data = self.data
         data.pose[chosen], data.odom[chosen] = starts, starts
@@ -322,7 +405,9 @@ class FastSimulator:
         count, shapes = self.sampler.count, scenes.bodies[..., SHAPE].astype(np.int64)
         data.bodies[chosen, :count] = scenes.bodies
         data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
-        data.bodies[chosen, count:] = place(starts, self.footprint.radius, self._in_table[-1])
+        data.bodies[chosen, count:] = place(
+            starts, self.footprint.radius, self._in_table[-1]
+        )
         self.goals[chosen] = scenes.goals
         if draws is None:
             return
@@ -331,7 +416,9 @@ class FastSimulator:
         data.faults[chosen] = draws.faults
         for name, values in draws.named().items():
             if name not in self.drawn:
-                self.drawn[name] = np.zeros((len(data.steps), *values.shape[1:]), values.dtype)
+                self.drawn[name] = np.zeros(
+                    (len(data.steps), *values.shape[1:]), values.dtype
+                )
             self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:

@@ -34,13 +34,17 @@ class State(NamedTuple):
     steps: Integers  # (N,) control periods since the reset
     seeds: Integers  # (N,) of the episode
     member: Integers  # (N,) world of a set in which the episode is
-    faults: Array  # (N, M, P) of each robot's lidar, columns as in `lidar.fault_kernels`
+    faults: (
+        Array  # (N, M, P) of each robot's lidar, columns as in `lidar.fault_kernels`
+    )
     coefficient: Array  # (N, M, T), in the order of `robot.kernels.term_arrays`
     delay: Integers  # (N, M) common latency of the commands [substeps], at most `longest_delay`
     age: Integers  # (N, M) of scan and odometry when reported [substeps], at most `longest_age`
     # (N, M, 2 + 3 + S) std of odometry [m/s, rad/s]; after a second, of x, y, heading, state
     noise: Array
-    velocity: Array  # (N, K, 3) of the obstacles in `map`, for a period [m/s, m/s, rad/s]
+    velocity: (
+        Array  # (N, K, 3) of the obstacles in `map`, for a period [m/s, m/s, rad/s]
+    )
     past: Array  # (N, M, R, 12) of the last periods, see `sensing_kernels`
     marks: Array  # (N, K, F) memory of moving obstacles, columns as in `separation_kernels`
 
@@ -97,7 +101,9 @@ class Members(NamedTuple):
 class Dynamics(NamedTuple):
     """Kinematics of the robots."""
 
-    terms: Terms  # with the model's coefficients; those of a robot are `State.coefficient`
+    terms: (
+        Terms  # with the model's coefficients; those of a robot are `State.coefficient`
+    )
     series: Array  # see `robot.kernels`
     dt: float  # length of a substep [s]
     substeps: int  # in a control period

@@ -18,8 +18,20 @@ from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim import state as records
-from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully, rates_at
-from nics_drl_bridge.sim.state import Array, Dynamics, Lanes, Members, Scratch, State, Surroundings
+from nics_drl_bridge.sim.careful_kernels import (
+    drift_carefully,
+    move_carefully,
+    rates_at,
+)
+from nics_drl_bridge.sim.state import (
+    Array,
+    Dynamics,
+    Lanes,
+    Members,
+    Scratch,
+    State,
+    Surroundings,
+)
 
 TOGETHER = 48  # Robots whose scans, with their faults, are made together: they stay in the L2 cache
 
@@ -31,11 +43,17 @@ def surroundings_of(n: int, members: Members) -> Surroundings:
     frame = members.fixtures.frames[p]
     distances = cells_of(members.distances, members.fields[p])
     grid = records.MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
-    movers = records.Movers(members.moves, members.plans[p], members.waypoints, members.field[p])
+    movers = records.Movers(
+        members.moves, members.plans[p], members.waypoints, members.field[p]
+    )
     return Surroundings(
-        walls_of(n, members.fixtures), grid, members.outlines, members.crowded,
-        members.standing, movers,
-    )  # fmt: skip
+        walls_of(n, members.fixtures),
+        grid,
+        members.outlines,
+        members.crowded,
+        members.standing,
+        movers,
+    )
 
 
 @kernel
@@ -50,7 +68,9 @@ def _send(history: Array, commands: Array, begin: int, curves: Array) -> None:
 
 
 @kernel
-def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes) -> None:
+def move_freely(
+    begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes
+) -> None:
     """Moves robot m of world n of [begin, end) one period freely, in lane (n - begin) M + m."""
     robots, size = state.pose.shape[1], state.state.shape[2]
     substeps, history = motion.substeps, state.history
@@ -86,7 +106,12 @@ def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lan
 
 @kernel
 def _move_world(
-    n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
+    n: int,
+    skip: int,
+    state: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    scratch: Scratch,
 ) -> None:
     lanes, nearby, single = scratch.lanes, scratch.nearby, scratch.single
     pose, period = state.pose, motion.dt * motion.substeps
@@ -100,7 +125,9 @@ def _move_world(
         scratch.cells.frame[n, cells.MOVED] = longest
     tight = False
     for m in range(robots):
-        nearby.meets[m] = contacts.find_near(n, m, state.bodies, scene, nearby, scratch.cells)
+        nearby.meets[m] = contacts.find_near(
+            n, m, state.bodies, scene, nearby, scratch.cells
+        )
         tight = tight or nearby.meets[m] != contacts.FREE
     for m in range(robots):
         if nearby.meets[m] == contacts.FREE:
@@ -126,14 +153,21 @@ def _move_world(
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
     """Steps the worlds of a part, from `begin` on, under commands (n, M, C) for a period."""
     part = packed.content
-    _step(part.state, part.members, part.lidar, part.motion, part.scratch, commands, begin)
+    _step(
+        part.state, part.members, part.lidar, part.motion, part.scratch, commands, begin
+    )
 
 
 @kernel
 def _step(
-    state: State, members: Members, lidar: LidarArrays, motion: Dynamics, scratch: Scratch,
-    commands: Array, begin: int,
-) -> None:  # fmt: skip
+    state: State,
+    members: Members,
+    lidar: LidarArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+    commands: Array,
+    begin: int,
+) -> None:
     """See `step_worlds`; without reference counts, which took longer than the step."""
     many, end = state.pose.shape[1], begin + commands.shape[0]
     _send(state.history, commands, begin, motion.terms.curves)
@@ -148,7 +182,9 @@ def _step(
             skip, scene = (n - low) * many, surroundings_of(n, members)
             _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, scene, motion, scratch)
-            waiting = sensing.scan_or_wait(n, waiting, state, members, lidar, motion, scratch)
+            waiting = sensing.scan_or_wait(
+                n, waiting, state, members, lidar, motion, scratch
+            )
             if n + 1 == high or (n + 1 - scanned) * many >= TOGETHER:
                 sensing.scan_together(waiting, state, members, lidar, scratch)
                 sensing.distort(scanned, n + 1, state, lidar)
@@ -157,13 +193,22 @@ def _step(
 
 @kernel(inline=True)
 def _begin_period(
-    low: int, high: int, state: State, members: Members, motion: Dynamics, scratch: Scratch
+    low: int,
+    high: int,
+    state: State,
+    members: Members,
+    motion: Dynamics,
+    scratch: Scratch,
 ) -> None:
     pose, before, speeds = state.pose, scratch.scans.before, scratch.nearby.speeds
     for n in range(low, high):
         for m in range(pose.shape[1]):
             i, row = (n - low) * pose.shape[1] + m, state.steps[n] % state.past.shape[2]
-            before[i, 0], before[i, 1], before[i, 2] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
+            before[i, 0], before[i, 1], before[i, 2] = (
+                pose[n, m, 0],
+                pose[n, m, 1],
+                pose[n, m, 2],
+            )
             if state.steps[n] == 0:
                 sensing.begin(n, m, state)
             if members.moves:
@@ -178,7 +223,12 @@ def _begin_period(
 
 @kernel(inline=True)
 def _measure(
-    n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
+    n: int,
+    skip: int,
+    state: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    scratch: Scratch,
 ) -> None:
     frame, pose, first = scratch.cells.frame, state.pose, state.velocity.shape[1]
     for m in range(pose.shape[1]):
@@ -188,7 +238,9 @@ def _measure(
         sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
         if scene.crowded:  # the cells count how far the robots came, drift included
             dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
-            frame[n, cells.MOVED] = max(frame[n, cells.MOVED], math.sqrt(dx * dx + dy * dy))
+            frame[n, cells.MOVED] = max(
+                frame[n, cells.MOVED], math.sqrt(dx * dx + dy * dy)
+            )
 
 
 @kernel
@@ -220,7 +272,9 @@ def begin(packed: Any, chosen: records.Integers) -> None:
         if part.members.moves:
             obstacles.begin(chosen[i], state, scene.movers.plans)
         sort(chosen[i], state, scene, part.scratch)
-    sensing.scan_together(chosen.shape[0], state, part.members, part.lidar, part.scratch)
+    sensing.scan_together(
+        chosen.shape[0], state, part.members, part.lidar, part.scratch
+    )
     for n in chosen:
         sensing.distort(n, n + 1, state, part.lidar)
 
@@ -234,14 +288,21 @@ def begin_period(packed: Any) -> None:
 
 
 @kernel(allocates=True)
-def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: Array) -> None:
+def end_period(
+    packed: Any, true: Array, before: Array, wheels: Array, counted: Array
+) -> None:
     """Measures what the robots sense at the end of a period in which they were moved from outside.
 
     Robots and obstacles stand where the period ends. All others are (N, M, 3): the true twist at
     the end, the pose by the wheels alone before and after, and the twist by the wheels at the end.
     """
     part = packed.content
-    state, members, motion, scratch = part.state, part.members, part.motion, part.scratch
+    state, members, motion, scratch = (
+        part.state,
+        part.members,
+        part.motion,
+        part.scratch,
+    )
     first, waiting = state.velocity.shape[1], 0
     for n in range(state.pose.shape[0]):
         state.steps[n] += 1
@@ -253,7 +314,9 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
                 row[m, sensing.POSE + i] = state.pose[n, m, i]
                 row[m, sensing.TWIST + i] = true[n, m, i]
         sort(n, state, surroundings_of(n, members), scratch)
-        waiting = sensing.scan_or_wait(n, waiting, state, members, part.lidar, motion, scratch)
+        waiting = sensing.scan_or_wait(
+            n, waiting, state, members, part.lidar, motion, scratch
+        )
     sensing.scan_together(waiting, state, members, part.lidar, scratch)
     sensing.distort(0, state.pose.shape[0], state, part.lidar)
 

@@ -33,18 +33,28 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 class Obstacles(Schema):
     """A group of obstacles with common properties."""
 
-    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)  # each takes any
-    count: int | tuple[int, int] | None = None  # or [least, greatest], drawn per episode
+    shapes: tuple[Shape, ...] = Field(
+        min_length=1, max_length=MOST_SHAPES
+    )  # each takes any
+    count: int | tuple[int, int] | None = (
+        None  # or [least, greatest], drawn per episode
+    )
     gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
-    at: tuple[Pose, ...] = ()  # fixed poses, x, y [m], heading [rad], instead of `count` at random
-    motion: Motion | None = None  # their motion, see `sim.obstacles`; by default they stand still
+    at: tuple[
+        Pose, ...
+    ] = ()  # fixed poses, x, y [m], heading [rad], instead of `count` at random
+    motion: Motion | None = (
+        None  # their motion, see `sim.obstacles`; by default they stand still
+    )
 
     @field_validator("count", mode="before")
     @classmethod
     def _numbers(cls, count: object) -> object:
         several = count if isinstance(count, list | tuple) else (count, count)
         whole = len(several) == 2 and all(type(n) is int for n in several)
-        if count is not None and not (whole and 0 <= several[0] <= several[1] <= MOST_OBSTACLES):
+        if count is not None and not (
+            whole and 0 <= several[0] <= several[1] <= MOST_OBSTACLES
+        ):
             needed = f"a whole number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
             raise ValueError(f"count must be {needed}")
         return count
@@ -66,7 +76,9 @@ class Obstacles(Schema):
 class Places(Schema):
     """Places in regions, x1, y1, x2, y2 of opposite corners [m], or at poses or points."""
 
-    regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)  # x1, y1, x2, y2 [m]
+    regions: tuple[Region, ...] = Field(
+        default=(), max_length=MOST_PLACES
+    )  # x1, y1, x2, y2 [m]
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
@@ -79,7 +91,9 @@ class Places(Schema):
 class Starts(Places):
     """Places where robots start: any point of the regions, or one of the poses."""
 
-    at: tuple[Pose, ...] = Field(default=(), max_length=MOST_PLACES)  # x, y [m], heading [rad]
+    at: tuple[Pose, ...] = Field(
+        default=(), max_length=MOST_PLACES
+    )  # x, y [m], heading [rad]
 
 
 class Goals(Places):
@@ -92,15 +106,21 @@ class World(Schema):
     """World of the episodes; everything is in the frame `map`."""
 
     name: str  # the name users refer to it by
-    size: tuple[Side, Side] | None = None  # along x, y of a walled field around the origin [m]
+    size: tuple[Side, Side] | None = (
+        None  # along x, y of a walled field around the origin [m]
+    )
     bounds: Region | None = None  # instead, x1, y1, x2, y2 of a field without walls [m]
     # further straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
     # a static map beside or instead of a field: a shipped one, or Nav2's YAML, from this folder
     map: str | None = None
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
-    clearance: Distance = 0.3  # around the footprint at start, goal, and on a path between [m]
-    goal_distance: tuple[Distance, Distance]  # least and greatest, from start straight to goal [m]
+    clearance: Distance = (
+        0.3  # around the footprint at start, goal, and on a path between [m]
+    )
+    goal_distance: tuple[
+        Distance, Distance
+    ]  # least and greatest, from start straight to goal [m]
     starts: Starts | None = None  # where robots start; None: anywhere with room
     goals: Goals | None = None  # where goals lie; None: anywhere with room
     _file: str | None = PrivateAttr(default=None)
@@ -111,10 +131,14 @@ class World(Schema):
         if self.size is None and self.bounds is None and self.map is None:
             raise ValueError("a world needs a `size`, `bounds`, or a `map`")
         if self.size is not None and self.bounds is not None:
-            raise ValueError("a field has either a `size` and walls, or `bounds` and none")
+            raise ValueError(
+                "a field has either a `size` and walls, or `bounds` and none"
+            )
         x1, y1, x2, y2 = self.bounds or (0.0, 0.0, 1.0, 1.0)
         if not all(SMALLEST_FIELD <= side <= LARGEST for side in (x2 - x1, y2 - y1)):
-            raise ValueError("bounds must be [least x, least y, greatest x, greatest y] in metres")
+            raise ValueError(
+                "bounds must be [least x, least y, greatest x, greatest y] in metres"
+            )
         field = self.size or (x2 - x1, y2 - y1)
         if (across := math.hypot(*field)) > MOST_ACROSS_M:
             fix = f"a field may be {MOST_ACROSS_M:g} m across, the farthest that a task can tell"
@@ -123,7 +147,9 @@ class World(Schema):
         if not 0.0 <= self.goal_distance[0] < self.goal_distance[1]:
             raise ValueError("goal_distance must be [least, greatest] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:
-            raise ValueError(f"all groups of obstacles together may have {MOST_OBSTACLES}")
+            raise ValueError(
+                f"all groups of obstacles together may have {MOST_OBSTACLES}"
+            )
         return self
 
     @property
@@ -158,14 +184,18 @@ class World(Schema):
         absent = {"bounds"} if self.bounds is None else set()
         content = self.model_dump_json(exclude={"map", *absent}).encode()
         if self.grid is not None:
-            about = repr((self.grid.cells.shape, self.grid.resolution, self.grid.origin))
+            about = repr(
+                (self.grid.cells.shape, self.grid.resolution, self.grid.origin)
+            )
             content += about.encode() + self.grid.cells.tobytes()
         return f"{self.name}-{sha256(content)[:8]}"
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
         """The distinct shapes of the obstacles."""
-        return tuple(dict.fromkeys(shape for group in self.obstacles for shape in group.shapes))
+        return tuple(
+            dict.fromkeys(shape for group in self.obstacles for shape in group.shapes)
+        )
 
     @property
     def extent(self) -> Region:
@@ -210,7 +240,9 @@ def check_places(world: World) -> None:
         where = f"{world.source}: key 'obstacles.{g}"
         for n, pose in enumerate(group.at):
             if not _inside(world, *pose[:2]):
-                raise ConfigError(f"{where}.at.{n}': {list(pose)} is outside the world; move it.")
+                raise ConfigError(
+                    f"{where}.at.{n}': {list(pose)} is outside the world; move it."
+                )
         radius = max(shape.radius for shape in group.shapes)
         waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
         for n, point in enumerate(waypoints):
@@ -219,7 +251,9 @@ def check_places(world: World) -> None:
                 raise ConfigError(f"{where}.motion.waypoints.{n}': {reason}; move it.")
 
 
-def check_place(what: str, world: World, x: float, y: float, radius: float = 0.0) -> None:
+def check_place(
+    what: str, world: World, x: float, y: float, radius: float = 0.0
+) -> None:
     """Raises ConfigError for a place off a world's field, or in a wall within a radius [m]."""
     solid = 0.0 if world.grid is None else world.grid.resolution  # room in a full cell
     if (room := room_at(world, x, y)) <= max(radius, solid):

@@ -65,13 +65,18 @@ class WorldSet:
     @cached_property
     def shapes(self) -> tuple[Shape, ...]:
         """The distinct shapes of all obstacles."""
-        return tuple(dict.fromkeys(shape for world in self.members for shape in world.shapes))
+        return tuple(
+            dict.fromkeys(shape for world in self.members for shape in world.shapes)
+        )
 
     @cached_property
     def extent(self) -> Region:
         """Least x, least y, greatest x, greatest y of all members [m]."""
         extents = np.array([world.extent for world in self.members])
-        low, high = extents[:, :2].min(axis=0).tolist(), extents[:, 2:].max(axis=0).tolist()
+        low, high = (
+            extents[:, :2].min(axis=0).tolist(),
+            extents[:, 2:].max(axis=0).tolist(),
+        )
         return low[0], low[1], high[0], high[1]
 
 
@@ -112,14 +117,24 @@ def _content(path: Path, keys: tuple[str, ...]) -> dict[str, Any] | None:
     if path.suffix not in YAML or not path.is_file():
         return None
     text = read_text(path)
-    content = parse_yaml(text, str(path)) if any(f"{key}:" in text for key in keys) else None
-    return content if isinstance(content, dict) and any(key in content for key in keys) else None
+    content = (
+        parse_yaml(text, str(path)) if any(f"{key}:" in text for key in keys) else None
+    )
+    return (
+        content
+        if isinstance(content, dict) and any(key in content for key in keys)
+        else None
+    )
 
 
 def _read_set(path: Path, file: SetFile) -> WorldSet:
     try:
         without = {world.source for world in _members(file.without, path.parent)}
-        chosen = [one for one in _members(file.worlds, path.parent) if one.source not in without]
+        chosen = [
+            one
+            for one in _members(file.worlds, path.parent)
+            if one.source not in without
+        ]
         if (given := file.generate) is not None:
             chosen += [grow(given, number) for number in range(given.worlds)]
     except ConfigError as error:
@@ -132,7 +147,9 @@ def _set_of(name: str, members: Sequence[World], source: str = "") -> WorldSet:
     if not members:
         raise ConfigError(f"{source}: holds no world; name at least one.")
     if len(members) > MOST_MEMBERS:
-        raise ConfigError(f"{source}: holds {len(members)} worlds; {MOST_MEMBERS} are the most.")
+        raise ConfigError(
+            f"{source}: holds {len(members)} worlds; {MOST_MEMBERS} are the most."
+        )
     return WorldSet(name, tuple(members))
 
 
@@ -157,8 +174,12 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
 
 def _member(path: Path) -> World:
     if _content(path, KEYS) is not None:
-        raise ConfigError(f"{path}: is a world set, and a set holds worlds; name its worlds.")
+        raise ConfigError(
+            f"{path}: is a world set, and a set holds worlds; name its worlds."
+        )
     if path.suffix in GAZEBO or _content(path, MAP_KEYS) is not None:
         kind = "a world of Gazebo" if path.suffix in GAZEBO else "a map"
-        raise ConfigError(f"{path}: is {kind}; make a world of it by `{IMPORT} {path}`.")
+        raise ConfigError(
+            f"{path}: is {kind}; make a world of it by `{IMPORT} {path}`."
+        )
     return load_world(path)

@@ -34,13 +34,21 @@ class BagSource:
     """
 
     def __init__(
-        self, path: str | Path, model: SimulatorModel, topics: Mapping[str, str],
+        self,
+        path: str | Path,
+        model: SimulatorModel,
+        topics: Mapping[str, str],
         world: AnyWorld | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._times, self._shots, lidar = _read(path, model, topics)
         self._model = replace(model, lidar=lidar)
-        self._path, self._world = Path(path), world or place_of(self._model, self._shots)
-        self.period_s = float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.1
+        self._path, self._world = (
+            Path(path),
+            world or place_of(self._model, self._shots),
+        )
+        self.period_s = (
+            float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.1
+        )
         self._now = 0
 
     def stage(self) -> Stage:
@@ -52,7 +60,9 @@ class BagSource:
         """See `show.FrameSource`."""
         poses = np.array([shot.poses for shot in self._shots[: self._now + 1]])
         step = -(-len(poses) // Track.MOST)
-        ways = tuple(np.concatenate([poses[::step], poses[-1:]])[:, :, :2].transpose(1, 0, 2))
+        ways = tuple(
+            np.concatenate([poses[::step], poses[-1:]])[:, :, :2].transpose(1, 0, 2)
+        )
         state = "the end" if self._now == len(self._shots) - 1 else ""
         world = WorldFrame(self._shots[self._now], self._path.name, 0, ways, state)
         return Frame(float(self._times[self._now]), (world,))
@@ -94,12 +104,18 @@ def _read(
             continue
         stamps.append(middleware.newest_ns or 0)
         view = middleware.view(stamps[-1])
-        shots.append(Snapshot(
-            view.pose[None], view.ranges[None], np.zeros((0, BODY)), np.zeros((0, 2)),
-            step=len(shots), estimates=view.pose[None],
-            covariance=middleware.estimator.covariance[None, :3, :3].copy(),
-            commands=None if command is None else command[None],
-        ))  # fmt: skip
+        shots.append(
+            Snapshot(
+                view.pose[None],
+                view.ranges[None],
+                np.zeros((0, BODY)),
+                np.zeros((0, 2)),
+                step=len(shots),
+                estimates=view.pose[None],
+                covariance=middleware.estimator.covariance[None, :3, :3].copy(),
+                commands=None if command is None else command[None],
+            )
+        )
     if not shots:
         reason = "none of its odometry and scans could be used"
         raise RecordingError(f"{path}: {reason}; see nics bag info.")
@@ -111,7 +127,11 @@ def place_of(model: SimulatorModel, shots: list[Snapshot]) -> World:
     poses = np.concatenate([shot.poses[:, :2] for shot in shots])
     some = shots[:: max(1, len(shots) // 50)]
     seen = [hits_of(model.lidar, shot.poses[0], shot.ranges[0]) for shot in some]
-    ends = np.percentile(np.concatenate([poses, *seen]), [100.0 - WITHIN, WITHIN], axis=0)
+    ends = np.percentile(
+        np.concatenate([poses, *seen]), [100.0 - WITHIN, WITHIN], axis=0
+    )
     low = np.minimum(ends[0], poses.min(axis=0)) - MARGIN_M
     high = np.maximum(ends[1], poses.max(axis=0)) + MARGIN_M
-    return World(name="bag", bounds=(*low.tolist(), *high.tolist()), goal_distance=(0.0, 1.0))
+    return World(
+        name="bag", bounds=(*low.tolist(), *high.tolist()), goal_distance=(0.0, 1.0)
+    )

@@ -25,12 +25,25 @@ from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 Env = gymnasium.Env[Any, Any]
-Make = Callable[[str, AnyWorld], tuple[Env, Policy]]  # for a policy and a world, see `env_of`
+Make = Callable[
+    [str, AnyWorld], tuple[Env, Policy]
+]  # for a policy and a world, see `env_of`
 HELD_S = 0.5  # without a request of the keyboard for so long, the robot stops [s]
 LINGER_S = 1.0  # of simulated time between the end of an episode and the next one [s]
-CAN = frozenset({
-    "goal", "obstacle", "clear", "policy", "world", "seed", "restart", "pause", "speed", "step",
-})  # fmt: skip
+CAN = frozenset(
+    {
+        "goal",
+        "obstacle",
+        "clear",
+        "policy",
+        "world",
+        "seed",
+        "restart",
+        "pause",
+        "speed",
+        "step",
+    }
+)
 
 
 class Lane:
@@ -73,18 +86,24 @@ class Lane:
         if self.state:
             self._over_s += self.env.model.control_period
             return False
-        action = self._driver.act(self._seen) if command is None else self._action(command)
+        action = (
+            self._driver.act(self._seen) if command is None else self._action(command)
+        )
         self._seen, _, terminated, truncated, info = self._env.step(action)
         self.time_s += self.env.model.control_period
         self.trail.add(self.env.snapshot().poses, 1)
         if terminated or truncated:
-            touched = "collision" if np.any(info.get("collision", False)) else "time-out"
+            touched = (
+                "collision" if np.any(info.get("collision", False)) else "time-out"
+            )
             self.state = "success" if np.all(info.get("is_success", False)) else touched
         return False
 
     def _action(self, command: NDArray[np.float64]) -> Any:
         if self.task.actions == "discrete":
-            return int(np.abs(self.task.discrete_commands - command).sum(axis=-1).argmin())
+            return int(
+                np.abs(self.task.discrete_commands - command).sum(axis=-1).argmin()
+            )
         return actions_of(self.task, command)
 
     def anew(self, seed: float) -> bool:
@@ -119,7 +138,9 @@ class Lane:
         reach = shape.radius + self.env.model.robot.footprint_radius
         apart = np.linalg.norm(self.env.snapshot().poses[:, :2] - (x, y), axis=1)
         if apart.min() <= reach:
-            raise ConfigError(f"an obstacle at ({x:.2f} m, {y:.2f} m) touches the robot; move it.")
+            raise ConfigError(
+                f"an obstacle at ({x:.2f} m, {y:.2f} m) touches the robot; move it."
+            )
         self._rebuild(self._policy, Obstacles(shapes=(shape,), at=((x, y, 0.0),)))
 
     def clear(self) -> None:
@@ -153,7 +174,9 @@ def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
     """The world of an env with its obstacles where they are now, or none, and more of them."""
     shot = env.snapshot()
     world, shapes, groups = env.world.members[shot.member], env.world.shapes, list(more)
-    motions = [group.motion for group in world.obstacles for _ in range(group.counts[1])]
+    motions = [
+        group.motion for group in world.obstacles for _ in range(group.counts[1])
+    ]
     for body, motion in zip(shot.bodies, motions, strict=False):
         if body[RADIUS] > 0.0 and not emptied:
             shape = shapes[int(body[SHAPE]) % len(shapes)]
@@ -166,7 +189,9 @@ def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
 class EpisodeSource:
     """Drives episodes in one world or several at once. Raises BridgeError."""
 
-    def __init__(self, make: Make, policy: str, worlds: Sequence[AnyWorld], seed: int) -> None:
+    def __init__(
+        self, make: Make, policy: str, worlds: Sequence[AnyWorld], seed: int
+    ) -> None:
         self._first = seed
         self._given_policy = policy
         self._given_worlds = {world.name: world for world in worlds}
@@ -175,21 +200,29 @@ class EpisodeSource:
         self.period_s, self._policy = self.model.control_period, policy
         robot = self.model.robot
         self._drives = robot.takes_cmd_vel
-        self._command, self._by_hand, self._asked_s = 0.0 * robot.command_low, False, 0.0
+        self._command, self._by_hand, self._asked_s = (
+            0.0 * robot.command_low,
+            False,
+            0.0,
+        )
 
     def stage(self) -> Stage:
         """See `show.FrameSource`."""
         robot, first = self.model.robot.name, self.lanes[0].world.name
         fitting = [name for name in shipped_policies() if name == robot]
         can = CAN | {"drive"} if self._drives else CAN
-        policies = dict.fromkeys([self._policy, self._given_policy, *fitting, *POLICIES])
+        policies = dict.fromkeys(
+            [self._policy, self._given_policy, *fitting, *POLICIES]
+        )
         worlds = dict.fromkeys([first, *self._given_worlds, *shipped_names("worlds")])
         return Stage(
-            f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}", self.model,
-            tuple(lane.env.world for lane in self.lanes), can,
+            f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}",
+            self.model,
+            tuple(lane.env.world for lane in self.lanes),
+            can,
             {"policy": list(policies), "world": list(worlds)},
             {"policy": self._policy, "world": first},
-        )  # fmt: skip
+        )
 
     def frame(self) -> Frame:
         """See `show.FrameSource`."""
@@ -201,7 +234,9 @@ class EpisodeSource:
         """Advances all worlds by one control period; see `show.FrameSource`."""
         held = time.monotonic() - self._asked_s < HELD_S
         command = self._command if held else 0.0 * self._command
-        changed = [lane.advance(command if self._by_hand else None) for lane in self.lanes]
+        changed = [
+            lane.advance(command if self._by_hand else None) for lane in self.lanes
+        ]
         return any(changed)
 
     def take(self, request: Request) -> bool:
@@ -226,7 +261,9 @@ class EpisodeSource:
         if request.kind == "obstacle":
             side = 2.0 * request.size
             round_ = request.shape == "circle"
-            shape = Circle(radius=request.size) if round_ else Rectangle(size=(side, side))
+            shape = (
+                Circle(radius=request.size) if round_ else Rectangle(size=(side, side))
+            )
             lane.add(shape, request.x, request.y)
         elif request.kind == "clear":
             lane.clear()
@@ -239,16 +276,23 @@ class EpisodeSource:
 
     def unfinished(self, episodes: int) -> bool:
         """True until so many episodes have been driven and shown to their ends in every world."""
-        return any(lane.seed < self._first + episodes - 1 or not lane.over for lane in self.lanes)
+        return any(
+            lane.seed < self._first + episodes - 1 or not lane.over
+            for lane in self.lanes
+        )
 
     def _drive(self, request: Request) -> None:
         """Takes shares of the greatest speed forward, to the left, and turning left."""
         robot = self.model.robot
         if not self._drives:
-            raise ConfigError(f"robot {robot.name!r} takes no cmd_vel: no keyboard drives it.")
+            raise ConfigError(
+                f"robot {robot.name!r} takes no cmd_vel: no keyboard drives it."
+            )
         shares = np.clip(np.array(request.twist)[list(robot.cmd_vel_places)], -1.0, 1.0)
         ends = np.where(shares < 0.0, robot.command_low, robot.command_high)
-        self._command = np.clip(np.abs(shares) * ends, robot.command_low, robot.command_high)
+        self._command = np.clip(
+            np.abs(shares) * ends, robot.command_low, robot.command_high
+        )
         self._by_hand, self._asked_s = request.on, time.monotonic()
 
     def close(self) -> None:

@@ -28,9 +28,15 @@ class Stage:
 
     title: str
     model: SimulatorModel
-    worlds: tuple[AnyWorld, ...]  # whose members, one after the other, are the places of the frames
-    can: frozenset[str] = frozenset()  # requests that the source takes, see `server.Request`
-    choices: Mapping[str, Sequence[str]] = field(default_factory=dict)  # of policies and worlds
+    worlds: tuple[
+        AnyWorld, ...
+    ]  # whose members, one after the other, are the places of the frames
+    can: frozenset[str] = (
+        frozenset()
+    )  # requests that the source takes, see `server.Request`
+    choices: Mapping[str, Sequence[str]] = field(
+        default_factory=dict
+    )  # of policies and worlds
     chosen: Mapping[str, str] = field(default_factory=dict)
     span_s: tuple[float, float] | None = None  # of a bag [s]
 
@@ -41,35 +47,51 @@ class Stage:
             {"name": one.name, "unit": one.unit, "min": one.min, "max": one.max}
             for one in robot.command
         ]
-        places = [_place(one, each.shapes) for each in self.worlds for one in each.members]
+        places = [
+            _place(one, each.shapes) for each in self.worlds for one in each.members
+        ]
         return {
-            "kind": "stage", "title": self.title, "can": sorted(self.can), "commands": commands,
-            "sideways": robot.moves_sideways, "footprint": robot.footprint,
+            "kind": "stage",
+            "title": self.title,
+            "can": sorted(self.can),
+            "commands": commands,
+            "sideways": robot.moves_sideways,
+            "footprint": robot.footprint,
             "radius": robot.footprint_radius,
             "lidar": {
-                "mount": lidar.mount, "first": lidar.angle_min, "step": lidar.angle_increment,
+                "mount": lidar.mount,
+                "first": lidar.angle_min,
+                "step": lidar.angle_increment,
                 "far": lidar.range_max,
             },
-            "places": places, "span": self.span_s, "chosen": dict(self.chosen),
+            "places": places,
+            "span": self.span_s,
+            "chosen": dict(self.chosen),
             "choices": {name: list(some) for name, some in self.choices.items()},
-        }  # fmt: skip
+        }
 
 
 def _place(world: World, shapes: Sequence[Shape]) -> dict[str, Any]:
     outlines = [np.round(shape.outline / shape.radius, 4).tolist() for shape in shapes]
     return {
-        "name": world.name, "extent": world.extent, "walls": world.all_walls().tolist(),
-        "map": None if world.grid is None else _map(world.grid), "shapes": outlines,
-    }  # fmt: skip
+        "name": world.name,
+        "extent": world.extent,
+        "walls": world.all_walls().tolist(),
+        "map": None if world.grid is None else _map(world.grid),
+        "shapes": outlines,
+    }
 
 
 def _map(grid: GridMap) -> dict[str, Any]:
     """Cells of a map, a byte each: 0 free, 1 unknown, 2 blocked."""
     cells = np.where(grid.free, 0, np.where(grid.blocked, 2, 1)).astype(np.uint8)
     return {
-        "rows": cells.shape[0], "columns": cells.shape[1], "resolution": grid.resolution,
-        "origin": grid.origin, "cells": base64.b64encode(cells.tobytes()).decode(),
-    }  # fmt: skip
+        "rows": cells.shape[0],
+        "columns": cells.shape[1],
+        "resolution": grid.resolution,
+        "origin": grid.origin,
+        "cells": base64.b64encode(cells.tobytes()).decode(),
+    }
 
 
 @dataclass(frozen=True)
@@ -90,14 +112,26 @@ class WorldFrame:
         kinds = there[:, SHAPE].astype(int).tolist()
         ranges = np.where(np.isfinite(shot.ranges), shot.ranges, NO_RETURN / MM)
         return {
-            "name": self.name, "place": self.place, "state": self.state, "gate": shot.gate,
-            "poses": thousandths(shot.poses), "ranges": thousandths(ranges),
-            "bodies": thousandths(bodies), "kinds": kinds, "goals": thousandths(shot.goals),
+            "name": self.name,
+            "place": self.place,
+            "state": self.state,
+            "gate": shot.gate,
+            "poses": thousandths(shot.poses),
+            "ranges": thousandths(ranges),
+            "bodies": thousandths(bodies),
+            "kinds": kinds,
+            "goals": thousandths(shot.goals),
             "trails": [thousandths(trail) for trail in self.trails],
-            "estimates": None if shot.estimates is None else thousandths(shot.estimates),
-            "ellipses": None if shot.covariance is None else [_ellipse(c) for c in shot.covariance],
-            "commands": None if shot.commands is None else np.round(shot.commands, 3).tolist(),
-        }  # fmt: skip
+            "estimates": None
+            if shot.estimates is None
+            else thousandths(shot.estimates),
+            "ellipses": None
+            if shot.covariance is None
+            else [_ellipse(c) for c in shot.covariance],
+            "commands": None
+            if shot.commands is None
+            else np.round(shot.commands, 3).tolist(),
+        }
 
 
 def _ellipse(covariance: Array) -> list[float]:
@@ -105,7 +139,11 @@ def _ellipse(covariance: Array) -> list[float]:
     values, vectors = np.linalg.eigh(covariance[:2, :2])
     scale = -2.0 * math.log(0.05)  # quantile of chi squared with two degrees of freedom
     small, large = np.sqrt(np.maximum(values, 0.0) * scale).tolist()
-    return [round(large, 4), round(small, 4), round(math.atan2(vectors[1, 1], vectors[0, 1]), 4)]
+    return [
+        round(large, 4),
+        round(small, 4),
+        round(math.atan2(vectors[1, 1], vectors[0, 1]), 4),
+    ]
 
 
 def thousandths(values: ArrayLike) -> Any:
@@ -125,7 +163,12 @@ class Frame:
     def plain(self) -> dict[str, Any]:
         """The frame as plain data."""
         worlds = [world.plain() for world in self.worlds]
-        return {"kind": "frame", "time": self.time_s, "note": self.note, "worlds": worlds}
+        return {
+            "kind": "frame",
+            "time": self.time_s,
+            "note": self.note,
+            "worlds": worlds,
+        }
 
 
 class Track:

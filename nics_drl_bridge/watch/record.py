@@ -55,19 +55,26 @@ def beside(row: list[Pixels]) -> Pixels:
 def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     """Writes a GIF that repeats for ever."""
     every = list(shown)
-    palette = palette_of(every[:: -(-len(every) // SAMPLES)])  # one for all, or colours flicker
+    palette = palette_of(
+        every[:: -(-len(every) // SAMPLES)]
+    )  # one for all, or colours flicker
     first, *rest = [
-        Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in every
+        Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE)
+        for each in every
     ]
     buffer, duration = io.BytesIO(), round(1000.0 / fps)
-    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
+    first.save(
+        buffer, "GIF", save_all=True, append_images=rest, duration=duration, loop=0
+    )
     write_bytes(path, buffer.getvalue())
 
 
 def palette_of(some: list[Pixels]) -> Image.Image:
     """Palette of the most frequent colours that differ: means would lose those of small things."""
     parts = np.concatenate([each.reshape(-1, 3) for each in some]).astype(np.int64)
-    colours, counts = np.unique(parts @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
+    colours, counts = np.unique(
+        parts @ np.array([1 << 16, 1 << 8, 1]), return_counts=True
+    )
     best = colours[np.argsort(-counts)]
     rows = np.stack([best >> 16, best >> 8 & 255, best & 255], axis=1)
     chosen = rows[:0]
@@ -87,8 +94,15 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     first = next(shown)
     height, width = first.shape[:2]
     with whole_file(path) as part:
-        options = {"fps": fps, "macro_block_size": 2, "quality": 8, "ffmpeg_log_level": "error"}
-        with closing(imageio_ffmpeg.write_frames(str(part), (width, height), **options)) as video:
+        options = {
+            "fps": fps,
+            "macro_block_size": 2,
+            "quality": 8,
+            "ffmpeg_log_level": "error",
+        }
+        with closing(
+            imageio_ffmpeg.write_frames(str(part), (width, height), **options)
+        ) as video:
             video.send(None)
             for each in chain([first], shown):
                 video.send(np.ascontiguousarray(each))
@@ -98,7 +112,10 @@ def write_rrd(path: Path, stage: Stage, frames: Iterable[Frame]) -> None:
     """Writes a recording of Rerun."""
     import rerun
 
-    with whole_file(path) as part, rerun.RecordingStream("nics_drl_bridge") as recording:
+    with (
+        whole_file(path) as part,
+        rerun.RecordingStream("nics_drl_bridge") as recording,
+    ):
         recording.save(str(part))
         members = [member for world in stage.worlds for member in world.members]
         for frame in frames:
@@ -117,18 +134,30 @@ def _log(rerun: Any, recording: Any, at: str, stage: Stage, world: WorldFrame) -
     shot, model = world.shot, stage.model
     shapes = [shape for each in stage.worlds for shape in each.shapes]
     bodies = [
-        FLIP * _ring(body[[X, Y, HEADING]], body[RADIUS], shapes[int(body[SHAPE]) % len(shapes)])
+        FLIP
+        * _ring(
+            body[[X, Y, HEADING]], body[RADIUS], shapes[int(body[SHAPE]) % len(shapes)]
+        )
         for body in shot.bodies
         if body[RADIUS] > 0.0
     ]
-    recording.log(f"{at}/obstacles", rerun.LineStrips2D(bodies, colors=[0x8D, 0x99, 0xAE]))
-    recording.log(f"{at}/goals", rerun.Points2D(FLIP * shot.goals, radii=0.1, colors=[230, 159, 0]))
+    recording.log(
+        f"{at}/obstacles", rerun.LineStrips2D(bodies, colors=[0x8D, 0x99, 0xAE])
+    )
+    recording.log(
+        f"{at}/goals",
+        rerun.Points2D(FLIP * shot.goals, radii=0.1, colors=[230, 159, 0]),
+    )
     for m, (pose, ranges) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
         robot, own = model.robot, f"{at}/robot_{m}"
         ring = _ring(pose, robot.footprint_radius, robot)
-        recording.log(f"{own}/footprint", rerun.LineStrips2D([FLIP * ring], colors=[0, 114, 178]))
+        recording.log(
+            f"{own}/footprint", rerun.LineStrips2D([FLIP * ring], colors=[0, 114, 178])
+        )
         hits = hits_of(model.lidar, pose, ranges)
-        recording.log(f"{own}/scan", rerun.Points2D(FLIP * hits, radii=0.02, colors=[213, 94, 0]))
+        recording.log(
+            f"{own}/scan", rerun.Points2D(FLIP * hits, radii=0.02, colors=[213, 94, 0])
+        )
         if world.trails:
             way = [FLIP * world.trails[m]]
             recording.log(f"{own}/trail", rerun.LineStrips2D(way, colors=[0, 158, 115]))
@@ -148,13 +177,19 @@ def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     if not len(corners):
         turns = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
         corners = radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    return np.asarray(geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2])
+    return np.asarray(
+        geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
+    )
 
 
 LIBRARIES = {".mp4": ("imageio_ffmpeg",), ".rrd": ("rerun",)}
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
-    ".gif": lambda path, stage, frames, fps: write_gif(path, pictures(stage, frames), fps),
-    ".mp4": lambda path, stage, frames, fps: write_mp4(path, pictures(stage, frames), fps),
+    ".gif": lambda path, stage, frames, fps: write_gif(
+        path, pictures(stage, frames), fps
+    ),
+    ".mp4": lambda path, stage, frames, fps: write_mp4(
+        path, pictures(stage, frames), fps
+    ),
     ".rrd": lambda path, stage, frames, _: write_rrd(path, stage, frames),
 }
 

@@ -20,30 +20,59 @@ from nics_drl_bridge.watch.frame import Frame, Stage
 
 HOST, PORT = "127.0.0.1", 8765
 MOST_REQUESTS, MOST_BYTES = 256, 4096
-QUIET = logging.Logger("pages", logging.CRITICAL + 1)  # one that sleeps or errs is no news
-POLICY = "; ".join([  # nothing comes from elsewhere, and nothing goes there
-    "default-src 'none'", "script-src 'unsafe-inline'", "style-src 'unsafe-inline'",
-    "img-src data:", "connect-src 'self' ws://{host}", "base-uri 'none'", "form-action 'none'",
-    "frame-ancestors 'none'",
-])  # fmt: skip
+QUIET = logging.Logger(
+    "pages", logging.CRITICAL + 1
+)  # one that sleeps or errs is no news
+POLICY = "; ".join(
+    [  # nothing comes from elsewhere, and nothing goes there
+        "default-src 'none'",
+        "script-src 'unsafe-inline'",
+        "style-src 'unsafe-inline'",
+        "img-src data:",
+        "connect-src 'self' ws://{host}",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    ]
+)
 
 
 class Request(Schema):
     """A request of a page."""
 
     kind: Literal[
-        "goal", "obstacle", "clear", "drive", "policy", "world", "seed", "restart", "seek",
-        "pause", "speed", "step",
-    ]  # fmt: skip
-    world: int = Field(default=0, ge=0, le=10_000)  # index of the frame's world that is meant
+        "goal",
+        "obstacle",
+        "clear",
+        "drive",
+        "policy",
+        "world",
+        "seed",
+        "restart",
+        "seek",
+        "pause",
+        "speed",
+        "step",
+    ]
+    world: int = Field(
+        default=0, ge=0, le=10_000
+    )  # index of the frame's world that is meant
     x: float = Field(default=0.0, ge=-1e8, le=1e8)  # place of a goal or an obstacle [m]
     y: float = Field(default=0.0, ge=-1e8, le=1e8)
-    size: float = Field(default=0.2, ge=0.01, le=10.0)  # radius, or half side of a box [m]
+    size: float = Field(
+        default=0.2, ge=0.01, le=10.0
+    )  # radius, or half side of a box [m]
     shape: Literal["circle", "box"] = "circle"
     name: str = Field(default="", max_length=500)  # of a policy or a world
-    value: int | float = Field(default=0.0, ge=-GREATEST_SEED, le=GREATEST_SEED)  # speed, seed, [s]
+    value: int | float = Field(
+        default=0.0, ge=-GREATEST_SEED, le=GREATEST_SEED
+    )  # speed, seed, [s]
     on: bool = True  # of a pause, or of driving by hand
-    twist: tuple[float, float, float] = (0.0, 0.0, 0.0)  # shares forward, left, to the left
+    twist: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # shares forward, left, to the left
 
 
 class PageServer:
@@ -57,20 +86,33 @@ class PageServer:
         try:
             from websockets.sync.server import serve
         except ImportError as error:
-            raise ConfigError(f"the page {missing(error.name or 'websockets')}") from None
+            raise ConfigError(
+                f"the page {missing(error.name or 'websockets')}"
+            ) from None
         self._requests: queue.Queue[Request] = queue.Queue(MOST_REQUESTS)
         self._news = threading.Condition()
-        self._texts, self._numbers = ["", "", ""], [0, 0, 0]  # newest stage, notice and frame
+        self._texts, self._numbers = (
+            ["", "", ""],
+            [0, 0, 0],
+        )  # newest stage, notice and frame
         self._pages: set[Any] = set()
         self.closed = False
         try:
             self._server = serve(
-                self._talk, HOST, port, process_request=self._answer, compression=None,
-                max_size=MOST_BYTES, origins=None, logger=QUIET,
-            )  # fmt: skip
+                self._talk,
+                HOST,
+                port,
+                process_request=self._answer,
+                compression=None,
+                max_size=MOST_BYTES,
+                origins=None,
+                logger=QUIET,
+            )
         except OSError as error:
             reason = f"port {port} of {HOST} can't be served ({os.strerror(error.errno or 0)})"
-            raise ConfigError(f"{reason}; take another with --port, 0 for any.") from None
+            raise ConfigError(
+                f"{reason}; take another with --port, 0 for any."
+            ) from None
         address = f"{HOST}:{self._server.socket.getsockname()[1]}"
         self.url = f"http://{address}/"
         self._hosts = {address, address.replace(HOST, "localhost")}
@@ -114,20 +156,27 @@ class PageServer:
 
         host = ", ".join(request.headers.get_all("Host"))
         if host not in self._hosts:  # a foreign name that was made to point here
-            return connection.respond(403, "This page is served to this machine only.\n")
+            return connection.respond(
+                403, "This page is served to this machine only.\n"
+            )
         if request.path == "/socket":
             origins = request.headers.get_all("Origin")  # programs send none
             if all(each.removeprefix("http://") in self._hosts for each in origins):
                 return None
-            return connection.respond(403, "This socket is open to its own page only.\n")
+            return connection.respond(
+                403, "This socket is open to its own page only.\n"
+            )
         if request.path != "/":
             return connection.respond(404, "There is the page / only.\n")
         body = files("nics_drl_bridge.watch").joinpath("page.html").read_bytes()
         about = {
-            "Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body)),
-            "Content-Security-Policy": POLICY.format(host=host), "Cache-Control": "no-store",
-            "X-Content-Type-Options": "nosniff", "Connection": "close",
-        }  # fmt: skip
+            "Content-Type": "text/html; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": POLICY.format(host=host),
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Connection": "close",
+        }
         return Response(200, "OK", Headers(about), body)
 
     def _talk(self, page: Any) -> None:
@@ -156,7 +205,9 @@ class PageServer:
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(map(str, first["loc"])) or "JSON"
-            self.tell(f"a request of the page is not understood: {place}: {first['msg']}.")
+            self.tell(
+                f"a request of the page is not understood: {place}: {first['msg']}."
+            )
 
     def _send(self, page: Any) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -183,7 +234,9 @@ class PageServer:
         """Ends all pages and frees the port; what waits for a frame ends, too."""
         self.closed = True
         for page in tuple(self._pages):
-            with suppress(OSError):  # a page that reads nothing would not answer a farewell
+            with suppress(
+                OSError
+            ):  # a page that reads nothing would not answer a farewell
                 page.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
         self._thread.join()

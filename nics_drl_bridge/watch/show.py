@@ -85,7 +85,9 @@ def check_listed(request: Request, stage: Stage) -> None:
         offered = stage.choices[request.kind]
         if request.name not in offered:
             hint = nearest(request.name, offered)
-            raise ConfigError(f"{request.kind} {request.name!r}: is not on the page's list; {hint}")
+            raise ConfigError(
+                f"{request.kind} {request.name!r}: is not on the page's list; {hint}"
+            )
 
 
 def show(source: FrameSource, server: PageServer) -> None:

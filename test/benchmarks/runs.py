@@ -12,12 +12,17 @@ from typing import Any
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
-def asked(script: str, *options: str, timeout_s: float = 280.0) -> tuple[int, dict[str, Any]]:
+def asked(
+    script: str, *options: str, timeout_s: float = 280.0
+) -> tuple[int, dict[str, Any]]:
     """The exit code of a benchmark and the one JSON object that it prints."""
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / script), "--json", *options],
-        capture_output=True, text=True, check=False, timeout=timeout_s,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=timeout_s,
+    )
     assert done.stdout.count("\n") == 1, done.stdout + done.stderr
     return done.returncode, json.loads(done.stdout, parse_constant=_no_json)
 
@@ -34,7 +39,9 @@ def controls_of(script: str) -> list[str]:
     return []
 
 
-def fails(script: str, control: str, *options: str, timeout_s: float = 280.0) -> list[str]:
+def fails(
+    script: str, control: str, *options: str, timeout_s: float = 280.0
+) -> list[str]:
     """The bars that a benchmark misses under a control, which has to be at least one."""
     code, result = asked(script, "--control", control, *options, timeout_s=timeout_s)
     assert (code, bool(result["failures"])) == (1, True), result

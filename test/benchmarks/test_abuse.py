@@ -22,7 +22,9 @@ def test_what_an_attacker_hands_in_is_refused_in_a_sentence_and_what_is_good_is_
 @pytest.mark.timeout(600)
 def test_without_the_checks_of_policies_and_yaml_bad_files_are_taken():
     missed = fails("abuse.py", "credulous", "--rounds", "12")
-    assert any("tracebacks" in line or "accepted" in line or "hangs" in line for line in missed)
+    assert any(
+        "tracebacks" in line or "accepted" in line or "hangs" in line for line in missed
+    )
 
 
 @pytest.mark.campaign
@@ -30,4 +32,6 @@ def test_without_the_checks_of_policies_and_yaml_bad_files_are_taken():
 @pytest.mark.timeout(600)
 def test_without_the_zero_behind_an_exception_a_robot_moves_on():
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    assert any("moved" in line for line in fails("abuse.py", "no_guard", "--rounds", "2"))
+    assert any(
+        "moved" in line for line in fails("abuse.py", "no_guard", "--rounds", "2")
+    )

@@ -39,5 +39,7 @@ def test_a_robot_that_does_not_move_is_no_round(abuse_env, monkeypatch):
     monkeypatch.setattr(abuse_env, "AHEAD", 0.0 * abuse_env.AHEAD)
     monkeypatch.setattr(abuse_env, "MOVES_S", 0.3)
     monkeypatch.setattr(abuse_env, "MOVING", 1e6)
-    with pytest.raises(RuntimeError, match="does not move, so that nothing can be measured"):
+    with pytest.raises(
+        RuntimeError, match="does not move, so that nothing can be measured"
+    ):
         abuse_env.campaign(1, 1)

@@ -71,21 +71,26 @@ def test_own_shortest_paths_are_a_little_shorter_than_those_of_the_benchmark(bar
     from measuring.shortest_path import shortest_path
 
     shares = [
-        barn.length_of(shortest_path(np.array(cylinders(n)))) / barn.length_of(worlds.barn_path(n))
+        barn.length_of(shortest_path(np.array(cylinders(n))))
+        / barn.length_of(worlds.barn_path(n))
         for n in worlds.barn_numbers()[::25]
     ]
     assert 0.85 < min(shares) <= max(shares) < 1.02
 
 
 def test_a_folder_without_worlds_is_refused(barn, tmp_path):
-    with pytest.raises(ConfigError, match=r"holds neither cylinders\.csv nor world files"):
+    with pytest.raises(
+        ConfigError, match=r"holds neither cylinders\.csv nor world files"
+    ):
         barn.courses(tmp_path)
 
 
 def test_a_world_of_other_shapes_is_refused(barn, tmp_path):
     wide = CYLINDER.format(0, 1.0, 5.0).replace("0.075", "0.5")
     (tmp_path / "world_7.world").write_text(SDF.format(wide))
-    with pytest.raises(ConfigError, match=r"world_7\.world: holds something else than cylinders"):
+    with pytest.raises(
+        ConfigError, match=r"world_7\.world: holds something else than cylinders"
+    ):
         barn.courses(tmp_path)
 
 
@@ -93,24 +98,31 @@ def test_a_score_is_half_for_twice_the_best_time_and_falls_with_more(barn):
     course = barn.courses(None)[1]
     times = [course.best_s * k for k in (1.0, 2.0, 4.0, 20.0, 2.0)]
     flags = [True, True, True, True, False]
-    told = barn.judged(dict.fromkeys(range(5), course), 1, [flags, flags, [False] * 5], times)
+    told = barn.judged(
+        dict.fromkeys(range(5), course), 1, [flags, flags, [False] * 5], times
+    )
     np.testing.assert_allclose(told.score, [0.5, 0.5, 0.25, 0.125, 0.0])
 
 
 @pytest.mark.slow
 def test_a_robot_that_stands_misses_every_bar(folder):
-    missed = fails("barn.py", "standing", "--worlds", str(folder), "--policy", "straight")
+    missed = fails(
+        "barn.py", "standing", "--worlds", str(folder), "--policy", "straight"
+    )
     assert [line.split(": ")[1].split()[0] for line in missed] == ["success", "score"]
 
 
 @pytest.mark.slow
 def test_each_world_has_its_figures(folder):
-    _, told = asked("barn.py", "--worlds", str(folder), "--policy", "straight", "--runs", "2")
+    _, told = asked(
+        "barn.py", "--worlds", str(folder), "--policy", "straight", "--runs", "2"
+    )
     assert set(told["worlds"]) == {str(n) for n in NUMBERS}
     keys = {"success", "believed", "collision", "time_out", "time_s", "score"}
     assert keys == set(told["worlds"]["1"]) < set(told)
     means = np.mean(
-        [[one[key] for key in ("success", "score")] for one in told["worlds"].values()], axis=0
+        [[one[key] for key in ("success", "score")] for one in told["worlds"].values()],
+        axis=0,
     )
     np.testing.assert_allclose(means, [told["success"], told["score"]])
 
@@ -122,7 +134,11 @@ def test_each_fold_learns_anew_and_is_judged_in_worlds_that_it_did_not_see(tmp_p
     pytest.importorskip("torch", reason="needs the extra train")
     numbers = worlds.barn_numbers()[:6]
     write(tmp_path / "cylinders.csv", cylinders, numbers)
-    write(tmp_path / "reference_paths.csv", lambda n: worlds.barn_path(n).tolist(), numbers)
+    write(
+        tmp_path / "reference_paths.csv",
+        lambda n: worlds.barn_path(n).tolist(),
+        numbers,
+    )
     shipped = load_training("shipped_jackal")
     given = {"worlds": {"barn": 4, "circles": 2}, "steps": 192, "hidden": (8,)}
     ppo = shipped.ppo.model_copy(update={"batch": 96})
@@ -152,8 +168,11 @@ def test_what_is_not_done_in_mujoco_is_refused(word):
     words = (word, "--in", "mujoco_dds")
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / "barn.py"), *words],
-        capture_output=True, text=True, check=False, timeout=100.0,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100.0,
+    )
     assert done.returncode == 2
     assert "in fast alone; leave out --in" in done.stderr
 
@@ -172,7 +191,9 @@ def test_each_bar_can_be_missed_in_each_place(barn):
 @pytest.mark.parametrize("text", ["world,x_m\n1,2.0\n", "world,x_m,y_m\n1,2.0,near\n"])
 def test_a_table_of_cylinders_that_lacks_numbers_is_refused(barn, tmp_path, text):
     (tmp_path / "cylinders.csv").write_text(text)
-    with pytest.raises(ConfigError, match=r"cylinders\.csv: line 2 lacks numbers in the columns"):
+    with pytest.raises(
+        ConfigError, match=r"cylinders\.csv: line 2 lacks numbers in the columns"
+    ):
         barn.courses(tmp_path)
 
 

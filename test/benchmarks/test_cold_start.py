@@ -8,7 +8,12 @@ from .runs import asked, fails
 
 pytest.importorskip("rclpy", reason="the demo needs ROS 2: rclpy is not installed")
 
-pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.campaign, pytest.mark.timeout(3600)]
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.process,
+    pytest.mark.campaign,
+    pytest.mark.timeout(3600),
+]
 SCRIPT = "cold_start.py"
 
 

@@ -6,7 +6,13 @@ from .runs import BENCHMARKS, asked, fails
 
 SCRIPT = "env_scaling.py"
 FEW = ("--ends-only", "--repeats", "5")
-CURVES = {"worlds": 16384, "robots": 64, "obstacles": 256, "beams": 2048, "members": 250}
+CURVES = {
+    "worlds": 16384,
+    "robots": 64,
+    "obstacles": 256,
+    "beams": 2048,
+    "members": 250,
+}
 pytestmark = pytest.mark.timeout(300)  # a cold start compiles
 
 
@@ -31,12 +37,16 @@ def test_the_curves_are_lists_under_their_names_and_are_drawn(tmp_path):
 
 @pytest.mark.campaign
 def test_robots_that_each_look_at_each_other_miss_the_bar_of_robots():
-    assert any(line.startswith("robots: 64 cost ") for line in fails(SCRIPT, "quadratic", *FEW))
+    assert any(
+        line.startswith("robots: 64 cost ") for line in fails(SCRIPT, "quadratic", *FEW)
+    )
 
 
 @pytest.mark.campaign
 def test_worlds_that_are_stepped_one_by_one_miss_the_bar_of_worlds():
-    assert any(line.startswith("worlds: 16384 cost ") for line in fails(SCRIPT, "slow", *FEW))
+    assert any(
+        line.startswith("worlds: 16384 cost ") for line in fails(SCRIPT, "slow", *FEW)
+    )
 
 
 @pytest.mark.campaign
@@ -56,7 +66,9 @@ def test_a_set_that_takes_much_more_memory_misses_its_bar(benchmark, times):
 
 @pytest.mark.parametrize("name", CURVES)
 @pytest.mark.parametrize("times", [13.0, float("nan")])
-def test_a_curve_that_grows_too_much_or_is_no_number_misses_its_bar(benchmark, name, times):
+def test_a_curve_that_grows_too_much_or_is_no_number_misses_its_bar(
+    benchmark, name, times
+):
     flat = dict.fromkeys(CURVES, 0.4)
     result = {name: [1, greatest] for name, greatest in CURVES.items()}
     result["members_memory"] = 1.2

@@ -30,8 +30,15 @@ def peers(benchmark):
 @pytest.mark.campaign
 def test_the_throughput_is_told_with_the_ratio_at_equal_work_first():
     _, found = asked(SCRIPT, *FEW)
-    assert list(found)[:2] == ["times_as_fast_at_equal_work", "times_as_fast_with_ten_scans"]
-    assert found["peers"] == found["peers_with_one_scan"] == {"ir_sim": None, "irsim_x": None}
+    assert list(found)[:2] == [
+        "times_as_fast_at_equal_work",
+        "times_as_fast_with_ten_scans",
+    ]
+    assert (
+        found["peers"]
+        == found["peers_with_one_scan"]
+        == {"ir_sim": None, "irsim_x": None}
+    )
     for name in ("single_thread", "all_threads"):
         assert found[f"{name}_env_steps_per_s"] > 0.0
     assert found["single_env_gym_steps_per_s"] > 0.0
@@ -97,7 +104,11 @@ def test_a_peer_that_does_not_agree_with_itself_or_does_nothing_misses_a_bar(
 
 
 def test_a_peer_that_is_as_fast_as_ours_misses_no_bar_but_the_ratios(benchmark, peers):
-    shares = ("share_of_write_limit", "share_of_cartpole", "share_of_cartpole_with_estimator")
+    shares = (
+        "share_of_write_limit",
+        "share_of_cartpole",
+        "share_of_cartpole_with_estimator",
+    )
     result = {**dict.fromkeys(shares, 1.0), "drove": {}}
     result["times_as_fast_at_equal_work"] = {"ir_sim": 1.0, "irsim_x": float("nan")}
     missed = benchmark.judge(result, measured(peers))
@@ -115,7 +126,11 @@ def test_another_lidar_or_more_obstacles_have_to_keep_their_share_of_the_usual_r
 ):
     case = benchmark.Case(**given)
     for share, enough in ((bar, True), (bar - 0.01, False), (float("nan"), False)):
-        result = {"share_of_usual": share, "drove": {}, "times_as_fast_at_equal_work": {}}
+        result = {
+            "share_of_usual": share,
+            "drove": {},
+            "times_as_fast_at_equal_work": {},
+        }
         missed = benchmark.judge(result, measured(peers), case)
         told = f"left of the usual env's speed: {100.0 * share:.3g} %, bar {100.0 * bar:g} %"
         assert missed == ([] if enough else [told])
@@ -125,7 +140,9 @@ def test_faults_that_make_a_scan_half_as_long_again_are_a_missed_bar(benchmark, 
     result = {"share_of_usual": 1.0, "drove": {}, "times_as_fast_at_equal_work": {}}
     for times, enough in ((1.3, True), (1.5, False), (float("nan"), False)):
         found = {**result, "times_as_long_as_clean": times}
-        missed = benchmark.judge(found, measured(peers), benchmark.Case(lidar="rplidar_a2"))
+        missed = benchmark.judge(
+            found, measured(peers), benchmark.Case(lidar="rplidar_a2")
+        )
         told = f"times as long as without the lidar's faults: {times:.3f}, bar 1.3"
         assert missed == ([] if enough else [told])
 
@@ -145,15 +162,21 @@ def test_another_case_is_of_another_lidar_or_as_dense_with_more_obstacles(benchm
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("option", [("--lidar", "hokuyo_ust_10lx"), ("--obstacles", "40")])
-def test_another_case_is_told_beside_the_usual_one_and_one_that_is_slow_misses_its_bar(option):
+@pytest.mark.parametrize(
+    "option", [("--lidar", "hokuyo_ust_10lx"), ("--obstacles", "40")]
+)
+def test_another_case_is_told_beside_the_usual_one_and_one_that_is_slow_misses_its_bar(
+    option,
+):
     _, found = asked(SCRIPT, *FEW, *option)
     assert found["share_of_usual"] > 0.0
     assert "usual" in found["drove"]
     speed = "share of ", "left of ", "times as long as "
     assert not [line for line in found["failures"] if not line.startswith(speed)]
     missed = fails(SCRIPT, "slow", *FEW, *option)
-    assert any(line.startswith("left of the usual env's speed: ") for line in missed), missed
+    assert any(line.startswith("left of the usual env's speed: ") for line in missed), (
+        missed
+    )
 
 
 def test_a_peer_that_crashes_is_a_missed_bar_and_no_hang(peers, monkeypatch, tmp_path):
@@ -235,7 +258,9 @@ def fake_peer(peers, monkeypatch, folder) -> None:
     pytest.importorskip("yaml")
     (folder / "irsim.py").write_text(FAKE)
     monkeypatch.setattr(peers, "python_with", lambda *_: sys.executable)
-    monkeypatch.setattr(peers, "clean", lambda: {**os.environ, "PYTHONPATH": str(folder)})
+    monkeypatch.setattr(
+        peers, "clean", lambda: {**os.environ, "PYTHONPATH": str(folder)}
+    )
 
 
 @pytest.mark.campaign

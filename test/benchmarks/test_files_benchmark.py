@@ -20,8 +20,13 @@ def test_no_kill_tears_a_file_although_kills_hit_writes():
     assert found["kills"] == 48
     assert found["kills_during_a_write"] > 0
     assert set(found["artefacts"]) == {
-        "drive.npz", "model", "table", "stop.jsonl", "policy.onnx", "checkpoint.pt",
-    }  # fmt: skip
+        "drive.npz",
+        "model",
+        "table",
+        "stop.jsonl",
+        "policy.onnx",
+        "checkpoint.pt",
+    }
 
 
 @pytest.mark.campaign
@@ -40,6 +45,8 @@ def test_without_checksums_flipped_bits_are_taken():
 
 @pytest.mark.campaign
 def test_a_run_without_kills_or_cuts_is_no_success():
-    code, found = asked("files.py", "--kills", "0", "--flips", "0", "--cuts", "0", "--changes", "0")
+    code, found = asked(
+        "files.py", "--kills", "0", "--flips", "0", "--cuts", "0", "--changes", "0"
+    )
     assert code == 1
     assert len(found["failures"]) >= 4

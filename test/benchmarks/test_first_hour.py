@@ -41,14 +41,19 @@ def first_hour(monkeypatch):
 )
 def test_each_bar_can_be_missed(first_hour, changed, sentence):
     missed = first_hour.missed_of(GOOD | changed)
-    assert [line[: len(sentence)] for line in missed] == ([] if sentence is None else [sentence])
+    assert [line[: len(sentence)] for line in missed] == (
+        [] if sentence is None else [sentence]
+    )
 
 
 def test_a_picture_moves_if_its_ends_differ(first_hour, tmp_path):
     still, shifted = (Image.new("RGB", (100, 80), "white") for _ in range(2))
     still.paste("black", (10, 10, 20, 20))
     shifted.paste("black", (60, 30, 70, 40))
-    for name, last, extent in (("moving.gif", shifted, 60), ("still.gif", still.copy(), 0)):
+    for name, last, extent in (
+        ("moving.gif", shifted, 60),
+        ("still.gif", still.copy(), 0),
+    ):
         still.save(tmp_path / name, save_all=True, append_images=[shifted, last])
         assert first_hour.moved(tmp_path / name) == extent
 
@@ -62,7 +67,10 @@ def test_every_command_and_option_of_a_road_exists(first_hour):
 def test_the_robot_is_that_of_the_page(first_hour, tmp_path):
     text = text_of(ROOT / "docs" / "robots.md")
     (shown,) = [block for block in INDENTED.findall(text) if "name: my_robot" in block]
-    for name, content in (("page.yaml", dedent(shown)), ("road.yaml", first_hour.BURGER)):
+    for name, content in (
+        ("page.yaml", dedent(shown)),
+        ("road.yaml", first_hour.BURGER),
+    ):
         (tmp_path / name).write_text(content)
     assert load_robot(tmp_path / "page.yaml") == load_robot(tmp_path / "road.yaml")
 

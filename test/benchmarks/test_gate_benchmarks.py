@@ -15,8 +15,11 @@ def result_of(script: str, *options: str) -> dict:
     """The one JSON object that a benchmark prints."""
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / script), "--json", *options],
-        capture_output=True, text=True, check=True, timeout=250,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=250,
+    )
     assert done.stdout.count("\n") == 1
     return json.loads(done.stdout)
 
@@ -32,7 +35,11 @@ def test_no_random_command_at_any_interval_leaves_the_envelope():
 @pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"),
-    [("no_limits", "violations, bar 0"), ("nan", "violations"), ("standing", "in motion at 0 of")],
+    [
+        ("no_limits", "violations, bar 0"),
+        ("nan", "violations"),
+        ("standing", "in motion at 0 of"),
+    ],
 )
 def test_an_envelope_that_is_none_is_noticed(control, bar):
     assert bar in fails("gate_envelope.py", control, "--steps", "6000")[0]
@@ -55,11 +62,16 @@ def best_of_three(fault):
 @pytest.mark.parametrize(
     ("fault", "limit_s"),
     [
-        ("scan_silent", 0.40), ("e_stop", 0.10), ("policy_hung", 0.40), ("odom_teleports", 0.40),
-        ("stamps_run_ahead", 0.40), ("scan_alternates", 1.50), ("gate_frozen", 0.90),
+        ("scan_silent", 0.40),
+        ("e_stop", 0.10),
+        ("policy_hung", 0.40),
+        ("odom_teleports", 0.40),
+        ("stamps_run_ahead", 0.40),
+        ("scan_alternates", 1.50),
+        ("gate_frozen", 0.90),
         ("no_motion", 1.10),
     ],
-)  # fmt: skip
+)
 def test_a_fault_around_a_real_gate_leads_to_zero_in_time(fault, limit_s):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     result = best_of_three(fault)
@@ -72,12 +84,17 @@ def test_a_fault_around_a_real_gate_leads_to_zero_in_time(fault, limit_s):
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("control", "bar"),
-    [("slow_gate", "scan_silent: zero after"), ("no_gate", "scan_silent: zero after inf s"),
-     ("standing", "scan_silent: 0 of 1 were measured: the robot did not move")],
-)  # fmt: skip
+    [
+        ("slow_gate", "scan_silent: zero after"),
+        ("no_gate", "scan_silent: zero after inf s"),
+        ("standing", "scan_silent: 0 of 1 were measured: the robot did not move"),
+    ],
+)
 def test_a_gate_that_does_not_stop_the_robot_is_noticed(control, bar):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    missed = fails("gate_faults.py", control, "--repeats", "1", "--fault", "scan_silent")
+    missed = fails(
+        "gate_faults.py", control, "--repeats", "1", "--fault", "scan_silent"
+    )
     assert missed[0].startswith(bar)
 
 
@@ -92,7 +109,9 @@ def test_a_gate_that_stopped_many_times_ends_at_once_and_keeps_the_first_stop():
     assert result["end_after_stops"]["exit_s"] <= 2.0
 
 
-def test_bars_of_a_fault_are_missed_by_what_is_no_number_late_unsafe_or_not_measured(monkeypatch):
+def test_bars_of_a_fault_are_missed_by_what_is_no_number_late_unsafe_or_not_measured(
+    monkeypatch,
+):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import gate_faults
@@ -112,7 +131,9 @@ def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
 
     names = gate_rules.names()
     assert len(names) == len(set(names)) > 30
-    assert {"stop/disarmed", "refusal/command_not_finite", "shaping/bounded"} <= set(names)
+    assert {"stop/disarmed", "refusal/command_not_finite", "shaping/bounded"} <= set(
+        names
+    )
     with pytest.raises(SystemExit, match="there is no rule 'stop/nothing'"):
         gate_rules.take_out("stop/nothing")
 
@@ -131,7 +152,10 @@ def test_a_rule_that_a_test_misses_is_found():
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("control", "bar"),
-    [("no_tests", "rule arming/one_publisher"), ("untested_rule", "rule stop/_covers_nothing")],
+    [
+        ("no_tests", "rule arming/one_publisher"),
+        ("untested_rule", "rule stop/_covers_nothing"),
+    ],
 )
 def test_a_rule_that_no_test_misses_is_reported(control, bar):
     assert bar in fails("gate_rules.py", control, *ONE_RULE)[0]
@@ -157,9 +181,14 @@ def test_a_held_body_is_stopped_and_free_driving_is_not():
     ("control", "bar"),
     [
         ("rule_off", "of the held bodies were stopped in time"),
-        ("zero_thresholds", "robots that drove freely were stopped by body_held, bar 0"),
+        (
+            "zero_thresholds",
+            "robots that drove freely were stopped by body_held, bar 0",
+        ),
     ],
 )
 def test_a_rule_for_held_bodies_that_is_none_is_noticed(control, bar):
-    missed = fails("gate_held.py", control, "--hours", "0.01", "--holds", "4", "--case", "7")
+    missed = fails(
+        "gate_held.py", control, "--hours", "0.01", "--holds", "4", "--case", "7"
+    )
     assert any(bar in line for line in missed)

@@ -25,7 +25,10 @@ def test_the_gate_passes_commands_and_leaves_the_first_stop_of_a_burst_behind():
 
 @pytest.mark.campaign
 def test_a_gate_that_does_everything_ten_times_takes_too_much():
-    assert any("times what the bare node takes" in line for line in fails(SCRIPT, "busy", *SHORT))
+    assert any(
+        "times what the bare node takes" in line
+        for line in fails(SCRIPT, "busy", *SHORT)
+    )
 
 
 @pytest.mark.campaign

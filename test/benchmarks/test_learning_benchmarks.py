@@ -13,9 +13,20 @@ from .runs import BENCHMARKS, asked, fails
 
 missing = [name for name in ("rclpy", "mujoco") if find_spec(name) is None]
 ready = not missing and "differential" in shipped_policies()
-over_ros = pytest.mark.skipif(not ready, reason="needs ROS 2, MuJoCo and the shipped policies")
-no_torch = pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="needs training")
-BASELINES = ("--robot", "differential", "--policy", "dynamic_window", "--episodes", "20")
+over_ros = pytest.mark.skipif(
+    not ready, reason="needs ROS 2, MuJoCo and the shipped policies"
+)
+no_torch = pytest.mark.skipif(
+    find_spec("stable_baselines3") is None, reason="needs training"
+)
+BASELINES = (
+    "--robot",
+    "differential",
+    "--policy",
+    "dynamic_window",
+    "--episodes",
+    "20",
+)
 
 
 @pytest.mark.campaign

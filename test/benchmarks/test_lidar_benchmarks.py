@@ -18,7 +18,9 @@ from .runs import asked, fails
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SCENES = ["circle", "square", "strip", "mixture"]
-CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nics_drl_bridge"
+CACHE = (
+    Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nics_drl_bridge"
+)
 PEERS = ("ir_sim", "irsim_x")
 
 
@@ -26,15 +28,21 @@ def result_of(script: str, *options: str, **variables: str) -> dict:
     """The one JSON object that a benchmark prints, in an environment of its own."""
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / script), "--json", *options],
-        capture_output=True, text=True, check=True, timeout=110, env={**os.environ, **variables},
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=110,
+        env={**os.environ, **variables},
+    )
     assert done.stdout.count("\n") == 1
     return json.loads(done.stdout)
 
 
 def missed_but(result: dict, *words: str) -> list[str]:
     """The bars that were missed, but for those of speed, which short runs do not settle."""
-    return [line for line in result["failures"] if not any(word in line for word in words)]
+    return [
+        line for line in result["failures"] if not any(word in line for word in words)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +91,9 @@ def test_table3_shows_that_half_the_distances_cost_a_plain_look_up_more_than_hal
 @pytest.mark.campaign
 def test_complexity_names_a_cost_for_every_number_of_vertices():
     options = ("--most", "16", "--scans", "32", "--repeats", "2")
-    _, result = asked("lidar_complexity.py", *options, "--distances", "10", "--rotations", "8")
+    _, result = asked(
+        "lidar_complexity.py", *options, "--distances", "10", "--rotations", "8"
+    )
     assert result["vertices"] == [4, 8, 16]
     for key in ("exact_us", "baked_us"):
         assert len(result[key]) == 3
@@ -99,8 +109,11 @@ def test_peers_are_null_with_a_reason_where_they_cant_be_installed(tmp_path):
     cache = {"XDG_CACHE_HOME": str(tmp_path), "PIP_FIND_LINKS": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / "lidar_peers.py"), "--json", *options],
-        capture_output=True, text=True, timeout=280, env={**os.environ, **nowhere, **cache},
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=280,
+        env={**os.environ, **nowhere, **cache},
+    )
     result = json.loads(done.stdout)
     assert result["baked"] > 0.0
     assert result["exact"] > 0.0
@@ -131,9 +144,14 @@ def test_a_scanner_that_is_ten_times_slower_misses_its_bar():
 @pytest.mark.campaign
 @pytest.mark.timeout(400)
 def test_a_scan_that_is_not_that_of_a_step_does_not_agree_with_it():
-    ready = [next(CACHE.glob(f"{name}-py3.{sys.version_info[1]}/.ready"), None) for name in PEERS]
+    ready = [
+        next(CACHE.glob(f"{name}-py3.{sys.version_info[1]}/.ready"), None)
+        for name in PEERS
+    ]
     if not all(ready):
-        pytest.skip(f"needs the other simulators, which lidar_peers.py installs below {CACHE}")
+        pytest.skip(
+            f"needs the other simulators, which lidar_peers.py installs below {CACHE}"
+        )
     few = ("--scans", "32", "--scenes", "4", "--repeats", "2")
     missed = fails("lidar_peers.py", "other_way", *few)
     assert any(line.startswith("agreement of irsim_x: ") for line in missed)
@@ -144,8 +162,14 @@ def test_a_scan_that_is_not_that_of_a_step_does_not_agree_with_it():
     ("changes", "named"),
     [
         ({"share_of_write_limit": float("nan")}, "share_of_write_limit"),
-        ({"times_as_fast_at_equal_work": {"ir_sim": 600.0}}, "times_as_fast_at_equal_work"),
-        ({"times_as_fast_at_equal_work": {"irsim_x": 5.0}}, "times_as_fast_at_equal_work"),
+        (
+            {"times_as_fast_at_equal_work": {"ir_sim": 600.0}},
+            "times_as_fast_at_equal_work",
+        ),
+        (
+            {"times_as_fast_at_equal_work": {"irsim_x": 5.0}},
+            "times_as_fast_at_equal_work",
+        ),
         ({"rmse_m": {"irsim_x": 0.13}}, "rmse_m of irsim_x"),
         ({"rmse_m": {"ir_sim": float("nan")}}, "rmse_m of ir_sim"),
     ],
@@ -169,7 +193,9 @@ def test_a_figure_of_the_peers_beyond_its_bar_is_missed(scenes, changes, named):
 def test_the_point_clouds_of_scan_mode_baked_and_mujoco_lie_on_each_other(tmp_path):
     pytest.importorskip("mujoco")
     out = tmp_path / "clouds.png"
-    code, result = asked("fig4_pointcloud.py", "--scans", "12", "--without-slam", "--out", str(out))
+    code, result = asked(
+        "fig4_pointcloud.py", "--scans", "12", "--without-slam", "--out", str(out)
+    )
     assert (code, result["failures"]) == (0, [])
     assert result["points"] == {"exact": 8640, "baked": 8640, "mujoco": 8640}
     assert result["range_rmse_m"]["mujoco"] < 1e-5
@@ -184,7 +210,10 @@ def test_random_scenes_keep_clear_of_the_lidar_and_differ_between_seeds(scenes):
         batch = scenes.random_batch(shapes, 300, 1)
         for k, shape in enumerate(batch.shapes):
             assert scenes.gap(shape, batch.poses[:, k]).min() > scenes.SPEC.range_min
-        assert np.hypot(*batch.poses[..., :2].reshape(-1, 2).T).max() <= scenes.SPEC.range_max
+        assert (
+            np.hypot(*batch.poses[..., :2].reshape(-1, 2).T).max()
+            <= scenes.SPEC.range_max
+        )
         assert not np.allclose(batch.poses, scenes.random_batch(shapes, 300, 2).poses)
 
 
@@ -220,20 +249,31 @@ def test_errors_count_no_return_as_the_greatest_range(scenes):
 
 def polar(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [m] and bearing [rad] of every obstacle."""
-    return np.hypot(poses[..., 0], poses[..., 1]), np.arctan2(poses[..., 1], poses[..., 0])
+    return np.hypot(poses[..., 0], poses[..., 1]), np.arctan2(
+        poses[..., 1], poses[..., 0]
+    )
 
 
 @pytest.mark.campaign
 def test_sensor_models_are_compared_with_none_in_one_run():
     _, result = asked(
-        "lidar_sensor_models.py", "--scans", "64", "--repeats", "2", "--distances", "10",
-        "--rotations", "16",
-    )  # fmt: skip
+        "lidar_sensor_models.py",
+        "--scans",
+        "64",
+        "--repeats",
+        "2",
+        "--distances",
+        "10",
+        "--rotations",
+        "16",
+    )
     tables = ["no model", "incidence dropout", "intensity", "both"]
     assert list(result["scans_per_s"]) == tables
     assert result["times_as_long"]["no model"] == 1.0
     assert min(result["scans_per_s"].values()) > 0.0
-    assert result["table_bytes"]["no model"] == result["table_bytes"]["incidence dropout"]
+    assert (
+        result["table_bytes"]["no model"] == result["table_bytes"]["incidence dropout"]
+    )
     assert not missed_but(result, "times as long")
 
 
@@ -247,12 +287,15 @@ SMALL = ("--scans", "64", "--repeats", "2", "--distances", "10", "--rotations", 
 def test_sensor_models_that_do_nothing_or_are_slow_are_found(control, bar):
     assert control in {"plain", "slow"}
     options = SMALL if control == "plain" else (*SMALL[:3], "20", *SMALL[4:])
-    assert any(bar in line for line in fails("lidar_sensor_models.py", control, *options))
+    assert any(
+        bar in line for line in fails("lidar_sensor_models.py", control, *options)
+    )
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("control", "bar"), [("coarse", "RMSE"), ("nan", "RMSE nan"), ("slow", "as fast as exact")]
+    ("control", "bar"),
+    [("coarse", "RMSE"), ("nan", "RMSE nan"), ("slow", "as fast as exact")],
 )
 def test_table2_fails_by_a_coarse_broken_or_slow_look_up(control, bar):
     options = ("--scans", "256", "--repeats", "2")
@@ -260,16 +303,26 @@ def test_table2_fails_by_a_coarse_broken_or_slow_look_up(control, bar):
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(("control", "bar"), [("plain", "bar a third"), ("nan", "nan m2")])
+@pytest.mark.parametrize(
+    ("control", "bar"), [("plain", "bar a third"), ("nan", "nan m2")]
+)
 def test_table3_fails_by_a_plain_or_broken_look_up(control, bar):
-    assert any(bar in line for line in fails("table3_density.py", control, "--scans", "128"))
+    assert any(
+        bar in line for line in fails("table3_density.py", control, "--scans", "128")
+    )
 
 
 @pytest.mark.campaign
 def test_the_cost_of_the_exact_scanner_is_not_that_of_the_look_up():
     options = ("--most", "256", "--scans", "32", "--repeats", "3")
     missed = fails(
-        "lidar_complexity.py", "exact", *options, "--distances", "10", "--rotations", "8"
+        "lidar_complexity.py",
+        "exact",
+        *options,
+        "--distances",
+        "10",
+        "--rotations",
+        "8",
     )
     assert any("with other vertices" in line for line in missed)
 
@@ -283,14 +336,17 @@ def test_jumps_through_a_map_give_the_ranges_of_the_walk():
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("control", "bar"), [("shifted", "RMSE"), ("slow", "the walk's speed"), ("nan", "RMSE nan")]
+    ("control", "bar"),
+    [("shifted", "RMSE"), ("slow", "the walk's speed"), ("nan", "RMSE nan")],
 )
 def test_another_map_a_walk_and_a_range_that_is_none_are_found(control, bar):
     assert any(bar in line for line in fails("map_lidar.py", control))
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(("control", "bar"), [("shifted", "cloud RMSE"), ("nan", "range RMSE nan")])
+@pytest.mark.parametrize(
+    ("control", "bar"), [("shifted", "cloud RMSE"), ("nan", "range RMSE nan")]
+)
 def test_a_point_cloud_from_elsewhere_is_found(control, bar, tmp_path):
     options = ("--scans", "12", "--without-slam", "--out", str(tmp_path / "clouds.png"))
     assert any(bar in line for line in fails("fig4_pointcloud.py", control, *options))

@@ -6,10 +6,22 @@ import pytest
 
 from .runs import BENCHMARKS, asked, fails
 
-TABLE1, REAL, MUJOCO = "table1_kinematics.py", "real_robot.py", "generate_from_mujoco.py"
+TABLE1, REAL, MUJOCO = (
+    "table1_kinematics.py",
+    "real_robot.py",
+    "generate_from_mujoco.py",
+)
 SHORT = ("--robots", "differential", "--train", "40", "--unseen", "10", "--drives", "1")
-DRIVE = BENCHMARKS.parents[1] / "shared" / "recordings" / "xtark_ackermann" / "random_drive_45s"
-real = pytest.mark.skipif(not DRIVE.is_dir(), reason=f"no recording of the real car at {DRIVE}")
+DRIVE = (
+    BENCHMARKS.parents[1]
+    / "shared"
+    / "recordings"
+    / "xtark_ackermann"
+    / "random_drive_45s"
+)
+real = pytest.mark.skipif(
+    not DRIVE.is_dir(), reason=f"no recording of the real car at {DRIVE}"
+)
 pytestmark = pytest.mark.timeout(300)  # a cold start compiles
 
 
@@ -17,12 +29,15 @@ pytestmark = pytest.mark.timeout(300)  # a cold start compiles
 def test_the_fitted_models_err_no_more_than_the_papers():
     _, result = asked(TABLE1)
     assert set(result["robots"]) == {"ackermann", "differential", "mecanum"}
-    assert not [line for line in result["failures"] if "rmse" in line or "float32" in line]
+    assert not [
+        line for line in result["failures"] if "rmse" in line or "float32" in line
+    ]
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("control", "bar"), [("rounded", "rmse_x_m"), ("nan", "nan"), ("slow", "times plain Python's")]
+    ("control", "bar"),
+    [("rounded", "rmse_x_m"), ("nan", "nan"), ("slow", "times plain Python's")],
 )
 def test_table1_fails_without_exact_or_fast_models(control, bar):
     assert control in {"rounded", "nan", "slow"}
@@ -53,7 +68,11 @@ def test_a_model_of_a_robot_in_mujoco_predicts_what_it_has_not_seen():
 @pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"),
-    [("standing", "error_over_path"), ("slow", "MuJoCo's speed"), ("nan", "error_over_path nan")],
+    [
+        ("standing", "error_over_path"),
+        ("slow", "MuJoCo's speed"),
+        ("nan", "error_over_path nan"),
+    ],
 )
 def test_a_model_that_stands_is_slow_or_is_none_does_not_predict_mujoco(control, bar):
     pytest.importorskip("mujoco")

@@ -18,7 +18,10 @@ def test_without_obstacles_nodes_and_a_known_controller_the_bars_are_missed():
     assert code == 1
     missed = " ".join(result["failures"])
     assert "map_agreement" in missed
-    for name, bad in (("follow_path_success", lambda v: v == 0.0), ("nav2_names_missing", bool)):
+    for name, bad in (
+        ("follow_path_success", lambda v: v == 0.0),
+        ("nav2_names_missing", bool),
+    ):
         if result[name] is not None:  # its messages are installed
             assert bad(result[name])
             assert name in missed
@@ -34,7 +37,9 @@ def test_paths_are_followed_and_every_name_of_nav2_is_served():
     assert (code, result["missing"], result["not_followed"]) == (0, [], [])
 
 
-def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(monkeypatch, tmp_path):
+def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(
+    monkeypatch, tmp_path
+):
     monkeypatch.syspath_prepend(BENCHMARKS)
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     from measuring import nav2_names
@@ -74,8 +79,12 @@ def test_a_topic_whose_quality_of_service_does_not_fit_is_named(
 
     from nics_drl_bridge.nodes.runner import holds, open_context
 
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE
-    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    durability = (
+        DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE
+    )
+    reliability = (
+        ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    )
     profile = QoSProfile(depth=1, durability=durability, reliability=reliability)
     kind = {"map": OccupancyGrid, "odom": Odometry, "cmd_vel": Twist}[topic]
     with claimed_domain() as domain_id:
@@ -90,7 +99,9 @@ def test_a_topic_whose_quality_of_service_does_not_fit_is_named(
             return "".join(nav2_names.unserved_topics(asker, {topic})).lower()
 
         # Of an end that is not yet known it says that there is none.
-        assert holds(lambda: fault in said() if fault else not said(), 10.0, 0.05), said()
+        assert holds(lambda: fault in said() if fault else not said(), 10.0, 0.05), (
+            said()
+        )
         for node in (robot, asker):
             node.destroy_node()
         context.try_shutdown()

@@ -17,7 +17,9 @@ SHORT = ("--times", "2", "--loops", "0", "--nodes", "middleware_node")
 def test_a_node_ends_at_once_with_0_also_while_it_starts_or_compiles():
     code, result = asked(SCRIPT, *SHORT, "--phases", *PHASES)
     assert set(result["endings"]) == {f"middleware_node {phase}" for phase in PHASES}
-    assert not [each["failed"] for each in result["endings"].values() if each["failed"]], result
+    assert not [
+        each["failed"] for each in result["endings"].values() if each["failed"]
+    ], result
     # The time is a matter of speed.
     assert all(" took " in line for line in result["failures"])
     assert code == bool(result["failures"])
@@ -42,7 +44,9 @@ def test_a_node_that_was_killed_or_took_too_long_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize(("loops", "count"), [(0, 1), (2, 0)])
-def test_a_first_line_that_comes_late_on_quiet_cores_is_named(monkeypatch, loops, count):
+def test_a_first_line_that_comes_late_on_quiet_cores_is_named(
+    monkeypatch, loops, count
+):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import node_endings
 

@@ -17,11 +17,17 @@ REAL = "real_drives.py"
 NAMES = ("skid_steer", "throttle_car", "tricycle", "omni", "ticks")
 XTARK = "xtark_random_drive_45s"
 DRIVES = BENCHMARKS.parents[1] / "shared" / "recordings"
-real = pytest.mark.skipif(not DRIVES.is_dir(), reason=f"no recordings of others at {DRIVES}")
+real = pytest.mark.skipif(
+    not DRIVES.is_dir(), reason=f"no recordings of others at {DRIVES}"
+)
 GOOD = {
-    "error_m": 0.02, "share_of_path": 0.02, "yardstick_share": 0.03, "constant_twist_share": 0.5,
-    "coverage_95": 0.95, "truths": {},
-}  # fmt: skip
+    "error_m": 0.02,
+    "share_of_path": 0.02,
+    "yardstick_share": 0.03,
+    "constant_twist_share": 0.5,
+    "coverage_95": 0.95,
+    "truths": {},
+}
 
 
 @pytest.fixture
@@ -47,7 +53,9 @@ def test_the_csv_of_a_foreign_robot_reads_as_its_recording(foreign, tmp_path, na
 
 def test_a_seed_is_a_drive(foreign):
     robot = foreign.ROBOTS["omni"]
-    first, again, other = (foreign.foreign_drive(robot, seed, 5.0) for seed in (1, 1, 2))
+    first, again, other = (
+        foreign.foreign_drive(robot, seed, 5.0) for seed in (1, 1, 2)
+    )
     assert np.array_equal(first.pose.values, again.pose.values)
     assert not np.allclose(first.pose.values, other.pose.values, atol=0.01)
 
@@ -56,7 +64,9 @@ def test_a_seed_is_a_drive(foreign):
 def test_a_throttle_car_stands_below_its_dead_zone(foreign, share, moves):
     car = foreign.ROBOTS["throttle_car"]
     reach = share * car.dead_zone
-    held = replace(car, commands={"throttle": (reach, 1.0001 * reach), "steering": (0.0, 0.0)})
+    held = replace(
+        car, commands={"throttle": (reach, 1.0001 * reach), "steering": (0.0, 0.0)}
+    )
     way = np.ptp(foreign.foreign_drive(held, 1, 20.0).pose.values[:, 0])
     assert (way > 0.1) == moves
 
@@ -71,7 +81,9 @@ def test_a_command_acts_after_its_latency(foreign):
 
 def test_a_skid_steer_turns_less_than_it_is_told(foreign):
     told = {"forward_command": (0.5, 0.5001), "turn_command": (1.0, 1.0001)}
-    drive = foreign.foreign_drive(replace(foreign.ROBOTS["skid_steer"], commands=told), 3, 20.0)
+    drive = foreign.foreign_drive(
+        replace(foreign.ROBOTS["skid_steer"], commands=told), 3, 20.0
+    )
     rate = np.gradient(np.unwrap(drive.pose.values[:, 2]), drive.pose.t).mean()
     assert 0.2 < rate < 0.8
 
@@ -79,7 +91,9 @@ def test_a_skid_steer_turns_less_than_it_is_told(foreign):
 def test_encoders_overflow(foreign, tmp_path):
     drive = foreign.foreign_drive(foreign.ROBOTS["ticks"], 1, 60.0)
     drive.write(tmp_path / "drive")
-    counts = np.loadtxt(tmp_path / "drive" / "commands.csv", delimiter=",", skiprows=1)[:, 1:]
+    counts = np.loadtxt(tmp_path / "drive" / "commands.csv", delimiter=",", skiprows=1)[
+        :, 1:
+    ]
     assert counts.min() >= 0
     assert counts.max() < 2**16
     assert np.abs(np.diff(counts, axis=0)).max() > 2**15
@@ -88,13 +102,19 @@ def test_encoders_overflow(foreign, tmp_path):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"share_of_path": 0.04, "yardstick_share": 0.1}, "0.040 of the path, bar 0.03"),
+        (
+            {"share_of_path": 0.04, "yardstick_share": 0.1},
+            "0.040 of the path, bar 0.03",
+        ),
         ({"yardstick_share": 0.01}, "the fitted textbook's bar 1 of its 0.010"),
         ({"constant_twist_share": 0.01}, "a robot that keeps its twist by 0.010"),
         ({"error_m": float("nan")}, "off by nan m"),
         ({"coverage_95": 0.8}, "the 95 % band holds 80.0% of the ends, bar 90% to 99%"),
         ({"coverage_95": float("nan")}, "the 95 % band holds nan%"),
-        ({"truths": {"dead_zone": {"true": 0.1, "found": 0.2, "near": False}}}, "dead_zone 0.2000"),
+        (
+            {"truths": {"dead_zone": {"true": 0.1, "found": 0.2, "near": False}}},
+            "dead_zone 0.2000",
+        ),
         ({"refused": "too short."}, "was refused: too short."),
         ({"crashed": "ValueError: x"}, "crashed: ValueError: x"),
     ],
@@ -112,7 +132,9 @@ def test_every_drive_has_its_mapping(module):
     bars = module("measuring.drive_bars")
     mappings = {drive.mapping for drive in bars.DRIVES.values()}
     found = [*bars.EXAMPLES.glob("*.yaml"), *bars.SHIPPED.glob("*.yaml")]
-    assert mappings == {path.resolve() for path in found}  # one is a link to a shipped one
+    assert mappings == {
+        path.resolve() for path in found
+    }  # one is a link to a shipped one
 
 
 def test_wheels_are_found_in_a_model_that_moves_by_them(module):
@@ -123,11 +145,19 @@ def test_wheels_are_found_in_a_model_that_moves_by_them(module):
     coefficients[3] = np.array([-1.0, 0.0, left / 2.0, right / 2.0]) / lag
     coefficients[4] = np.array([0.0, -1.0, -left / base, right / base]) / lag
     model = TaylorModel(
-        ("vx", "wz", "left", "right"), ("vx", "vy", "wz", "d_vx", "d_wz"), ("",) * 5, powers,
-        coefficients, 0.01, -np.ones(4), np.ones(4),
-    )  # fmt: skip
+        ("vx", "wz", "left", "right"),
+        ("vx", "vy", "wz", "d_vx", "d_wz"),
+        ("",) * 5,
+        powers,
+        coefficients,
+        0.01,
+        -np.ones(4),
+        np.ones(4),
+    )
     found = module("measuring.truths").wheels_of(model)
-    assert found == pytest.approx({"left_m": left, "right_m": right, "base_m": base}, rel=1e-3)
+    assert found == pytest.approx(
+        {"left_m": left, "right_m": right, "base_m": base}, rel=1e-3
+    )
 
 
 @pytest.mark.campaign
@@ -135,7 +165,9 @@ def test_wheels_are_found_in_a_model_that_moves_by_them(module):
 def test_a_model_beats_its_yardsticks_on_a_real_drive():
     _, result = asked(REAL, "--only", XTARK)
     told = result["drives"][XTARK]
-    assert told["share_of_path"] < min(told["yardstick_share"], told["constant_twist_share"])
+    assert told["share_of_path"] < min(
+        told["yardstick_share"], told["constant_twist_share"]
+    )
     assert result["left_out"][XTARK]["error_m"] < 0.026
 
 

@@ -41,7 +41,9 @@ def curves(nothing=0.97, **at):
         (curves(noise=math.nan), ["noise takes nan points"]),
     ],
 )
-def test_no_perturbation_may_take_five_points_at_its_declared_range(robustness, success, bars):
+def test_no_perturbation_may_take_five_points_at_its_declared_range(
+    robustness, success, bars
+):
     missed = robustness.missed({"mecanum": success})
     assert len(missed) == len(bars)
     assert all(bar in line for bar, line in zip(bars, missed, strict=True))
@@ -52,11 +54,15 @@ def test_no_policy_is_no_robustness(robustness):
 
 
 def test_the_worst_loss_is_that_of_one_policy_to_one_perturbation(robustness):
-    lost = robustness.losses({"mecanum": curves(drift=0.95), "ackermann": curves(noise=0.93)})
+    lost = robustness.losses(
+        {"mecanum": curves(drift=0.95), "ackermann": curves(noise=0.93)}
+    )
     assert lost["mecanum"]["drift"] == pytest.approx(2.0)
     assert robustness.worst(lost) == {
-        "points": pytest.approx(4.0), "robot": "ackermann", "perturbation": "noise",
-    }  # fmt: skip
+        "points": pytest.approx(4.0),
+        "robot": "ackermann",
+        "perturbation": "noise",
+    }
 
 
 @pytest.mark.parametrize("name", [each for each in NAMES if each != "footprint"])
@@ -67,10 +73,12 @@ def test_a_perturbation_alone_has_the_greatest_declared_value(robustness, name):
     drawn = Sampler(once, model).draw([1, 2, 3])
     whole = Sampler(MILD, model).draw(range(200))
     told = {
-        "noise": lambda d: d.faults[..., 0], "drop-out": lambda d: d.faults[..., 2],
-        "latency": lambda d: d.delay + d.age, "response": lambda d: d.response,
+        "noise": lambda d: d.faults[..., 0],
+        "drop-out": lambda d: d.faults[..., 2],
+        "latency": lambda d: d.delay + d.age,
+        "response": lambda d: d.response,
         "drift": lambda d: d.noise[..., 2:5],
-    }  # fmt: skip
+    }
     assert told[name](drawn).min() >= told[name](whole).max() - 1e-12
     others = [one for other, one in told.items() if other not in (name, "response")]
     plain = Sampler(robustness.ranges(MILD, "footprint", 0.0), model).draw([1, 2, 3])
@@ -85,7 +93,10 @@ def test_the_ranges_are_those_of_the_training_of_each_policy(robustness):
 
 def test_time_constants_are_longer_even_where_no_training_drew_them(robustness):
     for times, slow in ((1.0, 1.25), (2.0, 1.5)):
-        assert robustness.ranges(MILD, "response", times).kinematics.response == (slow, slow)
+        assert robustness.ranges(MILD, "response", times).kinematics.response == (
+            slow,
+            slow,
+        )
     assert robustness.declared(MILD)["response"].startswith("time constants x 1.25")
 
 
@@ -97,7 +108,9 @@ def test_a_lidar_keeps_the_noise_that_it_has_anyway(robustness):
 def test_a_larger_footprint_is_the_same_outline_scaled(robustness, robot):
     model = builtin_model(robot)
     larger = robustness.grown(model, 1.1)
-    assert larger.robot.footprint_radius == pytest.approx(1.1 * model.robot.footprint_radius)
+    assert larger.robot.footprint_radius == pytest.approx(
+        1.1 * model.robot.footprint_radius
+    )
     assert (larger.robot.footprint is None) == (model.robot.footprint is None)
     assert larger.kinematics is model.kinematics
 
@@ -116,13 +129,25 @@ def test_the_picture_is_drawn_of_runs_robot_by_robot(robustness, tmp_path):
     if not shipped_policies():
         pytest.skip("no policy is shipped")
     names = shipped_policies()[:2]
-    runs = {f"robustness_{name}": {"result": {"success": {name: curves()}}} for name in names}
+    runs = {
+        f"robustness_{name}": {"result": {"success": {name: curves()}}}
+        for name in names
+    }
     runs |= {"robustness_broken": {"result": None}, "parity": {"result": {"steps": 1}}}
     (tmp_path / "results.json").write_text(json.dumps({"runs": runs}))
-    assert robustness.measured_in(tmp_path / "results.json") == dict.fromkeys(names, curves())
-    words = ("--of", str(tmp_path / "results.json"), "--picture", str(tmp_path / "curves.png"))
+    assert robustness.measured_in(tmp_path / "results.json") == dict.fromkeys(
+        names, curves()
+    )
+    words = (
+        "--of",
+        str(tmp_path / "results.json"),
+        "--picture",
+        str(tmp_path / "curves.png"),
+    )
     done = subprocess.run(
-        [sys.executable, BENCHMARKS / "robustness.py", *words], capture_output=True, text=True
+        [sys.executable, BENCHMARKS / "robustness.py", *words],
+        capture_output=True,
+        text=True,
     )
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
@@ -135,9 +160,13 @@ ONE = ("--episodes", "2", "--robots", "differential", "--worlds", "circles")
 @pytest.mark.skipif(not ready, reason="no policy is shipped")
 def test_it_draws_its_curves_and_prints_one_json_object(tmp_path):
     picture = tmp_path / "curves.png"
-    code, told = asked("robustness.py", *ONE, "--picture", str(picture), "--only", "drop-out")
+    code, told = asked(
+        "robustness.py", *ONE, "--picture", str(picture), "--only", "drop-out"
+    )
     assert set(told["success"]["differential"]) == {"drop-out"}
-    assert len(told["success"]["differential"]["drop-out"]) == len(told["multiples"]) == 4
+    assert (
+        len(told["success"]["differential"]["drop-out"]) == len(told["multiples"]) == 4
+    )
     assert len(told["believed"]["differential"]["drop-out"]) == 4
     assert set(told["declared"]["differential"]) == set(NAMES)
     assert code == bool(told["failures"])
@@ -150,11 +179,17 @@ def test_it_draws_its_curves_and_prints_one_json_object(tmp_path):
     ("control", "bar"), [("tenfold", "drift takes"), ("standing", "0.0% success")]
 )
 def test_a_perturbation_tenfold_or_a_policy_that_stands_misses_a_bar(control, bar):
-    assert any(bar in line for line in fails("robustness.py", control, *ONE, "--only", "drift"))
+    assert any(
+        bar in line for line in fails("robustness.py", control, *ONE, "--only", "drift")
+    )
 
 
-@pytest.mark.skipif("jackal" not in shipped_policies(), reason="needs the shipped policy")
-def test_a_larger_footprint_is_driven_in_the_scenes_of_the_robot_it_is_believed_to_be(robustness):
+@pytest.mark.skipif(
+    "jackal" not in shipped_policies(), reason="needs the shipped policy"
+)
+def test_a_larger_footprint_is_driven_in_the_scenes_of_the_robot_it_is_believed_to_be(
+    robustness,
+):
     # Of so large a robot there would be no scene: the door's cells are narrower.
     job = robustness.Job("jackal", "doorway", 1, ("footprint",), (2.0,), None)
     assert robustness.reached(job, "footprint", 2.0) == (1, 1)

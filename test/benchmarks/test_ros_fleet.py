@@ -16,7 +16,9 @@ SHORT = ("--robots", "2", "--seconds", "2")
 def test_every_robot_of_a_fleet_drives_and_is_heard():
     code, result = asked(SCRIPT, *SHORT)
     assert set(result["each"]) == {"robot1", "robot2"}
-    assert result["scan_hz"] == pytest.approx(min(r["scan"] for r in result["each"].values()), 0.01)
+    assert result["scan_hz"] == pytest.approx(
+        min(r["scan"] for r in result["each"].values()), 0.01
+    )
     assert 0.0 < result["scan_hz"] < result["odom_hz"]
     assert result["driven_m"] >= 0.1
     # Rates are a matter of speed.
@@ -26,7 +28,9 @@ def test_every_robot_of_a_fleet_drives_and_is_heard():
 
 def test_a_fleet_that_nobody_commands_is_found_to_stand():
     missed = fails(SCRIPT, "standing", *SHORT)
-    assert any(": driven_m 0.0" in line and "must be 0.1 at least" in line for line in missed)
+    assert any(
+        ": driven_m 0.0" in line and "must be 0.1 at least" in line for line in missed
+    )
 
 
 def test_one_robot_that_nobody_hears_is_named():

@@ -16,8 +16,14 @@ SHORT = ("--chunks", "2", "--size", "20")
 def test_steps_and_echoes_are_measured_in_the_same_run():
     code, result = asked(SCRIPT, *SHORT)
     assert set(result) == {
-        "steps_per_s", "bare_echo_per_s", "ratio", "p50_ms", "p99_ms", "driven_m", "failures",
-    }  # fmt: skip
+        "steps_per_s",
+        "bare_echo_per_s",
+        "ratio",
+        "p50_ms",
+        "p99_ms",
+        "driven_m",
+        "failures",
+    }
     assert result["ratio"] == pytest.approx(
         result["steps_per_s"] / result["bare_echo_per_s"], rel=0.02
     )

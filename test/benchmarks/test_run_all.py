@@ -32,7 +32,11 @@ def command(scripts: Path, *options: str) -> list[str]:
 
 def run(scripts: Path, *options: str) -> tuple[subprocess.CompletedProcess[str], dict]:
     done = subprocess.run(
-        command(scripts, *options), cwd=BENCHMARKS, capture_output=True, text=True, timeout=200
+        command(scripts, *options),
+        cwd=BENCHMARKS,
+        capture_output=True,
+        text=True,
+        timeout=200,
     )
     file = scripts / "results.json"
     return done, json.loads(file.read_text()) if file.exists() else {}
@@ -53,7 +57,9 @@ def alive(pid: int) -> bool:
     return state != "Z"
 
 
-def test_bars_that_are_met_end_with_0_and_stand_in_the_file_with_machine_commit_and_load(scripts):
+def test_bars_that_are_met_end_with_0_and_stand_in_the_file_with_machine_commit_and_load(
+    scripts,
+):
     (scripts / "good.py").write_text(MET)
     done, found = run(scripts)
     assert done.returncode == 0
@@ -64,7 +70,11 @@ def test_bars_that_are_met_end_with_0_and_stand_in_the_file_with_machine_commit_
     assert entry["machine"]["libraries"]["numpy"]
     assert entry["result"] == {"figure": 1.5}
     assert (entry["state"], entry["exit_code"], entry["failures"]) == ("met", 0, [])
-    assert (entry["script"], entry["arguments"], entry["quick"]) == ("good.py", [], False)
+    assert (entry["script"], entry["arguments"], entry["quick"]) == (
+        "good.py",
+        [],
+        False,
+    )
     assert len(entry["load_before"]) == len(entry["load_after"]) == 3
     assert entry["seconds"] >= 0.0
     assert entry["started"].endswith("+00:00")
@@ -83,14 +93,30 @@ def test_bars_that_are_met_end_with_0_and_stand_in_the_file_with_machine_commit_
         ("print('what a day')\n", "broken", "printed no JSON object: what a day"),
         ("print('[1, 2]')\n", "broken", "printed no JSON object"),
         ("print('{\"figure\": 1.5')\n", "broken", "printed no JSON object"),
-        ("import sys\nsys.stdout.buffer.write(b'\\xff\\x00\\x80')\n", "broken", "no JSON object"),
-        ("print('{\"figure\": 1.5}')\n", "broken", "does not say which bars were missed"),
-        ('print(\'{"figure": 1, "failures": 5}\')\n', "broken", "`failures` is '5', no list"),
+        (
+            "import sys\nsys.stdout.buffer.write(b'\\xff\\x00\\x80')\n",
+            "broken",
+            "no JSON object",
+        ),
+        (
+            "print('{\"figure\": 1.5}')\n",
+            "broken",
+            "does not say which bars were missed",
+        ),
+        (
+            'print(\'{"figure": 1, "failures": 5}\')\n',
+            "broken",
+            "`failures` is '5', no list",
+        ),
         ('print(\'{"figure": 1, "failures": [5]}\')\n', "missed", "5"),
         ("print('{\"failures\": []}')\n", "broken", "measured nothing"),
         ("print('[' * 100000)\n", "broken", "printed no JSON object"),
         ("", "broken", "printed no JSON object: no message"),
-        ("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n", "broken", "by signal 9"),
+        (
+            "import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n",
+            "broken",
+            "by signal 9",
+        ),
         ("import os\nos.abort()\n", "broken", "by signal 6"),
     ],
 )
@@ -146,7 +172,9 @@ def test_what_a_benchmark_leaves_behind_is_ended_and_counted(scripts):
 
 
 def test_numbers_that_json_does_not_know_are_null(scripts):
-    (scripts / "odd.py").write_text('print(\'{"a": NaN, "b": [Infinity], "failures": []}\')\n')
+    (scripts / "odd.py").write_text(
+        'print(\'{"a": NaN, "b": [Infinity], "failures": []}\')\n'
+    )
     _, found = run(scripts)
     assert found["runs"]["odd"]["result"] == {"a": None, "b": [None]}
     assert "NaN" not in (scripts / "results.json").read_text()
@@ -181,7 +209,9 @@ def test_a_name_that_no_benchmark_has_is_refused_before_anything_is_run(scripts)
     assert "'nonsense' is no benchmark; there are good." in done.stderr
 
 
-@pytest.mark.parametrize("content", ["[]", "{", '{"runs": 3}', '{"runs": {"good": {}}}'])
+@pytest.mark.parametrize(
+    "content", ["[]", "{", '{"runs": 3}', '{"runs": {"good": {}}}']
+)
 def test_a_file_that_holds_no_results_is_not_written_over(scripts, content):
     (scripts / "good.py").write_text(MET)
     (scripts / "results.json").write_text(content)
@@ -194,7 +224,9 @@ def test_a_file_that_holds_no_results_is_not_written_over(scripts, content):
     assert (scripts / "results.json").read_text() == content
 
 
-def test_results_of_another_machine_stay_what_they_are_beside_those_of_this_one(scripts):
+def test_results_of_another_machine_stay_what_they_are_beside_those_of_this_one(
+    scripts,
+):
     (scripts / "good.py").write_text(MET)
     (scripts / "other.py").write_text(MET)
     _, found = run(scripts)
@@ -207,13 +239,18 @@ def test_results_of_another_machine_stay_what_they_are_beside_those_of_this_one(
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_ends_its_children_and_keeps_what_was_measured(scripts, number):
+def test_an_interrupted_run_ends_its_children_and_keeps_what_was_measured(
+    scripts, number
+):
     (scripts / "a_good_one.py").write_text(MET)
     (scripts / "hangs.py").write_text(HANGS + "child.wait()\n")
     runner = subprocess.Popen(
-        command(scripts), cwd=BENCHMARKS, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+        command(scripts),
+        cwd=BENCHMARKS,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
         text=True,
-    )  # fmt: skip
+    )
     until((scripts / "hangs.pid").exists)
     until((scripts / "hangs.pid").read_text)
     runner.send_signal(number)
@@ -243,10 +280,16 @@ def test_the_plan_names_scripts_that_there_are_and_options_that_they_have(monkey
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     from measuring.plan import RUNS, runs_of
 
-    assert {run.script for run in RUNS.values()} <= {path.name for path in BENCHMARKS.glob("*.py")}
+    assert {run.script for run in RUNS.values()} <= {
+        path.name for path in BENCHMARKS.glob("*.py")
+    }
     every = runs_of(BENCHMARKS)
-    assert {run.script for run in every.values()} == {p.name for p in BENCHMARKS.glob("*.py")}
+    assert {run.script for run in every.values()} == {
+        p.name for p in BENCHMARKS.glob("*.py")
+    }
     for name, run in every.items():
         source = (BENCHMARKS / run.script).read_text()
         for option in [*run.full, *run.quick]:
-            assert not option.startswith("--") or f'"{option}"' in source, f"{name}: {option}"
+            assert not option.startswith("--") or f'"{option}"' in source, (
+                f"{name}: {option}"
+            )

@@ -29,9 +29,15 @@ def test_no_adversary_makes_a_shielded_robot_touch_anything():
 def test_over_dds_and_in_real_time_nothing_is_touched():
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     _, result = asked(
-        "shield.py", "--episodes", "6", "--place", "mecanum/crowd", "--place", "ackermann/clutter",
+        "shield.py",
+        "--episodes",
+        "6",
+        "--place",
+        "mecanum/crowd",
+        "--place",
+        "ackermann/clutter",
         timeout_s=580.0,
-    )  # fmt: skip
+    )
     assert (result["driven"], result["contacts"]) == ("over DDS", 0)
     assert result["episodes"] == 6 or result["repeated"] > 0
     assert result["path_m"] > 0.5
@@ -43,7 +49,10 @@ def test_over_dds_and_in_real_time_nothing_is_touched():
 @pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_without_the_shield_there_are_contacts():
-    assert any(line.startswith("contacts of") for line in fails("shield.py", "no_shield", *SHORT))
+    assert any(
+        line.startswith("contacts of")
+        for line in fails("shield.py", "no_shield", *SHORT)
+    )
 
 
 @pytest.mark.campaign
@@ -96,7 +105,9 @@ def test_a_robot_that_drives_into_something_is_in_contact(module):
     assert place.outcome.speed == pytest.approx(0.5, abs=0.1)
 
 
-@pytest.mark.parametrize(("share", "met"), [(0.019, True), (0.021, False), (np.nan, False)])
+@pytest.mark.parametrize(
+    ("share", "met"), [(0.019, True), (0.021, False), (np.nan, False)]
+)
 def test_a_run_whose_robots_were_held_up_is_none(module, share, met):
     outcome = module("measuring.shield_places").Outcome
     shield = module("shield")
@@ -106,7 +117,9 @@ def test_a_run_whose_robots_were_held_up_is_none(module, share, met):
     result = shield.summary(driven, bare, (kept_up, {})) | {"braking": 0.9}
     assert (result["held_up"], result["repeated"]) == (3, 2)
     missed = shield.missed(result, 1)
-    assert [line.startswith("share of the time") for line in missed] == ([] if met else [True])
+    assert [line.startswith("share of the time") for line in missed] == (
+        [] if met else [True]
+    )
 
 
 def test_the_shipped_values_keep_room_to_brake_at_all_speeds(module):

@@ -7,7 +7,9 @@ import pytest
 from .runs import asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
+pytest.importorskip(
+    "simulation_interfaces", reason="needs what `make test-messages` builds"
+)
 
 pytestmark = [pytest.mark.ros, pytest.mark.campaign, pytest.mark.timeout(900)]
 SCRIPT = "standards.py"
@@ -28,7 +30,12 @@ def test_a_feature_that_is_only_claimed_fails():
 
 def test_what_is_answered_as_done_without_being_done_fails():
     missed = fails(SCRIPT, "idle", *SHORT)
-    for name in ("SPAWNING", "ENTITY_STATE_SETTING", "SIMULATION_STATE_PAUSE", "WORLD_LOADING"):
+    for name in (
+        "SPAWNING",
+        "ENTITY_STATE_SETTING",
+        "SIMULATION_STATE_PAUSE",
+        "WORLD_LOADING",
+    ):
         assert f"{name} is announced, but does not do what the standard says" in missed
 
 

@@ -50,7 +50,10 @@ def page(tables, **changes):
         ("{small|.1e}", "1.3e-6"),
         ("{share|.1%}", "98.4 %"),
         ("{share x100|.0f}", "98"),
-        ("{min robots.*.rmse x1000|.0f} to {max robots.*.rmse x1000|.0f} mm", "1 to 3 mm"),
+        (
+            "{min robots.*.rmse x1000|.0f} to {max robots.*.rmse x1000|.0f} mm",
+            "1 to 3 mm",
+        ),
         ("{max rows.*.ratio|.1f}, {rows.0.ratio|.1f}", "13.3, 9.4"),
         ("{two words.by/slash}", "3"),
         ("{name}", "office"),
@@ -67,18 +70,24 @@ def page(tables, **changes):
         ("{rate|.1e} of {nothing}", "not measured"),
     ],
 )
-def test_a_cell_is_written_from_what_was_measured_or_says_that_it_was_not(tables, template, text):
+def test_a_cell_is_written_from_what_was_measured_or_says_that_it_was_not(
+    tables, template, text
+):
     assert page(tables).cell(template, "parity")[0] == text
 
 
 def test_a_table_of_a_run_that_missed_its_bar_shows_it(tables):
-    table = tables.Table(("what", ""), (("parity", "rate", "{rate|.1e}"), ("parity", "", "x")))
+    table = tables.Table(
+        ("what", ""), (("parity", "rate", "{rate|.1e}"), ("parity", "", "x"))
+    )
     told = page(tables, state="missed", failures=["rate: 4.9e5, bar 9e5"]).table(table)
     assert told == (
         "| what | |\n|---|---|\n| rate | 4.9e5 † |\n| | x |\n"
         "\n† `parity.py` missed: rate: 4.9e5, bar 9e5\n"
     )
-    many = page(tables, state="missed", failures=["a: 1", "b: 2", "c: 3", "d: 4"]).table(table)
+    many = page(
+        tables, state="missed", failures=["a: 1", "b: 2", "c: 3", "d: 4"]
+    ).table(table)
     assert many.endswith("† `parity.py` missed: a: 1; b: 2; and 2 more\n")
     broken = page(tables, state="broken", result=None, error="was ended").table(table)
     assert "| rate | not measured |" in broken
@@ -88,7 +97,11 @@ def test_a_table_of_a_run_that_missed_its_bar_shows_it(tables):
 
 def test_the_machine_the_commit_and_the_load_are_told(tables):
     told = page(tables, dirty=True).text("machine")
-    for words in ("2 shared cores (Zuse Z3) with 25 GB", "Python 3.11.7", "789ab and changes"):
+    for words in (
+        "2 shared cores (Zuse Z3) with 25 GB",
+        "Python 3.11.7",
+        "789ab and changes",
+    ):
         assert words in told
     assert "1.5 to 1.5" in told
     assert "measured yet" in tables.Page({}).text("machine")
@@ -101,7 +114,9 @@ def test_what_was_measured_on_another_machine_than_most_is_marked(tables):
     table = tables.Table(("",), (("parity", "{rate|.0e}"), ("shield", "{rate|.0e}")))
     told = "§ on 2 shared cores (Analytical Engine)\n"
     assert found.table(table) == f"| |\n|---|\n| 5e5 |\n| 5e5 § |\n\n{told}"
-    assert "or on 2 shared cores (Analytical Engine) where marked §" in found.text("machine")
+    assert "or on 2 shared cores (Analytical Engine) where marked §" in found.text(
+        "machine"
+    )
     assert "§" not in page(tables).text("machine")
     more = {**entry, "machine": {**ENTRY["machine"], "cores": 16}}
     found = tables.Page({"runs": {"parity": entry, "soak": entry, "shield": more}})
@@ -118,7 +133,9 @@ def test_a_region_is_made_anew_and_all_else_stays(tables, monkeypatch):
     table = tables.Table(("",), (("parity", "{rate|.0e}"),))
     monkeypatch.setitem(tables.TABLES, "parity", table)
     before = "a\n\n<!-- results:parity -->\nold\n<!-- /results -->\n\nb\n"
-    assert tables.rendered(before, page(tables)) == before.replace("old", "| |\n|---|\n| 5e5 |")
+    assert tables.rendered(before, page(tables)) == before.replace(
+        "old", "| |\n|---|\n| 5e5 |"
+    )
 
 
 def test_a_region_that_no_table_has_is_an_error(tables):
@@ -136,7 +153,9 @@ def test_rows_are_of_runs_that_there_are_and_as_long_as_their_head(tables):
             assert len(cells) == len(table.head), f"{name}: {cells}"
 
 
-def test_each_table_stands_in_one_place_and_again_only_where_all_figures_or_the_papers_are(tables):
+def test_each_table_stands_in_one_place_and_again_only_where_all_figures_or_the_papers_are(
+    tables,
+):
     again, first = ("paper.md", "results.md"), []
     for path in tables.documents():
         found = [match[1] for match in tables.REGION.finditer(path.read_text())]
@@ -149,7 +168,9 @@ def test_each_table_stands_in_one_place_and_again_only_where_all_figures_or_the_
 def test_the_tables_are_what_results_json_gives(tables):
     page = tables.open_page()
     stale = [
-        p.name for p in tables.documents() if tables.rendered(p.read_text(), page) != p.read_text()
+        p.name
+        for p in tables.documents()
+        if tables.rendered(p.read_text(), page) != p.read_text()
     ]
     assert not stale, (
         f"{', '.join(stale)}: not what benchmarks/results.json gives; run `make tables`"
@@ -158,7 +179,9 @@ def test_the_tables_are_what_results_json_gives(tables):
 
 def test_the_peers_agree_between_the_benchmarks_that_measure_them(tables):
     runs = tables.open_page().runs
-    if not all(runs.get(name, {}).get("result") for name in ("lidar_peers", "env_throughput")):
+    if not all(
+        runs.get(name, {}).get("result") for name in ("lidar_peers", "env_throughput")
+    ):
         pytest.skip("benchmarks/results.json has no run of both")
     lidar, steps = (runs[name]["result"] for name in ("lidar_peers", "env_throughput"))
     for name in lidar["peer_readings"]:

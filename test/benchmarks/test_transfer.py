@@ -30,7 +30,9 @@ def places(fast, dds, mujoco, believed=0.0, length=5.0):
             "believed": [share + believed, 0.0, 1.0],
             "length": [length, 0.0, 9.0],
         }
-        for place, share in zip(("fast", "dds", "mujoco_dds"), (fast, dds, mujoco), strict=True)
+        for place, share in zip(
+            ("fast", "dds", "mujoco_dds"), (fast, dds, mujoco), strict=True
+        )
     }
 
 
@@ -39,12 +41,24 @@ def places(fast, dds, mujoco, believed=0.0, length=5.0):
     [
         ("circles", places(0.97, 0.95, 0.93), []),
         ("clutter", places(0.95, 0.95, 0.95), []),
-        ("circles", places(0.95, 0.95, 0.95), ["95.0% success in process, less than 97%"]),
+        (
+            "circles",
+            places(0.95, 0.95, 0.95),
+            ["95.0% success in process, less than 97%"],
+        ),
         ("doorway", places(0.97, 0.94, 0.97), ["success over DDS is 3.0 points off"]),
-        ("room", places(0.97, 0.97, 0.92), ["success MuJoCo over DDS is 5.0 points off"]),
+        (
+            "room",
+            places(0.97, 0.97, 0.92),
+            ["success MuJoCo over DDS is 5.0 points off"],
+        ),
         ("room", places(0.97, 0.97, 1.0), []),
         ("crowd", places(0.1, 0.1, 0.1), ["10.0% success in process"]),
-        ("room", places(0.97, 0.97, 0.97, believed=0.06), ["successes to the robot alone"] * 3),
+        (
+            "room",
+            places(0.97, 0.97, 0.97, believed=0.06),
+            ["successes to the robot alone"] * 3,
+        ),
         ("room", places(0.97, 0.97, 0.97, length=None), ["no successful way"] * 3),
         ("room", places(math.nan, 0.97, 0.97), ["nan", "nan", "nan", "nan"]),
     ],
@@ -69,22 +83,32 @@ def test_no_robot_is_no_transfer(transfer):
 def test_a_part_of_the_places_is_judged_alone(transfer):
     some = {place: places(0.97, 0.9, 0.9)[place] for place in ("dds", "mujoco_dds")}
     assert transfer.missed({"differential": {"circles": some}}) == []
-    assert transfer.apart({"differential": {"circles": some}}) == {"differential": {"circles": {}}}
+    assert transfer.apart({"differential": {"circles": some}}) == {
+        "differential": {"circles": {}}
+    }
 
 
 def test_shares_and_their_distance_are_told_of_each_robot_world_and_place(transfer):
     found = {"mecanum": {"room": places(0.9, 0.88, 0.95, believed=0.02)}}
     assert transfer.shares(found, "success")["mecanum"]["room"] == {
-        "fast": 0.9, "dds": 0.88, "mujoco_dds": 0.95,
-    }  # fmt: skip
-    assert transfer.shares(found, "believed")["mecanum"]["room"]["fast"] == pytest.approx(0.92)
+        "fast": 0.9,
+        "dds": 0.88,
+        "mujoco_dds": 0.95,
+    }
+    assert transfer.shares(found, "believed")["mecanum"]["room"][
+        "fast"
+    ] == pytest.approx(0.92)
     assert transfer.apart(found)["mecanum"]["room"] == {"dds": -2.0, "mujoco_dds": 5.0}
 
 
 def test_a_robot_drives_with_its_own_lidar_or_a_real_one_behind_its_own_gate(transfer):
     assert transfer.conditions("jackal").lidar is None
     given = transfer.conditions("mecanum")
-    assert (given.lidar, given.randomisation, given.gate) == ("rplidar_a2", "mild", "mecanum")
+    assert (given.lidar, given.randomisation, given.gate) == (
+        "rplidar_a2",
+        "mild",
+        "mecanum",
+    )
 
 
 ONE = ("--episodes", "1", "--robots", "differential", "--worlds", "circles")
@@ -99,7 +123,10 @@ def test_it_prints_one_json_object_with_all_places():
         shares = told[key]["differential"]["circles"]
         assert set(shares) == {"fast", "dds", "mujoco_dds"}
         assert set(shares.values()) <= {0.0, 1.0}
-    assert set(told["points_from_fast"]["differential"]["circles"]) == {"dds", "mujoco_dds"}
+    assert set(told["points_from_fast"]["differential"]["circles"]) == {
+        "dds",
+        "mujoco_dds",
+    }
     assert code == bool(told["failures"])
 
 

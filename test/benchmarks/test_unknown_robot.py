@@ -43,14 +43,18 @@ def turned(engine, dart, seconds: float) -> tuple[float, float]:
 
 
 def test_its_wheels_slip_when_it_turns_so_that_odometry_believes_in_too_much(dart):
-    engine = dart.Engine(dart.Place(np.array([8.0, 8.0]), np.zeros((0, 3))), np.zeros(3))
+    engine = dart.Engine(
+        dart.Place(np.array([8.0, 8.0]), np.zeros((0, 3))), np.zeros(3)
+    )
     true_turn, by_wheels = turned(engine, dart, 4.0)
     assert true_turn > 0.5
     assert by_wheels > 1.15 * true_turn
 
 
 def test_a_held_body_stands_while_its_wheels_go_on(dart):
-    engine = dart.Engine(dart.Place(np.array([8.0, 8.0]), np.zeros((0, 3))), np.zeros(3))
+    engine = dart.Engine(
+        dart.Place(np.array([8.0, 8.0]), np.zeros((0, 3))), np.zeros(3)
+    )
     engine.hold(True)
     true_turn, by_wheels = turned(engine, dart, 1.0)
     assert abs(true_turn) < 0.01
@@ -72,7 +76,9 @@ def test_its_lidar_sees_walls_and_pillars_where_they_are(dart, place):
     lidar = dart.Lidar(beams=8, noise=0.0)
     ranges = lidar.scan(place, np.array([0.0, 0.0, 0.0]), np.random.default_rng(0))
     far = 4.0 * math.sqrt(2.0)  # to a corner
-    np.testing.assert_allclose(ranges, [4.0, far, 4.0, far, 1.7, far, 4.0, far], atol=1e-9)
+    np.testing.assert_allclose(
+        ranges, [4.0, far, 4.0, far, 1.7, far, 4.0, far], atol=1e-9
+    )
 
 
 @pytest.mark.ros

@@ -30,7 +30,10 @@ def test_a_model_with_another_lidar_is_saved_where_a_node_can_read_it(tmp_path):
 
 @pytest.mark.parametrize(
     ("conditions", "said"),
-    [(Conditions(lidar="rplidar_a9"), "rplidar_a9"), (Conditions(randomisation="milt"), "mild")],
+    [
+        (Conditions(lidar="rplidar_a9"), "rplidar_a9"),
+        (Conditions(randomisation="milt"), "mild"),
+    ],
 )
 def test_an_unknown_condition_is_one_sentence(conditions, said, tmp_path):
     with pytest.raises(ConfigError, match=said):
@@ -41,7 +44,10 @@ def test_an_unknown_condition_is_one_sentence(conditions, said, tmp_path):
 def test_an_episode_is_driven_through_the_gate_and_with_what_was_drawn():
     model, told = builtin_model("differential"), []
     for gate in (None, "differential"):
-        given = {"estimator": True, "randomisation": Conditions(randomisation="mild").ranges}
+        given = {
+            "estimator": True,
+            "randomisation": Conditions(randomisation="mild").ranges,
+        }
         env, policy = env_of(
             "dynamic_window", model, "circles", "sim", Conditions(gate=gate), **given
         )
@@ -49,6 +55,8 @@ def test_an_episode_is_driven_through_the_gate_and_with_what_was_drawn():
         told.append((episode, env.reset(seed=5)[1]["randomisation"]))
     (bare, drawn), (behind, again) = told
     assert drawn == again
-    speeds = [np.linalg.norm(np.diff(one.path[:3, :2], axis=0), axis=1) for one, _ in told]
+    speeds = [
+        np.linalg.norm(np.diff(one.path[:3, :2], axis=0), axis=1) for one, _ in told
+    ]
     assert speeds[1][-1] < speeds[0][-1]  # the gate lets no robot start at once
     assert bare.goal.tolist() == behind.goal.tolist()

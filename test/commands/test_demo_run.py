@@ -30,16 +30,26 @@ from nics_drl_bridge.robot.spec import load_robot
 @pytest.fixture
 def without_torch(monkeypatch):
     monkeypatch.setattr(
-        extensions, "find_spec", lambda name: None if name == "torch" else find_spec(name)
+        extensions,
+        "find_spec",
+        lambda name: None if name == "torch" else find_spec(name),
     )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "robot", ["differential", *(pytest.param(name, marks=pytest.mark.campaign)
-                                for name in ("ackermann", "mecanum"))],
-)  # fmt: skip
-def test_without_the_extra_the_shipped_policy_of_the_robot_drives(tmp_path, without_torch, robot):
+    "robot",
+    [
+        "differential",
+        *(
+            pytest.param(name, marks=pytest.mark.campaign)
+            for name in ("ackermann", "mecanum")
+        ),
+    ],
+)
+def test_without_the_extra_the_shipped_policy_of_the_robot_drives(
+    tmp_path, without_torch, robot
+):
     pytest.importorskip("onnxruntime")
     said: list[str] = []
     learned = learn(DemoPlan(tmp_path, robot), builtin_model(robot), said.append)
@@ -58,7 +68,9 @@ def test_without_the_extra_a_robot_without_a_shipped_policy_gets_a_baseline(
     robot = load_robot("differential").model_dump(mode="json") | {"name": "mine"}
     (tmp_path / "mine.yaml").write_text(dump_yaml(robot))
     model = builtin_model(str(tmp_path / "mine.yaml"))
-    learned = learn(DemoPlan(tmp_path, str(tmp_path / "mine.yaml")), model, lambda _: None)
+    learned = learn(
+        DemoPlan(tmp_path, str(tmp_path / "mine.yaml")), model, lambda _: None
+    )
     assert learned.policy == "dynamic_window"
 
 
@@ -66,7 +78,9 @@ def test_a_named_policy_is_taken_and_a_misspelt_one_refused(tmp_path):
     model = direct_model()
     learned = learn(DemoPlan(tmp_path, policy="straight"), model, pytest.fail)
     assert learned.policy == "straight"
-    with pytest.raises(ConfigError, match="unknown policy 'strait'; did you mean 'straight'"):
+    with pytest.raises(
+        ConfigError, match="unknown policy 'strait'; did you mean 'straight'"
+    ):
         learn(DemoPlan(tmp_path, policy="strait"), model, pytest.fail)
 
 
@@ -92,11 +106,17 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
     points = [Point(8192, 0.1, 0.8), Point(80_000, 0.9, 0.1)]
     learned = Learned("policy.onnx", "PPO learned it.", points)
     summaries = {"as it is": summary, "lidar": summary}
-    of = DemoEpisodes(summaries, [episode(0), episode(1)], [episode(0), episode(1)], live)
+    of = DemoEpisodes(
+        summaries, [episode(0), episode(1)], [episode(0), episode(1)], live
+    )
     sections = dict(sections_of(DemoPlan(tmp_path), model, identified, learned, of))
     assert next(iter(sections)) == "Verdict"
     verdict = "".join(sections["Verdict"])
-    for words in (f"{100 * share:.1f} %", "2 of 2", "arrived" if arrived else "did not arrive"):
+    for words in (
+        f"{100 * share:.1f} %",
+        "2 of 2",
+        "arrived" if arrived else "did not arrive",
+    ):
         assert words in verdict
     assert verdict.count("⚠") == (0 if arrived else 2)
     assert "".join(sections["Paths in the world"]).count("<img") == 2
@@ -122,10 +142,14 @@ def test_without_ros_it_drives_in_process_alone_and_says_so(tmp_path, monkeypatc
     shown = []
     monkeypatch.setattr(demo_run, "find_spec", lambda name: None)
     monkeypatch.setattr(demo_run, "_generate", lambda plan, say: (direct_model(), None))
-    monkeypatch.setattr(demo_run, "learn", lambda *given: Learned("straight", "None was."))
+    monkeypatch.setattr(
+        demo_run, "learn", lambda *given: Learned("straight", "None was.")
+    )
     monkeypatch.setattr(demo_run, "_evaluate", lambda *given: None)
     monkeypatch.setattr(demo_run, "_drive", drive_here)
-    monkeypatch.setattr(demo_run, "sections_of", lambda *given: shown.append(given[-1]) or [])
+    monkeypatch.setattr(
+        demo_run, "sections_of", lambda *given: shown.append(given[-1]) or []
+    )
     said = list[str]()
     line = demo_run.run(DemoPlan(tmp_path, episodes=1), said.append)
     assert line == f"demo: in process 1/1, report {tmp_path / 'report.html'}"

@@ -28,7 +28,9 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import load_robot, robot_from
 from nics_drl_bridge.sim.world_set import load_worlds
 
-KART = SimpleNamespace(robot=robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2}))
+KART = SimpleNamespace(
+    robot=robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2})
+)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +57,9 @@ def order(*places):
 def test_a_robot_without_cmd_vel_is_driven_in_process_alone_and_that_is_said():
     said = []
     assert _places(order(), KART.robot, said.append) == [FAST]
-    assert said[0].startswith("in process alone: robot 'ackermann_throttle': the command 'throttl")
+    assert said[0].startswith(
+        "in process alone: robot 'ackermann_throttle': the command 'throttl"
+    )
     assert _places(order(FAST), KART.robot, said.append) == [FAST]
     assert len(said) == 1
 
@@ -68,9 +72,24 @@ def test_to_ask_for_topics_with_such_a_robot_is_refused():
 @pytest.mark.parametrize(
     ("lacking", "robot", "places", "why"),
     [
-        ("rclpy", "differential", [FAST], "in process alone: the world 'dds' needs the module"),
-        ("mujoco", "differential", [FAST, "dds"], "in process and over DDS alone: .*mujoco"),
-        ("", "tricycle", [FAST, "dds"], "in process and over DDS alone: .*no machine of the kind"),
+        (
+            "rclpy",
+            "differential",
+            [FAST],
+            "in process alone: the world 'dds' needs the module",
+        ),
+        (
+            "mujoco",
+            "differential",
+            [FAST, "dds"],
+            "in process and over DDS alone: .*mujoco",
+        ),
+        (
+            "",
+            "tricycle",
+            [FAST, "dds"],
+            "in process and over DDS alone: .*no machine of the kind",
+        ),
     ],
 )
 def test_without_in_an_evaluation_leaves_out_where_it_can_not_run_in_one_line(
@@ -112,7 +131,9 @@ def test_a_baseline_drives_the_robot_of_the_policy_beside_it(tmp_path):
 
 def test_a_policy_of_a_robot_that_is_gone_asks_for_its_model(tmp_path):
     gone = {"mine.onnx": contract("mine", model=str(tmp_path / "gone"))}
-    with pytest.raises(ConfigError, match=r"mine.onnx: .*'mine', .*which is gone; .* with --model"):
+    with pytest.raises(
+        ConfigError, match=r"mine.onnx: .*'mine', .*which is gone; .* with --model"
+    ):
         model_name(None, gone)
 
 

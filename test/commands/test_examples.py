@@ -80,7 +80,8 @@ def test_every_option_that_takes_a_shipped_name_completes():
 
 def test_every_command_but_the_page_speaks_json():
     mute = {
-        name for name, command in KNOWN.items()
+        name
+        for name, command in KNOWN.items()
         if not any("--json" in option.opts for option in command.params)
-    }  # fmt: skip
+    }
     assert mute == {("watch",)}

@@ -51,7 +51,13 @@ def test_a_wrong_name_or_place_is_refused_before_anything_heavy_is_loaded(
 ) -> None:
     (tmp_path / "mine.py").write_text("x = 1\n")
     (tmp_path / "empty").mkdir()
-    command = [sys.executable, "-B", "-c", PROGRAM, *words.split()]  # without __pycache__
+    command = [
+        sys.executable,
+        "-B",
+        "-c",
+        PROGRAM,
+        *words.split(),
+    ]  # without __pycache__
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
     )
@@ -64,12 +70,24 @@ def test_a_wrong_name_or_place_is_refused_before_anything_heavy_is_loaded(
 @pytest.mark.parametrize(
     "command",
     [
-        "train", "record --out d.npz", "generate d.npz --out m", "drive", "demo", "doctor",
-        "watch", "evaluate straight", "policy import x.yaml --out p.onnx", "world draw room",
-        "world map room", "bag replay b", "bag export b",
+        "train",
+        "record --out d.npz",
+        "generate d.npz --out m",
+        "drive",
+        "demo",
+        "doctor",
+        "watch",
+        "evaluate straight",
+        "policy import x.yaml --out p.onnx",
+        "world draw room",
+        "world map room",
+        "bag replay b",
+        "bag export b",
     ],
-)  # fmt: skip
-def test_robot_and_model_are_one_option_of_every_command(tmp_path: Path, command: str) -> None:
+)
+def test_robot_and_model_are_one_option_of_every_command(
+    tmp_path: Path, command: str
+) -> None:
     done = nics(*command.split(), "--robot", "jackal", "--model=mecanum", cwd=tmp_path)
     assert done.returncode == 2
     assert "--robot and --model are one option, and name" in done.stderr

@@ -23,7 +23,9 @@ DOCS = Path(__file__).resolve().parents[2] / "docs" / "recordings.md"
 def folder(tmp_path_factory):
     """A drive of a car as one table, with the names that users give."""
     room = tmp_path_factory.mktemp("log")
-    drive = textbook.record(load_robot("ackermann"), np.random.default_rng(0), duration=30.0)
+    drive = textbook.record(
+        load_robot("ackermann"), np.random.default_rng(0), duration=30.0
+    )
     row = np.searchsorted(drive.command.t, drive.pose.t + 1e-9, side="right") - 1
     command = drive.command.values[np.clip(row, 0, None)]
     table = np.column_stack([drive.pose.t, drive.pose.values, command, drive.pose.t])
@@ -48,7 +50,9 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
     told = json.loads(nics(*words, "again.npz", "--json", cwd=tmp_path).stdout)
     assert (told["recording"], told["robot"]["kind"]) == ("again.npz", "ackermann")
     (pose,) = (stream for stream in told["streams"] if stream["stream"] == "pose")
-    assert pose["rate_hz"] == pytest.approx((pose["rows"] - 1) / (pose["to_s"] - pose["from_s"]))
+    assert pose["rate_hz"] == pytest.approx(
+        (pose["rows"] - 1) / (pose["to_s"] - pose["from_s"])
+    )
     kept = load_recording(tmp_path / "drive.npz")
     assert kept.variables == ("speed_command", "steering_command")
     assert kept.robot == {"kind": "ackermann", "footprint_radius": 0.2}
@@ -71,7 +75,9 @@ def test_logs_of_two_robots_are_refused(tmp_path):
         robot = load_robot(name)
         driven = textbook.record(robot, np.random.default_rng(0), duration=10.0)
         write_drive(driven, tmp_path / f"{name}.npz", robot)
-    done = nics("generate", "differential.npz", "ackermann.npz", "--out", "m", cwd=tmp_path)
+    done = nics(
+        "generate", "differential.npz", "ackermann.npz", "--out", "m", cwd=tmp_path
+    )
     assert done.returncode == 2
     assert "fit only drives of one robot together" in done.stderr
 
@@ -96,19 +102,33 @@ def test_a_log_with_its_mapping_becomes_a_simulator(folder, tmp_path):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("import", "drive.csv", "--map", "none.yaml", "--out", "a.npz"), "none.yaml: no such"),
+        (
+            ("import", "drive.csv", "--map", "none.yaml", "--out", "a.npz"),
+            "none.yaml: no such",
+        ),
         (("import", "drive.csv", "--map", "my.yaml", "--out", "a"), "must end in .npz"),
         (("generate", "drive.csv", "--out", "m"), "with --map; `nics inspect"),
         (
-            ("generate", "drive.csv", "--map", "my.yaml", "--topic", "pose=/p", "--out", "m"),
+            (
+                "generate",
+                "drive.csv",
+                "--map",
+                "my.yaml",
+                "--topic",
+                "pose=/p",
+                "--out",
+                "m",
+            ),
             "name the topics in the map",
         ),
         (("inspect", "nothing.csv"), "nothing.csv: no such file or folder"),
     ],
-)  # fmt: skip
+)
 def test_what_can_not_be_done_is_one_sentence(folder, tmp_path, words, sentence):
     (tmp_path / "drive.csv").write_bytes((folder / "drive.csv").read_bytes())
-    (tmp_path / "my.yaml").write_text("time: 0\npose: {x: 1, y: 2, heading: 3}\ncommand: {v: 4}\n")
+    (tmp_path / "my.yaml").write_text(
+        "time: 0\npose: {x: 1, y: 2, heading: 3}\ncommand: {v: 4}\n"
+    )
     done = nics(*words, cwd=tmp_path)
     assert done.returncode == 2
     assert sentence in done.stderr
@@ -122,6 +142,8 @@ def test_the_mapping_and_the_units_of_the_docs_are_those_of_the_code():
     example = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
     Mapping.model_validate(parse_yaml(example.group(1), "docs"))
     row = next(line for line in text.splitlines() if line.startswith("| `unit`"))
-    listed = [unit for some in re.findall("`([^`]+)`", row)[1:] for unit in some.split()]
+    listed = [
+        unit for some in re.findall("`([^`]+)`", row)[1:] for unit in some.split()
+    ]
     assert set(listed) <= set(UNITS)
     assert len(set(UNITS) - set(listed)) < 12  # rare ones and synonyms

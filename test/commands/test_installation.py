@@ -14,9 +14,13 @@ def test_the_doctor_tells_what_works_on_this_machine(tmp_path):
     told = nics("doctor", "--install", "--json", cwd=tmp_path)
     assert told.returncode == 0, told.stderr
     parts = {each["part"]: each for each in json.loads(told.stdout)["checks"]}
-    assert {"Python", "ROS 2", "cores", "kernels", *(f"extra {name}" for name in EXTRAS)} <= set(
-        parts
-    )
+    assert {
+        "Python",
+        "ROS 2",
+        "cores",
+        "kernels",
+        *(f"extra {name}" for name in EXTRAS),
+    } <= set(parts)
     assert parts["Python"]["works"]
     assert "of " in parts["kernels"]["found"]
 

@@ -21,7 +21,9 @@ from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.recording.write import write_drive
 from nics_drl_bridge.robot.spec import load_robot
 
-ROBOT = (share_folder() / "config" / "robots" / "differential.yaml").read_text(encoding="utf-8")
+ROBOT = (share_folder() / "config" / "robots" / "differential.yaml").read_text(
+    encoding="utf-8"
+)
 FILES = {
     "text.txt": "hello\n",
     "text.onnx": "hello\n",
@@ -31,7 +33,9 @@ FILES = {
     "misspelt.yaml": ROBOT.replace("wheel_radius", "wheel_radus"),
     "no_command.yaml": ROBOT.partition("command:")[0],
     "turned.yaml": ROBOT.replace("min: -2.0, max: 2.0", "min: 2.0, max: -2.0"),
-    "with_unit.yaml": ROBOT.replace("footprint_radius: 0.15", "footprint_radius: 0.15 m"),
+    "with_unit.yaml": ROBOT.replace(
+        "footprint_radius: 0.15", "footprint_radius: 0.15 m"
+    ),
     "twice.yaml": ROBOT + "footprint_radius: 0.2\n",
     "listed.yaml": "- name: differential\n",
     "kind.yaml": "name: mine\nkind: diferential\nfootprint_radius: 0.2\n",
@@ -156,10 +160,16 @@ MODULES = {
         "train",
         "torch",
     ): r"training needs the module 'torch'; pip install 'nics_drl_bridge\[train\]'",
-    ("train", "onnx"): r"training needs the module 'onnx'; pip install 'nics_drl_bridge\[deploy\]'",
+    (
+        "train",
+        "onnx",
+    ): r"training needs the module 'onnx'; pip install 'nics_drl_bridge\[deploy\]'",
     ("train", "onnxruntime"): r"pip install 'nics_drl_bridge\[deploy\]'",
     ("evaluate straight --in dds", "rclpy"): r"pip install 'nics_drl_bridge\[ros\]'",
-    ("train --engine ray", "ray"): r"pip install 'nics_drl_bridge\[train,distributed\]'",
+    (
+        "train --engine ray",
+        "ray",
+    ): r"pip install 'nics_drl_bridge\[train,distributed\]'",
 }
 
 
@@ -199,7 +209,9 @@ def test_a_mistake_is_one_sentence(words, folder):
 
 
 @pytest.mark.parametrize("given", MODULES, ids=" without ".join)
-def test_a_missing_module_is_one_sentence_with_what_to_install(given, folder, monkeypatch):
+def test_a_missing_module_is_one_sentence_with_what_to_install(
+    given, folder, monkeypatch
+):
     words, module = given
     monkeypatch.setitem(sys.modules, module, None)
     sentence = sentence_of(nics(*words.split(), cwd=folder))
@@ -210,7 +222,9 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(folder):
     full = OSError(errno.ENOSPC, "No space left on device", "m/model.yaml")
     with mock.patch("nics_drl_bridge.files.write_text", side_effect=full):
         done = nics("drive", "--robot", "differential", "--out", "m", cwd=folder)
-    assert "m/model.yaml: No space left on device; choose another place" in sentence_of(done)
+    assert "m/model.yaml: No space left on device; choose another place" in sentence_of(
+        done
+    )
     assert not (folder / "m").exists()
 
 
@@ -224,9 +238,13 @@ def test_ctrl_c_at_any_time_is_one_sentence(where, folder):
 
 def test_a_run_with_other_settings_is_not_overwritten(folder):
     (folder / "run").mkdir()
-    (folder / "run" / "settings.yaml").write_text("robot: ackermann\n", encoding="utf-8")
+    (folder / "run" / "settings.yaml").write_text(
+        "robot: ackermann\n", encoding="utf-8"
+    )
     done = nics("train", "--robot", "differential", "--out", "run", cwd=folder)
-    assert "run: holds a run with other settings; choose another --out" in sentence_of(done)
+    assert "run: holds a run with other settings; choose another --out" in sentence_of(
+        done
+    )
 
 
 @pytest.fixture
@@ -250,7 +268,9 @@ def test_ctrl_c_before_a_command_has_begun_is_one_sentence(signals, capsys):
 
 
 def test_where_no_kernel_can_be_kept_the_sentence_names_the_variable(signals, capsys):
-    error = RuntimeError("cannot cache function 'step': no locator available for file 'kernels.py'")
+    error = RuntimeError(
+        "cannot cache function 'step': no locator available for file 'kernels.py'"
+    )
     with (
         mock.patch("nics_drl_bridge.commands.cli.main", side_effect=error),
         pytest.raises(SystemExit) as end,
@@ -282,7 +302,9 @@ def test_a_recording_of_this_package_gets_no_mapping_and_says_so(tmp_path):
     driven = textbook.record(robot, np.random.default_rng(0), 5.0)
     write_drive(driven, tmp_path / "own.npz", robot)
     said = nics("inspect", "own.npz", "--map", "my.yaml", cwd=tmp_path).stdout
-    assert said.startswith("own.npz: was written by this package, and needs no mapping: nics gen")
+    assert said.startswith(
+        "own.npz: was written by this package, and needs no mapping: nics gen"
+    )
     assert not (tmp_path / "my.yaml").exists()
 
 

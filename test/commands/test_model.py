@@ -29,7 +29,15 @@ state:
 @pytest.mark.slow
 def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_path):
     (tmp_path / "mine.yaml").write_text(NARROW, encoding="utf-8")
-    words = ("drive", "--robot", "mine.yaml", "--out", "mine", "--recording", "drive.npz")
+    words = (
+        "drive",
+        "--robot",
+        "mine.yaml",
+        "--out",
+        "mine",
+        "--recording",
+        "drive.npz",
+    )
     done = nics(*words, "--duration", "20", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("next: nics train --robot mine\n")
@@ -38,13 +46,31 @@ def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_p
     assert "beyond its limits -10 and 10" in first
     model = load_model(tmp_path / "mine")
     assert model.lidar.mount == (0.05, 0.0, 0.0)
-    assert model.control_period == pytest.approx(0.18)  # that of the lidar, which scans at 5.5 Hz
-    assert load_recording(tmp_path / "drive.npz").command.t[-1] == pytest.approx(20.0, abs=0.1)
+    assert model.control_period == pytest.approx(
+        0.18
+    )  # that of the lidar, which scans at 5.5 Hz
+    assert load_recording(tmp_path / "drive.npz").command.t[-1] == pytest.approx(
+        20.0, abs=0.1
+    )
     spec, _ = robot_and_drive(tmp_path / "drive.npz", None, TopicRoles(), None)
     assert spec == load_robot(tmp_path / "mine.yaml")  # a recording tells its robot
-    words = ("drive", "--robot", "mine.yaml", "--out", "again", "--duration", "10", "--json")
+    words = (
+        "drive",
+        "--robot",
+        "mine.yaml",
+        "--out",
+        "again",
+        "--duration",
+        "10",
+        "--json",
+    )
     told = json.loads(nics(*words, cwd=tmp_path).stdout)
-    assert told == {"model": "again", "robot": "mine", "lidar": model.lidar.name, "recording": None}
+    assert told == {
+        "model": "again",
+        "robot": "mine",
+        "lidar": model.lidar.name,
+        "recording": None,
+    }
     done = nics("drive", "--robot", "mine.yaml", "--duration", "10", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert load_model(tmp_path / "mine_model").robot == spec

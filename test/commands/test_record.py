@@ -25,18 +25,31 @@ def many(*row: object) -> object:
 
 
 def nics(*words, cwd, **environment):
-    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", *map(str, words)]
+    command = [
+        sys.executable,
+        "-m",
+        "nics_drl_bridge.commands.cli",
+        "record",
+        *map(str, words),
+    ]
     return subprocess.run(
-        command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True,
-        timeout=100, input="n\n",
-    )  # fmt: skip
+        command,
+        cwd=cwd,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        input="n\n",
+    )
 
 
 @pytest.mark.slow
 def test_a_preview_tells_and_draws_the_drive_and_does_no_more(tmp_path):
     # A module path without ROS 2: a preview needs none.
     (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no', name='rclpy')")
-    done = nics("--preview", "--out", "new/drive.npz", cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    done = nics(
+        "--preview", "--out", "new/drive.npz", cwd=tmp_path, PYTHONPATH=str(tmp_path)
+    )
     assert done.returncode == 0, done.stderr
     told = done.stdout.splitlines()
     assert told[0].startswith("preview of 60 s: a path of ")
@@ -54,7 +67,9 @@ def test_it_asks_before_the_robot_moves(tmp_path):
     done = nics("--out", "drive.npz", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("preview of ") == 1
-    assert done.stdout.endswith("Drive the robot now? [y/N]: nothing was driven or recorded.\n")
+    assert done.stdout.endswith(
+        "Drive the robot now? [y/N]: nothing was driven or recorded.\n"
+    )
     facts = json.loads(nics("--out", "drive.npz", "--json", cwd=tmp_path).stdout)
     assert facts == {"out": "drive.npz", "robot": DEFAULT_ROBOT, "recorded": False}
 
@@ -79,7 +94,9 @@ def test_without_ros_it_is_one_sentence(tmp_path):
     [
         (("--out", "drive.csv"), "unknown kind of recording '.csv'"),
         many(("--out", "taken.npz"), "taken.npz: is there already"),
-        many(("--out", "drive.npz", "--robot", "ackerman"), "did you mean 'ackermann'?"),
+        many(
+            ("--out", "drive.npz", "--robot", "ackerman"), "did you mean 'ackermann'?"
+        ),
         many(
             ("--out", "d.npz", "--robot", "ackermann", "--bound", "0.5"),
             "too small for robot 'ackermann'",
@@ -112,7 +129,10 @@ def test_the_summary_tells_each_command_and_the_next_step():
     assert measured.startswith("measured: a path of ")
     assert speed.startswith("speed_command: moved from -0.4")
     assert "on its own" in steering
-    assert after == "next: nics generate runs/drive.npz --robot ackermann --out drive_model"
+    assert (
+        after
+        == "next: nics generate runs/drive.npz --robot ackermann --out drive_model"
+    )
 
 
 @pytest.mark.ros

@@ -57,9 +57,11 @@ def until(condition):
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_warm_up_that_is_ended_leaves_no_process_and_no_traceback(tmp_path):
     with subprocess.Popen(
-        [*NICS, "warmup"], env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
-        stderr=subprocess.PIPE, text=True,
-    ) as warming:  # fmt: skip
+        [*NICS, "warmup"],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as warming:
         until(lambda: any(tmp_path.iterdir()))  # the workers compile
         children = children_of(warming.pid)
         assert len(children) >= 2
@@ -124,8 +126,12 @@ start.main()
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("then", ["raise", "pass; raise RuntimeError('lost')", "sys.exit(1)"])
-def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(tmp_path, then):
+@pytest.mark.parametrize(
+    "then", ["raise", "pass; raise RuntimeError('lost')", "sys.exit(1)"]
+)
+def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(
+    tmp_path, then
+):
     (tmp_path / "loses_it.py").write_text(LOSES_IT.format(then=then))
     words = [sys.executable, "-m", "loses_it"]
     path = os.pathsep.join([str(tmp_path), *sys.path])

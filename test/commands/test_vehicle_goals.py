@@ -11,7 +11,9 @@ from nics_drl_bridge.commands.vehicle_goals import GoalOrder
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.sim.world import load_world
 
-SCENE = SimpleNamespace(starts=np.array([[1.0, -1.0, np.pi / 2]]), goals=np.array([[1.0, 2.0]]))
+SCENE = SimpleNamespace(
+    starts=np.array([[1.0, -1.0, np.pi / 2]]), goals=np.array([[1.0, 2.0]])
+)
 ELSEWHERE = np.array([18.0, 5.0, np.pi])
 
 
@@ -23,7 +25,9 @@ def test_a_goal_from_where_it_stands_lays_the_map_there():
     assert episode.options["start"].tolist() == [0.0, 0.0, 0.0]
     assert episode.options["goal"].tolist() == [2.0, 0.5]
     assert episode.distance == pytest.approx(np.hypot(2.0, 0.5))
-    assert "2.00 m ahead and 0.50 m to the left of where it stands" in episode.sentence()
+    assert (
+        "2.00 m ahead and 0.50 m to the left of where it stands" in episode.sentence()
+    )
 
 
 def test_with_a_pose_sensor_a_goal_from_where_it_stands_is_composed_with_the_pose():
@@ -63,7 +67,9 @@ def test_where_the_start_is_awaited_goals_are_in_map(frame):
 
 def test_where_the_start_is_awaited_a_goal_may_be_seen_from_it():
     episode = GoalOrder((2.0, 0.5), "robot").episode(SCENE)
-    assert episode.goal == pytest.approx(geometry.compose(SCENE.starts[0], (2.0, 0.5, 0.0))[:2])
+    assert episode.goal == pytest.approx(
+        geometry.compose(SCENE.starts[0], (2.0, 0.5, 0.0))[:2]
+    )
 
 
 def test_the_ground_around_a_vehicle_is_open_and_wide_enough_for_its_goal():
@@ -71,7 +77,11 @@ def test_the_ground_around_a_vehicle_is_open_and_wide_enough_for_its_goal():
     ground = GoalOrder((30.0, 0.0), start="present").ground(world)
     assert ground.bounds[2] > 30.0
     assert not ground.obstacles
-    for other in (GoalOrder(start="present"), GoalOrder((1.0, 0.0)), GoalOrder((1.0, 0.0), "map")):
+    for other in (
+        GoalOrder(start="present"),
+        GoalOrder((1.0, 0.0)),
+        GoalOrder((1.0, 0.0), "map"),
+    ):
         assert other.ground(world) is world
 
 
@@ -81,17 +91,23 @@ def test_only_a_far_goal_is_confirmed():
     assert not asked
     GoalOrder((4.0, 3.1), start="present").episode(SCENE).confirm(asked.append)
     assert "farther than 5 m" in asked[0]
-    GoalOrder((4.0, 3.1), start="present", confirm_beyond_m=6.0).episode(SCENE).confirm(None)
+    GoalOrder((4.0, 3.1), start="present", confirm_beyond_m=6.0).episode(SCENE).confirm(
+        None
+    )
 
 
 def test_a_far_goal_that_nobody_can_confirm_is_refused_in_one_sentence(monkeypatch):
     far = GoalOrder((20.0, 0.0), start="present").episode(SCENE)
     for confirm in (None, vehicle_goals.confirm_at_terminal):
-        with pytest.raises(ConfigError, match=r"20.00 m ahead.*farther than 5 m.*say --yes"):
+        with pytest.raises(
+            ConfigError, match=r"20.00 m ahead.*farther than 5 m.*say --yes"
+        ):
             far.confirm(confirm)
 
 
-@pytest.mark.parametrize(("answer", "driven"), [("y\n", True), ("n\n", False), ("\n", False)])
+@pytest.mark.parametrize(
+    ("answer", "driven"), [("y\n", True), ("n\n", False), ("\n", False)]
+)
 def test_at_a_terminal_the_answer_decides(monkeypatch, answer, driven):
     monkeypatch.setattr(vehicle_goals.sys, "stdin", Terminal(answer))
     if driven:

@@ -23,15 +23,24 @@ from nics_drl_bridge.commands import watch as module
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--ros", "--bag", "drive"], "--bag does not go with --ros; leave out --bag, or --ros."),
+        (
+            ["--ros", "--bag", "drive"],
+            "--bag does not go with --ros; leave out --bag, or --ros.",
+        ),
         (["straight", "--bag", "drive"], "a policy does not go with --bag"),
         (["--ros", "--gate", "differential"], "--gate does not go with --ros"),
         (["--ros", "--record", "a.gif"], "--record does not go with --ros"),
-        (["straight", "--topic", "odom=/wheels"], "--topic: belongs to --bag; add that, or leave"),
+        (
+            ["straight", "--topic", "odom=/wheels"],
+            "--topic: belongs to --bag; add that, or leave",
+        ),
         (["straight", "--namespace", "ant"], "--namespace: belongs to --ros"),
         (["straight", "--episodes", "3"], "--episodes: belongs to --record"),
         (["--record", "a.avi"], "--record 'a.avi': "),
-        (["--bag", "nowhere", "--world", "arena", "--world", "room"], "a robot is in one"),
+        (
+            ["--bag", "nowhere", "--world", "arena", "--world", "room"],
+            "a robot is in one",
+        ),
         (["strait"], "did you mean 'straight'?"),
         (["straight", "--world", "areena"], "did you mean 'arena'?"),
     ],
@@ -44,9 +53,13 @@ def test_options_that_do_not_fit_are_one_sentence(options, said, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_page_without_its_library_is_refused_before_a_robot_is_opened(monkeypatch, capsys):
+def test_a_page_without_its_library_is_refused_before_a_robot_is_opened(
+    monkeypatch, capsys
+):
     monkeypatch.setattr(module.extensions, "lacking", lambda names: next(iter(names)))
-    monkeypatch.setattr(module, "_episodes", lambda *given: pytest.fail("a robot was opened"))
+    monkeypatch.setattr(
+        module, "_episodes", lambda *given: pytest.fail("a robot was opened")
+    )
     with pytest.raises(typer.Exit):
         console.checked(module.watch)(policy="straight")
     assert "pip install 'nics_drl_bridge[view]'" in capsys.readouterr().err
@@ -57,9 +70,13 @@ def test_an_episode_has_the_time_that_its_policy_was_learnt_with(monkeypatch):
         provenance={}, robot=SimpleNamespace(name="differential"), max_episode_steps=777
     )
     driven, env_of = [], driving.env_of
-    monkeypatch.setattr(driving, "contracts_of", lambda policies: dict.fromkeys(policies, learnt))
     monkeypatch.setattr(
-        driving, "env_of", lambda *given, **more: driven.append(given[4]) or env_of(*given, **more)
+        driving, "contracts_of", lambda policies: dict.fromkeys(policies, learnt)
+    )
+    monkeypatch.setattr(
+        driving,
+        "env_of",
+        lambda *given, **more: driven.append(given[4]) or env_of(*given, **more),
     )
     under = dict.fromkeys(("lidar", "randomisation", "gate", "task"))
     with closing(module._episodes("straight", None, ["circles"], 0, under)):
@@ -69,7 +86,9 @@ def test_an_episode_has_the_time_that_its_policy_was_learnt_with(monkeypatch):
 def test_a_training_of_other_processes_can_not_be_watched(tmp_path):
     done = nics("train", "--watch", "--engine", "ray", cwd=tmp_path)
     assert done.returncode == 2
-    assert "--watch --engine ray: worlds of other processes are not shown" in done.stderr
+    assert (
+        "--watch --engine ray: worlds of other processes are not shown" in done.stderr
+    )
 
 
 def test_an_episode_is_written_to_its_end(tmp_path, monkeypatch):
@@ -85,7 +104,9 @@ def test_an_episode_is_written_to_its_end(tmp_path, monkeypatch):
     names = [frame.worlds[0].name.rpartition(" ")[2] for frame in frames]
     assert set(names) == {"3", "4"}
     assert frames[-1].worlds[0].state
-    assert frames[-1].worlds[0].state == frames[-5].worlds[0].state  # it stays for a second
+    assert (
+        frames[-1].worlds[0].state == frames[-5].worlds[0].state
+    )  # it stays for a second
 
 
 def test_the_page_is_served_until_it_is_interrupted(monkeypatch):
@@ -114,12 +135,19 @@ def serving(*words, cwd):
     command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *words]
     environment = os.environ | {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
     process = subprocess.Popen(
-        command, cwd=cwd, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        command,
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
-    )  # fmt: skip
+    )
     try:
         lines = iter(process.stderr.readline, "")
-        place = next(filter(None, (re.match(r"watch: (http://\S+)", line) for line in lines)), None)
+        place = next(
+            filter(None, (re.match(r"watch: (http://\S+)", line) for line in lines)),
+            None,
+        )
         assert place is not None, "it ended without a page"
         with closing(Client(SimpleNamespace(url=place[1]))) as client:
             yield process, client

@@ -30,7 +30,9 @@ def sdf(folder, *geometries, name="my.world"):
         f"<geometry>{geometry}</geometry></collision></link></model>"
         for n, geometry in enumerate(geometries)
     )
-    (folder / name).write_text(f"<sdf version='1.9'><world name='w'>{models}</world></sdf>")
+    (folder / name).write_text(
+        f"<sdf version='1.9'><world name='w'>{models}</world></sdf>"
+    )
     return name
 
 
@@ -66,9 +68,17 @@ def test_a_world_of_gazebo_becomes_a_world_file_that_an_env_drives_in(tmp_path):
 def test_without_options_robots_start_and_end_anywhere_in_the_field(tmp_path):
     done("import", sdf(tmp_path, DISC, DISC, DISC), cwd=tmp_path)
     world = load_world(tmp_path / "my.yaml")
-    assert (world.name, world.starts, world.goals, world.clearance) == ("my", None, None, 0.1)
+    assert (world.name, world.starts, world.goals, world.clearance) == (
+        "my",
+        None,
+        None,
+        0.1,
+    )
     assert world.bounds == (-0.25, -0.25, 4.25, 0.25)
-    assert world.goal_distance == (1.132, 4.528)  # a quarter of the diagonal, and all of it
+    assert world.goal_distance == (
+        1.132,
+        4.528,
+    )  # a quarter of the diagonal, and all of it
 
 
 def test_field_distances_and_height_are_taken_from_options(tmp_path):
@@ -78,7 +88,9 @@ def test_field_distances_and_height_are_taken_from_options(tmp_path):
     assert world.bounds == (-5.0, -5.0, 6.0, 5.0)
     assert world.goal_distance == (3.0, 4.0)
     words = ("--height", 0.51, "--out", "high.yaml")
-    assert "stands at a height of 0.51 m" in refused("import", "my.world", *words, cwd=tmp_path)
+    assert "stands at a height of 0.51 m" in refused(
+        "import", "my.world", *words, cwd=tmp_path
+    )
 
 
 def test_bounds_that_leave_an_obstacle_out_are_refused_and_nothing_is_written(tmp_path):
@@ -92,10 +104,15 @@ def test_bounds_that_leave_an_obstacle_out_are_refused_and_nothing_is_written(tm
 def test_a_mesh_is_refused_or_left_out_and_listed_in_the_file_too(tmp_path):
     name = sdf(tmp_path, DISC, MESH)
     sentence = refused("import", name, cwd=tmp_path)
-    assert sentence.startswith("my.world: model 'm1' has a mesh chair.dae, which is no shape of a")
+    assert sentence.startswith(
+        "my.world: model 'm1' has a mesh chair.dae, which is no shape of a"
+    )
     told = done("import", name, "--skip-unknown", cwd=tmp_path)
     assert told.endswith("\n  left out: model 'm1' has a mesh chair.dae\n")
-    assert "# Left out: model 'm1' has a mesh chair.dae.\n" in (tmp_path / "my.yaml").read_text()
+    assert (
+        "# Left out: model 'm1' has a mesh chair.dae.\n"
+        in (tmp_path / "my.yaml").read_text()
+    )
     done("import", name, "--without", "m1", "--out", "other", cwd=tmp_path)
     assert len(load_world(tmp_path / "other" / "my.yaml").obstacles[0].at) == 1
 
@@ -110,8 +127,12 @@ def test_several_files_go_to_a_folder_all_or_none(tmp_path):
     assert {file.name for file in (tmp_path / "all").iterdir()} == {"a.yaml", "b.yaml"}
     words = ("import", "a.world", "b.sdf")
     assert "is for one file, not for 2" in refused(*words, "--name", "x", cwd=tmp_path)
-    assert "--out x.yaml: is for one" in refused(*words, "--out", "x.yaml", cwd=tmp_path)
-    assert "all/a.yaml: is there already" in refused(*words, "--out", "all", cwd=tmp_path)
+    assert "--out x.yaml: is for one" in refused(
+        *words, "--out", "x.yaml", cwd=tmp_path
+    )
+    assert "all/a.yaml: is there already" in refused(
+        *words, "--out", "all", cwd=tmp_path
+    )
     sdf(tmp_path, DISC, name="a.sdf")
     assert "two files would be" in refused("import", "a.world", "a.sdf", cwd=tmp_path)
 
@@ -143,7 +164,9 @@ def test_a_picture_becomes_a_map_and_a_world(tmp_path):
     pixels[:10, :10] = 0
     Image.fromarray(pixels).save(tmp_path / "plan.png")
     sentence = refused("import", "plan.png", cwd=tmp_path)
-    assert sentence.startswith("plan.png: there is no plan.yaml beside the picture; give")
+    assert sentence.startswith(
+        "plan.png: there is no plan.yaml beside the picture; give"
+    )
     done("import", "plan.png", "--resolution", 0.1, cwd=tmp_path)
     world = load_world(tmp_path / "plan_world.yaml")
     assert world.extent == pytest.approx((0.0, 0.0, 3.0, 2.0))
@@ -153,15 +176,21 @@ def test_a_picture_becomes_a_map_and_a_world(tmp_path):
 
 
 def test_the_ending_of_a_file_may_be_in_capitals(tmp_path):
-    Image.fromarray(np.full((20, 30), 255, np.uint8)).save(tmp_path / "PLAN.PGM", format="PPM")
+    Image.fromarray(np.full((20, 30), 255, np.uint8)).save(
+        tmp_path / "PLAN.PGM", format="PPM"
+    )
     done("import", "PLAN.PGM", "--resolution", 0.1, cwd=tmp_path)
-    assert load_world(tmp_path / "PLAN_world.yaml").extent == pytest.approx((0.0, 0.0, 3.0, 2.0))
+    assert load_world(tmp_path / "PLAN_world.yaml").extent == pytest.approx(
+        (0.0, 0.0, 3.0, 2.0)
+    )
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path):
     (tmp_path / "my.usd").write_text("")
     sentence = refused("import", "my.usd", cwd=tmp_path)
-    assert sentence.startswith("my.usd: unknown kind of file; give one of .world, .sdf, .yaml")
+    assert sentence.startswith(
+        "my.usd: unknown kind of file; give one of .world, .sdf, .yaml"
+    )
     (tmp_path / "map.yaml").write_text("name: hall\n")
     assert refused("import", "map.yaml", cwd=tmp_path).startswith("map.yaml: ")
 
@@ -183,7 +212,10 @@ def test_a_saved_world_of_gazebo_classic_can_be_drawn(tmp_path):
         (("draw", "arenna"), "unknown world 'arenna'; did you mean 'arena'?"),
         (("draw", "arena", "--out", "a.jpg"), "--out a.jpg: must end in .png."),
         (("draw", "arena", "--footprint", 0), "--footprint 0: must be above 0 m."),
-        (("draw", "arena", "--footprint", 9), "no free space for a robot of radius 9 m"),
+        (
+            ("draw", "arena", "--footprint", 9),
+            "no free space for a robot of radius 9 m",
+        ),
         (("draw", "arena", "--robot", "car"), "unknown robot 'car'"),
     ],
 )
@@ -230,7 +262,8 @@ def test_neither_picture_nor_map_replaces_a_file_that_the_world_is_made_of(tmp_p
     ):
         sentence = refused(*words, cwd=tmp_path)
         assert (
-            sentence == f"{tmp_path / file}: the world itself is made of it; name another as --out."
+            sentence
+            == f"{tmp_path / file}: the world itself is made of it; name another as --out."
         )
         assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     done("draw", "plan.yaml", cwd=tmp_path)
@@ -255,7 +288,9 @@ def test_what_is_written_is_told_as_json_too(tmp_path):
     mapped = json.loads(done(*words, cwd=tmp_path))
     assert (mapped["file"], mapped["cells"]) == ("arena_map.yaml", [122, 122])
     assert mapped["resolution_m"] == pytest.approx(0.05, rel=0.01)
-    (imported,) = json.loads(done("import", "arena_map.yaml", "--json", cwd=tmp_path))["worlds"]
+    (imported,) = json.loads(done("import", "arena_map.yaml", "--json", cwd=tmp_path))[
+        "worlds"
+    ]
     assert imported["file"] == "arena_map_world.yaml"
     assert (tmp_path / imported["file"]).is_file()
 
@@ -263,5 +298,7 @@ def test_what_is_written_is_told_as_json_too(tmp_path):
 def test_a_world_of_too_many_bodies_is_refused_by_the_file_that_holds_them(tmp_path):
     boxes = [f"<box><size>{0.1 + 1e-5 * k:.5f} 0.1 1</size></box>" for k in range(6000)]
     many = refused("import", sdf(tmp_path, *boxes), "--out", "made.yaml", cwd=tmp_path)
-    assert many.startswith("my.world: its 6000 bodies make a larger file than is read; ")
+    assert many.startswith(
+        "my.world: its 6000 bodies make a larger file than is read; "
+    )
     assert not (tmp_path / "made.yaml").exists()

@@ -42,15 +42,27 @@ def worlds() -> Found:
     for robot in ROBOTS:
         for world in WORLDS:
             random = "strong" if world == "clutter" else None
-            env = BridgeVectorEnv(6, robot, world, randomisation=random, max_episode_steps=40)
+            env = BridgeVectorEnv(
+                6, robot, world, randomisation=random, max_episode_steps=40
+            )
             seen, _ = env.reset(seed=5)
             rng, rows = np.random.default_rng(1), [seen.copy()]
             for _ in range(80):
-                action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+                action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(
+                    np.float32
+                )
                 seen, reward, ended, cut, _ = env.step(action)
-                rows += [seen.copy(), reward, ended, cut, env.simulator.data.pose.copy()]
+                rows += [
+                    seen.copy(),
+                    reward,
+                    ended,
+                    cut,
+                    env.simulator.data.pose.copy(),
+                ]
             env.close()
-            found[f"{robot} {world}"] = projected(np.concatenate([np.ravel(row) for row in rows]))
+            found[f"{robot} {world}"] = projected(
+                np.concatenate([np.ravel(row) for row in rows])
+            )
     return found
 
 
@@ -99,7 +111,9 @@ def table_2() -> Found:
         drawn = table.batches(shapes, 64)
         exact = [table.scan(baked, "exact", batch) for batch in drawn]
         fast = [table.scan(baked, "baked", batch) for batch in drawn]
-        found[name] = projected(np.concatenate([np.ravel(each) for each in (*exact, *fast)]))
+        found[name] = projected(
+            np.concatenate([np.ravel(each) for each in (*exact, *fast)])
+        )
         found[f"{name} errors"] = [float(each) for each in table.errors(fast, exact)]
     return found
 
@@ -115,8 +129,18 @@ def identified() -> Found:
     for name, disturbed in {
         "clean": {},
         "late and noisy": {"latency": 0.08, "noise": (0.002, 0.004), "seed": 1},
-        "turned": {"rotation": 0.1, "lever": (0.05, -0.02), "noise": (0.001, 0.002), "seed": 2},
-        "bursts": {"burst": 0.1, "pose_clock_ahead": 3.0, "noise": (0.001, 0.002), "seed": 3},
+        "turned": {
+            "rotation": 0.1,
+            "lever": (0.05, -0.02),
+            "noise": (0.001, 0.002),
+            "seed": 2,
+        },
+        "bursts": {
+            "burst": 0.1,
+            "pose_clock_ahead": 3.0,
+            "noise": (0.001, 0.002),
+            "seed": 3,
+        },
         "poses only": {"measured_state": False, "latency": 0.05, "seed": 4},
     }.items():
         for robot in ROBOTS:
@@ -128,7 +152,10 @@ def identified() -> Found:
                 given = disturbed
             result = identify(drive(spec, **given), spec)
             for each, of in ((result.trial, ""), (result, ", all data")):
-                numbers = [*each.model.coefficients.ravel(), *numbers_of(asdict(each.calibration))]
+                numbers = [
+                    *each.model.coefficients.ravel(),
+                    *numbers_of(asdict(each.calibration)),
+                ]
                 found[f"{robot} {name}{of}"] = projected(numbers)
     return found
 
@@ -154,7 +181,9 @@ def gate() -> Found:
         config = shield_in_process.config_of(place, {})
         decisions: list[float] = []
         for seed, kind in enumerate(ADVERSARIES):
-            shield_in_process.drive(place, config, [Job(kind, seed)], decisions_into(decisions))
+            shield_in_process.drive(
+                place, config, [Job(kind, seed)], decisions_into(decisions)
+            )
         found[robot] = projected(decisions)
     return found
 

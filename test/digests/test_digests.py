@@ -20,4 +20,6 @@ def test_what_the_package_computes_is_what_it_computed_before(name, monkeypatch)
     assert sorted(found) == sorted(kept)
     for part, numbers in found.items():
         scale = np.sqrt(max(1.0, numbers[0]))
-        np.testing.assert_allclose(numbers, kept[part], rtol=1e-9, atol=1e-9 * scale, err_msg=part)
+        np.testing.assert_allclose(
+            numbers, kept[part], rtol=1e-9, atol=1e-9 * scale, err_msg=part
+        )

@@ -47,7 +47,9 @@ SDF = """<sdf version="1.6"><world name="hall"><model name="pillar"><static>true
 def lines_of(page: Path) -> list[str]:
     """The lines of a page's blocks that begin with `nics`, in order."""
     plain = re.sub(r"\\\n\s+", "", FENCED.sub("", text_of(page)))
-    lines = [line.strip() for block in INDENTED.findall(plain) for line in block.splitlines()]
+    lines = [
+        line.strip() for block in INDENTED.findall(plain) for line in block.splitlines()
+    ]
     return [line for line in lines if re.match(r"nics [a-z]", line)]
 
 
@@ -69,7 +71,13 @@ def table(path: Path) -> None:
     """A drive as columns of text."""
     drive = drive_of("differential")
     rows = np.column_stack([drive.pose.t, drive.pose.values, drive.command.values])
-    np.savetxt(path, rows, delimiter=",", header="t,x,y,yaw,cmd_vel_x,cmd_vel_omega", comments="")
+    np.savetxt(
+        path,
+        rows,
+        delimiter=",",
+        header="t,x,y,yaw,cmd_vel_x,cmd_vel_omega",
+        comments="",
+    )
 
 
 def bag(path: Path) -> None:
@@ -78,21 +86,41 @@ def bag(path: Path) -> None:
 
     env = BridgeEnv(model="differential", world="empty", estimator=True)
     data, rng = env._backend.simulator.data, np.random.default_rng(2)
-    topics: dict[str, list[Any]] = {"/odom": [], "/scan": [], "/cmd_vel": [], "/mocap": []}
+    topics: dict[str, list[Any]] = {
+        "/odom": [],
+        "/scan": [],
+        "/cmd_vel": [],
+        "/mocap": [],
+    }
     known, nothing = np.diag(np.full(6, 0.01)).ravel(), np.zeros(0, np.float32)
     env.reset(seed=1)
     actions = np.repeat(rng.uniform(-0.8, 0.8, (60, 2)), 5, axis=0)
     for k, action in enumerate(actions, 1):
         t = 0.1 * k
         forward, _, turn = env.task.robot.to_cmd_vel(env.task.command(action))
-        place = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(*data.odom[0, 0]), known)
-        twist = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(*data.twist[0, 0]), known)
+        place = bags.new(
+            "geometry_msgs/PoseWithCovariance", bags.pose(*data.odom[0, 0]), known
+        )
+        twist = bags.new(
+            "geometry_msgs/TwistWithCovariance", bags.twist(*data.twist[0, 0]), known
+        )
         fields = [float(value) for value in env.task.lidar.header]
         said = {
-            "/odom": ("nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", place, twist),
-            "/scan": ("sensor_msgs/msg/LaserScan", bags.header(t, "laser"), *fields,
-                      data.ranges[0, 0].copy(), nothing),
-        }  # fmt: skip
+            "/odom": (
+                "nav_msgs/msg/Odometry",
+                bags.header(t, "odom"),
+                "base_link",
+                place,
+                twist,
+            ),
+            "/scan": (
+                "sensor_msgs/msg/LaserScan",
+                bags.header(t, "laser"),
+                *fields,
+                data.ranges[0, 0].copy(),
+                nothing,
+            ),
+        }
         for topic, message in said.items():
             topics[topic].append((t, bags.new(*message)))
         topics["/cmd_vel"].append((t, bags.twist(float(forward), 0.0, float(turn))))
@@ -105,8 +133,14 @@ def bag(path: Path) -> None:
 def map_of(path: Path) -> None:
     """A map of Nav2 with a room in it."""
     picture(path.with_suffix(".pgm"))
-    given = {"image": f"{path.stem}.pgm", "resolution": 0.05, "origin": [-4.0, -4.0, 0.0],
-             "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.25}  # fmt: skip
+    given = {
+        "image": f"{path.stem}.pgm",
+        "resolution": 0.05,
+        "origin": [-4.0, -4.0, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.25,
+    }
     path.write_text(yaml.safe_dump(given))
 
 
@@ -161,7 +195,9 @@ SUPPLIES: dict[str, Callable[[Path], object]] = {
     "my.onnx": policy,
     "my_world.yaml": text(WORLD),
     "my_worlds": worlds,
-    "my_task.py": text(text_of(ROOT / "examples" / "own_task.py").replace("Patrol", "MyTask")),
+    "my_task.py": text(
+        text_of(ROOT / "examples" / "own_task.py").replace("Patrol", "MyTask")
+    ),
     "hall.world": text(SDF),
     "world_1.world": text(SDF),
     "my_map.yaml": map_of,
@@ -176,8 +212,14 @@ def supply(line: str, folder: Path) -> None:
     """Puts those files of a reader there that a line reads and no line before it wrote."""
     words = shlex.split(line, comments=True)
     read = [word for before, word in pairwise(words) if before not in WRITES]
-    names = {"my_worlds" if "my_worlds" in word else re.split(r"[/:]", word)[0] for word in read}
-    for name, make in SUPPLIES.items():  # in their order: a drive is of the robot that is there
+    names = {
+        "my_worlds" if "my_worlds" in word else re.split(r"[/:]", word)[0]
+        for word in read
+    }
+    for (
+        name,
+        make,
+    ) in SUPPLIES.items():  # in their order: a drive is of the robot that is there
         if name in names and not (folder / name).exists():
             make(folder / name)
 
@@ -185,5 +227,7 @@ def supply(line: str, folder: Path) -> None:
 def words_of(line: str, folder: Path) -> list[str]:
     """The words as a shell gives them to the command, with what makes it short."""
     words = shlex.split(line, comments=True)[1:]
-    names = [sorted(p.name for p in folder.glob(w)) if w == "*.world" else [w] for w in words]
+    names = [
+        sorted(p.name for p in folder.glob(w)) if w == "*.world" else [w] for w in words
+    ]
     return [*(name for some in names for name in some), *SHORT.get(words[0], ())]

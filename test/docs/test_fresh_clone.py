@@ -15,9 +15,16 @@ from docs.shown import supply
 from docs.test_pages import FENCED, INDENTED, PAGES, ROOT, text_of
 
 INSTALLS = re.compile(r"pip install '\.\[|make (demo|setup|benchmark)\b")
-SERVES = re.compile(r"nics watch|mujoco_node")  # until Ctrl-C: tests of their own run these
+SERVES = re.compile(
+    r"nics watch|mujoco_node"
+)  # until Ctrl-C: tests of their own run these
 OWN = "python3 -m venv venv && . venv/bin/activate"
-OF_OTHERS = ("PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
+OF_OTHERS = (
+    "PYTHONPATH",
+    "VIRTUAL_ENV",
+    "LD_LIBRARY_PATH",
+    "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+)
 
 
 def blocks() -> dict[str, list[str]]:
@@ -42,7 +49,9 @@ def environment() -> dict[str, str]:
 
 @pytest.mark.campaign
 @pytest.mark.process
-@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs the repository, to clone it")
+@pytest.mark.skipif(
+    not (ROOT / ".git").exists(), reason="needs the repository, to clone it"
+)
 @pytest.mark.timeout(2400)
 @pytest.mark.parametrize("lines", blocks().values(), ids=blocks().keys())
 def test_a_block_that_installs_something_runs_in_a_fresh_clone(lines, tmp_path):
@@ -55,9 +64,13 @@ def test_a_block_that_installs_something_runs_in_a_fresh_clone(lines, tmp_path):
     if lines[0].startswith("pip "):
         lines = [OWN, *lines]
     done = subprocess.run(
-        ["bash", "-e", "-c", "\n".join(lines)], cwd=clone, env=environment(), text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
+        ["bash", "-e", "-c", "\n".join(lines)],
+        cwd=clone,
+        env=environment(),
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
     measured = "met their bars: " in done.stdout and " broken " not in done.stdout
     assert done.returncode == 0 or measured, done.stdout  # a speed may be missed here
 

@@ -16,15 +16,25 @@ from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.commands.listing import worlds
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 MAKE_TARGETS = set(
-    re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    re.findall(
+        r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+    )
 )
-FENCED = re.compile(r"^```(?P<kind>[a-z]*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCED = re.compile(
+    r"^```(?P<kind>[a-z]*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL
+)
 INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n+)+")
 INLINE = re.compile(r"`((?:nics|make) [^`\n]+)`")
 FROM_INDEX = re.compile(r"pip install.*nics_drl_bridge\b")
-FOLDERS = "|".join(sorted(each.parent.name for each in ROOT.glob("nics_drl_bridge/*/__init__.py")))
+FOLDERS = "|".join(
+    sorted(each.parent.name for each in ROOT.glob("nics_drl_bridge/*/__init__.py"))
+)
 DOTTED = re.compile(
     rf"`((?:(?:nics_drl_bridge\.)?(?:{FOLDERS})(?:\.\w+){{2,}})|[a-z_]+(?:\.[a-z_]+)+\.[A-Z]\w+)[`(]"
 )
@@ -39,7 +49,9 @@ def text_of(page: Path) -> str:
 def command_lines(text: str) -> list[str]:
     """Lines that begin with `nics` or `make`, in blocks and between backticks."""
     plain = re.sub(r"\\\n\s+", "", FENCED.sub("", text))
-    lines = [line.strip() for block in INDENTED.findall(plain) for line in block.splitlines()]
+    lines = [
+        line.strip() for block in INDENTED.findall(plain) for line in block.splitlines()
+    ]
     lines += INLINE.findall(plain)
     return [line for line in lines if line.startswith(("nics ", "make "))]
 
@@ -73,7 +85,9 @@ def test_every_command_that_a_page_shows_exists(page, line):
     if line.startswith("nics "):
         check_options(words)
     else:
-        targets = [word for word in words if "=" not in word and not word.startswith("-")]
+        targets = [
+            word for word in words if "=" not in word and not word.startswith("-")
+        ]
         assert set(targets) <= MAKE_TARGETS, f"{page.name}: {line}"
 
 
@@ -87,7 +101,11 @@ def test_a_command_or_an_option_that_there_is_not_is_found(line):
 
 def test_commands_are_found_in_blocks_and_in_sentences():
     text = "Text `nics urdf X`.\n\n    nics train --seeds 0  # once\n    make demo\n\nMore.\n"
-    assert command_lines(text) == ["nics train --seeds 0  # once", "make demo", "nics urdf X"]
+    assert command_lines(text) == [
+        "nics train --seeds 0  # once",
+        "make demo",
+        "nics urdf X",
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -99,14 +117,24 @@ def test_every_piece_of_python_that_a_page_shows_compiles(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_page_and_file_that_a_page_names_exists(page):
-    named = re.findall(r"`((?:docs|examples|config|benchmarks)/[\w/.-]+\.\w+)`", text_of(page))
+    named = re.findall(
+        r"`((?:docs|examples|config|benchmarks)/[\w/.-]+\.\w+)`", text_of(page)
+    )
     named += [
         str((page.parent / to).resolve().relative_to(ROOT))
-        for to in re.findall(r"\]\((?![a-z]+:)([^)#\s]+)", FENCED.sub("", text_of(page)))
+        for to in re.findall(
+            r"\]\((?![a-z]+:)([^)#\s]+)", FENCED.sub("", text_of(page))
+        )
     ]
     made = {"docs/CHANGELOG.md", "docs/CONTRIBUTING.md"}
-    notebooks = {f"docs/notebooks/{p.stem}.md" for p in (ROOT / "docs/notebooks").glob("*.ipynb")}
-    missing = [one for one in named if one not in made | notebooks and not (ROOT / one).exists()]
+    notebooks = {
+        f"docs/notebooks/{p.stem}.md" for p in (ROOT / "docs/notebooks").glob("*.ipynb")
+    }
+    missing = [
+        one
+        for one in named
+        if one not in made | notebooks and not (ROOT / one).exists()
+    ]
     assert not [one for one in missing if "NAME" not in one and "ROBOT" not in one]
 
 
@@ -114,7 +142,11 @@ def test_every_page_and_file_that_a_page_names_exists(page):
 def test_a_page_installs_from_the_folder_as_no_index_has_the_package(page):
     """What the commands say is another matter: there it is installed, and pip adds the extra."""
     lines = text_of(page).splitlines()
-    wrong = [line for line in lines if FROM_INDEX.search(line) and not line.startswith("    nics:")]
+    wrong = [
+        line
+        for line in lines
+        if FROM_INDEX.search(line) and not line.startswith("    nics:")
+    ]
     assert not wrong
 
 
@@ -126,7 +158,9 @@ def resolved(name: str) -> object:
     return getattr(import_module(place), attribute)
 
 
-NAMES = sorted({(page, name) for page in PAGES for name in DOTTED.findall(text_of(page))})
+NAMES = sorted(
+    {(page, name) for page in PAGES for name in DOTTED.findall(text_of(page))}
+)
 
 
 @pytest.mark.parametrize(("page", "name"), NAMES, ids=lambda value: str(value)[-60:])

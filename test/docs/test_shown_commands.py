@@ -18,7 +18,9 @@ NEEDED = ("rosbags", "onnx", "mujoco", "torch", "rclpy")
 BEGINNING = ("README.md", "start_robot.md", "start_training.md")
 CASES = [
     pytest.param(
-        page, id=page.name, marks=() if page.name in BEGINNING else (pytest.mark.campaign,)
+        page,
+        id=page.name,
+        marks=() if page.name in BEGINNING else (pytest.mark.campaign,),
     )
     for page in PAGES
     if any(map(runs_here, lines_of(page)))

@@ -26,27 +26,39 @@ import reference  # noqa: E402
 def test_the_reference_is_what_the_schemas_and_commands_say():
     for name, text in reference.pages().items():
         written = (ROOT / "docs" / "reference" / name).read_text(encoding="utf-8")
-        assert written == text, f"docs/reference/{name} is out of date; run `make reference`"
+        assert written == text, (
+            f"docs/reference/{name} is out of date; run `make reference`"
+        )
 
 
 def test_no_key_argument_or_parameter_of_the_reference_is_without_a_meaning():
     for name, text in reference.pages().items():
-        rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| `")]
+        rows = [
+            line.split("|")[1:-1]
+            for line in text.splitlines()
+            if line.startswith("| `")
+        ]
         bare = [row[0].strip() for row in rows if not row[-1].strip()]
         assert rows, name
-        assert not bare, f"docs/reference/{name}: say beside the field what it is: {bare}"
+        assert not bare, (
+            f"docs/reference/{name}: say beside the field what it is: {bare}"
+        )
 
 
 def test_a_key_has_its_type_default_range_and_the_comment_at_its_field():
     schema = World.model_json_schema()
     found = reference.rows(World, schema["properties"], schema["required"])
     rows = {row.split("|")[1].strip(): row for row in found}
-    assert "| number | `0.3` | ≥ 0 | around the footprint at start" in rows["`clearance`"]
+    assert (
+        "| number | `0.3` | ≥ 0 | around the footprint at start" in rows["`clearance`"]
+    )
     assert "| text | required |" in rows["`name`"]
 
 
 def test_a_comment_above_a_field_is_its_meaning_too():
-    assert reference.meaning(RobotSpec, "angular_is").startswith("meaning of `angular.z`")
+    assert reference.meaning(RobotSpec, "angular_is").startswith(
+        "meaning of `angular.z`"
+    )
 
 
 def test_every_schema_within_a_file_has_a_table():
@@ -58,7 +70,9 @@ def test_every_schema_within_a_file_has_a_table():
 def test_every_page_of_the_reference_and_of_docs_is_in_the_navigation():
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     listed = set(re.findall(r"[\w/]+\.md", text))
-    written = {p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")}
+    written = {
+        p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")
+    }
     assert written <= listed, f"add to nav of mkdocs.yml: {sorted(written - listed)}"
     assert yaml.safe_load(text)["site_dir"] == "build/docs"
 
@@ -67,8 +81,18 @@ def test_every_page_of_the_reference_and_of_docs_is_in_the_navigation():
 def site(tmp_path_factory):
     """The folder of the site, built without a warning."""
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--site-dir",
+        str(folder),
+    ]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -77,7 +101,9 @@ def site(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_site_asks_for_nothing_outside(site):
-    asked = re.compile(r"""<(?:script|img|iframe)[^>]*\ssrc="https?:|<link[^>]*\shref="https?:""")
+    asked = re.compile(
+        r"""<(?:script|img|iframe)[^>]*\ssrc="https?:|<link[^>]*\shref="https?:"""
+    )
     pages = list(site.rglob("*.html"))
     assert len(pages) > 50
     canonical = re.compile(r'<link rel="canonical"[^>]*>')
@@ -108,11 +134,15 @@ class Quiet(SimpleHTTPRequestHandler):
 @pytest.mark.timeout(900)
 def test_a_browser_shows_every_page_of_the_site_without_a_flaw(site, tmp_path):
     with (
-        ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site))) as server,
+        ThreadingHTTPServer(
+            ("127.0.0.1", 0), partial(Quiet, directory=str(site))
+        ) as server,
         closing(Browser(tmp_path)) as browser,
     ):
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        (tmp_path / "flawed.html").write_text("<img src=none.png><p style='width: 2000px'>x")
+        (tmp_path / "flawed.html").write_text(
+            "<img src=none.png><p style='width: 2000px'>x"
+        )
         assert len(browser.flaws((tmp_path / "flawed.html").as_uri())) >= 3
         for page in site.rglob("*.html"):
             name = page.relative_to(site).as_posix()
@@ -124,7 +154,9 @@ def test_a_browser_shows_every_page_of_the_site_without_a_flaw(site, tmp_path):
 @pytest.mark.process
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_word_typed_into_the_search_of_the_site_on_disk_finds_its_page(site, tmp_path):
+def test_a_word_typed_into_the_search_of_the_site_on_disk_finds_its_page(
+    site, tmp_path
+):
     with closing(Browser(tmp_path)) as browser:
         field = "document.querySelector('.md-search__input')"
         browser.open((site / "index.html").as_uri(), 1280, 800, ready=f"!!{field}")

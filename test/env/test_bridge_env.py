@@ -54,7 +54,9 @@ def assert_same(one, other):
 
 def random_actions(env, count, seed=0):
     size = env.action_space.shape[0]
-    return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, size)).astype(np.float32)
+    return (
+        np.random.default_rng(seed).uniform(-1.0, 1.0, (count, size)).astype(np.float32)
+    )
 
 
 @pytest.mark.slow
@@ -124,7 +126,9 @@ def test_two_envs_in_one_process_do_not_disturb_each_other():
 
 
 def test_start_and_goal_can_be_given(env):
-    _, info = env.reset(seed=0, options={"start": (1.0, -1.0, 0.5), "goal": (-1.0, 1.0)})
+    _, info = env.reset(
+        seed=0, options={"start": (1.0, -1.0, 0.5), "goal": (-1.0, 1.0)}
+    )
     assert info["pose"] == pytest.approx([1.0, -1.0, 0.5])
     assert info["goal"] == pytest.approx([-1.0, 1.0])
 
@@ -133,7 +137,9 @@ def test_driving_to_the_goal_ends_in_success(env):
     env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (1.05, 0.0)})
     total, approach = 0.0, 0.0
     for _ in range(20):
-        _, reward, terminated, truncated, info = env.step(np.array([0.5, 0.0, 0.0], np.float32))
+        _, reward, terminated, truncated, info = env.step(
+            np.array([0.5, 0.0, 0.0], np.float32)
+        )
         assert reward == pytest.approx(sum(info["reward_terms"].values()))
         total += reward
         approach += info["reward_terms"]["progress"]
@@ -258,7 +264,10 @@ def test_facts_of_a_backend_of_ones_own_are_those_of_its_last_step_unless_it_has
 def test_a_randomised_backend_gives_the_same_episode_as_an_backendas_by_its_name():
     model, world, strong = direct_model(), field(count=4), "strong"
     backend = SimBackend(model, world, randomisation=strong)
-    given = (BridgeEnv("sim", model, world, randomisation=strong), BridgeEnv(backend, model, world))
+    given = (
+        BridgeEnv("sim", model, world, randomisation=strong),
+        BridgeEnv(backend, model, world),
+    )
     infos = [env.reset(seed=3)[1] for env in given]
     assert infos[0]["randomisation"]
     for name, value in infos[0].items():
@@ -276,12 +285,16 @@ def test_a_backend_that_does_not_take_what_it_is_told_is_named():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(extensions, "known", lambda group: {"mine": Point})
         BridgeEnv("mine", direct_model(), field()).reset(seed=0)
-        with pytest.raises(ConfigError, match=r"'mine': got an unexpected .*'randomisation'; look"):
+        with pytest.raises(
+            ConfigError, match=r"'mine': got an unexpected .*'randomisation'; look"
+        ):
             BridgeEnv("mine", direct_model(), field(), randomisation="mild")
 
 
 def test_what_is_no_backend_is_refused_with_what_it_lacks():
-    with pytest.raises(ConfigError, match=r"backend of type object: has no reset, no step, no clo"):
+    with pytest.raises(
+        ConfigError, match=r"backend of type object: has no reset, no step, no clo"
+    ):
         BridgeEnv(object())
 
 
@@ -320,7 +333,9 @@ def test_an_unknown_name_gives_the_nearest(arguments, error, sentence):
 
 
 def test_an_option_that_the_simulator_does_not_take_is_named():
-    with pytest.raises(ConfigError, match=r"backend 'sim': unknown argument 'sead'; valid are: "):
+    with pytest.raises(
+        ConfigError, match=r"backend 'sim': unknown argument 'sead'; valid are: "
+    ):
         BridgeEnv(backend_options={"sead": 3})
 
 
@@ -352,7 +367,10 @@ def test_the_pose_is_that_of_odometry_unless_an_estimator_is_asked_for():
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"start": (1.0, 0.0)}, r"reset option 'start', \(1.0, 0.0\): must be numbers of shape"),
+        (
+            {"start": (1.0, 0.0)},
+            r"reset option 'start', \(1.0, 0.0\): must be numbers of shape",
+        ),
         ({"goal": (1.0, 0.0, 2.0)}, "reset option 'goal'.*: must be numbers of shape"),
         ({"start": (0.0, 0.0, np.nan)}, "reset option 'start'.*: must be finite"),
         ({"goal": "there"}, "reset option 'goal', 'there': must be numbers"),
@@ -368,7 +386,9 @@ BLOCK = {"shapes": [{"kind": "rectangle", "size": [2.0, 1.0]}], "at": [[1.0, 1.0
 CORNER = [[0.0, 0.0], [2.0, 0.0], [2.0, 0.4], [0.4, 0.4], [0.4, 2.0], [0.0, 2.0]]
 NOTCHED = {"shapes": [{"kind": "polygon", "points": CORNER}], "at": [[-2.5, -2.5, 0.0]]}
 BLOCKED = field(obstacles=[BLOCK, NOTCHED])
-MODEL = replace(direct_model(), table=bake(lidar(), (*BLOCKED.shapes, Circle(radius=FOOTPRINT))))
+MODEL = replace(
+    direct_model(), table=bake(lidar(), (*BLOCKED.shapes, Circle(radius=FOOTPRINT)))
+)
 SETS = WorldSet("two", (BLOCKED, field(obstacles=[BLOCK, NOTCHED], clearance=0.11)))
 
 
@@ -376,10 +396,16 @@ SETS = WorldSet("two", (BLOCKED, field(obstacles=[BLOCK, NOTCHED], clearance=0.1
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"start": (2.9, 0.0, 0.0)}, r"'start': \(2.9, 0\) m is in a wall; the field is"),
+        (
+            {"start": (2.9, 0.0, 0.0)},
+            r"'start': \(2.9, 0\) m is in a wall; the field is",
+        ),
         ({"start": (2.6, -3.1, 0.0)}, "'start'.*lies outside the world"),
         ({"start": (1.0, 1.0, 0.0)}, "'start'.*is on an obstacle; move it"),  # amid it
-        ({"start": (0.3, 1.4, 0.0)}, "'start'.*is on an obstacle; move it"),  # with its edge
+        (
+            {"start": (0.3, 1.4, 0.0)},
+            "'start'.*is on an obstacle; move it",
+        ),  # with its edge
         ({"start": (-2.3, -1.0, 0.0)}, "'start'.*is on an obstacle; move it"),
         ({"goal": (4.0, 0.0)}, "'goal'.*lies outside the world"),
         ({"goal": (3.0, 0.0)}, "'goal'.*is in a wall"),
@@ -396,21 +422,28 @@ def test_a_start_or_goal_where_something_stands_is_refused(world, options, sente
 def test_a_start_beside_what_stands_is_taken(world):
     for start in ((2.7, 0.0, 0.0), (-1.3, -1.3, 0.0), (1.0, 0.2, 0.0)):
         options = {"start": start, "goal": (2.9, -2.9)}
-        for env in (BridgeEnv(model=MODEL, world=world), BridgeVectorEnv(3, MODEL, world)):
+        for env in (
+            BridgeEnv(model=MODEL, world=world),
+            BridgeVectorEnv(3, MODEL, world),
+        ):
             _, info = env.reset(seed=0, options=options)
             assert np.reshape(info["start"], (-1, 3))[-1] == pytest.approx(start)
 
 
 def test_many_worlds_begin_at_a_start_where_an_obstacle_stands_in_some_of_them():
     world = field(obstacles=[circles(8, (0.5,))])
-    model = replace(direct_model(), table=bake(lidar(), (*world.shapes, Circle(radius=FOOTPRINT))))
+    model = replace(
+        direct_model(), table=bake(lidar(), (*world.shapes, Circle(radius=FOOTPRINT)))
+    )
     single, taken = BridgeEnv(model=model, world=world), []
     for seed in range(16):
         with contextlib.suppress(ConfigError):
             single.reset(seed=seed, options={"start": (0.0, 0.0, 0.0)})
             taken.append(seed)
     assert 0 < len(taken) < 16
-    _, info = BridgeVectorEnv(16, model, world).reset(seed=0, options={"start": (0.0, 0.0, 0.0)})
+    _, info = BridgeVectorEnv(16, model, world).reset(
+        seed=0, options={"start": (0.0, 0.0, 0.0)}
+    )
     assert not info["start"].any()
 
 
@@ -421,6 +454,8 @@ def test_a_reward_of_the_scan_is_not_judged_by_a_view_that_no_step_gives():
 
     model = direct_model()
     task = Clear(model.robot, model.lidar)
-    with contextlib.closing(BridgeEnv(task=task, model=model, world=field(count=3))) as env:
+    with contextlib.closing(
+        BridgeEnv(task=task, model=model, world=field(count=3))
+    ) as env:
         env.reset(seed=0)
         assert np.isfinite(env.step(env.action_space.sample())[1])

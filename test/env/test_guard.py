@@ -25,9 +25,24 @@ from nics_drl_bridge.policy.evaluation import drive
 
 MODEL, FIELD = direct_model(), field()
 AHEAD = np.array([1.0, 0.5, -0.5], np.float32)
-ERRORS = (ValueError, ConfigError, MemoryError, RecursionError, KeyboardInterrupt, SystemExit)
-OF_TASK = ("reset", "command", "step_into", "update", "observation", "reward",
-           "end", "info")  # fmt: skip
+ERRORS = (
+    ValueError,
+    ConfigError,
+    MemoryError,
+    RecursionError,
+    KeyboardInterrupt,
+    SystemExit,
+)
+OF_TASK = (
+    "reset",
+    "command",
+    "step_into",
+    "update",
+    "observation",
+    "reward",
+    "end",
+    "info",
+)
 
 
 class Fault:
@@ -147,7 +162,16 @@ def action_of(env, value):
     return np.tile(value, env.robots) if isinstance(value, np.ndarray) else value
 
 
-BAD_ACTIONS = (AHEAD * np.nan, AHEAD * np.inf, AHEAD[:2], None, "ahead", object(), 3, [[AHEAD]])
+BAD_ACTIONS = (
+    AHEAD * np.nan,
+    AHEAD * np.inf,
+    AHEAD[:2],
+    None,
+    "ahead",
+    object(),
+    3,
+    [[AHEAD]],
+)
 CALLS = st.one_of(
     st.just(("step", (AHEAD,), {})),
     st.sampled_from(BAD_ACTIONS).map(lambda value: ("step", (value,), {})),
@@ -157,7 +181,15 @@ CALLS = st.one_of(
         lambda seed: ("reset", (), {"seed": seed})
     ),
     st.sampled_from(
-        [{"strat": 0}, {"start": (1.0,)}, {"start": "there"}, {"goal": np.nan}, [1], "start", 7]
+        [
+            {"strat": 0},
+            {"start": (1.0,)},
+            {"start": "there"},
+            {"goal": np.nan},
+            [1],
+            "start",
+            7,
+        ]
     ).map(lambda options: ("reset", (), {"options": options})),
     st.sampled_from(["step", "advance"]).map(lambda name: (name, (), {})),
     st.just(("reset", (), {"unknown": 1})),
@@ -172,9 +204,14 @@ WHENS = st.one_of(st.integers(0, 12), st.integers(0, 80))
 @pytest.mark.slow
 @settings(max_examples=400, deadline=None)
 @given(
-    st.sampled_from(sorted(ENVS)), st.sampled_from([Robot, RobotWithoutHalt]), st.booleans(),
-    st.sampled_from(["rgb_array", "human"]), WHENS, st.sampled_from(ERRORS), PLANS,
-)  # fmt: skip
+    st.sampled_from(sorted(ENVS)),
+    st.sampled_from([Robot, RobotWithoutHalt]),
+    st.booleans(),
+    st.sampled_from(["rgb_array", "human"]),
+    WHENS,
+    st.sampled_from(ERRORS),
+    PLANS,
+)
 def test_the_last_word_to_a_robot_is_zero_whatever_is_thrown_from_wherever(
     kind, make_robot, whole, mode, when, error, plan
 ):
@@ -194,7 +231,10 @@ def test_the_last_word_to_a_robot_is_zero_whatever_is_thrown_from_wherever(
             getattr(env if hasattr(env, name) else of_agents, name)(*arguments, **named)
         except BaseException:  # noqa: BLE001
             assert not robot.last.any()
-            refused = (gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError)
+            refused = (
+                gymnasium.error.ResetNeeded,
+                gymnasium.error.ClosedEnvironmentError,
+            )
             with pytest.raises(refused):
                 of_agents.step(np.tile(AHEAD, robots))
             assert not robot.last.any()
@@ -210,8 +250,14 @@ def test_the_last_word_to_a_robot_is_zero_whatever_is_thrown_from_wherever(
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 30), st.sampled_from(ERRORS), st.sampled_from([Robot, RobotWithoutHalt]))
-def test_a_policy_or_callback_that_raises_amid_an_episode_stops_the_robot(when, error, make_robot):
+@given(
+    st.integers(0, 30),
+    st.sampled_from(ERRORS),
+    st.sampled_from([Robot, RobotWithoutHalt]),
+)
+def test_a_policy_or_callback_that_raises_amid_an_episode_stops_the_robot(
+    when, error, make_robot
+):
     robot = make_robot()
     FAULT.now = Fault()
     env = gymnasium.wrappers.TimeLimit(single(robot, True, None), 20)
@@ -224,7 +270,13 @@ def test_a_policy_or_callback_that_raises_amid_an_episode_stops_the_robot(when, 
     FAULT.now = Fault(when, error)
     with pytest.raises(error):  # noqa: PT012
         for seed in range(20):
-            drive(env, SimpleNamespace(act=act), seed, None, lambda: FAULT.now.at("on_start"))
+            drive(
+                env,
+                SimpleNamespace(act=act),
+                seed,
+                None,
+                lambda: FAULT.now.at("on_start"),
+            )
     assert not robot.last.any()
 
 
@@ -247,7 +299,13 @@ def test_everything_that_an_env_calls_was_thrown_from():
         env.render()
         env.close()
         names |= FAULT.now.names
-    backend = {"backend reset", "backend step", "backend close", "picture draw", "picture close"}
+    backend = {
+        "backend reset",
+        "backend step",
+        "backend close",
+        "picture draw",
+        "picture close",
+    }
     assert names >= backend | set(OF_TASK)
 
 

@@ -23,19 +23,27 @@ MODEL = direct_model()
 
 def world(side):
     """A field with one obstacle and a goal, on the left or right of a robot that looks ahead."""
-    circle = {"shapes": [{"kind": "circle", "radius": 0.25}], "at": [[0.9, 0.7 * side, 0.0]]}
+    circle = {
+        "shapes": [{"kind": "circle", "radius": 0.25}],
+        "at": [[0.9, 0.7 * side, 0.0]],
+    }
     return field(
-        6.0, starts={"at": [[0.0, 0.1 * side, 0.3 * side]]}, goals={"at": [[2.0, -0.5 * side]]},
+        6.0,
+        starts={"at": [[0.0, 0.1 * side, 0.3 * side]]},
+        goals={"at": [[2.0, -0.5 * side]]},
         obstacles=[circle],
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("scan", [None, "around", {"sectors": 20, "range_max": 2.0}])
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
-def test_mirrored_actions_in_a_mirrored_world_show_the_mirrored_observation(scan, actions):
+def test_mirrored_actions_in_a_mirrored_world_show_the_mirrored_observation(
+    scan, actions
+):
     options = {"scan": scan, "actions": actions}
     left, right = (
-        BridgeEnv("sim", MODEL, world(side), "navigation", task_options=options) for side in (1, -1)
+        BridgeEnv("sim", MODEL, world(side), "navigation", task_options=options)
+        for side in (1, -1)
     )
     mirror = left.unwrapped.task.mirror()
     seen, other = (env.reset(seed=1)[0] for env in (left, right))
@@ -54,7 +62,9 @@ def test_mirrored_actions_in_a_mirrored_world_show_the_mirrored_observation(scan
 def test_the_mirror_image_of_a_mirror_image_is_the_thing_itself():
     for robot in ("differential", "ackermann", "mecanum", "jackal"):
         for actions in ("continuous", "discrete"):
-            task = make_task("navigation", open_model(robot), {"actions": actions, "scan": "front"})
+            task = make_task(
+                "navigation", open_model(robot), {"actions": actions, "scan": "front"}
+            )
             mirror = task.mirror()
             twice = mirror.places[mirror.places]
             assert twice.tolist() == list(range(len(twice)))
@@ -69,7 +79,9 @@ def test_limits_that_differ_on_both_sides_are_reckoned_with():
     mirror = task.mirror()
     action = np.array([0.3, 0.2, -0.4])  # -0.4 turns by 0.2 rad/s, to the left
     mirrored = action[mirror.acted] * mirror.scale + mirror.offset
-    np.testing.assert_allclose(task.command(mirrored), task.command(action) * [1.0, -1.0, -1.0])
+    np.testing.assert_allclose(
+        task.command(mirrored), task.command(action) * [1.0, -1.0, -1.0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -81,12 +93,18 @@ def test_limits_that_differ_on_both_sides_are_reckoned_with():
     ],
 )
 def test_a_scan_that_does_not_look_alike_to_both_sides_is_refused(sensor):
-    with pytest.raises(ConfigError, match="does not look alike to the left and to the right"):
+    with pytest.raises(
+        ConfigError, match="does not look alike to the left and to the right"
+    ):
         Navigation(MODEL.robot, sensor).mirror()
 
 
 def test_a_lidar_whose_last_beam_is_its_first_or_not_has_a_mirror_image():
-    for sensor in (lidar(beams=7), lidar(beams=8), lidar(angle_min=-1.0, angle_max=1.0, beams=5)):
+    for sensor in (
+        lidar(beams=7),
+        lidar(beams=8),
+        lidar(angle_min=-1.0, angle_max=1.0, beams=5),
+    ):
         mirror = Navigation(MODEL.robot, sensor).mirror()
         angles = sensor.angles[mirror.places[: sensor.beams]]
         np.testing.assert_allclose(np.cos(angles), np.cos(sensor.angles), atol=1e-9)
@@ -111,10 +129,16 @@ class Bare(Task):
 
 def test_a_task_without_a_mirror_image_is_refused_and_a_wrong_one():
     task = Bare(MODEL.robot, MODEL.lidar)
-    with pytest.raises(ConfigError, match="task Bare does not tell what it looks like in a mirror"):
+    with pytest.raises(
+        ConfigError, match="task Bare does not tell what it looks like in a mirror"
+    ):
         task.mirror()
-    with pytest.raises(ConfigError, match="mirrors 73 parts of an observation, which has 74"):
+    with pytest.raises(
+        ConfigError, match="mirrors 73 parts of an observation, which has 74"
+    ):
         mirror_of(task, [1])
-    with pytest.raises(ConfigError, match="part 72 lies from 0 to 1, its mirror image not"):
+    with pytest.raises(
+        ConfigError, match="part 72 lies from 0 to 1, its mirror image not"
+    ):
         mirror_of(task, [-1, -1])
     assert mirror_of(task, [1, -1]).signs[-2:].tolist() == [1.0, -1.0]

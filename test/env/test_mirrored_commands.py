@@ -25,14 +25,21 @@ SIZE = {"footprint_radius": 0.2}
             {
                 "kind": "mecanum",
                 "command": [
-                    {"name": f"{end}_{side}_wheel", "unit": "rad/s", "min": -9.0, "max": 9.0}
-                    for end in ("front", "rear") for side in ("left", "right")
+                    {
+                        "name": f"{end}_{side}_wheel",
+                        "unit": "rad/s",
+                        "min": -9.0,
+                        "max": 9.0,
+                    }
+                    for end in ("front", "rear")
+                    for side in ("left", "right")
                 ],
             },
-            [1, 0, 3, 2], [1, 1, 1, 1],
+            [1, 0, 3, 2],
+            [1, 1, 1, 1],
         ),
     ],
-)  # fmt: skip
+)
 def test_commands_of_the_mirror_image_lead_to_the_mirrored_twist(robot, places, signs):
     spec = load_robot(robot) if isinstance(robot, str) else robot_from(robot | SIZE)
     found, factors = mirrored_commands(spec)
@@ -47,7 +54,9 @@ def test_commands_of_the_mirror_image_lead_to_the_mirrored_twist(robot, places, 
 def test_an_outline_that_is_not_the_same_on_both_sides_is_refused():
     outline = [[0.3, 0.2], [-0.2, 0.2], [-0.2, -0.1], [0.3, -0.1]]
     spec = robot_from({"kind": "differential", "footprint": outline})
-    with pytest.raises(ConfigError, match="its footprint is not the same on the left and on the"):
+    with pytest.raises(
+        ConfigError, match="its footprint is not the same on the left and on the"
+    ):
         mirrored_commands(spec)
     assert mirrored_commands(load_robot("jackal"))[1].tolist() == [1, -1]
 
@@ -55,5 +64,7 @@ def test_an_outline_that_is_not_the_same_on_both_sides_is_refused():
 def test_commands_of_which_nothing_tells_where_they_lead_are_refused():
     command = [{"name": "a", "unit": "1", "min": -1.0, "max": 1.0}]
     spec = robot_from({"name": "odd", "footprint_radius": 0.2, "command": command})
-    with pytest.raises(ConfigError, match="robot 'odd': which of its commands drive its mirror"):
+    with pytest.raises(
+        ConfigError, match="robot 'odd': which of its commands drive its mirror"
+    ):
         mirrored_commands(spec)

@@ -22,25 +22,45 @@ NO_FLAGS = (None, "yes", 1, 0.0, [], {})
 NO_COUNTS = (0, -1, 1.5, NAN, True, "3", [], {})
 NO_LENGTHS = (0.0, -1, NAN, float("inf"), True, "far", None, [1.0])
 WRONG: dict[str, tuple[Any, ...]] = {
-    "model": (*NO_NAMES, []), "robot": (*NO_NAMES, []), "world": (*NO_NAMES, [], [3]),
-    "task": (*NO_NAMES, int, []), "task_options": NO_DICTS, "randomisation": (*NO_NAMES, []),
-    "render_mode": (*NO_NAMES, []), "bogus": (1,),
-}  # fmt: skip
+    "model": (*NO_NAMES, []),
+    "robot": (*NO_NAMES, []),
+    "world": (*NO_NAMES, [], [3]),
+    "task": (*NO_NAMES, int, []),
+    "task_options": NO_DICTS,
+    "randomisation": (*NO_NAMES, []),
+    "render_mode": (*NO_NAMES, []),
+    "bogus": (1,),
+}
 OF_ONE: dict[str, tuple[Any, ...]] = {
-    "backend": (*NO_NAMES, None, []), "backend_options": NO_DICTS, "estimator": NO_FLAGS[1:],
+    "backend": (*NO_NAMES, None, []),
+    "backend_options": NO_DICTS,
+    "estimator": NO_FLAGS[1:],
     "simulator": ("gazebo", 3),
-}  # fmt: skip
+}
 OF_MANY: dict[str, tuple[Any, ...]] = {
-    "num_envs": (*NO_COUNTS, None), "max_episode_steps": (*NO_COUNTS, None), "copy": NO_FLAGS,
-    "autoreset_mode": (*NO_NAMES, None, []), "renderer": (*NO_NAMES, None, []),
-    "threads": (*NO_COUNTS, None), "longest_delay": (-1, 1.5, "3", True), "worlds": (2,),
-    "longest_age": (-1, 1.5, None, True), "vectorization_mode": ("async", 3), "robots": (2,),
-}  # fmt: skip
+    "num_envs": (*NO_COUNTS, None),
+    "max_episode_steps": (*NO_COUNTS, None),
+    "copy": NO_FLAGS,
+    "autoreset_mode": (*NO_NAMES, None, []),
+    "renderer": (*NO_NAMES, None, []),
+    "threads": (*NO_COUNTS, None),
+    "longest_delay": (-1, 1.5, "3", True),
+    "worlds": (2,),
+    "longest_age": (-1, 1.5, None, True),
+    "vectorization_mode": ("async", 3),
+    "robots": (2,),
+}
 OPTIONS: dict[str, tuple[Any, ...]] = {
-    "goal_radius": NO_LENGTHS, "contact_margin": NO_LENGTHS[2:], "top_speed": (0.0, -1.0),
-    "success_reward": (NAN, "x", None, True), "scan": (0, -3, 1.5, "x", [1]), "robot": ("x",),
-    "actions": (3, None, "x", []), "sensors": ("x", 3, [3]), "goal_radios": (1.0,),
-}  # fmt: skip
+    "goal_radius": NO_LENGTHS,
+    "contact_margin": NO_LENGTHS[2:],
+    "top_speed": (0.0, -1.0),
+    "success_reward": (NAN, "x", None, True),
+    "scan": (0, -3, 1.5, "x", [1]),
+    "robot": ("x",),
+    "actions": (3, None, "x", []),
+    "sensors": ("x", 3, [3]),
+    "goal_radios": (1.0,),
+}
 Maker = Callable[..., Any]
 
 
@@ -58,8 +78,10 @@ def cases(maker: Maker, *tables: dict[str, tuple[Any, ...]]) -> list[Any]:
     """Lists maker, keyword and value of every mistake in some tables."""
     return [
         pytest.param(maker, name, value, id=f"{maker.__name__}-{name}={value!r:.20}")
-        for table in tables for name, values in table.items() for value in values
-    ]  # fmt: skip
+        for table in tables
+        for name, values in table.items()
+        for value in values
+    ]
 
 
 OF_TEAM = {name: each for name, each in OF_MANY.items() if name == "max_episode_steps"}
@@ -69,10 +91,12 @@ OF_MAKE = {"max_episode_steps": NO_COUNTS}
 @pytest.mark.parametrize(
     ("maker", "name", "value"),
     [
-        *cases(single, WRONG, OF_ONE, OF_MAKE), *cases(several, WRONG, OF_MANY),
-        *cases(BridgeParallelEnv, WRONG, OF_TEAM), *cases(BridgeEnv, WRONG, OF_ONE),
+        *cases(single, WRONG, OF_ONE, OF_MAKE),
+        *cases(several, WRONG, OF_MANY),
+        *cases(BridgeParallelEnv, WRONG, OF_TEAM),
+        *cases(BridgeEnv, WRONG, OF_ONE),
     ],
-)  # fmt: skip
+)
 def test_a_mistaken_argument_is_refused_in_one_sentence(
     maker: Maker, name: str, value: Any
 ) -> None:
@@ -85,10 +109,15 @@ def test_a_mistaken_argument_is_refused_in_one_sentence(
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [(name, value) for name, values in OPTIONS.items() for value in values]
+    ("name", "value"),
+    [(name, value) for name, values in OPTIONS.items() for value in values],
 )
-def test_a_mistaken_task_option_is_refused_in_one_sentence(name: str, value: Any) -> None:
-    with pytest.raises(BridgeError, match=name.replace("radios", "radius").split("_")[0]):
+def test_a_mistaken_task_option_is_refused_in_one_sentence(
+    name: str, value: Any
+) -> None:
+    with pytest.raises(
+        BridgeError, match=name.replace("radios", "radius").split("_")[0]
+    ):
         single(task_options={name: value})
 
 
@@ -118,12 +147,16 @@ def test_make_and_make_vec_take_the_task_first() -> None:
 
 @pytest.mark.parametrize("make", [nics_drl_bridge.make, nics_drl_bridge.make_vec])
 @pytest.mark.parametrize("method", ["reset", "step", "render"])
-def test_a_closed_env_refuses_what_is_called_after_close(make: Maker, method: str) -> None:
+def test_a_closed_env_refuses_what_is_called_after_close(
+    make: Maker, method: str
+) -> None:
     env = make()
     env.reset(seed=0)
     env.close()
     given = (env.action_space.sample(),) if method == "step" else ()
-    with pytest.raises(BridgeError, match=rf"{method}\(\) after close\(\).*make another"):
+    with pytest.raises(
+        BridgeError, match=rf"{method}\(\) after close\(\).*make another"
+    ):
         getattr(env, method)(*given)
     env.close()  # a second time does nothing
 
@@ -187,11 +220,14 @@ def test_a_task_that_returns_what_no_task_may_is_told_which_method(
     [
         ("x = 1", "", "defines no subclass of nics_drl_bridge.env.task.Task"),
         ("x = 1", ":Patrol", "defines no subclass of nics_drl_bridge.env.task.Task"),
-        ("from nics_drl_bridge.env.navigation import Navigation\nclass Mine(Navigation): pass",
-         "", "name the class in it, as .*:Mine"),
+        (
+            "from nics_drl_bridge.env.navigation import Navigation\nclass Mine(Navigation): pass",
+            "",
+            "name the class in it, as .*:Mine",
+        ),
         (None, "", "no such file; give path/to/file.py:ClassName"),
     ],
-)  # fmt: skip
+)
 def test_a_file_without_a_task_is_told(
     tmp_path: Path, text: str | None, suffix: str, sentence: str
 ) -> None:
@@ -212,5 +248,7 @@ def test_a_field_of_800_metres_is_refused_with_the_limit(tmp_path: Path) -> None
 def test_a_model_that_is_not_there_is_told_without_a_dangling_clause() -> None:
     with pytest.raises(BridgeError) as caught:
         nics_drl_bridge.make(model="jackel")
-    assert str(caught.value).startswith("unknown robot 'jackel'; did you mean 'jackal'? (or")
+    assert str(caught.value).startswith(
+        "unknown robot 'jackel'; did you mean 'jackal'? (or"
+    )
     assert "either." not in str(caught.value)

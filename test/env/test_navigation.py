@@ -17,8 +17,14 @@ def task():
 
 
 def view(pose=(0.0, 0.0, 0.0), twist=(0.0, 0.0, 0.0), ranges=None):
-    ranges = np.full(B, np.inf, np.float32) if ranges is None else np.asarray(ranges, np.float32)
-    return RobotView(np.array(pose, float), np.array(twist, float), ranges, 0.0, 0.0, 0.0)
+    ranges = (
+        np.full(B, np.inf, np.float32)
+        if ranges is None
+        else np.asarray(ranges, np.float32)
+    )
+    return RobotView(
+        np.array(pose, float), np.array(twist, float), ranges, 0.0, 0.0, 0.0
+    )
 
 
 def observe(task, view, goal):
@@ -31,7 +37,9 @@ def judge(task, view, goal):
 
 def test_the_observation_is_laid_out_as_documented(task):
     ranges = np.full(B, 1.5, np.float32)
-    observation = observe(task, view([1.0, 1.0, np.pi / 2], [0.1, 0.2, 0.3], ranges), [1.0, 3.0])
+    observation = observe(
+        task, view([1.0, 1.0, np.pi / 2], [0.1, 0.2, 0.3], ranges), [1.0, 3.0]
+    )
     assert observation.dtype == np.float32
     assert observation.shape == (B + 6,)
     assert observation[:B] == pytest.approx(0.5)
@@ -56,7 +64,9 @@ def test_every_observation_lies_in_its_space(task):
         ranges = rng.uniform(0.0, 4.0, B).astype(np.float32)
         ranges[rng.random(B) < 0.2] = rng.choice([np.nan, np.inf, -np.inf])
         pose = rng.normal(size=3) * 5.0
-        observation = observe(task, view(pose, rng.normal(size=3), ranges), rng.normal(size=2))
+        observation = observe(
+            task, view(pose, rng.normal(size=3), ranges), rng.normal(size=2)
+        )
         assert task.observation_space.contains(observation)
         assert np.isfinite(observation).all()
     assert task.observation_space.contains(observe(task, view(), [0.0, 0.0]))
@@ -70,7 +80,9 @@ def test_actions_span_the_commands_between_their_limits(robot):
     assert task.action_space.shape == (size,)
     assert np.array_equal(task.command(-np.ones(size)), spec.command_low)
     assert np.array_equal(task.command(np.ones(size)), spec.command_high)
-    assert task.command(np.zeros(size)) == pytest.approx((spec.command_low + spec.command_high) / 2)
+    assert task.command(np.zeros(size)) == pytest.approx(
+        (spec.command_low + spec.command_high) / 2
+    )
     assert np.array_equal(task.command(np.full(size, 7.0)), spec.command_high)
 
 
@@ -81,7 +93,9 @@ def test_the_goal_is_reached_within_its_radius(task, distance, reached):
     assert not verdict.touched
 
 
-@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.15, 0.05, 0.0), (-0.1, 0.1, 2.5)])
+@pytest.mark.parametrize(
+    "mount", [(0.0, 0.0, 0.0), (0.15, 0.05, 0.0), (-0.1, 0.1, 2.5)]
+)
 def test_a_touch_is_judged_from_the_footprint_wherever_the_lidar_sits(mount):
     sensor = lidar(mount=mount)
     task = Navigation(DIRECT, sensor)
@@ -90,7 +104,9 @@ def test_a_touch_is_judged_from_the_footprint_wherever_the_lidar_sits(mount):
         for angle in np.linspace(-np.pi, np.pi, 12, endpoint=False):
             # The return of one beam that ends at this distance from the robot's middle.
             beam = int(
-                np.argmin(np.abs(np.exp(1j * (sensor.angles + mount[2])) - np.exp(1j * angle)))
+                np.argmin(
+                    np.abs(np.exp(1j * (sensor.angles + mount[2])) - np.exp(1j * angle))
+                )
             )
             direction = sensor.angles[beam] + mount[2]
             along = mount[0] * np.cos(direction) + mount[1] * np.sin(direction)
@@ -170,6 +186,6 @@ def test_a_batch_gives_what_its_robots_give_one_by_one(task):
             assert verdict.reached[n, m] == single.reached
             assert verdict.touched[n, m] == single.touched
             expected = task.reward(alone, alone, {"goal": goal[n, m]})
-            assert {name: float(term[n, m]) for name, term in terms.items()} == pytest.approx(
-                {name: float(term) for name, term in expected.items()}
-            )
+            assert {
+                name: float(term[n, m]) for name, term in terms.items()
+            } == pytest.approx({name: float(term) for name, term in expected.items()})

@@ -26,7 +26,9 @@ TASKS = (
 
 
 def env(task="cooperative_reaching", task_options=None, **arguments):
-    return BridgeParallelEnv(direct_model(), field(8.0), task, task_options, **arguments)
+    return BridgeParallelEnv(
+        direct_model(), field(8.0), task, task_options, **arguments
+    )
 
 
 def sampled(env, seed=0):
@@ -54,14 +56,18 @@ def test_its_rewards_sum_to_the_teams_and_its_rows_are_the_teams(task):
     while each.agents:
         before, actions = list(each.agents), next(moves)
         rest = np.zeros(3, np.float32)
-        joint = np.concatenate([actions.get(name, rest) for name in each.possible_agents])
+        joint = np.concatenate(
+            [actions.get(name, rest) for name in each.possible_agents]
+        )
         seen, rewards, *_ = each.step(actions)
         rows, reward, terminated, _, info = team.step(joint)
         assert sum(rewards.values()) == pytest.approx(reward)
         for name in before:
             m = each.possible_agents.index(name)
             assert np.array_equal(seen[name], rows.reshape(3, -1)[m])
-        assert reward == pytest.approx(sum(term.sum() for term in info["reward_terms"].values()))
+        assert reward == pytest.approx(
+            sum(term.sum() for term in info["reward_terms"].values())
+        )
         assert not (terminated and each.agents)
 
 
@@ -107,7 +113,9 @@ def test_each_agent_is_told_what_the_randomisation_drew_for_it(task):
     drawn = Randomisation.model_validate(
         {"name": "both", "action_latency": [0.0, 1.0], "obstacles": {"count": [1, 3]}}
     )
-    parallel = BridgeParallelEnv(direct_model(), field(8.0, 2), task, randomisation=drawn)
+    parallel = BridgeParallelEnv(
+        direct_model(), field(8.0, 2), task, randomisation=drawn
+    )
     _, infos = parallel.reset(seed=3)
     _, info = parallel.env.reset(seed=3)
     latency = np.atleast_1d(info["randomisation"]["action_latency_s"])

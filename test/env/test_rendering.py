@@ -26,7 +26,9 @@ BLUE = pixel(ROBOTS[0])
 
 
 def env(mode, **arguments):
-    return BridgeEnv(model=direct_model(), world=field(count=2), render_mode=mode, **arguments)
+    return BridgeEnv(
+        model=direct_model(), world=field(count=2), render_mode=mode, **arguments
+    )
 
 
 def blue_at(picture):
@@ -41,7 +43,9 @@ def test_a_picture_shows_the_robot_where_it_stands():
     picture = shown.render()
     assert picture.dtype == np.uint8
     assert picture.shape == (500, 500, 3)
-    assert blue_at(picture) == pytest.approx((0.5 + 1.5 / 6.6, 0.5 + 1.5 / 6.6), abs=0.02)
+    assert blue_at(picture) == pytest.approx(
+        (0.5 + 1.5 / 6.6, 0.5 + 1.5 / 6.6), abs=0.02
+    )
     for _ in range(5):
         shown.step(np.array([1.0, 0.0, 0.0], np.float32))
     row, column = blue_at(shown.render())
@@ -107,12 +111,16 @@ def test_nothing_is_drawn_without_a_mode_and_nothing_before_a_reset():
     assert quiet.render() is None
     with pytest.raises(gymnasium.error.ResetNeeded):
         env("rgb_array").render()
-    with pytest.raises(ConfigError, match="unknown render_mode 'rgb_aray'; did you mean"):
+    with pytest.raises(
+        ConfigError, match="unknown render_mode 'rgb_aray'; did you mean"
+    ):
         env("rgb_aray")
 
 
 def test_a_vector_env_draws_what_its_single_envs_draw():
-    vector = BridgeVectorEnv(2, model=direct_model(), world=field(count=2), render_mode="rgb_array")
+    vector = BridgeVectorEnv(
+        2, model=direct_model(), world=field(count=2), render_mode="rgb_array"
+    )
     vector.reset(seed=3)
     pictures = vector.render()
     for n in range(2):
@@ -138,7 +146,9 @@ def test_a_footprint_of_corners_is_drawn_with_its_corners():
     model = replace(model, robot=RobotSpec.model_validate(about))
     shown = BridgeEnv(model=model, world=field(count=0), render_mode="rgb_array")
     shown.reset(seed=0, options={"start": (0.0, 0.0, np.pi / 2.0)})
-    rows, columns = np.nonzero((np.abs(shown.render().astype(int) - BLUE) < 3).all(axis=-1))
+    rows, columns = np.nonzero(
+        (np.abs(shown.render().astype(int) - BLUE) < 3).all(axis=-1)
+    )
     scale = 500 / 6.6  # pixels per metre
     assert np.ptp(rows) == pytest.approx(1.6 * scale, abs=4)
     assert np.ptp(columns) == pytest.approx(0.2 * scale, abs=4)

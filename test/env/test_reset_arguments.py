@@ -38,11 +38,16 @@ ENVS = {"single": single, "vector": vector, "agents": agents}
         ({"seed": 3.0}, "^seed 3.0: must be a whole number"),
         ({"options": [1]}, "^reset options of type list: must be a dict"),
         ({"options": "start"}, "^reset options of type str: must be a dict"),
-        ({"options": {"gaol": (1.0, 1.0)}}, "^unknown reset option 'gaol'; did you mean 'goal'?"),
+        (
+            {"options": {"gaol": (1.0, 1.0)}},
+            "^unknown reset option 'gaol'; did you mean 'goal'?",
+        ),
         ({"options": {3: 1}}, "^unknown reset option 3; "),
     ],
 )
-def test_what_a_reset_cant_use_is_one_sentence_and_the_next_reset_works(kind, arguments, sentence):
+def test_what_a_reset_cant_use_is_one_sentence_and_the_next_reset_works(
+    kind, arguments, sentence
+):
     env = ENVS[kind]()
     with pytest.raises(ConfigError, match=sentence.replace("?", r"\?")):
         env.reset(**arguments)
@@ -63,7 +68,9 @@ def test_the_greatest_seed_works():
 
 
 def test_the_last_world_counts_on_from_the_seed_of_the_first():
-    with pytest.raises(ConfigError, match=f"must be a whole number from 0 to {2**63 - 3}"):
+    with pytest.raises(
+        ConfigError, match=f"must be a whole number from 0 to {2**63 - 3}"
+    ):
         vector(3).reset(seed=2**63 - 2)
 
 
@@ -79,15 +86,28 @@ def test_reset_mask_is_an_option_of_the_vector_env_alone():
 
 
 @pytest.mark.parametrize(
-    "goal", [5.0, (1.0,), [[1.0], [1.0, 2.0]], None, object(), "12", (1j, 2.0), np.ones((1, 1, 1))]
+    "goal",
+    [
+        5.0,
+        (1.0,),
+        [[1.0], [1.0, 2.0]],
+        None,
+        object(),
+        "12",
+        (1j, 2.0),
+        np.ones((1, 1, 1)),
+    ],
 )
 def test_an_option_of_another_shape_is_refused_rather_than_spread(goal):
-    with pytest.raises(ConfigError, match=r"reset option 'goal'.*must be numbers of shape"):
+    with pytest.raises(
+        ConfigError, match=r"reset option 'goal'.*must be numbers of shape"
+    ):
         single().reset(options={"goal": goal})
 
 
 @pytest.mark.parametrize(
-    "action", [np.array(["a", "b", "c"]), np.ones(3) * 1j, np.array([None] * 3), [[1.0], 2.0]]
+    "action",
+    [np.array(["a", "b", "c"]), np.ones(3) * 1j, np.array([None] * 3), [[1.0], 2.0]],
 )
 def test_an_action_of_no_numbers_is_refused_by_its_type(action):
     env = single()
@@ -105,7 +125,9 @@ def test_an_action_of_any_real_numbers_is_an_action(kind):
     assert np.array_equal(told[0], env.step(np.array(ones, np.float32))[0])
 
 
-@pytest.mark.parametrize("command", [lambda c: c[..., :1], lambda c: c * np.nan, lambda c: c[0]])
+@pytest.mark.parametrize(
+    "command", [lambda c: c[..., :1], lambda c: c * np.nan, lambda c: c[0]]
+)
 def test_a_task_whose_command_no_robot_can_be_told_is_named(command):
     class Senseless(Navigation):
         def command(self, action):
@@ -113,5 +135,7 @@ def test_a_task_whose_command_no_robot_can_be_told_is_named(command):
 
     env = BridgeEnv(model=direct_model(), world=field(), task=Senseless)
     env.reset(seed=0)
-    with pytest.raises(ConfigError, match=r"^the task's command .*must be finite, of shape \(1, 3"):
+    with pytest.raises(
+        ConfigError, match=r"^the task's command .*must be finite, of shape \(1, 3"
+    ):
         env.step(np.ones(3, np.float32))

@@ -83,14 +83,30 @@ def test_the_own_tasks_terms_stand_in_info_and_sum_to_the_reward():
         ("navigtion", None, "unknown task 'navigtion'; did you mean 'navigation'?"),
         ("nowhere.py:Patrol", None, "task 'nowhere.py': no such file"),
         (f"{OWN}:Patrole", None, "has no such Task; did you mean 'Patrol'?"),
-        ("navigation", {"goal_radus": 1.0}, "'goal_radus'; did you mean 'goal_radius'?"),
-        ("navigation", {"goal_radius": "far"}, "goal_radius='far': must be a finite number"),
-        ("navigation", {"goal_radius": np.nan}, "goal_radius=nan: must be a finite number"),
+        (
+            "navigation",
+            {"goal_radus": 1.0},
+            "'goal_radus'; did you mean 'goal_radius'?",
+        ),
+        (
+            "navigation",
+            {"goal_radius": "far"},
+            "goal_radius='far': must be a finite number",
+        ),
+        (
+            "navigation",
+            {"goal_radius": np.nan},
+            "goal_radius=nan: must be a finite number",
+        ),
         ("cooperative_reaching", {"robots": 2.5}, "robots=2.5: must be a whole number"),
         ("navigation", {"actions": "discreet"}, "did you mean 'discrete'?"),
         ("cooperative_reaching", {"robots": 1}, "a team has at least 2"),
         ("pursuit_evasion", {"evaders": 0}, "at least 1 each"),
-        (Navigation(DIRECT, lidar(beams=36)), None, "make it with model.robot and model.lidar"),
+        (
+            Navigation(DIRECT, lidar(beams=36)),
+            None,
+            "make it with model.robot and model.lidar",
+        ),
         (Navigation(DIRECT, lidar()), {"goal_radius": 1.0}, "is already made"),
     ],
 )
@@ -105,7 +121,10 @@ def test_a_wrong_task_gives_one_sentence(task, options, sentence):
     ("text", "told"),
     [
         ("x = 1\nclass Own(:\n", "line 2: can't be imported (SyntaxError"),
-        ("import nowhere_to_be_found\n", "line 1: can't be imported (ModuleNotFoundError"),
+        (
+            "import nowhere_to_be_found\n",
+            "line 1: can't be imported (ModuleNotFoundError",
+        ),
         ("x = 1\n\ny = 1 / 0\n", "line 3: can't be imported (ZeroDivisionError"),
         ("\0", "can't be imported ("),
     ],
@@ -130,8 +149,14 @@ def test_the_discrete_actions_are_the_papers_drives():
     """efc-robot/MultiVehicleEnv, basic.py: stop, then ahead and back, each straight and turning."""
     car = load_robot("ackermann")  # speed from -0.5 to 1
     assert discrete_commands(car).tolist() == [
-        [0, 0], [1, 0], [1, 0.5], [1, -0.5], [-0.5, 0], [-0.5, 0.5], [-0.5, -0.5],
-    ]  # fmt: skip
+        [0, 0],
+        [1, 0],
+        [1, 0.5],
+        [1, -0.5],
+        [-0.5, 0],
+        [-0.5, 0.5],
+        [-0.5, -0.5],
+    ]
     mecanum = discrete_commands(load_robot("mecanum"))
     assert mecanum.shape == (9, 3)
     assert mecanum[4].tolist() == [-0.7, 0.0, 0.0]
@@ -171,7 +196,13 @@ def test_a_robot_without_cmd_vel_gets_each_command_alone():
             ],
         }
     )
-    assert discrete_commands(wheels).tolist() == [[0, 1], [5, 1], [0, 2], [-3, 1], [0, 1]]
+    assert discrete_commands(wheels).tolist() == [
+        [0, 1],
+        [5, 1],
+        [0, 2],
+        [-3, 1],
+        [0, 1],
+    ]
 
 
 def test_bearing_and_distance_agree_with_plane_geometry():
@@ -186,7 +217,9 @@ def test_bearing_and_distance_agree_with_plane_geometry():
     assert bearing([1.0, 2.0, 0.3], [1.0, 2.0]).tolist() == [0.0, 1.0, 0.0]
 
 
-@pytest.mark.parametrize("name", ["navigation", "cooperative_reaching", "pursuit_evasion"])
+@pytest.mark.parametrize(
+    "name", ["navigation", "cooperative_reaching", "pursuit_evasion"]
+)
 def test_a_task_sees_sectors_where_a_layout_is_given_and_judges_touches_by_beams(name):
     model = direct_model(sensor=lidar(beams=720))
     own, sectors = make_task(name, model), make_task(name, model, {"scan": "around"})
@@ -204,13 +237,17 @@ def test_a_task_sees_sectors_where_a_layout_is_given_and_judges_touches_by_beams
 
 def test_a_scan_layout_that_the_lidar_cannot_fill_is_refused_when_the_task_is_made():
     with pytest.raises(ConfigError, match="range_max"):
-        make_task("navigation", direct_model(), {"scan": {"sectors": 36, "range_max": 9.0}})
+        make_task(
+            "navigation", direct_model(), {"scan": {"sectors": 36, "range_max": 9.0}}
+        )
 
 
 def test_a_policy_of_sectors_sees_the_same_from_lidars_of_other_layout():
     views = []
     for beams, angle_min in ((720, -np.pi), (1440, 0.0)):
-        spec = lidar(beams=beams, angle_min=angle_min, angle_max=angle_min + 2.0 * np.pi)
+        spec = lidar(
+            beams=beams, angle_min=angle_min, angle_max=angle_min + 2.0 * np.pi
+        )
         task = make_task("navigation", direct_model(sensor=spec), {"scan": "around"})
         ranges = (1.5 + np.cos(spec.angles)).astype(np.float32)
         views.append(task.free_share(ranges))
@@ -264,11 +301,18 @@ def test_a_round_footprint_is_left_at_its_radius_from_the_middle():
 def test_a_top_speed_limits_commands_in_m_per_s_and_no_others():
     jackal = open_model("jackal")
     slow = Navigation(jackal.robot, jackal.lidar, top_speed=0.4)
-    assert slow.command([[-1.0, -1.0], [1.0, 1.0]]).tolist() == [[-0.4, -2.5], [0.4, 2.5]]
+    assert slow.command([[-1.0, -1.0], [1.0, 1.0]]).tolist() == [
+        [-0.4, -2.5],
+        [0.4, 2.5],
+    ]
     assert np.abs(slow.discrete_commands[:, 0]).max() == 0.4
     free = Navigation(jackal.robot, jackal.lidar)
     fast = Navigation(jackal.robot, jackal.lidar, top_speed=9.0)
-    assert fast.command([1.0, 1.0]).tolist() == free.command([1.0, 1.0]).tolist() == [2.0, 2.5]
+    assert (
+        fast.command([1.0, 1.0]).tolist()
+        == free.command([1.0, 1.0]).tolist()
+        == [2.0, 2.5]
+    )
 
 
 def test_a_top_speed_that_is_none_is_refused():
@@ -327,7 +371,10 @@ def test_a_step_of_ones_own_in_one_pass_is_kept():
 @pytest.mark.parametrize("task", [Mixed, Own])
 def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
     arguments = {"model": direct_model(), "world": field(), "task": task}
-    alone, several = gymnasium.make(TASK, **arguments), gymnasium.make_vec(TASK, 2, **arguments)
+    alone, several = (
+        gymnasium.make(TASK, **arguments),
+        gymnasium.make_vec(TASK, 2, **arguments),
+    )
     alone.reset(seed=0)
     several.reset(seed=0)
     ahead = np.ones((2, 3), np.float32)
@@ -339,7 +386,10 @@ def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
 
 def test_a_memory_that_update_binds_anew_counts_alone_and_in_a_vector():
     arguments = {"model": direct_model(), "world": field(), "task": Counting}
-    alone, several = gymnasium.make(TASK, **arguments), gymnasium.make_vec(TASK, 3, **arguments)
+    alone, several = (
+        gymnasium.make(TASK, **arguments),
+        gymnasium.make_vec(TASK, 3, **arguments),
+    )
     alone.reset(seed=0)
     several.reset(seed=0)
     still_there = np.zeros((3, 3), np.float32)
@@ -380,18 +430,42 @@ def test_a_memory_that_update_shifts_holds_what_was_there(make):
 @pytest.mark.parametrize(
     ("method", "wrong", "sentence"),
     [
-        ("update", lambda _: {"gaol": 1}, "task Wrong: its memory ['count', 'gaol', 'goal'] must"),
-        ("update", lambda _: {"count": np.ones(5)}, "its memory 'count' must stay float64 of ("),
-        ("update", lambda rows: {"count": rows + 0.5j}, "in `update`, not complex128 of ("),
+        (
+            "update",
+            lambda _: {"gaol": 1},
+            "task Wrong: its memory ['count', 'gaol', 'goal'] must",
+        ),
+        (
+            "update",
+            lambda _: {"count": np.ones(5)},
+            "its memory 'count' must stay float64 of (",
+        ),
+        (
+            "update",
+            lambda rows: {"count": rows + 0.5j},
+            "in `update`, not complex128 of (",
+        ),
         (
             "info",
             lambda _: {"battery": 0.5},
             "info 'battery' must be an array whose shape",
         ),
         ("info", lambda _: None, "its info must be a dictionary of arrays"),
-        ("reset", lambda rows: {"count": rows, "goal": [[1.0, 2.0]]}, "memory 'goal' must be an"),
-        ("reset", lambda rows: {"goal": rows}, "reset must give a dictionary of arrays, with"),
-        ("reset", lambda rows: {"count": rows[:, 0]}, "memory 'count', which is shown, must be"),
+        (
+            "reset",
+            lambda rows: {"count": rows, "goal": [[1.0, 2.0]]},
+            "memory 'goal' must be an",
+        ),
+        (
+            "reset",
+            lambda rows: {"goal": rows},
+            "reset must give a dictionary of arrays, with",
+        ),
+        (
+            "reset",
+            lambda rows: {"count": rows[:, 0]},
+            "memory 'count', which is shown, must be",
+        ),
         ("reset", lambda _: None, "reset must give a dictionary of arrays"),
     ],
 )
@@ -427,5 +501,7 @@ def test_a_command_of_no_numbers_is_named_in_a_vector_too():
 
     env = BridgeVectorEnv(2, direct_model(), field(), Senseless)
     env.reset(seed=0)
-    with pytest.raises(ConfigError, match=r"^the task's command .* look at its `command`"):
+    with pytest.raises(
+        ConfigError, match=r"^the task's command .* look at its `command`"
+    ):
         env.step(np.zeros((2, 3), np.float32))

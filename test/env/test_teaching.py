@@ -16,8 +16,13 @@ def env_of(teaching, mode="NextStep", steps=100, **changes):
     """A robot that sees nothing behind, in the middle of a field."""
     places = {"starts": {"at": [[0.0, 0.0, 0.0]]}, "goals": {"at": [[2.0, 0.5]]}}
     world = field(6.0, **(places | changes))
-    env = BridgeVectorEnv(1, direct_model(sensor=BLIND_BEHIND), world, max_episode_steps=steps,
-                          autoreset_mode=mode)  # fmt: skip
+    env = BridgeVectorEnv(
+        1,
+        direct_model(sensor=BLIND_BEHIND),
+        world,
+        max_episode_steps=steps,
+        autoreset_mode=mode,
+    )
     if teaching is not None:
         env.teach(teaching)
     return env
@@ -61,10 +66,13 @@ def test_the_reward_of_the_path_adds_up_to_its_length():
 
 def test_rewards_of_the_task_stay_as_they_are():
     plain, more = (
-        [reward - sum(info["reward_terms"].get(n, [0.0])[0] for n in ("path", "contact"))
-         for reward, _, info in drive(env_of(given), BACK, 10)]
+        [
+            reward
+            - sum(info["reward_terms"].get(n, [0.0])[0] for n in ("path", "contact"))
+            for reward, _, info in drive(env_of(given), BACK, 10)
+        ]
         for given in (None, Teaching(path=1.0, contact=-1.0))
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(plain, more, atol=1e-12)
 
 
@@ -102,7 +110,11 @@ def starts_of(level, world=WIDE, worlds=20):
     env.teach(Teaching(path=1.0, curriculum=Curriculum(begin=level)))
     env.reset(seed=2)
     teacher = env._teacher
-    return env._starts[:, 0].copy(), env.simulator.goals[:, 0].copy(), teacher._left[:, 0].copy()
+    return (
+        env._starts[:, 0].copy(),
+        env.simulator.goals[:, 0].copy(),
+        teacher._left[:, 0].copy(),
+    )
 
 
 def test_starts_of_a_curriculum_leave_a_share_of_the_way_with_the_headings_and_goals_as_drawn():
@@ -129,9 +141,10 @@ def test_a_start_moves_along_the_way_around_a_wall():
 def test_a_start_stays_as_drawn_where_there_is_no_room_on_the_way():
     places = {"starts": {"at": [[-2.0, 0.0, 0.0]]}, "goals": {"at": [[2.0, 0.0]]}}
     moving = {
-        "shapes": [{"kind": "circle", "radius": 0.4}], "at": [[0.0, 0.0, 0.0]],
+        "shapes": [{"kind": "circle", "radius": 0.4}],
+        "at": [[0.0, 0.0, 0.0]],
         "motion": {"kind": "pedestrian", "speed": [0.2, 0.4]},
-    }  # fmt: skip
+    }
     apart = {"goal_distance": [1.0, 9.0], "clearance": 0.0}
     crowd = field(9.0, obstacles=[moving], **places, **apart)
     free = field(9.0, obstacles=[], **places, **apart)
@@ -150,8 +163,9 @@ def levels(action, steps, success=0.7):
     """The level after each step, in worlds whose goals lie ahead."""
     places = {"starts": {"at": [[-2.0, 0.0, 0.0]]}, "goals": {"at": [[2.0, 0.0]]}}
     world = field(9.0, goal_distance=[1.0, 9.0], obstacles=[], **places)
-    env = BridgeVectorEnv(120, direct_model(), world, max_episode_steps=30,
-                          autoreset_mode="SameStep")  # fmt: skip
+    env = BridgeVectorEnv(
+        120, direct_model(), world, max_episode_steps=30, autoreset_mode="SameStep"
+    )
     env.teach(Teaching(curriculum=Curriculum(begin=0.4, step=0.3, success=success)))
     env.reset(seed=0)
     for _ in range(steps):
@@ -189,9 +203,13 @@ def test_a_curriculum_is_for_one_robot():
 def test_levels_do_not_depend_on_the_number_of_threads():
     def driven(threads):
         env = BridgeVectorEnv(
-            120, direct_model(), WIDE, max_episode_steps=20, autoreset_mode="SameStep",
+            120,
+            direct_model(),
+            WIDE,
+            max_episode_steps=20,
+            autoreset_mode="SameStep",
             threads=threads,
-        )  # fmt: skip
+        )
         env.teach(Teaching(path=1.0, retries=1, curriculum=Curriculum(success=0.05)))
         env.reset(seed=0)
         for _ in range(50):

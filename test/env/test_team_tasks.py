@@ -45,7 +45,9 @@ def test_the_team_is_paid_for_the_approach_of_whoever_is_nearest_to_a_goal(team)
     before, after = views([(1.0, 0, 0), (5.0, 0, 0)]), views([(0.8, 0, 0), (4.5, 0, 0)])
     outcome, _ = step(team, before, after, memory)
     # Goal 0 came 0.2 m nearer to robot 0; goal 1 0.5 m to robot 1, from 2 m to 1.5 m.
-    assert outcome.terms["progress"] == pytest.approx(np.full((1, 2), (0.2 + 0.5) / 2.0))
+    assert outcome.terms["progress"] == pytest.approx(
+        np.full((1, 2), (0.2 + 0.5) / 2.0)
+    )
     assert outcome.terms["reached"].tolist() == [[0.0, 0.0]]
     assert not outcome.ended.any()
 
@@ -87,7 +89,11 @@ def test_what_a_robot_of_a_team_sees_is_laid_out_as_documented(team):
     memory["reached"][0, 1] = True
     seen = team.observation(views(poses), memory)[0]
     assert seen.shape == (2, B + 4 * 2 + 3 + 3)
-    goal_0, goal_1, mate = seen[0, B : B + 4], seen[0, B + 4 : B + 8], seen[0, B + 8 : B + 11]
+    goal_0, goal_1, mate = (
+        seen[0, B : B + 4],
+        seen[0, B + 4 : B + 8],
+        seen[0, B + 8 : B + 11],
+    )
     assert goal_0 == pytest.approx([1.0, 0.0, 1.0, 0.0], abs=1e-6)
     assert goal_1 == pytest.approx([2.0, 0.0, -1.0, 1.0], abs=1e-6)
     assert mate == pytest.approx([2.0, 1.0, 0.0], abs=1e-6)
@@ -116,9 +122,13 @@ def test_a_capture_pays_every_pursuer_costs_the_evader_and_ends_it(chase):
     memory = begun(chase, before.pose[0], np.zeros((3, 2)))
     reach = 2.0 * FOOTPRINT + chase.capture_gap
     for gap, caught in ((reach + 1e-6, False), (reach - 1e-6, True)):
-        after = views([(2.0 - gap, 0, 0), PURSUERS[1], EVADER], near=[2] if caught else [])
+        after = views(
+            [(2.0 - gap, 0, 0), PURSUERS[1], EVADER], near=[2] if caught else []
+        )
         outcome, _ = step(chase, before, after, memory)
-        assert outcome.terms["capture"].tolist() == [[10.0, 10.0, -10.0] if caught else [0.0] * 3]
+        assert outcome.terms["capture"].tolist() == [
+            [10.0, 10.0, -10.0] if caught else [0.0] * 3
+        ]
         # Being caught is no collision, whatever the scan says.
         assert outcome.terms["collision"].tolist() == [[0.0, 0.0, 0.0]]
         assert outcome.ended.all() == caught
@@ -166,7 +176,10 @@ def test_the_teams_reward_is_the_sum_over_its_robots(task):
 
 def test_each_robot_of_an_estimating_team_has_an_estimate_of_its_own():
     env = BridgeEnv(
-        model=direct_model(), world=field(8.0), task="cooperative_reaching", estimator=True
+        model=direct_model(),
+        world=field(8.0),
+        task="cooperative_reaching",
+        estimator=True,
     )
     env.reset(seed=0)
     for _ in range(5):

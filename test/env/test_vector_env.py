@@ -23,11 +23,14 @@ from nics_drl_bridge.errors import ConfigError
 CHECKS = [
     getattr(checking, f"check_{name}")
     for name in (
-        "seed_deprecation", "reset_return_info_deprecation", "reset_return_type",
-        "reset_seed_determinism", "reset_options",
+        "seed_deprecation",
+        "reset_return_info_deprecation",
+        "reset_return_type",
+        "reset_seed_determinism",
+        "reset_options",
     )
     if hasattr(checking, f"check_{name}")  # Gymnasium 1.2 has not all of them
-]  # fmt: skip
+]
 """Those parts of Gymnasium's `check_env` that a vector env, which it refuses, can be given to."""
 MODES = ("NextStep", "SameStep")
 TASKS = (
@@ -39,9 +42,13 @@ TASKS = (
     {"task": "cooperative_reaching", "task_options": {"scan": "around"}},
 )
 IDS = (
-    "navigation", "navigation-discrete", "cooperative", "pursuit-discrete", "navigation-sectors",
+    "navigation",
+    "navigation-discrete",
+    "cooperative",
+    "pursuit-discrete",
+    "navigation-sectors",
     "cooperative-sectors",
-)  # fmt: skip
+)
 LIMIT = 25
 THREADS = (1, 2)
 
@@ -52,12 +59,16 @@ def model():
 
 def vector(count, **arguments):
     return BridgeVectorEnv(
-        count, **{"model": model(), "world": field(count=3), "max_episode_steps": LIMIT} | arguments
+        count,
+        **{"model": model(), "world": field(count=3), "max_episode_steps": LIMIT}
+        | arguments,
     )
 
 
 def single(**arguments):
-    return TimeLimit(BridgeEnv(**{"model": model(), "world": field(count=3)} | arguments), LIMIT)
+    return TimeLimit(
+        BridgeEnv(**{"model": model(), "world": field(count=3)} | arguments), LIMIT
+    )
 
 
 def actions_of(env, steps, seed=0):
@@ -160,7 +171,9 @@ def test_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_thread
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
 def test_threads_change_no_bit(task, mode):
-    envs = [vector(5, threads=threads, autoreset_mode=mode, **task) for threads in THREADS]
+    envs = [
+        vector(5, threads=threads, autoreset_mode=mode, **task) for threads in THREADS
+    ]
     firsts = [env.reset(seed=6) for env in envs]
     for other in firsts[1:]:
         assert np.array_equal(firsts[0][0], other[0])
@@ -210,7 +223,9 @@ def test_a_mask_resets_some_worlds_only():
 
 def test_start_and_goal_can_be_given_to_all_worlds():
     env = vector(2)
-    _, info = env.reset(seed=0, options={"start": (1.0, -1.0, 0.5), "goal": (-1.0, 1.0)})
+    _, info = env.reset(
+        seed=0, options={"start": (1.0, -1.0, 0.5), "goal": (-1.0, 1.0)}
+    )
     assert info["pose"] == pytest.approx(np.array([[1.0, -1.0, 0.5]] * 2))
     assert info["goal"] == pytest.approx(np.array([[-1.0, 1.0]] * 2))
 
@@ -218,13 +233,19 @@ def test_start_and_goal_can_be_given_to_all_worlds():
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 @pytest.mark.parametrize("mode", MODES)
-def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(name, actions, mode):
+def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
+    name, actions, mode
+):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make_vec(
-            name, 3, model=model(), world=field(), autoreset_mode=mode,
+            name,
+            3,
+            model=model(),
+            world=field(),
+            autoreset_mode=mode,
             task_options={"actions": actions},
-        ).unwrapped  # fmt: skip
+        ).unwrapped
         for check in CHECKS:
             check(env)
         for space in (env.observation_space, env.single_observation_space):
@@ -241,7 +262,9 @@ def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(name, a
 def test_make_vec_gives_the_native_env_without_a_warning(name, mode):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make_vec(name, 2, model=model(), world=field(), autoreset_mode=mode)
+        env = gymnasium.make_vec(
+            name, 2, model=model(), world=field(), autoreset_mode=mode
+        )
         assert isinstance(env.unwrapped, BridgeVectorEnv)
         assert env.metadata["autoreset_mode"] is AutoresetMode(mode)
         observation, _ = env.reset(seed=0)
@@ -315,7 +338,9 @@ class Forgetful(Navigation):
         return {}
 
     def step_into(self, out, before, after, memory):
-        return super().step_into(out, before, after, {"goal": np.zeros((*after.pose.shape[:2], 2))})
+        return super().step_into(
+            out, before, after, {"goal": np.zeros((*after.pose.shape[:2], 2))}
+        )
 
     def observation(self, view, memory):
         return super().observation(view, {"goal": np.zeros((*view.pose.shape[:2], 2))})
@@ -338,7 +363,9 @@ def test_actions_that_hold_nan_are_refused():
         env.step(np.zeros((3, 3), np.float32))
 
 
-def test_many_zeros_are_zeros_where_memory_can_not_be_mapped_privately_as_on_windows(monkeypatch):
+def test_many_zeros_are_zeros_where_memory_can_not_be_mapped_privately_as_on_windows(
+    monkeypatch,
+):
     monkeypatch.delattr(vector_env.mmap, "MAP_PRIVATE")
     many = vector_env.zeros((vector_env.LARGE,), np.dtype(np.float32))
     assert many.shape == (vector_env.LARGE,)
@@ -347,7 +374,9 @@ def test_many_zeros_are_zeros_where_memory_can_not_be_mapped_privately_as_on_win
 
 @pytest.mark.parametrize("kept", [(0,), (0, 1, 3)])
 @pytest.mark.parametrize("kind", ["f8", "f4", "i8", "?", "U3", "S3", "O"])
-def test_facts_of_some_worlds_are_copies_and_zeros_elsewhere_however_many_they_are(kind, kept):
+def test_facts_of_some_worlds_are_copies_and_zeros_elsewhere_however_many_they_are(
+    kind, kept
+):
     values = np.array([[1, 2], [3, 4], [5, 6], [7, 8]]).astype(kind)
     mask = np.isin(np.arange(4), kept)
     found = vector_env.masked({"of": {"these": values}}, mask, True)["of"]

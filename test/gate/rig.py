@@ -9,7 +9,15 @@ from functools import cache
 import numpy as np
 
 from nics_drl_bridge.gate.gate import decide
-from nics_drl_bridge.gate.inputs import Arm, Command, Estimate, EStop, Odometry, Scan, Tick
+from nics_drl_bridge.gate.inputs import (
+    Arm,
+    Command,
+    Estimate,
+    EStop,
+    Odometry,
+    Scan,
+    Tick,
+)
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.state import GateConfig, begin
 from nics_drl_bridge.interface import NS_PER_S
@@ -70,12 +78,16 @@ class Rig:
     def scan(self, **changes):
         if not self.frozen:
             self.ranges = (self.ranges + np.float32(1e-3)).astype(np.float32)
-        event = Scan(self.stamp, self.ranges.copy(), (LIDAR.angle_min, LIDAR.angle_increment))
+        event = Scan(
+            self.stamp, self.ranges.copy(), (LIDAR.angle_min, LIDAR.angle_increment)
+        )
         return self.give(replace(event, **changes))
 
     def odom(self, **changes):
         twist = np.array([self.speed, 0.0, 0.0])
-        return self.give(replace(Odometry(self.stamp, self.pose.copy(), twist), **changes))
+        return self.give(
+            replace(Odometry(self.stamp, self.pose.copy(), twist), **changes)
+        )
 
     def command(self, twist=None, stamp=None):
         twist = self.wish if twist is None else np.array(twist, dtype=np.float64)
@@ -108,7 +120,9 @@ class Rig:
         if "e_stop" not in without:
             self.give(EStop(False))
         if "command" not in without:
-            self.command(stamp=self.state.scans.stamps_ns[-1] if self.state.scans.times else 0)
+            self.command(
+                stamp=self.state.scans.stamps_ns[-1] if self.state.scans.times else 0
+            )
 
     def arm(self, publishers: int = 1):
         return self.give(Arm(publishers))

@@ -66,7 +66,9 @@ def test_a_gap_within_the_last_second_is_not_enough(topic):
     assert f"{topic}_fresh" in failed(rig)
 
 
-@pytest.mark.parametrize(("declared", "right"), [(5.0, False), (10.0, True), (20.0, False)])
+@pytest.mark.parametrize(
+    ("declared", "right"), [(5.0, False), (10.0, True), (20.0, False)]
+)
 @pytest.mark.parametrize("topic", ["scan", "odom"])
 def test_a_rate_other_than_declared_is_named(topic, declared, right):
     rig = settled(**{f"{topic}_rate": declared})
@@ -76,8 +78,12 @@ def test_a_rate_other_than_declared_is_named(topic, declared, right):
         assert failed(rig) == {f"{topic}_rate"}
 
 
-@pytest.mark.parametrize(("needed", "right"), [(5.0, True), (10.0, True), (20.0, False)])
-def test_where_no_rate_of_odometry_is_declared_more_than_is_needed_is_as_good(needed, right):
+@pytest.mark.parametrize(
+    ("needed", "right"), [(5.0, True), (10.0, True), (20.0, False)]
+)
+def test_where_no_rate_of_odometry_is_declared_more_than_is_needed_is_as_good(
+    needed, right
+):
     rig = settled(odom_rate=needed, odom_rate_declared=False)
     if right:
         assert rig.arm().granted

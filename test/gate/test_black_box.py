@@ -84,7 +84,9 @@ def test_the_story_of_a_replay_names_each_stop_and_when_it_was(tmp_path):
     story = replay(tmp_path / "stop.jsonl").story
     assert "stopped by disarmed" in story[0]
     assert story[-2].startswith("  +0.000 s  stopped by stamps_jumped: topic=scan")
-    assert any("stopped by command_malformed: topic=cmd_vel_raw" in line for line in story)
+    assert any(
+        "stopped by command_malformed: topic=cmd_vel_raw" in line for line in story
+    )
     assert story[-1].endswith("all decided the same again")
 
 
@@ -147,8 +149,12 @@ def test_a_file_that_is_no_black_box_is_one_sentence(tmp_path, text, sentence):
 
 
 def sealed(lines) -> str:
-    text = "".join(line if isinstance(line, str) else json.dumps(line) + "\n" for line in lines)
-    return text + json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest()}) + "\n"
+    text = "".join(
+        line if isinstance(line, str) else json.dumps(line) + "\n" for line in lines
+    )
+    return (
+        text + json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest()}) + "\n"
+    )
 
 
 def huge(**changes):
@@ -191,7 +197,10 @@ def test_a_record_that_is_none_of_the_gate_is_one_sentence(tmp_path, change):
 
 def test_very_many_records_or_brackets_are_refused_at_once(tmp_path):
     path = tmp_path / "stop.jsonl"
-    for text, words in (("[" * 3_000_000, "holds 3000000 values"), ("[" * 5000, "no JSON")):
+    for text, words in (
+        ("[" * 3_000_000, "holds 3000000 values"),
+        ("[" * 5000, "no JSON"),
+    ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=words):
             replay(path)

@@ -5,7 +5,16 @@ import pytest
 
 from gate.rig import Rig, config, driving
 from nics_drl_bridge.gate.estimate import WINDOW_S, growth_since
-from nics_drl_bridge.gate.inputs import Arm, Command, Estimate, EStop, Odometry, Reset, Scan, Tick
+from nics_drl_bridge.gate.inputs import (
+    Arm,
+    Command,
+    Estimate,
+    EStop,
+    Odometry,
+    Reset,
+    Scan,
+    Tick,
+)
 from nics_drl_bridge.gate.state import EstimateMark
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.geometry import compose, exp
@@ -24,7 +33,9 @@ def stops(rig, seconds=0.3):
 
 
 @pytest.mark.parametrize("std", [(0.6, 0.0), (0.0, 0.4)])
-def test_an_estimate_that_becomes_uncertain_at_once_stops_the_robot_and_names_the_remedy(std):
+def test_an_estimate_that_becomes_uncertain_at_once_stops_the_robot_and_names_the_remedy(
+    std,
+):
     rig = driving()
     rig.covariance = np.diag([std[0] ** 2, 0.0, std[1] ** 2])
     line = stops(rig)
@@ -121,7 +132,10 @@ def test_what_an_uncertain_heading_does_over_the_way_driven_is_no_growth():
     grown = carried @ mark.covariance @ carried.T + np.diag([0.04, 0.01, 0.09])
     found = growth_since(mark, Estimate(np.zeros(3), pose, grown))
     assert found == pytest.approx((0.2, 0.3))
-    assert growth_since(mark, Estimate(np.zeros(3), mark.pose, 1e-4 * np.eye(3))) == (0.0, 0.0)
+    assert growth_since(mark, Estimate(np.zeros(3), mark.pose, 1e-4 * np.eye(3))) == (
+        0.0,
+        0.0,
+    )
 
 
 class DeadReckoning:
@@ -142,9 +156,13 @@ class DeadReckoning:
         gate.stamp += round(PERIOD_S * NS_PER_S)
         stamp = self.steps * round(PERIOD_S * NS_PER_S)
         self.estimator.predict(stamp)
-        self.estimator.correct(Measurement(Kind.TWIST, np.array(twist), None, self.pose))
+        self.estimator.correct(
+            Measurement(Kind.TWIST, np.array(twist), None, self.pose)
+        )
         covariance = self.estimator.covariance[:3, :3]
-        self.std = np.sqrt(np.array([covariance[:2, :2].diagonal().max(), covariance[2, 2]]))
+        self.std = np.sqrt(
+            np.array([covariance[:2, :2].diagonal().max(), covariance[2, 2]])
+        )
         gate.give(Odometry(gate.stamp, self.pose.copy(), np.array(twist)))
         gate.ranges = gate.ranges + np.float32(1e-3)
         angles = gate.config.beam_angles
@@ -165,7 +183,9 @@ class DeadReckoning:
 
 
 @pytest.mark.parametrize(
-    "hours", [0.25, pytest.param(2.0, marks=pytest.mark.campaign)], ids=["short", "two_hours"]
+    "hours",
+    [0.25, pytest.param(2.0, marks=pytest.mark.campaign)],
+    ids=["short", "two_hours"],
 )
 def test_without_a_localiser_it_can_be_armed_again_every_five_minutes_and_drives(hours):
     robot = DeadReckoning()
@@ -177,7 +197,9 @@ def test_without_a_localiser_it_can_be_armed_again_every_five_minutes_and_drives
             assert robot.gate.decision.cause is None, robot.gate.decision.cause
             passing += robot.gate.moves
     assert passing > 0.99 * hours * 3600.0 / PERIOD_S
-    assert robot.std.max() > 2 * 0.2  # by what was counted before, it could not be armed
+    assert (
+        robot.std.max() > 2 * 0.2
+    )  # by what was counted before, it could not be armed
 
 
 def test_uncertainty_is_counted_over_some_seconds_not_since_the_last_hour():

@@ -33,7 +33,10 @@ class Looking(Rig):
     def scan(self, **changes):
         true = room(float(self.pose[0]) - 1.5)
         self.shown.append(true)
-        self.frozen, self.ranges = True, true if self.broken is None else self.broken(true)
+        self.frozen, self.ranges = (
+            True,
+            true if self.broken is None else self.broken(true),
+        )
         return super().scan(**changes)
 
 
@@ -128,7 +131,9 @@ class Turning(Rig):
         self.wish = np.array([0.0, 0.0, 1.0])
 
     def odom(self, **changes):
-        self.pose[2] = np.mod(self.pose[2] + 0.1 * self.moves + np.pi, 2.0 * np.pi) - np.pi
+        self.pose[2] = (
+            np.mod(self.pose[2] + 0.1 * self.moves + np.pi, 2.0 * np.pi) - np.pi
+        )
         return super().odom(**changes)
 
 
@@ -186,7 +191,9 @@ def told(rig, speed):
 
 @pytest.mark.parametrize("phase", range(0, 50, 17))
 @pytest.mark.parametrize("speed", [1.0, 0.3, 0.1])
-def test_a_robot_that_stops_following_is_stopped_within_a_second_at_any_phase(phase, speed):
+def test_a_robot_that_stops_following_is_stopped_within_a_second_at_any_phase(
+    phase, speed
+):
     rig = Rig()
     told(rig, speed)
     rig.drive(1.0 + phase * TICK_S)
@@ -264,7 +271,9 @@ def test_a_leap_beyond_all_numbers_is_told_in_a_few_digits():
     rig.pose = np.array([1e308, 0.0, 0.0])
     rig.until_stopped(0.2)
     assert rig.rule == "odom_jumped"
-    assert re.search(r"its pose jumped by 1e\+308 m and 0 rad in", rig.decision.cause.line)
+    assert re.search(
+        r"its pose jumped by 1e\+308 m and 0 rad in", rig.decision.cause.line
+    )
 
 
 @pytest.mark.parametrize("armed", [True, False])

@@ -22,7 +22,9 @@ class Backed(Rig):
     def send(self, without: str = ""):
         super().send(without)
         if "rear" not in without:
-            self.give(SensorReading(self.stamp, "rear", np.array([[-self.behind, 0.0]])))
+            self.give(
+                SensorReading(self.stamp, "rear", np.array([[-self.behind, 0.0]]))
+            )
 
 
 def test_it_has_to_be_fresh_before_the_gate_is_armed():
@@ -62,9 +64,14 @@ def test_its_jump_in_time_latches():
 
 @pytest.mark.parametrize(
     ("name", "points", "reason"),
-    [("front", [[1.0, 0.0]], "no such sensor"), ("rear", [[np.nan, 0.0]], "NaN or inf")],
+    [
+        ("front", [[1.0, 0.0]], "no such sensor"),
+        ("rear", [[np.nan, 0.0]], "NaN or inf"),
+    ],
 )
 def test_what_is_malformed_is_refused(name, points, reason):
     rig = Backed()
     rig.run(0.2)
-    assert reason in rig.give(SensorReading(rig.stamp + 1, name, np.array(points))).refused
+    assert (
+        reason in rig.give(SensorReading(rig.stamp + 1, name, np.array(points))).refused
+    )

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from gate.rig import TICK_S, Rig, config, driving
-from nics_drl_bridge.gate.inputs import Command, EStop, Odometry, Press, Reset, Scan, Tick
+from nics_drl_bridge.gate.inputs import (
+    Command,
+    EStop,
+    Odometry,
+    Press,
+    Reset,
+    Scan,
+    Tick,
+)
 from nics_drl_bridge.gate.stops import FROZEN_INPUTS
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import NS_PER_S
@@ -33,7 +41,9 @@ def test_a_car_that_takes_turn_rates_is_limited_by_its_steering_angle():
     assert rig.state.value.tolist() == pytest.approx([0.5, np.arctan(0.2 * 0.3 / 0.5)])
     rig.wish = np.array([0.5, 0.0, 30.0])
     rig.run(2.0)
-    assert rig.decision.twist[2] == pytest.approx(0.5 * np.tan(rig.config.limits.high[1]) / 0.2)
+    assert rig.decision.twist[2] == pytest.approx(
+        0.5 * np.tan(rig.config.limits.high[1]) / 0.2
+    )
 
 
 @pytest.mark.parametrize(
@@ -269,9 +279,12 @@ def test_the_first_word_of_a_gate_that_was_asleep_is_a_zero_whatever_wakes_it(fi
     rig.stamp += round(0.05 * NS_PER_S)
     known = len(rig.published)
     inputs = {
-        "scan": rig.scan, "odom": rig.odom, "command": rig.command, "tick": rig.tick,
+        "scan": rig.scan,
+        "odom": rig.odom,
+        "command": rig.command,
+        "tick": rig.tick,
         "e_stop": lambda: rig.give(EStop(False)),
-    }  # fmt: skip
+    }
     assert inputs[first]().cause.rule == "own_clock"
     assert len(rig.published) == known + 1
     assert not rig.published[-1][1].any()
@@ -422,7 +435,9 @@ def test_whatever_comes_in_what_goes_out_is_finite_within_limits_and_zero_when_s
         for _ in range(150):
             rig.run(TICK_S, without=str(rng.choice(["", "scan", "odom", "command"])))
             stamp = int(rng.choice([rig.stamp, 0, -1, rig.stamp + 10**12]))
-            twist = np.where(rng.random(3) < 0.2, rng.choice(odd, 3), rng.normal(size=3))
+            twist = np.where(
+                rng.random(3) < 0.2, rng.choice(odd, 3), rng.normal(size=3)
+            )
             event = [
                 Command(stamp, twist),
                 Scan(

@@ -47,7 +47,9 @@ WEAK = "robot: jackal\ncommands:\n" + "".join(
     f"  {name}: {{min: -0.5, max: {most}, rate: {rate}, jerk: {20 * rate}}}\n"
     for name, most, rate in (("forward_command", 1.0, 2.0), ("turn_command", 2.5, 8.0))
 )
-ASSUMED = "shield: {latency: 0.305, deceleration: 2.0, margin: 0.05, obstacle_speed: 0.0}\n"
+ASSUMED = (
+    "shield: {latency: 0.305, deceleration: 2.0, margin: 0.05, obstacle_speed: 0.0}\n"
+)
 
 
 @pytest.mark.parametrize(("shield", "hits"), [("", False), (ASSUMED, True)])
@@ -95,5 +97,7 @@ def test_an_episode_begins_armed_and_without_the_stop_of_the_one_before(model):
 
 def test_a_robot_that_is_commanded_too_seldom_is_refused(model):
     slow = replace(model, control_period=0.3)
-    with pytest.raises(ConfigError, match=r"commands come every 0\.3 s, and it stops after 0\.2 s"):
+    with pytest.raises(
+        ConfigError, match=r"commands come every 0\.3 s, and it stops after 0\.2 s"
+    ):
         gated(slow)

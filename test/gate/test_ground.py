@@ -24,14 +24,18 @@ ANGLES = np.deg2rad(np.linspace(-135.0, 135.0, 541))
 BLIND = config(shield=SHIELD, beam_angles=ANGLES, mount=(0.12, 0.0, 0.0))
 BODY, PERIOD_S, REACT_S = body_of(SHIELD), 0.1, 0.2
 SEEDS, FAR = 8, np.zeros((0, 4))
-BOX = np.array([[-2, -2, 2, -2], [2, -2, 2, 2], [2, 2, -2, 2], [-2, 2, -2, -2]], dtype=float)
+BOX = np.array(
+    [[-2, -2, 2, -2], [2, -2, 2, 2], [2, 2, -2, 2], [-2, 2, -2, -2]], dtype=float
+)
 BACK, TURN = (-0.3, 0.0, 0.0), (0.0, 0.0, 0.6)
 
 
 def scan(pose, walls):
     """Ranges (B,) to walls (W, 4), by geometry."""
     x, y, heading = geometry.compose(pose, BLIND.mount)
-    along = np.stack([np.cos(ANGLES + heading), np.sin(ANGLES + heading)], axis=1)[:, None]
+    along = np.stack([np.cos(ANGLES + heading), np.sin(ANGLES + heading)], axis=1)[
+        :, None
+    ]
     start, edge = walls[:, :2] - (x, y), walls[:, 2:] - walls[:, :2]
     turned = along[..., 0] * edge[:, 1] - along[..., 1] * edge[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -60,7 +64,9 @@ class Robot:
 
     def moves(self, twist, seconds=PERIOD_S):
         for _ in range(round(seconds / PERIOD_S)):
-            self.pose = geometry.compose(self.pose, geometry.exp(PERIOD_S * np.array(twist)))
+            self.pose = geometry.compose(
+                self.pose, geometry.exp(PERIOD_S * np.array(twist))
+            )
             self.time += PERIOD_S
             self.looks()
 
@@ -189,7 +195,9 @@ def drive(seed, remembers):
     rng = np.random.default_rng(seed)
     ends = rng.uniform(-1.8, 1.8, (6, 2))
     ends = ends[np.hypot(*ends.T) > 0.8]
-    walls = np.concatenate([BOX, np.hstack([ends, ends + rng.uniform(-0.3, 0.3, ends.shape)])])
+    walls = np.concatenate(
+        [BOX, np.hstack([ends, ends + rng.uniform(-0.3, 0.3, ends.shape)])]
+    )
     lines, robot, way = shapely.linestrings(walls.reshape(-1, 2, 2)), Robot(walls), 0.0
     for _ in range(25):
         twist = np.array([rng.choice([-0.5, -0.3, 0.4]), 0.0, rng.uniform(-1.0, 1.0)])
@@ -217,20 +225,25 @@ def test_what_stands_is_not_touched_wherever_the_lidar_does_not_look():
 def test_what_was_known_is_forgotten_when_the_gate_is_armed():
     """Somebody may have carried the robot elsewhere, which its odometry does not show."""
     part = slice(90, LIDAR.beams)  # it is blind behind, to the right
-    given = config(shield=replace(SHIELD, range_max=3.0), beam_angles=LIDAR.angles[part])
+    given = config(
+        shield=replace(SHIELD, range_max=3.0), beam_angles=LIDAR.angles[part]
+    )
     rig = HalfBlind(replace(given, frozen_distance=1e9))
     rig.run(1.5)
     assert rig.arm().granted
     first = rig.state.ground
     rig.run(1.0)
-    rig.state = replace(rig.state, ground=replace(first, times=np.zeros_like(first.times)))
+    rig.state = replace(
+        rig.state, ground=replace(first, times=np.zeros_like(first.times))
+    )
     rig.run(0.1)
     assert np.hypot(*rig.state.ground.unseen.T).min() > 1.0
     assert rig.arm().granted
     assert rig.state.ground.since_ns == rig.state.views[-1].stamp_ns
     assert np.hypot(*rig.state.ground.unseen.T).min() < 0.5
     assert (
-        rig.state.obstacles[-len(rig.state.ground.unseen) :, :2] == rig.state.ground.unseen
+        rig.state.obstacles[-len(rig.state.ground.unseen) :, :2]
+        == rig.state.ground.unseen
     ).all()
 
 

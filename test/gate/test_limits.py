@@ -13,7 +13,14 @@ from nics_drl_bridge.config import find_config, shipped_names
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import gate
 from nics_drl_bridge.gate.inputs import Command
-from nics_drl_bridge.gate.limits import Limits, follow, implausible, load_limits, saturate, within
+from nics_drl_bridge.gate.limits import (
+    Limits,
+    follow,
+    implausible,
+    load_limits,
+    saturate,
+    within,
+)
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -26,7 +33,9 @@ WISH = st.floats(-3.0, 3.0)
 @pytest.mark.parametrize("robot", ["differential", "mecanum"])
 def test_speeds_are_scaled_by_one_factor_so_that_the_curvature_stays(robot):
     limits = LIMITS[robot]
-    command = np.array([0.9, 3.0]) if robot == "differential" else np.array([1.4, -0.7, 1.0])
+    command = (
+        np.array([0.9, 3.0]) if robot == "differential" else np.array([1.4, -0.7, 1.0])
+    )
     out = saturate(command, limits)
     assert out / out[0] == pytest.approx(command / command[0])
     assert (np.abs(out) / limits.high).max() == pytest.approx(1.0)
@@ -53,7 +62,9 @@ def test_a_command_within_the_limits_stays_as_it_is(robot):
 @settings(max_examples=30, deadline=None)
 @given(
     robot=st.sampled_from(ROBOTS),
-    steps=st.lists(st.tuples(WISH, WISH, WISH, st.floats(1e-3, 0.2)), min_size=5, max_size=60),
+    steps=st.lists(
+        st.tuples(WISH, WISH, WISH, st.floats(1e-3, 0.2)), min_size=5, max_size=60
+    ),
 )
 def test_no_wish_at_any_interval_exceeds_speed_rate_or_jerk(robot, steps):
     limits = LIMITS[robot]
@@ -62,12 +73,16 @@ def test_no_wish_at_any_interval_exceeds_speed_rate_or_jerk(robot, steps):
     last_change = np.zeros(size)
     for *wish, dt in steps:
         before = value
-        value, slope = follow(value, slope, saturate(np.array(wish[:size]), limits), dt, limits)
+        value, slope = follow(
+            value, slope, saturate(np.array(wish[:size]), limits), dt, limits
+        )
         change = (value - before) / dt
         assert (value <= limits.high).all()
         assert (value >= limits.low).all()
         assert (np.abs(change) <= limits.rate * (1 + TOLERANCE)).all()
-        assert (np.abs(change - last_change) <= limits.jerk * dt * (1 + TOLERANCE) + 1e-9).all()
+        assert (
+            np.abs(change - last_change) <= limits.jerk * dt * (1 + TOLERANCE) + 1e-9
+        ).all()
         last_change = change
 
 
@@ -102,7 +117,9 @@ def test_the_gate_speeds_up_within_rate_and_jerk_and_cuts_what_is_too_fast():
     assert rig.decision.twist.tolist() == [1.0, 0.0, 0.5]
     moving = np.array([(time, *twist) for time, twist in rig.published])
     dt, change = np.diff(moving[:, 0]), np.diff(moving[:, [1, 3]], axis=0)
-    assert (np.abs(change) <= np.array([2.0, 4.0]) * dt[:, None] * (1 + TOLERANCE)).all()
+    assert (
+        np.abs(change) <= np.array([2.0, 4.0]) * dt[:, None] * (1 + TOLERANCE)
+    ).all()
     jerk = np.abs(np.diff(change / dt[:, None], axis=0)) / dt[1:, None]
     assert (jerk <= np.array([40.0, 80.0]) * (1 + TOLERANCE)).all()
 
@@ -119,15 +136,24 @@ def test_a_motion_too_soon_after_the_last_is_not_published():
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (("robot: ackermann", "robot: car"), "the limits are for 'car', not for 'ackermann'"),
-        (("speed_command:", "sped_command:"), "'commands.sped_command'; did you mean 'speed_comm"),
+        (
+            ("robot: ackermann", "robot: car"),
+            "the limits are for 'car', not for 'ackermann'",
+        ),
+        (
+            ("speed_command:", "sped_command:"),
+            "'commands.sped_command'; did you mean 'speed_comm",
+        ),
         (("rate: 2.0, ", ""), "the key 'commands.speed_command.rate' is missing"),
         ((", jerk: 40.0", ""), "the key 'commands.speed_command.jerk' is missing"),
         (("max: 1.0", "max: .inf"), "finite"),
         (("rate: 2.0", "rate: 0.0"), "greater than 0"),
         (("min: -0.5, max: 1.0", "min: 0.0, max: 0.0"), "min must be less than max"),
         (("min: -0.5, max: 1.0", "min: 0.2, max: 1.0"), "less than or equal to 0"),
-        (("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"), "unknown key 'commands.speed_command.snap'"),
+        (
+            ("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"),
+            "unknown key 'commands.speed_command.snap'",
+        ),
         (
             ("max: 1.0", "max: 10.0"),
             "'commands.speed_command.max': 10 m/s is beyond the robot's own",
@@ -137,11 +163,23 @@ def test_a_motion_too_soon_after_the_last_is_not_published():
             "'commands.speed_command.min': -0.6 m/s is beyond the robot's",
         ),
         (("max: 0.5", "max: 0.51"), "give at most 0.5"),
-        (("rate: 2.0", "rate: 1e308"), "within a period of the gate, 0.02 s, and limits nothing"),
+        (
+            ("rate: 2.0", "rate: 1e308"),
+            "within a period of the gate, 0.02 s, and limits nothing",
+        ),
         (("rate: 2.0", "rate: 76.0"), "give at most 75"),
-        (("jerk: 40.0", "jerk: 1e308"), "'commands.speed_command.jerk': 1e+308 m/s/s^2 crosses"),
-        (("rate: 2.0", "rate: 1e-4"), "'commands.speed_command.rate': 0.0001 would never let it"),
-        (("jerk: 80.0", "jerk: 1e-300"), "'commands.steering_command.jerk': 1e-300 would never"),
+        (
+            ("jerk: 40.0", "jerk: 1e308"),
+            "'commands.speed_command.jerk': 1e+308 m/s/s^2 crosses",
+        ),
+        (
+            ("rate: 2.0", "rate: 1e-4"),
+            "'commands.speed_command.rate': 0.0001 would never let it",
+        ),
+        (
+            ("jerk: 80.0", "jerk: 1e-300"),
+            "'commands.steering_command.jerk': 1e-300 would never",
+        ),
         (
             ("min: -0.5, max: 1.0", "min: -0.001, max: 0.001"),
             "the robot could never move: none of its speeds",
@@ -170,7 +208,10 @@ def test_without_limits_nothing_is_armed():
     rig = Rig(config(limits=None))
     rig.run(1.5)
     assert not rig.arm().granted
-    assert rig.decision.answer == "limits_set: no limits are set, name their file in `limits`"
+    assert (
+        rig.decision.answer
+        == "limits_set: no limits are set, name their file in `limits`"
+    )
 
 
 @pytest.mark.parametrize(
@@ -205,7 +246,9 @@ def absurd_limits(draw):
 @settings(max_examples=120, deadline=None)
 @given(
     limits=absurd_limits(),
-    steps=st.lists(st.tuples(TWIST, TWIST, ABSURD | st.floats(1e-3, 0.2)), min_size=1, max_size=8),
+    steps=st.lists(
+        st.tuples(TWIST, TWIST, ABSURD | st.floats(1e-3, 0.2)), min_size=1, max_size=8
+    ),
 )
 def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_within(
     limits, steps
@@ -213,7 +256,9 @@ def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_
     value, slope = np.zeros(2), np.zeros(2)
     with np.errstate(all="ignore"):
         for *wish, dt in steps:
-            value, slope = follow(value, slope, saturate(np.array(wish), limits), dt, limits)
+            value, slope = follow(
+                value, slope, saturate(np.array(wish), limits), dt, limits
+            )
             assert within(value, limits)
             assert np.isfinite(slope).all()
 
@@ -226,7 +271,11 @@ def test_a_gate_with_absurd_limits_publishes_numbers_within_them(limits, wish, d
     assert rig.arm().granted
     with np.errstate(all="ignore"):
         for _ in range(4):
-            rig.give(Command(rig.state.scans.stamps_ns[-1], np.array([wish[0], 0.0, wish[1]])))
+            rig.give(
+                Command(
+                    rig.state.scans.stamps_ns[-1], np.array([wish[0], 0.0, wish[1]])
+                )
+            )
             rig.now += dt
             value = rig.tick().twist[[0, 2]]
             assert within(value, limits)

@@ -22,10 +22,14 @@ from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 
 ROOM = np.array(
     [
-        [-3.0, -2.0, 3.0, -2.0], [3.0, -2.0, 3.0, 2.5], [3.0, 2.5, -3.0, 2.5],
-        [-3.0, 2.5, -3.0, -2.0], [0.5, 1.2, 1.4, 1.2], [-1.5, -0.8, -1.5, -1.4],
+        [-3.0, -2.0, 3.0, -2.0],
+        [3.0, -2.0, 3.0, 2.5],
+        [3.0, 2.5, -3.0, 2.5],
+        [-3.0, 2.5, -3.0, -2.0],
+        [0.5, 1.2, 1.4, 1.2],
+        [-1.5, -0.8, -1.5, -1.4],
     ]
-)  # fmt: skip
+)
 CORRIDOR = np.array([[-500.0, -0.8, 500.0, -0.8], [500.0, 0.8, -500.0, 0.8]])
 NOWHERE = np.zeros((0, 4))
 
@@ -47,14 +51,25 @@ def seen_from(pose, angles, walls):
 class Scene(Rig):
     """A rig that sees walls and people from where its body is, which odometry may not know."""
 
-    def __init__(self, lidar=None, walls=ROOM, period_s=PERIOD_S, twist=(0.5, 0.0, 0.1), **changes):
+    def __init__(
+        self,
+        lidar=None,
+        walls=ROOM,
+        period_s=PERIOD_S,
+        twist=(0.5, 0.0, 0.1),
+        **changes,
+    ):
         self.lidar = lidar or load_lidar("sick_tim571")
         given = config(
-            "mecanum", beam_angles=self.lidar.angles, range_max=self.lidar.range_max,
-            scan_rate=1.0 / period_s, odom_rate=1.0 / period_s, stop_when_held=True,
+            "mecanum",
+            beam_angles=self.lidar.angles,
+            range_max=self.lidar.range_max,
+            scan_rate=1.0 / period_s,
+            odom_rate=1.0 / period_s,
+            stop_when_held=True,
             range_noise=(self.lidar.noise_std, self.lidar.faults.noise_proportional),
             **changes,
-        )  # fmt: skip
+        )
         super().__init__(given)
         self.period_s, self.walls = period_s, walls
         self.wish = np.array(twist)
@@ -74,7 +89,9 @@ class Scene(Rig):
             if not self.held:
                 self.body = compose(self.body, step)
             if self.ticks % round(self.period_s / TICK_S) == 0:
-                self.stamp += round((self.period_s - PERIOD_S) * NS_PER_S)  # `send` adds the rest
+                self.stamp += round(
+                    (self.period_s - PERIOD_S) * NS_PER_S
+                )  # `send` adds the rest
                 self.send(without)
             self.tick()
         return self.decision
@@ -93,7 +110,9 @@ class Scene(Rig):
         ranges = ranges + self.rng.normal(size=len(ranges)) * std
         if quantum := lidar.faults.quantisation:
             ranges = np.round(ranges / quantum) * quantum
-        ranges[(ranges > lidar.range_max) | (self.rng.random(len(ranges)) < 0.03)] = np.inf
+        ranges[(ranges > lidar.range_max) | (self.rng.random(len(ranges)) < 0.03)] = (
+            np.inf
+        )
         angles = (lidar.angle_min, lidar.angle_increment)
         return self.give(Scan(self.stamp, ranges.astype(np.float32), angles))
 
@@ -174,7 +193,9 @@ def test_without_the_rule_a_held_body_is_not_stopped():
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.3), (1.1, 1.1, 1.0), (0.9, 0.9, 0.8)])
 @pytest.mark.parametrize("twist", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.8), (0.1, 0.0, -0.5)])
-def test_odometry_that_shows_too_much_or_too_little_does_not_stop_the_robot(scale, twist):
+def test_odometry_that_shows_too_much_or_too_little_does_not_stop_the_robot(
+    scale, twist
+):
     scene = started(twist=twist)
     scene.scale = np.array(scale)
     assert scene.run(4.0).cause is None
@@ -186,7 +207,9 @@ def test_wheels_that_slip_as_a_turn_begins_do_not_stop_the_robot():
     assert scene.run(1.0).cause is None
 
 
-@pytest.mark.parametrize("walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"])
+@pytest.mark.parametrize(
+    "walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"]
+)
 def test_where_a_motion_can_not_be_seen_nothing_is_decided(walls):
     scene = started(walls=walls, twist=(0.5, 0.0, 0.0))
     scene.held = True
@@ -230,14 +253,19 @@ def test_a_robot_at_rest_is_never_taken_for_a_held_one():
 
 
 @pytest.mark.parametrize("late_s", [0.1, 0.2])
-def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_and_stops(late_s):
+def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_and_stops(
+    late_s,
+):
     scene = started(twist=(0.6, 0.0, 0.0))
     past = [scene.body.copy()]
     scan = scene.scan
 
     def scan_of_before(**changes):
         past.append(scene.body.copy())
-        now, scene.body = scene.body, past[max(0, len(past) - 1 - round(late_s / PERIOD_S))]
+        now, scene.body = (
+            scene.body,
+            past[max(0, len(past) - 1 - round(late_s / PERIOD_S))],
+        )
         decision = scan(**changes)
         scene.body = now
         return decision
@@ -265,7 +293,9 @@ def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
     assert np.isnan(out).all()
 
 
-@pytest.mark.parametrize("moved", [(0.2, 0.0, 0.0), (0.0, -0.15, 0.0), (0.1, 0.05, 0.6), (0, 0, 3)])
+@pytest.mark.parametrize(
+    "moved", [(0.2, 0.0, 0.0), (0.0, -0.15, 0.0), (0.1, 0.05, 0.6), (0, 0, 3)]
+)
 @pytest.mark.parametrize("name", ["paper_12m", "hokuyo_ust_10lx"])
 def test_a_predicted_scan_is_what_is_seen_after_the_motion(moved, name):
     lidar = load_lidar(name)
@@ -277,7 +307,11 @@ def test_a_predicted_scan_is_what_is_seen_after_the_motion(moved, name):
     new = seen_from(compose([0.3, 0.2, 0.1], moved), angles, walls)
     predicted = np.empty(count, np.float32)
     predict_scan(
-        old.astype(np.float32), directions, np.array(moved, float), SETTINGS.gap, predicted
+        old.astype(np.float32),
+        directions,
+        np.array(moved, float),
+        SETTINGS.gap,
+        predicted,
     )
     known = np.isfinite(predicted)
     assert known.mean() > (0.9 if directions.full_circle else 0.4)
@@ -291,7 +325,9 @@ def test_sectors_show_the_share_of_the_motion_that_took_place():
     new = old + 0.5 * (predicted - old)
     new[25] = np.nan
     thresholds = Thresholds(0.03, 2.0, 0.04, 3.0)
-    shares, changed = compare_sectors(old, new, predicted, 10, Noise(0.01, 0.0), thresholds)
+    shares, changed = compare_sectors(
+        old, new, predicted, 10, Noise(0.01, 0.0), thresholds
+    )
     assert shares[:2] == pytest.approx(0.5, abs=1e-5)
     assert np.isnan(shares[2])
     assert changed.tolist() == [1.0, 1.0, 0.0]
@@ -302,7 +338,12 @@ def test_sectors_show_the_share_of_the_motion_that_took_place():
 @pytest.mark.parametrize("beams", [1, 2, 3, 24])
 def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
     lidar = LidarSpec(
-        beams=beams, angle_min=-1.5, angle_max=1.5, range_min=0.1, range_max=10.0, rate=10.0
+        beams=beams,
+        angle_min=-1.5,
+        angle_max=1.5,
+        range_min=0.1,
+        range_max=10.0,
+        rate=10.0,
     )
     scene = Scene(lidar)
     scene.run(1.5)

@@ -27,7 +27,12 @@ from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
 
 CAR = ShieldConfig(
-    latency_s=0.15, deceleration=1.0, margin=0.05, hold_s=0.02, footprint_radius=0.15, wheelbase=0.2
+    latency_s=0.15,
+    deceleration=1.0,
+    margin=0.05,
+    hold_s=0.02,
+    footprint_radius=0.15,
+    wheelbase=0.2,
 )
 BRAKE = 1.0
 FAR = np.full(LIDAR.beams, 3.0, np.float32)
@@ -79,7 +84,9 @@ def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase, monkeypatch
     rehearse()
     known = {name: list(kernel.signatures) for name, kernel in fresh.items()}
     assert all(known.values())
-    Faced(ranges(0.3), replace(CAR, wheelbase=wheelbase, obstacle_speed=1.0)).settles(0.1)
+    Faced(ranges(0.3), replace(CAR, wheelbase=wheelbase, obstacle_speed=1.0)).settles(
+        0.1
+    )
     assert {name: kernel.signatures for name, kernel in fresh.items()} == known
 
 
@@ -106,7 +113,9 @@ def test_what_bars_the_way_bars_no_turn_on_the_spot():
     assert rig.decision.twist[2] == pytest.approx(0.5)
     assert rig.decision.shielded
     corners = ((0.4, 0.15), (-0.4, 0.15), (-0.4, -0.15), (0.4, -0.15))
-    box = replace(round_one, outline=corners, footprint_radius=float(np.hypot(0.4, 0.15)))
+    box = replace(
+        round_one, outline=corners, footprint_radius=float(np.hypot(0.4, 0.15))
+    )
     at_a_corner = ranges(0.46, where=np.abs(LIDAR.angles - 0.5) < 0.1)
     barred = Faced(at_a_corner, box, (0.0, 0.0, 0.5), "differential")
     barred.settles(0.5)
@@ -129,7 +138,9 @@ def test_what_bars_a_turn_bars_no_way_straight_back():
 def test_a_robot_that_turns_does_not_creep_nearer():
     wishes = {"ahead": (1.0, 0.0, 0.0), "turning": (1.0, 0.0, 0.5)}
     rigs = {
-        name: Faced(ranges(0.23), replace(CAR, wheelbase=0.0), wish, robot="differential")
+        name: Faced(
+            ranges(0.23), replace(CAR, wheelbase=0.0), wish, robot="differential"
+        )
         for name, wish in wishes.items()
     }
     assert 0.0 < rigs["ahead"].settles(0.5) < CREEP
@@ -164,14 +175,22 @@ def test_a_scan_shows_its_returns_where_they_are():
     given = config(shield=CAR, mount=(0.1, 0.0, np.pi / 2))
     seen = np.full(LIDAR.beams, np.inf, np.float32)
     seen[LIDAR.beams // 2] = 2.0  # straight ahead of the lidar, left of the robot
-    assert obstacles(given, seen, ()) == pytest.approx(np.array([[0.1, 2.0, 0.0]]), abs=1e-6)
+    assert obstacles(given, seen, ()) == pytest.approx(
+        np.array([[0.1, 2.0, 0.0]]), abs=1e-6
+    )
 
 
 def test_unknown_beams_are_a_wall_on_the_outline_and_blind_directions_are_none():
     corners = ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2))
     some = slice(180, 540)  # of 720, those to the front
-    for unseen, front in ((slice(0), False), (slice(None), True), (slice(0, 90), False)):
-        given = config(shield=replace(CAR, outline=corners), beam_angles=LIDAR.angles[some])
+    for unseen, front in (
+        (slice(0), False),
+        (slice(None), True),
+        (slice(0, 90), False),
+    ):
+        given = config(
+            shield=replace(CAR, outline=corners), beam_angles=LIDAR.angles[some]
+        )
         seen = np.full(360, np.inf, np.float32)
         seen[unseen] = np.nan
         wall = obstacles(given, seen, ())[:, :2]
@@ -194,12 +213,16 @@ def test_the_sweep_agrees_with_geometry():
         twist = np.array([rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-2, 2)])
         blind, point = rng.uniform(0.1, 0.8), rng.uniform(-1.2, 1.2, 2)
         duration = blind + np.hypot(*twist[:2]) / (2.0 * BRAKE)
-        path = LineString([place(twist, t)[:2] for t in np.linspace(0.0, duration, 400)])
+        path = LineString(
+            [place(twist, t)[:2] for t in np.linspace(0.0, duration, 400)]
+        )
         away = path.distance(Point(point))
         if abs(away - room) < step or np.hypot(*point) <= room:
             unclear += 1
             continue
-        swept_free = free(np.array([[*point, 0.0]]), twist[None], disc(room), blind, BRAKE, step)
+        swept_free = free(
+            np.array([[*point, 0.0]]), twist[None], disc(room), blind, BRAKE, step
+        )
         assert swept_free == (away > room)
     assert unclear < 50
 
@@ -225,12 +248,22 @@ def test_who_catches_up_from_behind_finds_the_robot_at_rest(away, may):
     """At 0.3 m/s it is no faster than who comes on, and would be met in motion."""
     behind = np.array([[-away, 0.1, 1.0]])
     assert free(behind, np.array([[0.3, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02) == may
-    assert free(behind * (1.0, 1.0, 0.0), np.array([[0.3, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02)
+    assert free(
+        behind * (1.0, 1.0, 0.0),
+        np.array([[0.3, 0.0, 0.0]]),
+        disc(0.2),
+        0.5,
+        BRAKE,
+        0.02,
+    )
 
 
 def test_a_command_of_before_that_the_scan_does_not_show_yet_is_reckoned_with():
     """It was told a latency before the scan was made, and turns the robot towards what is there."""
-    rig = Faced(ranges(0.45, where=np.abs(LIDAR.angles - 0.9) < 0.3), replace(CAR, latency_s=0.3))
+    rig = Faced(
+        ranges(0.45, where=np.abs(LIDAR.angles - 0.9) < 0.3),
+        replace(CAR, latency_s=0.3),
+    )
     rig.wish = np.array([0.6, 0.0, 0.0])
     rig.settles()
     while rig.now - rig.state.scans.times[-1] < 0.09:
@@ -240,7 +273,9 @@ def test_a_command_of_before_that_the_scan_does_not_show_yet_is_reckoned_with():
     for ago, cut in ((0.33, True), (0.6, False)):  # that of 0.6 s ago the scan shows
         later = (one for one in before.recent if one[0] > rig.now - ago)
         recent = ((rig.now - ago, told), *later)
-        _, decision = decide(rig.config, replace(before, recent=recent), Tick(), rig.now + 0.02)
+        _, decision = decide(
+            rig.config, replace(before, recent=recent), Tick(), rig.now + 0.02
+        )
         assert (decision.twist[0] < straight - 0.1) == cut
 
 
@@ -259,14 +294,19 @@ def test_a_stop_in_between_does_not_make_it_forget_what_the_robot_was_told():
 
 
 def test_what_was_told_before_a_pause_of_the_gate_counts_as_long_as_it_was_in_force():
-    rig = Faced(ranges(0.45, where=np.abs(LIDAR.angles - 0.9) < 0.3), replace(CAR, latency_s=0.3))
+    rig = Faced(
+        ranges(0.45, where=np.abs(LIDAR.angles - 0.9) < 0.3),
+        replace(CAR, latency_s=0.3),
+    )
     rig.wish = np.array([0.6, 0.0, 0.0])
     rig.settles()
     straight, before = rig.decision.twist[0], rig.state
     since = rig.now - before.scans.times[-1] + 0.3
     kept = tuple(one for one in before.recent if one[0] > rig.now - since + 0.05)
     recent = ((rig.now - since - 0.05, np.array([0.6, 0.5])), *kept)
-    _, decision = decide(rig.config, replace(before, recent=recent), Tick(), rig.now + 0.02)
+    _, decision = decide(
+        rig.config, replace(before, recent=recent), Tick(), rig.now + 0.02
+    )
     assert decision.twist[0] < straight - 0.1
 
 
@@ -307,7 +347,9 @@ def facing(views, bearing, width=0.05):
     return np.abs(LIDAR.angles - bearing) < width
 
 
-@pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.7, -0.7, 2.0), (0, 0, -2)])
+@pytest.mark.parametrize(
+    "twist", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.7, -0.7, 2.0), (0, 0, -2)]
+)
 def test_what_stands_does_not_move_however_the_robot_does(twist):
     discs = [(1.5, 0.4, 0.2), (1.0, -0.9, 0.15), (-0.8, 0.3, 0.25), (2.4, -0.2, 0.2)]
     assert not movers(GIVEN, SHIELD, drive(twist, lambda _: discs)).any()
@@ -332,7 +374,10 @@ def test_the_leading_edge_of_somebody_who_crosses_moves():
 def test_who_walks_away_and_what_was_hidden_does_not():
     away = drive((0.0, 0.0, 0.0), lambda t: [(1.0 + 0.8 * t, -0.3, 0.2)])
     assert not movers(GIVEN, SHIELD, away).any()
-    behind = [(1.0, 0.0, 0.15), (2.0, -0.1, 0.2)]  # the second comes out from behind the first
+    behind = [
+        (1.0, 0.0, 0.15),
+        (2.0, -0.1, 0.2),
+    ]  # the second comes out from behind the first
     assert not movers(GIVEN, SHIELD, drive((0.0, 0.7, 0.0), lambda _: behind)).any()
 
 
@@ -341,7 +386,9 @@ def test_noise_that_is_declared_is_no_motion():
     noisy = replace(SHIELD, range_noise=(0.03, 0.0))
     discs = [(1.5, 0.4, 0.2)]
     found = [
-        movers(GIVEN, noisy, drive((0.3, 0.0, 0.0), lambda _: discs, noise=0.03, rng=rng)).sum()
+        movers(
+            GIVEN, noisy, drive((0.3, 0.0, 0.0), lambda _: discs, noise=0.03, rng=rng)
+        ).sum()
         for _ in range(20)
     ]
     assert np.mean(found) < 3.0
@@ -358,19 +405,25 @@ def test_one_beam_alone_is_noise():
 def test_where_nothing_was_known_nothing_moves():
     views = list(drive((0.0, 0.0, 0.0), lambda t: [(2.0 - t, 0.0, 0.2)]))
     for index in range(3):
-        views[index] = replace(views[index], ranges=np.full(LIDAR.beams, np.nan, np.float32))
+        views[index] = replace(
+            views[index], ranges=np.full(LIDAR.beams, np.nan, np.float32)
+        )
     assert not movers(GIVEN, SHIELD, tuple(views)).any()
 
 
 def test_where_all_is_taken_to_stand_nothing_moves():
     still = replace(SHIELD, obstacle_speed=0.0)
-    assert not movers(GIVEN, still, drive((0, 0, 0), lambda t: [(2.0 - t, 0.0, 0.2)])).any()
+    assert not movers(
+        GIVEN, still, drive((0, 0, 0), lambda t: [(2.0 - t, 0.0, 0.2)])
+    ).any()
 
 
 def test_the_views_of_the_last_moments_are_kept_apart_from_each_other():
     state, step = begin(GIVEN), NS_PER_S // 40
     for index in range(40):
-        state = replace(state, odometry=Odometry(index * step, np.zeros(3), np.zeros(3)))
+        state = replace(
+            state, odometry=Odometry(index * step, np.zeros(3), np.zeros(3))
+        )
         scan = Scan(index * step, np.full(LIDAR.beams, 1.0, np.float32), (0.0, 0.01))
         state = replace(state, views=remember(GIVEN, state, scan))
     stamps = np.array([view.stamp_ns for view in state.views])
@@ -381,9 +434,13 @@ def test_the_views_of_the_last_moments_are_kept_apart_from_each_other():
 
 
 def test_a_view_is_from_where_the_robot_was_when_it_was_scanned():
-    odometry = Odometry(5 * NS_PER_S, np.array([1.0, 2.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
+    odometry = Odometry(
+        5 * NS_PER_S, np.array([1.0, 2.0, np.pi / 2]), np.array([1.0, 0.0, 0.0])
+    )
     state = replace(begin(GIVEN), odometry=odometry)
-    scan = Scan(5 * NS_PER_S + NS_PER_S // 10, np.ones(LIDAR.beams, np.float32), (0.0, 0.01))
+    scan = Scan(
+        5 * NS_PER_S + NS_PER_S // 10, np.ones(LIDAR.beams, np.float32), (0.0, 0.01)
+    )
     assert remember(GIVEN, state, scan)[-1].pose == pytest.approx([1.0, 2.1, np.pi / 2])
     assert remember(config(), state, scan) == ()
 

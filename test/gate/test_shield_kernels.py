@@ -60,9 +60,14 @@ def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
     rng, told = np.random.default_rng(3), []
     for _ in range(200):
         outline = make(rng)
-        twist = rng.uniform(-1.0, 1.0, 3) * rng.choice([(1, 0, 2), (1, 1, 2), (0, 0, 2), (1, 0, 0)])
+        twist = rng.uniform(-1.0, 1.0, 3) * rng.choice(
+            [(1, 0, 2), (1, 1, 2), (0, 0, 2), (1, 0, 0)]
+        )
         twist[:2] += 0.0 if outline else 0.05  # a turn alone does not move a circle
-        blind, point = rng.uniform(0.1, 0.6), np.array([*rng.uniform(-0.7, 0.7, 2), speed])
+        blind, point = (
+            rng.uniform(0.1, 0.6),
+            np.array([*rng.uniform(-0.7, 0.7, 2), speed]),
+        )
         least, now = nearest(outline, point, twist, blind)
         leaves = now < MARGIN and least > -1e-12
         if abs(least) < STEP and not leaves:
@@ -92,7 +97,9 @@ def test_one_point_among_many_and_one_twist_among_many_are_found():
 
 @pytest.mark.parametrize(("outline", "may"), [(LONG, True), ((), False)])
 def test_a_robot_passes_where_its_outline_does_and_its_circle_does_not(outline, may):
-    beside = np.array([[x, side, 0.0] for x in np.linspace(0.3, 2.0, 60) for side in (-0.26, 0.26)])
+    beside = np.array(
+        [[x, side, 0.0] for x in np.linspace(0.3, 2.0, 60) for side in (-0.26, 0.26)]
+    )
     round_ = body_of(ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=outline))
     assert free(beside, np.array([[0.5, 0.0, 0.0]]), round_, 0.5, BRAKE, STEP) == may
 
@@ -100,7 +107,10 @@ def test_a_robot_passes_where_its_outline_does_and_its_circle_does_not(outline, 
 @pytest.mark.parametrize(("outline", "may"), [(LONG, False), ((), True)])
 def test_a_turn_on_the_spot_sweeps_corners_but_no_circle(outline, may):
     beside = np.array([[0.0, 0.26, 0.0]])
-    assert free(beside, np.array([[0.0, 0.0, 1.5]]), body(outline), 0.5, BRAKE, STEP) == may
+    assert (
+        free(beside, np.array([[0.0, 0.0, 1.5]]), body(outline), 0.5, BRAKE, STEP)
+        == may
+    )
 
 
 @pytest.mark.parametrize("turn", [-1.5, 1.5])
@@ -109,26 +119,37 @@ def test_a_turn_brakes_as_its_corners_do(turn):
     reach = np.hypot(*LONG[0])
     angle = np.arctan2(0.2, 0.25) + 1.5 * (0.5 + 1.5 * reach / (2.0 * BRAKE))
     for further, may in ((0.0, False), (0.3, True)):
-        corner = (reach + 0.01) * np.array([np.cos(angle + further), np.sin(angle + further), 0.0])
+        corner = (reach + 0.01) * np.array(
+            [np.cos(angle + further), np.sin(angle + further), 0.0]
+        )
         there = corner * (1.0, np.sign(turn), 1.0)
-        swept = free(there[None], np.array([[0.0, 0.0, turn]]), body(LONG), 0.5, BRAKE, STEP)
+        swept = free(
+            there[None], np.array([[0.0, 0.0, turn]]), body(LONG), 0.5, BRAKE, STEP
+        )
         assert swept == may
 
 
 @pytest.mark.parametrize(("speed", "may"), [(0.3, False), (-0.3, True)])
 def test_between_the_tines_a_robot_may_leave_and_not_go_on(speed, may):
     within = np.array([[0.12, 0.0, 0.0]])
-    assert free(within, np.array([[speed, 0.0, 0.0]]), body(FORK), 0.5, BRAKE, STEP) == may
+    assert (
+        free(within, np.array([[speed, 0.0, 0.0]]), body(FORK), 0.5, BRAKE, STEP) == may
+    )
 
 
 @pytest.mark.parametrize(("speed", "may"), [(0.3, False), (-0.3, True)])
 def test_what_noise_puts_inside_the_outline_must_not_get_deeper(speed, may):
     inside = np.array([[0.24, 0.0, 0.0]])
-    assert free(inside, np.array([[speed, 0.0, 0.0]]), body(LONG), 0.5, BRAKE, STEP) == may
+    assert (
+        free(inside, np.array([[speed, 0.0, 0.0]]), body(LONG), 0.5, BRAKE, STEP) == may
+    )
 
 
 def test_a_speed_next_to_nothing_is_swept():
-    twist, ahead = np.array([[1e-300, 0.0, 0.0]]), np.array([[0.29, 0.0, 0.0], [9.0, 0.0, 1e-9]])
+    twist, ahead = (
+        np.array([[1e-300, 0.0, 0.0]]),
+        np.array([[0.29, 0.0, 0.0], [9.0, 0.0, 1e-9]]),
+    )
     assert free(ahead, twist, body(LONG), 0.5, BRAKE, STEP)
     assert free(ahead, 0.0 * twist, body(LONG), 0.5, BRAKE, STEP)
 

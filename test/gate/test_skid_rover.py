@@ -127,7 +127,15 @@ def stopping_poses(plant, command, latency_s):
     return np.array(poses)
 
 
-COMMANDS = [(0.8, 1.2), (0.8, 0.5), (0.4, -1.2), (-0.4, 1.0), (0.15, 1.2), (0.0, 1.2), (0.8, 0.0)]
+COMMANDS = [
+    (0.8, 1.2),
+    (0.8, 0.5),
+    (0.4, -1.2),
+    (-0.4, 1.0),
+    (0.15, 1.2),
+    (0.0, 1.2),
+    (0.8, 0.0),
+]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

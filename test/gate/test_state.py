@@ -10,7 +10,11 @@ from nics_drl_bridge.gate.state import Cause, EStopState, replace
 
 def test_a_changed_record_is_what_the_standard_library_makes_of_it():
     state = driving().state
-    changes = {"now_s": 7.0, "latched": Cause("rule", "topic", "detail"), "armed": False}
+    changes = {
+        "now_s": 7.0,
+        "latched": Cause("rule", "topic", "detail"),
+        "armed": False,
+    }
     mine, theirs = replace(state, **changes), dataclasses.replace(state, **changes)
     assert type(mine) is type(theirs)
     assert list(vars(mine)) == [field.name for field in dataclasses.fields(state)]

@@ -10,7 +10,12 @@ from gate.rig import Rig, config
 from nics_drl_bridge.config import find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config, wheelbase
+from nics_drl_bridge.gate.stopping import (
+    doubtful,
+    require_possible,
+    shield_config,
+    wheelbase,
+)
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import load_robot
@@ -27,7 +32,11 @@ def shield_of(robot, file=None, **given):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_shipped_robot_has_measured_values_and_room_of_its_own(robot):
     shield, said = shield_of(robot)
-    assert (shield.latency_s, shield.deceleration, shield.obstacle_speed) == (0.2, 2.0, 1.0)
+    assert (shield.latency_s, shield.deceleration, shield.obstacle_speed) == (
+        0.2,
+        2.0,
+        1.0,
+    )
     assert shield.footprint_radius == load_robot(robot).footprint_radius
     assert (shield.wheelbase > 0.0) == (robot == "ackermann")
     assert shield.range_max == builtin_model(robot).lidar.range_max
@@ -82,7 +91,9 @@ def stopping_distance(model, limits, speed, command=0):
     sim.step(commands)
     path = float(np.hypot(*(sim.data.pose[0, 0] - before)[:2]))
     while abs(commands[0, 0, command]) > 0.0:
-        slower = abs(commands[0, 0, command]) - limits.rate[command] * model.control_period
+        slower = (
+            abs(commands[0, 0, command]) - limits.rate[command] * model.control_period
+        )
         commands[..., command] = np.sign(speed) * max(0.0, slower)
         path += moved_by(sim, commands)
     while (step := moved_by(sim, commands)) > 1e-4 * model.control_period:
@@ -96,7 +107,9 @@ def moved_by(sim, commands):
     return float(np.hypot(*(sim.data.pose[0, 0] - before)[:2]))
 
 
-@pytest.mark.parametrize(("at_the_rim", "least"), [(None, 0.45), (0.2, 2.4), (0.5, 1.05)])
+@pytest.mark.parametrize(
+    ("at_the_rim", "least"), [(None, 0.45), (0.2, 2.4), (0.5, 1.05)]
+)
 def test_the_way_that_is_kept_free_is_what_the_simulator_needs(at_the_rim, least):
     """Also for wheels, whose limits of rates are in rad/s^2: at 0.2 m/s^2 it is over 2.5 m."""
     model = replace(builtin_model("jackal"), noise=Noise())
@@ -137,26 +150,40 @@ def test_a_model_that_shows_no_lag_has_an_assumed_one():
     assert shield.latency_s == pytest.approx(0.5 + model.control_period)
 
 
-def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops(tmp_path):
+def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops(
+    tmp_path,
+):
     model = builtin_model("jackal")
     rolling = limited(model, 1e-4)
     limits = load_limits("jackal", model.robot)
-    with pytest.raises(ConfigError, match=r"does not stop.* or tell it: `shield: {lat.*limits"):
+    with pytest.raises(
+        ConfigError, match=r"does not stop.* or tell it: `shield: {lat.*limits"
+    ):
         shield_config(rolling, limits)
     told = {"latency": 0.5, "deceleration": 0.05}
     assert shield_config(rolling, limits, given=told)[0].deceleration == 0.05
     text = find_config("jackal", "limits").read_text()
-    (tmp_path / "my.yaml").write_text(f"{text}shield: {{latency: 0.5, deceleration: 0.05}}\n")
+    (tmp_path / "my.yaml").write_text(
+        f"{text}shield: {{latency: 0.5, deceleration: 0.05}}\n"
+    )
     assert shield_config(rolling, limits, tmp_path / "my.yaml")[0].latency_s == 0.5
 
 
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("deceleration", 0.0, "'shield_deceleration' is 0; it must be from 0.001 to 10000"),
+        (
+            "deceleration",
+            0.0,
+            "'shield_deceleration' is 0; it must be from 0.001 to 10000",
+        ),
         ("latency", -0.1, "'shield_latency' is -0.1; it must be from 0 to 10"),
         ("latency", 1e9, "'shield_latency' is 1e\\+09; it must be from 0 to 10"),
-        ("obstacle_speed", 1e9, "'shield_obstacle_speed' is 1e\\+09; it must be from 0 to 100"),
+        (
+            "obstacle_speed",
+            1e9,
+            "'shield_obstacle_speed' is 1e\\+09; it must be from 0 to 100",
+        ),
         ("margin", float("inf"), "'shield_margin' is inf; it must be from 0 to 10"),
     ],
 )
@@ -174,28 +201,37 @@ def test_a_limits_file_whose_shield_is_wrong_is_one_sentence(tmp_path):
 
 def test_a_car_that_does_not_tell_its_wheelbase_needs_it_or_no_shield():
     car = load_robot("ackermann").model_copy(update={"parameters": {}})
-    with pytest.raises(ConfigError, match=r"'wheelbase' of a car; add it .* `shield: false`"):
+    with pytest.raises(
+        ConfigError, match=r"'wheelbase' of a car; add it .* `shield: false`"
+    ):
         wheelbase(car)
 
 
 def test_a_robot_that_is_told_volts_has_no_shield():
     robot = load_robot("differential")
     volts = robot.command[0].model_copy(update={"unit": "V"})
-    with pytest.raises(ConfigError, match=r"'forward_command' is in 'V'; .* `shield: false`"):
+    with pytest.raises(
+        ConfigError, match=r"'forward_command' is in 'V'; .* `shield: false`"
+    ):
         wheelbase(robot.model_copy(update={"command": (volts, robot.command[1])}))
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"scan_age_s": 0.05}, "'scan_age': 0.05 s: scan comes every 0.1 s .* could never move"),
+        (
+            {"scan_age_s": 0.05},
+            "'scan_age': 0.05 s: scan comes every 0.1 s .* could never move",
+        ),
         ({"scan_age_s": 0.09}, "give more than 0.1"),
         ({"odom_age_s": 0.05}, "'odom_age': 0.05 s"),
         ({"scan_rate": 2.0}, "scan comes every 0.5 s"),
         ({"odom_rate": 1.5, "odom_age_s": 2.0}, "too seldom to be judged within 1 s"),
     ],
 )
-def test_a_setting_with_which_the_gate_is_never_armed_is_one_sentence(changes, sentence):
+def test_a_setting_with_which_the_gate_is_never_armed_is_one_sentence(
+    changes, sentence
+):
     given = config(**changes)
     with pytest.raises(ConfigError, match=sentence):
         require_possible(given)

@@ -57,7 +57,9 @@ def test_stamps_of_one_topic_that_run_ahead_are_named(topic):
     assert (rig.rule, rig.state.latched.topic) == ("stamps_jumped", topic)
 
 
-@pytest.mark.parametrize("pace", [0.9, 0.5, pytest.param(0.99, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "pace", [0.9, 0.5, pytest.param(0.99, marks=pytest.mark.campaign)]
+)
 def test_data_whose_stamps_fall_behind_get_older_and_stop_the_robot_for_good(pace):
     rig = driven(pace)
     began, known = rig.now, len(rig.published)
@@ -68,7 +70,9 @@ def test_data_whose_stamps_fall_behind_get_older_and_stop_the_robot_for_good(pac
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pace", [1.0 + 5e-4, pytest.param(1.0 - 5e-4, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "pace", [1.0 + 5e-4, pytest.param(1.0 - 5e-4, marks=pytest.mark.campaign)]
+)
 def test_clocks_that_drift_as_real_ones_do_are_followed(pace):
     rig = driven(pace)
     for _ in range(22):  # by more than what an armed gate takes for the future
@@ -122,7 +126,9 @@ def test_a_simulator_that_runs_ahead_is_stopped_all_the_same():
 
 
 @pytest.mark.parametrize("pace", [2.0, 1.5, 0.6])
-def test_stamps_of_another_pace_are_named_at_arming_and_let_pass_if_they_are_declared(pace):
+def test_stamps_of_another_pace_are_named_at_arming_and_let_pass_if_they_are_declared(
+    pace,
+):
     named = Stamped(config(rate_tolerance=0.9))
     named.pace = pace
     named.run(2.0)

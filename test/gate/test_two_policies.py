@@ -28,7 +28,9 @@ def test_one_policy_whose_name_is_known_drives():
 
 
 @pytest.mark.parametrize("apart_s", [TICK_S, 0.5])
-def test_a_second_policy_that_joins_stops_the_robot_for_good_and_both_are_named(apart_s):
+def test_a_second_policy_that_joins_stops_the_robot_for_good_and_both_are_named(
+    apart_s,
+):
     rig = driving()
     named(rig, "/policy_node")
     rig.run(1.0)

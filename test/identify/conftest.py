@@ -6,7 +6,9 @@ import pytest
 
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
-RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "recordings" / "xtark_ackermann"
+RECORDINGS = (
+    Path(__file__).resolve().parents[3] / "shared" / "recordings" / "xtark_ackermann"
+)
 
 
 @pytest.fixture(scope="session")

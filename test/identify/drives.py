@@ -51,7 +51,9 @@ def drive(
     rng = np.random.default_rng(seed)
     clean = record(spec, rng, duration)
     tracked = geometry.compose(clean.pose.values, np.array([*lever, -rotation]))
-    tracked = tracked + rng.normal(0.0, 1.0, tracked.shape) * np.array([*noise[:1], *noise])
+    tracked = tracked + rng.normal(0.0, 1.0, tracked.shape) * np.array(
+        [*noise[:1], *noise]
+    )
     t = clean.pose.t
     arrival = t if burst == 0.0 else in_bursts(t, burst)
     clock = "mocap" if pose_clock_ahead != 0.0 else "robot"
@@ -65,21 +67,35 @@ def drive(
 
 def tricycle() -> RobotSpec:
     """A forklift whose front wheel turns by 63 degrees."""
-    given = {"kind": "tricycle", "footprint_radius": 0.6, "parameters": {"wheelbase": BASE}}
+    given = {
+        "kind": "tricycle",
+        "footprint_radius": 0.6,
+        "parameters": {"wheelbase": BASE},
+    }
     return robot_from(given | {"angular_is": "steering"}, STEERED)
 
 
 def front_driven(state: np.ndarray) -> np.ndarray:
     speed, angle = state.T
-    return np.stack([speed * np.cos(angle), 0.0 * speed, speed * np.sin(angle) / BASE], axis=1)
+    return np.stack(
+        [speed * np.cos(angle), 0.0 * speed, speed * np.sin(angle) / BASE], axis=1
+    )
 
 
 def servoed(
-    twist=front_driven, seed: int = 0, latency: float = 0.1, duration: float = 60.0,
-    mounting: tuple[float, float, float] = (0.25, 0.12, 0.5), steering: float = 1.1,
-    noise: float = 5e-4, steering_servo=SERVO, dead: float = 0.0, later: float = 0.0,
-    slew: float = np.inf, motor=MOTOR,
-) -> Recording:  # fmt: skip
+    twist=front_driven,
+    seed: int = 0,
+    latency: float = 0.1,
+    duration: float = 60.0,
+    mounting: tuple[float, float, float] = (0.25, 0.12, 0.5),
+    steering: float = 1.1,
+    noise: float = 5e-4,
+    steering_servo=SERVO,
+    dead: float = 0.0,
+    later: float = 0.0,
+    slew: float = np.inf,
+    motor=MOTOR,
+) -> Recording:
     """A drive of a robot with a motor and a servo, of which commands and poses were recorded.
 
     Args:
@@ -120,7 +136,8 @@ def servoed(
     poses = poses + noise * rng.normal(size=poses.shape) * [1.0, 1.0, 2.0]
     t = FINE_S * np.arange(count)
     return Recording(
-        Stream(t[::rows], command[::rows]), Stream(POSE_S * np.arange(len(poses)), poses)
+        Stream(t[::rows], command[::rows]),
+        Stream(POSE_S * np.arange(len(poses)), poses),
     )
 
 
@@ -134,7 +151,10 @@ def with_wheels(recording: Recording, truth: Recording, swapped: bool) -> Record
     """Adds wheel encoders of a car, counts per tick, on the robot's clock."""
     state = truth.state
     assert state is not None
-    speed, turn = state.values[:, 0], state.values[:, 0] * np.tan(state.values[:, 1]) / 0.2
+    speed, turn = (
+        state.values[:, 0],
+        state.values[:, 0] * np.tan(state.values[:, 1]) / 0.2,
+    )
     left = np.round(TICKS_PER_METRE * (speed - turn * TRACK / 2.0))
     right = np.round(TICKS_PER_METRE * (speed + turn * TRACK / 2.0))
     both = np.stack([right, left] if swapped else [left, right], axis=1)
@@ -145,7 +165,9 @@ def without(recording: Recording, start: float, end: float) -> Recording:
     """Loses the poses between two times."""
     pose = recording.pose
     keep = (pose.t < start) | (pose.t > end)
-    return replace(recording, pose=replace(pose, t=pose.t[keep], values=pose.values[keep]))
+    return replace(
+        recording, pose=replace(pose, t=pose.t[keep], values=pose.values[keep])
+    )
 
 
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
@@ -156,17 +178,24 @@ def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
 
 
 def slipping_car(
-    seed: int = 0, duration: float = 40.0, dead: float = 0.1, friction: float = 0.3,
-    drag: float = 0.15, slip: float = 0.015, mounting: tuple[float, float, float] = (0.08, 0, 0.1),
+    seed: int = 0,
+    duration: float = 40.0,
+    dead: float = 0.1,
+    friction: float = 0.3,
+    drag: float = 0.15,
+    slip: float = 0.015,
+    mounting: tuple[float, float, float] = (0.08, 0, 0.1),
     throttle: float | None = None,
-) -> tuple[RobotSpec, Recording]:  # fmt: skip
+) -> tuple[RobotSpec, Recording]:
     """A car by throttle that slips aside and turns less at speed; only its poses were seen."""
     limits = {"throttle": (-0.3, 0.6), "steering": (-1.0, 1.0)}
     given = {"kind": "ackermann_throttle", "footprint_radius": 0.25}
     spec = robot_from(given | {"parameters": {"wheelbase": 0.26}}, limits)
     rng, count = np.random.default_rng(seed), round(duration / COMMAND_S)
     draws = rng.uniform(*np.array(list(limits.values())).T, (count // 40 + 1, 2))
-    command = np.repeat(np.where(rng.random(draws.shape) < 0.15, 0.0, draws), 40, axis=0)[:count]
+    command = np.repeat(
+        np.where(rng.random(draws.shape) < 0.15, 0.0, draws), 40, axis=0
+    )[:count]
     if throttle is not None:
         command[:, 0] = throttle
     state, poses = np.zeros(6), []
@@ -179,12 +208,19 @@ def slipping_car(
         c, s = np.cos(heading), np.sin(heading)
         v += FINE_S * push
         v = np.sign(v) * max(abs(v) - FINE_S * friction, 0.0)
-        state = np.array([
-            x + FINE_S * (c * state[3] - s * aside), y + FINE_S * (s * state[3] + c * aside),
-            heading + FINE_S * turn, v, angle + FINE_S * (0.4 * steering - angle) / 0.06,
-            turn + FINE_S * (wanted - turn) / 0.04,
-        ])  # fmt: skip
+        state = np.array(
+            [
+                x + FINE_S * (c * state[3] - s * aside),
+                y + FINE_S * (s * state[3] + c * aside),
+                heading + FINE_S * turn,
+                v,
+                angle + FINE_S * (0.4 * steering - angle) / 0.06,
+                turn + FINE_S * (wanted - turn) / 0.04,
+            ]
+        )
     pose = geometry.compose(np.array(poses), np.array(mounting, np.float64))[::5]
     pose = pose + 0.0003 * rng.normal(size=pose.shape)
     t = FINE_S * 5.0 * np.arange(len(pose))
-    return spec, Recording(Stream(COMMAND_S * np.arange(count), command), Stream(t, pose))
+    return spec, Recording(
+        Stream(COMMAND_S * np.arange(count), command), Stream(t, pose)
+    )

@@ -61,7 +61,9 @@ def sound_drive(seed: int = 0, duration: float = DURATION_S) -> Recording:
     t = STEP_S * np.arange(count)
     told = round(COMMAND_S / STEP_S)
     return Recording(
-        Stream(t[::told], command[::told]), Stream(t[::rows], poses), source="planted drive"
+        Stream(t[::told], command[::told]),
+        Stream(t[::rows], poses),
+        source="planted drive",
     )
 
 
@@ -84,7 +86,10 @@ def poses_of(command: np.ndarray) -> np.ndarray:
 
 
 def with_pose(
-    recording: Recording, values: np.ndarray, t: np.ndarray | None = None, clock: str = "robot"
+    recording: Recording,
+    values: np.ndarray,
+    t: np.ndarray | None = None,
+    clock: str = "robot",
 ) -> Recording:
     """Returns a recording with other poses."""
     stamps = recording.pose.t if t is None else t
@@ -103,7 +108,9 @@ def scaled_pose(x: float = 1.0, y: float = 1.0, heading: float = 1.0) -> Defect:
 
 def scaled_command(speed: float = 1.0, steering: float = 1.0) -> Defect:
     """Multiplies the columns of the command."""
-    return lambda drive: with_command(drive, drive.command.values * np.array([speed, steering]))
+    return lambda drive: with_command(
+        drive, drive.command.values * np.array([speed, steering])
+    )
 
 
 def swapped_axes(drive: Recording) -> Recording:
@@ -118,12 +125,16 @@ def swapped_commands(drive: Recording) -> Recording:
 
 def ahead(seconds: float, clock: str = "robot") -> Defect:
     """Stamps the poses by a clock that is ahead; that it is another one is told if it is named."""
-    return lambda drive: with_pose(drive, drive.pose.values, drive.pose.t + seconds, clock)
+    return lambda drive: with_pose(
+        drive, drive.pose.values, drive.pose.t + seconds, clock
+    )
 
 
 def drifting(share: float) -> Defect:
     """Stamps the poses by a clock that runs faster by a share."""
-    return lambda drive: with_pose(drive, drive.pose.values, drive.pose.t * (1.0 + share))
+    return lambda drive: with_pose(
+        drive, drive.pose.values, drive.pose.t * (1.0 + share)
+    )
 
 
 def frozen_pose(drive: Recording) -> Recording:
@@ -162,7 +173,9 @@ def gap(start: float, end: float) -> Defect:
 
 def duplicated_rows(drive: Recording) -> Recording:
     """Writes every row of the poses twice."""
-    return with_pose(drive, np.repeat(drive.pose.values, 2, axis=0), np.repeat(drive.pose.t, 2))
+    return with_pose(
+        drive, np.repeat(drive.pose.values, 2, axis=0), np.repeat(drive.pose.t, 2)
+    )
 
 
 TRACK_M = 0.3
@@ -176,7 +189,11 @@ def wheeled() -> RobotSpec:
         "name": "two_wheels",
         "textbook": "differential",
         "footprint_radius": 0.25,
-        "parameters": {"wheel_radius": WHEEL_RADIUS_M, "track": TRACK_M, "wheel_lag": WHEEL_LAG_S},
+        "parameters": {
+            "wheel_radius": WHEEL_RADIUS_M,
+            "track": TRACK_M,
+            "wheel_lag": WHEEL_LAG_S,
+        },
         "state": [
             {"name": f"{side}_wheel", "unit": "rad/s", "min": -40.0, "max": 40.0}
             for side in ("left", "right")
@@ -197,7 +214,7 @@ def wheeled() -> RobotSpec:
                 "cmd_vel": "angular.z",
             },
         ],
-    }  # fmt: skip
+    }
     return robot_from(given, {})
 
 
@@ -235,9 +252,15 @@ def wheeled_drive(seed: int = 0, duration: float = 60.0, levels: int = 0) -> Rec
         x += STEP_S * rolling * np.cos(heading)
         y += STEP_S * rolling * np.sin(heading)
         heading += STEP_S * WHEEL_RADIUS_M * (right - left) / TRACK_M
-        left += STEP_S * ((forward - around * TRACK_M / 2.0) / WHEEL_RADIUS_M - left) / WHEEL_LAG_S
+        left += (
+            STEP_S
+            * ((forward - around * TRACK_M / 2.0) / WHEEL_RADIUS_M - left)
+            / WHEEL_LAG_S
+        )
         right += (
-            STEP_S * ((forward + around * TRACK_M / 2.0) / WHEEL_RADIUS_M - right) / WHEEL_LAG_S
+            STEP_S
+            * ((forward + around * TRACK_M / 2.0) / WHEEL_RADIUS_M - right)
+            / WHEEL_LAG_S
         )
     rows = round(POSE_S / STEP_S)
     noise = np.array([POSITION_NOISE_M, POSITION_NOISE_M, HEADING_NOISE_RAD])
@@ -248,7 +271,7 @@ def wheeled_drive(seed: int = 0, duration: float = 60.0, levels: int = 0) -> Rec
         Stream(t[::rows], poses),
         state=Stream(t[::rows], wheels[::rows]),
         source="planted drive",
-    )  # fmt: skip
+    )
 
 
 def scaled_wheels(left: float = 1.0, right: float = 1.0) -> Defect:

@@ -73,7 +73,10 @@ def after_5_s(
         (after_5_s(0.9, twist=1.0, noise=0.5), Verdict.WITH_CARE),
         (after_5_s(0.9, textbook=0.5), Verdict.DO_NOT_TRAIN),
         (after_5_s(0.9, textbook=0.5, noise=0.5), Verdict.GOOD),
-        (after_5_s(0.1, path=0.0), Verdict.DO_NOT_TRAIN),  # half of the robot, on the spot
+        (
+            after_5_s(0.1, path=0.0),
+            Verdict.DO_NOT_TRAIN,
+        ),  # half of the robot, on the spot
         (after_5_s(0.01, path=0.0), Verdict.GOOD),
         ((), Verdict.DO_NOT_TRAIN),
     ],
@@ -100,7 +103,11 @@ def test_much_time_without_a_pose_is_a_reason_for_care():
 
 
 def test_the_least_favourable_verdict_counts():
-    ratings = [rate_unseen(0.0, 100.0), rate(after_5_s(3.0), RADIUS_M, False), rate_unseen(9.0, 10)]
+    ratings = [
+        rate_unseen(0.0, 100.0),
+        rate(after_5_s(3.0), RADIUS_M, False),
+        rate_unseen(9.0, 10),
+    ]
     both = combined(ratings)
     assert both.verdict is Verdict.DO_NOT_TRAIN
     assert len(both.reasons) == 2
@@ -126,7 +133,9 @@ def test_the_noise_of_a_comparison_is_that_of_stretches_and_not_of_windows():
     rng = np.random.default_rng(0)
     means = rng.normal(size=20)
     few = comparison_noise(np.repeat(means, 5), np.repeat(5.0 * np.arange(20), 5), 5.0)
-    many = comparison_noise(np.repeat(means, 50), np.repeat(5.0 * np.arange(20), 50), 5.0)
+    many = comparison_noise(
+        np.repeat(means, 50), np.repeat(5.0 * np.arange(20), 50), 5.0
+    )
     assert few == pytest.approx(many)
     assert few == pytest.approx(means.std(ddof=1) / np.sqrt(20.0), rel=0.3)
 
@@ -161,7 +170,9 @@ def commanded():
 
 
 @pytest.mark.slow
-def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(commanded, tmp_path):
+def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(
+    commanded, tmp_path
+):
     spec, recording, found = commanded
     assert found.findings.replaced
     told = conclude(found)

@@ -18,7 +18,14 @@ from nics_drl_bridge.robot.spec import load_robot
 
 @pytest.mark.parametrize(
     ("step", "part"),
-    [(0.01, 0.01), (0.0100036, 0.01), (0.0083, 0.1 / 12), (0.05, 0.05), (0.07, 0.1), (0.2, 0.1)],
+    [
+        (0.01, 0.01),
+        (0.0100036, 0.01),
+        (0.0083, 0.1 / 12),
+        (0.05, 0.05),
+        (0.07, 0.1),
+        (0.2, 0.1),
+    ],
 )
 def test_a_step_becomes_a_part_of_the_control_period(step, part):
     assert part_of(0.1, step) == part
@@ -36,7 +43,9 @@ def test_stamps_that_were_rounded_are_taken_as_they_are(car):
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_stamps_whose_step_is_no_part_of_the_control_period_are_resampled(car, measured):
+def test_stamps_whose_step_is_no_part_of_the_control_period_are_resampled(
+    car, measured
+):
     recording = record(car, np.random.default_rng(0), 20.0, 0.0083)
     recording = recording if measured else replace(recording, state=None)
     responses = () if measured else (Response("speed", "speed_command", 0.1),) * 2
@@ -53,7 +62,9 @@ def test_a_textbook_recording_needs_no_correction_and_is_taken_digit_by_digit(na
     assert calibration.is_exact
     samples = align(Drive(recording, spec), calibration)
     r = recording
-    plain = samples_on_one_clock(r.pose.t, r.pose.values, r.state.values, r.command.values)
+    plain = samples_on_one_clock(
+        r.pose.t, r.pose.values, r.state.values, r.command.values
+    )
     for field in ("t", "q", "x", "dq"):
         assert np.array_equal(getattr(samples, field), getattr(plain, field))
 
@@ -70,7 +81,9 @@ def test_latency_is_found_from_the_measured_state(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ackermann", "differential"])
 @pytest.mark.parametrize(("ahead", "rotation"), [(0.31, 2.5), (-1.7, -1.48)])
-def test_clock_offset_rotation_lever_arm_and_noise_are_found_together(name, ahead, rotation):
+def test_clock_offset_rotation_lever_arm_and_noise_are_found_together(
+    name, ahead, rotation
+):
     spec = load_robot(name)
     recording = drive(
         spec,
@@ -87,13 +100,18 @@ def test_clock_offset_rotation_lever_arm_and_noise_are_found_together(name, ahea
     assert found.lever_arm_m[0] == pytest.approx(0.05, abs=3e-3)
     assert found.position_noise_m == pytest.approx(0.001, rel=0.1)
     assert found.heading_noise_rad == pytest.approx(0.002, rel=0.1)
-    assert abs(found.clock_offset_s + ahead) < 5 * found.uncertainty["clock_offset_s"] + 1e-3
+    assert (
+        abs(found.clock_offset_s + ahead)
+        < 5 * found.uncertainty["clock_offset_s"] + 1e-3
+    )
 
 
 @pytest.mark.slow
 def test_offset_is_found_between_clocks_that_share_no_epoch(differential):
     recording = drive(differential, pose_clock_ahead=1.7e9)
-    assert calibrate(recording, differential).clock_offset_s == pytest.approx(-1.7e9, abs=0.01)
+    assert calibrate(recording, differential).clock_offset_s == pytest.approx(
+        -1.7e9, abs=0.01
+    )
 
 
 def test_the_lever_arm_along_y_is_found_where_the_speed_is_measured(car):
@@ -101,7 +119,9 @@ def test_the_lever_arm_along_y_is_found_where_the_speed_is_measured(car):
     assert found.lever_arm_m == pytest.approx((0.05, -0.03), abs=3e-3)
 
 
-def test_the_lever_arm_along_y_of_a_differential_robot_is_said_to_be_unknown(differential):
+def test_the_lever_arm_along_y_of_a_differential_robot_is_said_to_be_unknown(
+    differential,
+):
     found = calibrate(drive(differential, lever=(0.05, -0.03)), differential)
     assert found.lever_arm_m[1] == 0.0
     assert any("along y could not be learnt" in note for note in found.notes)
@@ -153,7 +173,11 @@ def test_lags_and_latency_of_a_state_that_was_not_measured_are_found(car):
 @pytest.mark.slow
 def test_without_wheels_offset_and_latency_are_said_to_be_one_sum(car):
     recording = drive(
-        car, latency=0.06, pose_clock_ahead=0.4, noise=(5e-4, 1e-3), measured_state=False
+        car,
+        latency=0.06,
+        pose_clock_ahead=0.4,
+        noise=(5e-4, 1e-3),
+        measured_state=False,
     )
     found = calibrate(recording, car)
     assert found.command_latency_s == 0.0
@@ -163,10 +187,16 @@ def test_without_wheels_offset_and_latency_are_said_to_be_one_sum(car):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("swapped", [True, False])
-def test_wheels_tell_latency_from_clock_offset_and_whether_they_are_swapped(car, swapped):
+def test_wheels_tell_latency_from_clock_offset_and_whether_they_are_swapped(
+    car, swapped
+):
     truth = drive(car)
     recording = drive(
-        car, latency=0.06, pose_clock_ahead=0.4, noise=(5e-4, 1e-3), measured_state=False
+        car,
+        latency=0.06,
+        pose_clock_ahead=0.4,
+        noise=(5e-4, 1e-3),
+        measured_state=False,
     )
     found = calibrate(with_wheels(recording, truth, swapped), car)
     assert found.command_latency_s == pytest.approx(0.06, abs=0.015)
@@ -182,7 +212,9 @@ def test_a_robot_whose_state_follows_nothing_must_have_it_measured(differential)
 
 
 def test_a_recording_of_another_robot_is_refused(car, mecanum):
-    with pytest.raises(RecordingError, match="check that the recording is of this robot"):
+    with pytest.raises(
+        RecordingError, match="check that the recording is of this robot"
+    ):
         calibrate(drive(car, duration=5.0), mecanum)
 
 
@@ -195,7 +227,9 @@ def test_streams_that_do_not_overlap_are_refused(car):
 
 @pytest.mark.slow
 def test_a_calibration_survives_plain_data(car):
-    found = calibrate(drive(car, latency=0.05, duration=20.0, measured_state=False), car)
+    found = calibrate(
+        drive(car, latency=0.05, duration=20.0, measured_state=False), car
+    )
     plain = json.loads(json.dumps(asdict(found)))
     assert TypeAdapter(Calibration).validate_python(plain) == found
 

@@ -50,18 +50,24 @@ def test_a_wide_steering_angle_does_not_bend_the_latency():
 
 @pytest.mark.slow
 def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
-    recording = drive(car, 4, 20.0, latency=0.05, noise=(0.003, 0.006), measured_state=False)
+    recording = drive(
+        car, 4, 20.0, latency=0.05, noise=(0.003, 0.006), measured_state=False
+    )
     found = calibrate(recording, car)
     assert found.uncertainty["command_latency_s"] > TOLD_S
     sigma = found.uncertainty[SUM]
     both = found.command_latency_s + found.responses[0].lag_s
     assert both == pytest.approx(0.15, abs=3.0 * sigma)
-    assert any("can hardly be told apart: trust their sum" in note for note in found.notes)
+    assert any(
+        "can hardly be told apart: trust their sum" in note for note in found.notes
+    )
 
 
 @pytest.mark.parametrize("ahead", [0.0, 0.2])
 def test_a_robot_that_moves_before_its_commands_has_poses_of_another_clock(car, ahead):
-    recording = drive(car, 4, 20.0, latency=0.05, noise=(0.001, 0.002), measured_state=False)
+    recording = drive(
+        car, 4, 20.0, latency=0.05, noise=(0.001, 0.002), measured_state=False
+    )
     pose = replace(recording.pose, t=recording.pose.t - ahead)
     tried = Drive(replace(recording, pose=pose), car)
     timing = timing_of(tried)
@@ -78,7 +84,10 @@ def test_a_measured_state_that_moves_before_its_commands_is_of_another_clock(car
     }
     tried = Drive(replace(recording, **ahead), car)
     told = " ".join(about_clocks(tried, Calibration(), timing_of(tried)))
-    assert "The robot moves 0.15 s before its commands: its state is stamped by another" in told
+    assert (
+        "The robot moves 0.15 s before its commands: its state is stamped by another"
+        in told
+    )
 
 
 def test_what_the_pose_tells_is_not_asked_to_be_measured(car, differential):
@@ -90,8 +99,6 @@ def test_what_the_pose_tells_is_not_asked_to_be_measured(car, differential):
         update={"state": (speed, steering.model_copy(update={"follows": None}))}
     )
     assert not any(v.must_be_measured for v in told.state)
-    sentence = (
-        "'steering' of robot 'ackermann' follows no command; .*`nics inspect .* --map my.yaml`"
-    )
+    sentence = "'steering' of robot 'ackermann' follows no command; .*`nics inspect .* --map my.yaml`"
     with pytest.raises(RecordingError, match=sentence):
         timing_of(Drive(recording, untold))

@@ -32,9 +32,17 @@ def judged(found, position, path=2.0):
 @pytest.mark.parametrize(
     ("position", "path", "text"),
     [
-        (0.0228, 2.0, "end 0.0228 m off after 5 s (1.1 % of the path); a fitted textbook 25.0 %"),
+        (
+            0.0228,
+            2.0,
+            "end 0.0228 m off after 5 s (1.1 % of the path); a fitted textbook 25.0 %",
+        ),
         (1e-5, 2.0, "(< 0.1 % of the path)"),
-        (0.02, 0.0, "end 0.02 m off after 5 s; a fitted textbook 0.5 m, constant twist 1 m."),
+        (
+            0.02,
+            0.0,
+            "end 0.02 m off after 5 s; a fitted textbook 0.5 m, constant twist 1 m.",
+        ),
         (math.inf, 2.0, "the predictions run away within 5 s."),
         (math.nan, 2.0, "the predictions run away within 5 s."),
     ],
@@ -82,13 +90,17 @@ def test_gaps_are_those_notes_that_tell_what_the_drive_could_not_teach(found):
     assert type(told.gaps[0]) is str  # a file takes no other
 
 
-def test_a_mistake_of_the_mapping_is_told_first_and_to_be_mended_before_a_training(found):
+def test_a_mistake_of_the_mapping_is_told_first_and_to_be_mended_before_a_training(
+    found,
+):
     assert conclude(found).ready
     mistake = "The commands ask for 57.3 times the turn_command that was driven."
     told = conclude(replace(judged(found, 2.0), notes=(Mistake(mistake),)))
     assert told.doubts[0] == mistake
     assert type(told.doubts[0]) is str  # a file takes no other
-    assert told.advice.startswith("Next: fix the mapping as described above, or the robot")
+    assert told.advice.startswith(
+        "Next: fix the mapping as described above, or the robot"
+    )
     assert not told.ready
 
 

@@ -37,7 +37,9 @@ def driven(spec, commands, dt=0.02, noise=(0.0, 0.0), seed=0) -> Recording:
     moved = geometry.exp(book.twist(np.concatenate(states)) * dt / FINE)
     heading = np.cumsum(moved[:, 2]) - moved[:, 2]
     path = np.cumsum(geometry.rotate(moved[:, :2], heading), axis=0)
-    poses = np.concatenate([np.append(np.zeros((1, 2)), path[:-1], 0), heading[:, None]], 1)[::FINE]
+    poses = np.concatenate(
+        [np.append(np.zeros((1, 2)), path[:-1], 0), heading[:, None]], 1
+    )[::FINE]
     poses = poses + rng.normal(size=poses.shape) * [noise[0], *noise]
     t = np.arange(len(commands)) * dt
     states = np.array([block[0] for block in states])
@@ -46,7 +48,9 @@ def driven(spec, commands, dt=0.02, noise=(0.0, 0.0), seed=0) -> Recording:
 
 def random_commands(spec, count=1500, hold=25, seed=0):
     rng = np.random.default_rng(seed)
-    held = rng.uniform(spec.command_low, spec.command_high, (-(-count // hold), len(spec.command)))
+    held = rng.uniform(
+        spec.command_low, spec.command_high, (-(-count // hold), len(spec.command))
+    )
     return np.repeat(held, hold, axis=0)[:count]
 
 
@@ -95,7 +99,12 @@ def test_straight_only_of_a_differential_robot_names_the_turn_command(differenti
     ("column", "constant", "name", "advice"),
     [
         (0, 0.6, "speed_command", "is valid for this drive's constant value only"),
-        (1, -0.4, "steering_command", "drive with steering_command changing over its whole range"),
+        (
+            1,
+            -0.4,
+            "steering_command",
+            "drive with steering_command changing over its whole range",
+        ),
     ],
 )
 def test_a_constant_command_gives_a_model_without_it_and_says_so(
@@ -118,7 +127,9 @@ def test_noise_of_a_measured_state_is_no_excitation(car):
     values = recording.state.values.copy()
     values[:, 1] = -0.4
     values += np.random.default_rng(3).normal(size=values.shape) * 0.01
-    found = identify(replace(recording, state=replace(recording.state, values=values)), car)
+    found = identify(
+        replace(recording, state=replace(recording.state, values=values)), car
+    )
     assert "steering" in found.fit.unmoved
     assert harmless(found, car)
 
@@ -136,12 +147,18 @@ def test_constant_commands_are_refused_instead_of_predicting_nonsense(car):
     commands = np.tile([0.1, -0.5], (1500, 1))
     with pytest.raises(FitError, match="no command ever changed"):
         identify(replace(driven(car, commands), state=None), car)
-    started = driven(car, commands)  # the start of the drive moved the state, and no command
+    started = driven(
+        car, commands
+    )  # the start of the drive moved the state, and no command
     found = identify(started, car)
     assert {"speed_command", "steering_command"} <= set(found.fit.unmoved)
     assert said(found, "Drive with")
-    assert found.model.rates([0.1, -0.5, 0.1, -0.5])[2] == pytest.approx(-0.273, abs=0.01)
-    with pytest.raises(FitError, match="speed_command and steering_command never moved"):
+    assert found.model.rates([0.1, -0.5, 0.1, -0.5])[2] == pytest.approx(
+        -0.273, abs=0.01
+    )
+    with pytest.raises(
+        FitError, match="speed_command and steering_command never moved"
+    ):
         identify(started, car, strict=True)
 
 
@@ -153,7 +170,9 @@ def test_one_sample_is_refused(car):
 
 @pytest.mark.parametrize("count", [2, 5, 19, 60])
 def test_too_short_a_drive_is_refused(car, count):
-    with pytest.raises((FitError, RecordingError), match=r"too few|usable intervals|overlap|rec"):
+    with pytest.raises(
+        (FitError, RecordingError), match=r"too few|usable intervals|overlap|rec"
+    ):
         identify(driven(car, random_commands(car, count)), car)
 
 
@@ -221,8 +240,12 @@ def test_the_heading_of_a_compass_is_refused_with_the_line_to_write(car):
     recording = driven(car, np.stack([0.8 + 0.0 * t, 0.1 * np.sin(0.35 * t)], axis=1))
     values = recording.pose.values.copy()
     values[:, 2] = np.pi / 2.0 - values[:, 2]
-    with pytest.raises(RecordingError, match=r"heading: {from: ..., scale: -1, offset: 1.5708}"):
-        check_axes(Drive(replace(recording, pose=replace(recording.pose, values=values)), car))
+    with pytest.raises(
+        RecordingError, match=r"heading: {from: ..., scale: -1, offset: 1.5708}"
+    ):
+        check_axes(
+            Drive(replace(recording, pose=replace(recording.pose, values=values)), car)
+        )
 
 
 def test_a_reversed_axis_of_a_robot_that_moves_sideways_is_not_silent(mecanum):
@@ -236,7 +259,9 @@ def test_a_reversed_axis_of_a_robot_that_moves_sideways_is_not_silent(mecanum):
 def test_a_whole_mirror_image_is_told(car):
     recording = driven(car, random_commands(car))
     values = recording.pose.values * [1.0, -1.0, -1.0]
-    found = identify(replace(recording, pose=replace(recording.pose, values=values)), car)
+    found = identify(
+        replace(recording, pose=replace(recording.pose, values=values)), car
+    )
     assert said(found, "turns right where steering_command is positive")
     assert not conclude(found).ready
     upright = identify(recording, car)
@@ -248,7 +273,9 @@ def test_commands_beyond_the_limits_are_held_there_and_told(differential):
     found = identify(driven(differential, commands), differential)
     assert said(found, "forward_command was beyond the robot's limits, -0.5 to 1 m/s")
     terms = found.model.named.terms
-    assert terms["d_left_wheel"]["left_wheel"] == pytest.approx(-9.06, abs=0.1)  # dt is 20 ms
+    assert terms["d_left_wheel"]["left_wheel"] == pytest.approx(
+        -9.06, abs=0.1
+    )  # dt is 20 ms
     assert found.fit.r2[3:].min() > 0.999
 
 
@@ -263,8 +290,10 @@ def test_two_valued_commands_are_told(differential):
 def test_a_robot_that_does_not_follow_its_commands_is_not_trusted(differential):
     recording = driven(differential, random_commands(differential))
     other = random_commands(differential, seed=9)
-    found = identify(replace(recording, command=replace(recording.command, values=other)),
-                     differential)  # fmt: skip
+    found = identify(
+        replace(recording, command=replace(recording.command, values=other)),
+        differential,
+    )
     assert said(found, "does not follow the commands") or said(found, "did not follow")
 
 
@@ -275,7 +304,9 @@ def test_commands_that_always_move_together_are_named(differential):
     found = identify(recording, differential)
     assert said(found, "forward_command and turn_command always moved together")
     assert harmless(found, differential)
-    with pytest.raises(FitError, match="forward_command and turn_command always moved together"):
+    with pytest.raises(
+        FitError, match="forward_command and turn_command always moved together"
+    ):
         identify(recording, differential, strict=True)
 
 
@@ -297,9 +328,13 @@ def test_a_model_of_every_partial_drive_stays_finite(car):
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
             rollout(
-                poses, states, random_commands(car, 500, seed=5)[None], term_arrays(model), SERIES,
+                poses,
+                states,
+                random_commands(car, 500, seed=5)[None],
+                term_arrays(model),
+                SERIES,
                 model.dt,
-            )  # fmt: skip
+            )
         assert np.abs(poses[0, :, :2]).max() < 20.0
 
 
@@ -312,7 +347,9 @@ def test_where_predictions_run_away_the_model_is_linear(monkeypatch):
     late = np.repeat(rng.uniform(0.0, 0.4, len(whole.command.t) // 25 + 1), 25)
     t = np.maximum.accumulate(whole.command.t - late[: len(whole.command.t)])
     late_commands = replace(whole.command, t=t + 1e-6 * np.arange(len(t)))
-    jittered = replace(whole, pose=replace(whole.pose, values=poses), command=late_commands)
+    jittered = replace(
+        whole, pose=replace(whole.pose, values=poses), command=late_commands
+    )
     found = identify(jittered, spec)
     assert verdict.LINEAR in found.notes
     assert (found.model.powers.sum(axis=1) <= 1).all()

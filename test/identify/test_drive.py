@@ -34,7 +34,10 @@ def test_the_newest_of_each_burst_is_dated_at_its_arrival():
     arrival = in_bursts(np.arange(1, 201) * 0.02, 0.1)
     bursts = find_bursts(arrival)
     assert len(bursts.newest) == 40
-    assert np.abs(spread(arrival, bursts)[bursts.newest] - np.arange(1, 41) * 0.1).max() < 1e-3
+    assert (
+        np.abs(spread(arrival, bursts)[bursts.newest] - np.arange(1, 41) * 0.1).max()
+        < 1e-3
+    )
 
 
 def test_after_a_gap_a_burst_fills_one_period_only():
@@ -51,6 +54,9 @@ def test_a_motion_is_trusted_by_the_variances_of_the_poses_at_both_ends():
     sigma = np.where((pose.t > 1.4)[:, None], [0.03, 0.03, 0.01], 0.01)
     drive = Drive(replace(recording, pose=replace(pose, sigma=sigma)), spec)
     usual = np.array([0.03, 0.03, 0.01])  # of most poses
-    before, across = 1.0 / (0.01 / usual) ** 2, 1.0 / (((0.01 / usual) ** 2 + 1.0) / 2.0)
+    before, across = (
+        1.0 / (0.01 / usual) ** 2,
+        1.0 / (((0.01 / usual) ** 2 + 1.0) / 2.0),
+    )
     trust = drive.trust(start, np.array([1.0, 2.0]))
     assert trust == pytest.approx(np.stack([before, across]))

@@ -18,8 +18,20 @@ PAIR = RobotSpec.model_validate(
         "name": "pair",
         "footprint_radius": 0.1,
         "command": [
-            {"name": "a", "unit": "m/s", "min": -1.0, "max": 1.0, "cmd_vel": "linear.x"},
-            {"name": "b", "unit": "rad/s", "min": -1.0, "max": 1.0, "cmd_vel": "angular.z"},
+            {
+                "name": "a",
+                "unit": "m/s",
+                "min": -1.0,
+                "max": 1.0,
+                "cmd_vel": "linear.x",
+            },
+            {
+                "name": "b",
+                "unit": "rad/s",
+                "min": -1.0,
+                "max": 1.0,
+                "cmd_vel": "angular.z",
+            },
         ],
     }
 )
@@ -94,7 +106,10 @@ def test_a_larger_alpha_never_keeps_fewer_terms():
 
 
 def test_rounding_errors_never_count_as_terms():
-    assert prune(np.array([1.0, 1e-12]), 1.0, noise_floor=1e-9).tolist() == [True, False]
+    assert prune(np.array([1.0, 1e-12]), 1.0, noise_floor=1e-9).tolist() == [
+        True,
+        False,
+    ]
 
 
 def test_the_weight_of_a_term_does_not_depend_on_its_unit():
@@ -144,8 +159,16 @@ def test_terms_that_noise_could_have_made_are_dropped_from_a_noisy_fit():
     dq = rates_of(x)
     dq += np.random.default_rng(4).normal(size=dq.shape) * 0.1
     clean = fit(samples_of(x, dq), PAIR, alpha=1.0, noisy=True)
-    assert clean.model.terms_kept <= 7  # 5 are true, two in 18 may slip through three sigma
-    for dof, name in (("vx", "a"), ("vx", "a*b"), ("vy", "1"), ("vy", "b^2"), ("wz", "b")):
+    assert (
+        clean.model.terms_kept <= 7
+    )  # 5 are true, two in 18 may slip through three sigma
+    for dof, name in (
+        ("vx", "a"),
+        ("vx", "a*b"),
+        ("vy", "1"),
+        ("vy", "b^2"),
+        ("wz", "b"),
+    ):
         assert term(clean.model, dof, name) != 0.0
     assert fit(samples_of(x, dq), PAIR, alpha=1.0).model.terms_kept == 18
     assert clean.rmse == pytest.approx([0.1, 0.1, 0.1], rel=0.05)
@@ -155,10 +178,14 @@ def test_the_errors_are_those_of_the_pruned_model():
     x = random_x()
     dq = rates_of(x)
     result = fit(samples_of(x, dq), PAIR, alpha=0.3)
-    residual = dq - taylor.evaluate(x, result.model.powers) @ result.model.coefficients.T
+    residual = (
+        dq - taylor.evaluate(x, result.model.powers) @ result.model.coefficients.T
+    )
     assert result.model.terms_kept < 5
     assert result.rmse == pytest.approx(np.sqrt((residual**2).mean(axis=0)))
-    assert result.r2 == pytest.approx(1.0 - residual.var(axis=0) / dq.var(axis=0), abs=0.02)
+    assert result.r2 == pytest.approx(
+        1.0 - residual.var(axis=0) / dq.var(axis=0), abs=0.02
+    )
 
 
 def step_error(name, alpha):

@@ -43,7 +43,10 @@ def test_a_dead_zone_of_the_speed_is_found_and_predicted(mounting):
     (curve,) = (each for each in identified.model.inputs if each.bends)
     assert (curve.command, curve.least, curve.most) == (SPEED, -np.inf, np.inf)
     assert curve.dead == pytest.approx(0.1, rel=0.1)
-    assert abs(curve.dead - 0.1) < 3.0 * identified.calibration.uncertainty[f"{SPEED}.dead"]
+    assert (
+        abs(curve.dead - 0.1)
+        < 3.0 * identified.calibration.uncertainty[f"{SPEED}.dead"]
+    )
     assert identified.dead_zone == curve.dead
     error, textbook = ends(identified)
     assert error < 0.8 * textbook
@@ -63,7 +66,9 @@ def test_limits_of_acceleration_are_found_and_predicted():
 
 @pytest.mark.slow
 def test_no_state_overshoots_its_command_in_a_step():
-    recording = servoed(steering_servo=MOTOR, steering=0.5, slew=0.7, later=0.15, dead=0.1)
+    recording = servoed(
+        steering_servo=MOTOR, steering=0.5, slew=0.7, later=0.15, dead=0.1
+    )
     model = identify(recording, tricycle(), order="auto", alpha="auto").model
     (alone,) = (k for k, term in enumerate(model.term_names) if term == "speed")
     assert 0.0 <= 1.0 + model.dt * model.coefficients[3, alone] < 1.0
@@ -80,7 +85,9 @@ def test_a_lag_before_a_limit_makes_the_latency_uncertain(slew):
 
 @pytest.mark.slow
 def test_a_limit_of_the_speed_makes_no_limit_of_the_steering():
-    recording = servoed(steering_servo=([1.0], [0.15, 1.0]), slew=0.7, steering=0.5, motor=QUICK)
+    recording = servoed(
+        steering_servo=([1.0], [0.15, 1.0]), slew=0.7, steering=0.5, motor=QUICK
+    )
     limits = identify(recording, tricycle()).model.limits
     assert limits[0] == pytest.approx([-0.7, 0.7], rel=0.1)
     assert not np.isfinite(limits[1]).any()
@@ -88,29 +95,44 @@ def test_a_limit_of_the_speed_makes_no_limit_of_the_steering():
 
 @pytest.mark.slow
 def test_a_motor_without_a_lag_may_have_limits():
-    recording = servoed(steering_servo=QUICK, slew=2.0, steering=0.5, latency=0.0, motor=QUICK)
+    recording = servoed(
+        steering_servo=QUICK, slew=2.0, steering=0.5, latency=0.0, motor=QUICK
+    )
     early = replace(recording, pose=replace(recording.pose, t=recording.pose.t - 0.04))
-    assert identify(early, tricycle()).model.limits[0] == pytest.approx([-2.0, 2.0], rel=0.1)
+    assert identify(early, tricycle()).model.limits[0] == pytest.approx(
+        [-2.0, 2.0], rel=0.1
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [{"slew": 0.7}, {"later": 0.12}, {"dead": 0.1}])
-def test_motors_are_found_where_the_wheels_tell_the_latency_of_a_pose_on_another_clock(given):
-    recording = servoed(steering_servo=MOTOR, steering=0.5, mounting=(0.0, 0.0, 0.0), **given)
+def test_motors_are_found_where_the_wheels_tell_the_latency_of_a_pose_on_another_clock(
+    given,
+):
+    recording = servoed(
+        steering_servo=MOTOR, steering=0.5, mounting=(0.0, 0.0, 0.0), **given
+    )
     pose = recording.pose
     moved = geometry.log(geometry.between(pose.values[:-5], pose.values[5:]))
     twist = moved / (pose.t[5:] - pose.t[:-5])[:, None]
-    both = np.stack([twist[:, 0] - 0.2 * twist[:, 2], twist[:, 0] + 0.2 * twist[:, 2]], axis=1)
+    both = np.stack(
+        [twist[:, 0] - 0.2 * twist[:, 2], twist[:, 0] + 0.2 * twist[:, 2]], axis=1
+    )
     wheels = Stream(pose.t[5::2], both[::2], "robot")
     tracked = replace(pose, t=pose.t + 3.0, clock="mocap")
-    error, textbook = ends(identify(replace(recording, wheels=wheels, pose=tracked), tricycle()))
+    error, textbook = ends(
+        identify(replace(recording, wheels=wheels, pose=tracked), tricycle())
+    )
     assert error < 0.6 * textbook
 
 
 @pytest.mark.slow
 def test_what_holds_a_state_back_is_written_at_the_gain_of_the_state():
     identified = found(slew=0.7)
-    (response, _), limits = identified.calibration.responses, identified.calibration.limits
+    (response, _), limits = (
+        identified.calibration.responses,
+        identified.calibration.limits,
+    )
     assert identified.model.limits[0] == pytest.approx(
         np.multiply(limits["speed"], response.gain), rel=0.05
     )

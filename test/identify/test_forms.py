@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.forms import (
     two_way,
     with_back,
     with_dead,
-)  # fmt: skip
+)
 from nics_drl_bridge.identify.identify import STAGES, Findings, aligned, inputs, run
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -63,7 +63,9 @@ def test_a_command_in_proportion_to_what_it_does_has_no_curve(found, samples):
     assert curve_of(follows, found.training.spec, 0) is None
 
 
-def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(found, samples):
+def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(
+    found, samples
+):
     slower = replace(samples, x=samples.x.copy())
     slower.x[:, 0] -= 2.0 * np.maximum(np.abs(samples.x[:, 4]) - 0.4, 0.0)
     slower.x[:, 1:3] = 0.0
@@ -74,9 +76,16 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
     form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
     sought = form_inputs(found, samples, form)
     assert sought.names == (
-        "latency", "throttle.dead", "throttle.least", "throttle.most",
-        "vx.friction", "vx.drag", "vx.back_emf.throttle", "vx.fall", "vx.rise",
-    )  # fmt: skip
+        "latency",
+        "throttle.dead",
+        "throttle.least",
+        "throttle.most",
+        "vx.friction",
+        "vx.drag",
+        "vx.back_emf.throttle",
+        "vx.fall",
+        "vx.rise",
+    )
     assert len(sought.sought) == len(sought.names)
     assert (sought.low <= sought.start).all()
     assert (sought.start <= sought.high).all()
@@ -101,8 +110,12 @@ def test_the_least_delay_of_the_commands_is_their_latency(found, samples):
     delayed = problem_of(found.training, Calibration(), samples, form, sought).commands(
         sought.start
     )
-    shared = replace(sought, start=np.where(np.arange(len(sought.start)) == 1, 0.02, sought.start))
-    alike = problem_of(found.training, Calibration(), samples, form, shared).commands(shared.start)
+    shared = replace(
+        sought, start=np.where(np.arange(len(sought.start)) == 1, 0.02, sought.start)
+    )
+    alike = problem_of(found.training, Calibration(), samples, form, shared).commands(
+        shared.start
+    )
     step = round(0.06 / samples.dt)
     assert delayed[step:, 0] == pytest.approx(alike[:-step, 0])
     assert np.array_equal(delayed[:, 1], alike[:, 1])
@@ -113,14 +126,21 @@ def test_values_become_curves_friction_limits_and_drag(found, samples):
     sought = form_inputs(found, samples, form)
     values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 1.2, 3.0, 2.0])
     (curve,) = form.curves_at(sought, values)
-    assert curve == InputCurve(command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8)
+    assert curve == InputCurve(
+        command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8
+    )
     spec = found.training.spec
     none = np.zeros((len(spec.dof_names), 1))
     model = TaylorModel(
-        spec.variable_names, spec.dof_names, spec.dof_units,
-        np.zeros((1, len(spec.variable_names)), dtype=np.int64), none, 0.01, none[:5, 0],
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        np.zeros((1, len(spec.variable_names)), dtype=np.int64),
+        none,
+        0.01,
         none[:5, 0],
-    )  # fmt: skip
+        none[:5, 0],
+    )
     model = form.actuated(model, sought, values)
     assert model.friction.tolist() == [0.25, 0.0, 0.0]
     assert model.drag.tolist() == [0.15, 0.0, 0.0]
@@ -133,10 +153,14 @@ def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(found, samples):
     assert curve.command == "throttle"
     assert 0.0 < curve.dead < 0.05
     assert with_dead(Form((CURVE,)), found.training, samples).curves == (CURVE,)
-    assert with_back(with_dead(Form(), found.training, samples), (curve,)).back == ("throttle",)
+    assert with_back(with_dead(Form(), found.training, samples), (curve,)).back == (
+        "throttle",
+    )
 
 
-def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(found, samples):
+def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(
+    found, samples
+):
     (both,) = two_way(found.training, samples)
     assert both.command == "throttle"
     form = with_back(Form(), (both,))
@@ -155,13 +179,23 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
     asked = 5.0 * samples.x[:, 3]
 
     def written(most: float, rise: float) -> TaylorModel:
-        curve = InputCurve(command="throttle", dead=0.1, least=1.2 * sent.min(), most=most)
+        curve = InputCurve(
+            command="throttle", dead=0.1, least=1.2 * sent.min(), most=most
+        )
         limits = np.tile([-np.inf, np.inf], (3, 1))
         limits[0] = 2.0 * asked.min(), rise
         model = TaylorModel(
-            spec.variable_names, spec.dof_names, spec.dof_units, powers, gains, 0.01,
-            np.zeros(size), np.zeros(size), inputs=(curve,), limits=limits,
-        )  # fmt: skip
+            spec.variable_names,
+            spec.dof_names,
+            spec.dof_units,
+            powers,
+            gains,
+            0.01,
+            np.zeros(size),
+            np.zeros(size),
+            inputs=(curve,),
+            limits=limits,
+        )
         return reached(model, found.training, samples, {})
 
     beyond = written(1.1 * sent.max(), 2.0 * asked.max())

@@ -26,7 +26,9 @@ ROBOT = {
 def recorded(drive, measured_by="odometry", gyro=True):
     """Returns the recording of a drive as a bag of the robot holds it."""
     imu = np.stack([np.zeros_like(drive.t), np.zeros_like(drive.t), drive.gyro], axis=1)
-    pose = np.concatenate([drive.odom[:, :2], geometry.wrap_angle(drive.odom[:, 2:])], axis=1)
+    pose = np.concatenate(
+        [drive.odom[:, :2], geometry.wrap_angle(drive.odom[:, 2:])], axis=1
+    )
     every = slice(None, None, 5)
     return Recording(
         command=Stream(drive.t[every], drive.command[every]),
@@ -114,22 +116,31 @@ def test_poses_of_unknown_origin_are_not_turned_but_the_fix_is_told(slipping):
 @pytest.mark.parametrize(
     ("measured_by", "gyro", "said"),
     [
-        ("odometry", False, "relative to odometry; nothing here tells how far that drifts."),
+        (
+            "odometry",
+            False,
+            "relative to odometry; nothing here tells how far that drifts.",
+        ),
         ("odometry", True, "relative to odometry with its heading from the gyro"),
         ("tracker", False, "relative to motion capture or a localiser."),
         ("", False, "relative to the recorded pose"),
     ],
 )
-def test_the_report_says_relative_to_what_the_error_is(slipping, measured_by, gyro, said):
+def test_the_report_says_relative_to_what_the_error_is(
+    slipping, measured_by, gyro, said
+):
     recording = turned_by_gyro(recorded(slipping, measured_by, gyro))
     assert said in relative_to(recording)
 
 
 def test_each_of_several_recordings_turns_by_its_own_bias():
     drives = [
-        drive_skid_steer(np.random.default_rng(k), duration=40.0, bias=0.02 * k) for k in (1, 2)
+        drive_skid_steer(np.random.default_rng(k), duration=40.0, bias=0.02 * k)
+        for k in (1, 2)
     ]
-    spec = robot_from(ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)})
+    spec = robot_from(
+        ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)}
+    )
     joined = join_recordings([recorded(each) for each in drives], spec)
     assert joined.gyro is not None
     turned = np.diff(np.unwrap(joined.pose.values[:, 2]))
@@ -159,10 +170,14 @@ def heading_errors(model, drive, latency_s):
 @pytest.mark.slow
 def test_the_model_turns_as_the_robot_truly_does(slipping):
     unseen = drive_skid_steer(np.random.default_rng(11))
-    spec = robot_from(ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)})
+    spec = robot_from(
+        ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)}
+    )
     by_wheels = identify(recorded(slipping, gyro=False), spec)
     by_gyro = identify(recorded(slipping), spec)
-    wrong = heading_errors(by_wheels.model, unseen, by_wheels.calibration.command_latency_s)
+    wrong = heading_errors(
+        by_wheels.model, unseen, by_wheels.calibration.command_latency_s
+    )
     right = heading_errors(by_gyro.model, unseen, by_gyro.calibration.command_latency_s)
     assert wrong > 0.2
     assert right < 0.05

@@ -18,7 +18,7 @@ from nics_drl_bridge.identify.hypotheses import (
     chosen,
     hypotheses,
     lags_of,
-)  # fmt: skip
+)
 from nics_drl_bridge.identify.identify import STAGES, aligned, fit, identify, run
 from nics_drl_bridge.identify.terms import by_textbook
 from nics_drl_bridge.robot import taylor
@@ -65,7 +65,8 @@ def test_a_car_that_slips_is_predicted_and_its_lever_is_not_bent_by_the_slip():
     assert "command_latency_s" not in sigma
     assert 0.0 < sigma["throttle.dead"] < 0.02
     assert any(
-        "The model is the textbook with an input curve of throttle" in n for n in found.notes
+        "The model is the textbook with an input curve of throttle" in n
+        for n in found.notes
     )
     assert any("can't be told from the lags" in note for note in found.notes)
 
@@ -95,16 +96,24 @@ def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
     powers = taylor.exponents(len(spec.variable_names), 1)
     allowed = by_textbook(powers, spec)
     model = taylor.TaylorModel(
-        spec.variable_names, spec.dof_names, spec.dof_units, powers,
-        np.where(allowed, -4.0, 0.0), 0.01, np.zeros(5), np.zeros(5),
-    )  # fmt: skip
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers,
+        np.where(allowed, -4.0, 0.0),
+        0.01,
+        np.zeros(5),
+        np.zeros(5),
+    )
     assert lags_of(model, spec) == {"vx": 0.25, "vy": 0.25, "wz": 0.25}
     rolling = replace(model, coefficients=0.01 * model.coefficients)
     assert lags_of(rolling, spec) == {}
 
 
 @pytest.mark.parametrize("duration", [4.0, 8.0])
-def test_a_drive_too_short_for_predictions_over_seconds_gets_the_textbook_in_silence(duration):
+def test_a_drive_too_short_for_predictions_over_seconds_gets_the_textbook_in_silence(
+    duration,
+):
     spec, recording = slipping_car(duration=duration)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -117,7 +126,9 @@ def test_no_state_grows_by_itself_however_little_it_moved():
     model = identify(recording, spec, alpha="auto").model
     alone = model.powers.sum(axis=1) == 1
     for i, _ in enumerate(spec.state):
-        assert (model.coefficients[3 + i, alone & (model.powers[:, i] == 1)] <= 0.0).all()
+        assert (
+            model.coefficients[3 + i, alone & (model.powers[:, i] == 1)] <= 0.0
+        ).all()
 
 
 def test_strict_refuses_a_motion_that_a_command_never_moved():

@@ -36,7 +36,9 @@ def held(angle: float, assume: bool) -> Identified:
     car = load_robot("ackermann")
     data = car.model_dump()
     data["command"][1].update(min=angle - 1e-9, max=angle + 1e-9)
-    recording = drive(RobotSpec.model_validate(data), noise=(5e-4, 1e-3), measured_state=False)
+    recording = drive(
+        RobotSpec.model_validate(data), noise=(5e-4, 1e-3), measured_state=False
+    )
     values = recording.command.values.copy()
     values[:, 1] = angle
     held = replace(recording, command=replace(recording.command, values=values))
@@ -54,14 +56,18 @@ def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
     for n in range(30):
         pose, state = model.step(pose, state, command[:, n])
     assert np.allclose(poses[:, -1, :2], pose[:, :2], atol=1e-12)
-    assert np.allclose(np.exp(1j * poses[:, -1, 2]), np.exp(1j * pose[:, 2]), atol=1e-12)
+    assert np.allclose(
+        np.exp(1j * poses[:, -1, 2]), np.exp(1j * pose[:, 2]), atol=1e-12
+    )
     assert np.allclose(states[:, -1], state, atol=1e-12)
 
 
 def test_an_exact_recording_is_fitted_to_nine_digits_and_not_refined(differential):
     found = identify(drive(differential, duration=45.0), differential)
     assert np.delete(found.fit.rmse, 1).max() < 1e-8
-    assert found.fit.rmse[1] < 1e-4  # sideways the robot hardly moves, and gets no terms
+    assert (
+        found.fit.rmse[1] < 1e-4
+    )  # sideways the robot hardly moves, and gets no terms
     assert found.model is found.fit.model
     assert found.held_out is not None
     assert found.held_out.mean_position_error_m < 1e-4
@@ -112,7 +118,11 @@ def test_a_noisy_drive_in_bursts_without_state_still_gives_the_textbook_terms(ca
 @pytest.mark.slow
 def test_a_noisy_drive_with_measured_wheels_gives_the_textbook_terms(differential):
     recording = drive(
-        differential, latency=0.08, rotation=2.5, lever=(-0.05, 0.0), noise=(0.001, 0.002)
+        differential,
+        latency=0.08,
+        rotation=2.5,
+        lever=(-0.05, 0.0),
+        noise=(0.001, 0.002),
     )
     found = identify(recording, differential)
     for wheel, sign in (("left_wheel", -1.0), ("right_wheel", 1.0)):
@@ -157,7 +167,9 @@ def test_at_the_same_steering_the_completed_model_moves_like_the_learnt_one():
 @pytest.mark.slow
 def test_at_zero_steering_the_parameters_of_the_spec_are_assumed():
     found = held(0.0, assume=True)
-    assert term(found.model, "wz", "speed*steering") == pytest.approx(1.0 / 0.2, rel=1e-3)
+    assert term(found.model, "wz", "speed*steering") == pytest.approx(
+        1.0 / 0.2, rel=1e-3
+    )
     assert any("from the parameters" in note for note in found.notes)
 
 
@@ -173,7 +185,9 @@ def test_a_drive_in_which_no_command_changes_is_refused(car):
     recording = drive(car, duration=20.0, measured_state=False)
     still = np.full_like(recording.command.values, 0.1)
     with pytest.raises(FitError, match="no command ever changed"):
-        identify(replace(recording, command=replace(recording.command, values=still)), car)
+        identify(
+            replace(recording, command=replace(recording.command, values=still)), car
+        )
 
 
 @pytest.mark.parametrize("until", [0.0, -3.0])
@@ -202,7 +216,9 @@ def test_a_wheel_that_always_follows_from_the_others_is_named(name, request):
 def by_throttle(steering: float, **given) -> tuple[RobotSpec, TaylorModel]:
     """A car by throttle, and its model of a drive that held one steering."""
     names = ("vx", "vy", "wz", "throttle", "steering")
-    spec = robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2, **given}, {})
+    spec = robot_from(
+        {"kind": "ackermann_throttle", "footprint_radius": 0.2, **given}, {}
+    )
     powers = np.eye(5, dtype=np.int64)[[0, 2, 3]]
     rows = np.zeros((6, 3))
     rows[0, 0], rows[3, [0, 2]] = 1.0, (-2.0, 6.0)
@@ -211,7 +227,15 @@ def by_throttle(steering: float, **given) -> tuple[RobotSpec, TaylorModel]:
     low = np.array([-1.0, -0.01, -0.01, -0.5, steering])
     high = np.array([2.0, 0.01, 0.01, 0.5, steering])
     model = TaylorModel(
-        names, spec.dof_names, spec.dof_units, powers, rows, 0.02, low, high, bounded=True
+        names,
+        spec.dof_names,
+        spec.dof_units,
+        powers,
+        rows,
+        0.02,
+        low,
+        high,
+        bounded=True,
     )
     return spec, model
 
@@ -225,7 +249,9 @@ def test_what_is_assumed_of_a_car_by_its_motion_turns_it_by_its_speed(steering):
     curvature = spec.parameters["greatest_steering"] / spec.parameters["wheelbase"]
     assert turned == pytest.approx(1.5 if steering else curvature, rel=1e-6)
     assert term(completed, "d_wz", "steering") == 0.0
-    assert all(dof == "d_wz" for dof, _ in completed.assumed)  # no twist, which is by definition
+    assert all(
+        dof == "d_wz" for dof, _ in completed.assumed
+    )  # no twist, which is by definition
     pose, state = np.zeros(3), np.array([1.0, 0.0, 0.0])
     for _ in range(100):
         state[0] = 1.0

@@ -33,8 +33,15 @@ LAG_S = 0.1
 GAIN = np.array([0.9, 0.8])  # of forward and turn
 
 
-def driven(source: str, forward: float, turn: float, seconds: float = 24.0, seed: int = 0,
-           gain: np.ndarray = GAIN, clock_ahead: float = 0.0) -> Recording:  # fmt: skip
+def driven(
+    source: str,
+    forward: float,
+    turn: float,
+    seconds: float = 24.0,
+    seed: int = 0,
+    gain: np.ndarray = GAIN,
+    clock_ahead: float = 0.0,
+) -> Recording:
     """A differential robot that lags behind commands up to these [m/s, rad/s], seen at 50 Hz."""
     rng = np.random.default_rng(seed)
     count = round(seconds / STEP)
@@ -43,12 +50,16 @@ def driven(source: str, forward: float, turn: float, seconds: float = 24.0, seed
     command = held * np.array([forward, turn])
     twist, pose = np.zeros((count, 2)), np.zeros((count, 3))
     for k in range(1, count):
-        twist[k] = twist[k - 1] + (STEP / LAG_S) * (gain * command[k - 1] - twist[k - 1])
+        twist[k] = twist[k - 1] + (STEP / LAG_S) * (
+            gain * command[k - 1] - twist[k - 1]
+        )
         arc = np.array([twist[k, 0], 0.0, twist[k, 1]]) * STEP
         pose[k] = geometry.compose(pose[k - 1], geometry.exp(arc))
     pose += rng.normal(0.0, [0.001, 0.001, 0.001], pose.shape)
     clock = "mocap" if clock_ahead else "robot"
-    return Recording(Stream(t, command), Stream(t + clock_ahead, pose, clock), source=source)
+    return Recording(
+        Stream(t, command), Stream(t + clock_ahead, pose, clock), source=source
+    )
 
 
 STRAIGHT = driven("straight.csv", 0.8, 0.0)
@@ -70,7 +81,9 @@ def test_no_prediction_window_crosses_from_one_drive_to_another():
     joined = join_recordings([STRAIGHT, TURNING], ROBOT)
     drive = Drive(joined, ROBOT)
     for horizon in (0.5, 2.0, 5.0):
-        chosen = open_loop.windows(drive, Calibration(), 0.0, drive.duration_s, horizon, 0.1)
+        chosen = open_loop.windows(
+            drive, Calibration(), 0.0, drive.duration_s, horizon, 0.1
+        )
         assert len(chosen.start_t) > 50
         ends = joined.episode_at(chosen.end_t)
         assert np.array_equal(joined.episode_at(chosen.start_t), ends)
@@ -80,7 +93,9 @@ def test_no_prediction_window_crosses_from_one_drive_to_another():
 def test_no_window_of_the_fit_crosses_either(together):
     _, identified = together
     samples, recording = identified.samples, identified.recording
-    problem = Shooting(samples, lambda _: samples.x, lambda model, _: model, lambda *_: np.ones(3))
+    problem = Shooting(
+        samples, lambda _: samples.x, lambda model, _: model, lambda *_: np.ones(3)
+    )
     first, steps = problem.starts()
     at = recording.episode_at(samples.t)
     assert set(at) == {0, 1, 2, 3}
@@ -92,7 +107,9 @@ def test_no_window_of_the_fit_crosses_either(together):
 def test_not_even_episodes_without_a_gap_are_crossed():
     whole = driven("whole.csv", 0.8, 1.5)
     joined = join_recordings([STRAIGHT, TURNING], ROBOT)
-    start, end = (replace(joined.episodes[0], start_s=a, end_s=b) for a, b in ((0, 12), (12, 24)))
+    start, end = (
+        replace(joined.episodes[0], start_s=a, end_s=b) for a, b in ((0, 12), (12, 24))
+    )
     cut = replace(whole, episodes=(start, end))
     chosen = open_loop.windows(Drive(cut, ROBOT), Calibration(), 0.0, 24.0, 2.0, 0.1)
     crossing = (chosen.start_t < 12.0) & (chosen.end_t > 12.0)
@@ -120,10 +137,13 @@ def test_clocks_of_their_own_are_aligned_drive_by_drive():
     ]
     joined = join_recordings(drives, ROBOT)
     said = " ".join(joined.repairs)
-    aligned = re.findall(r"(\d).csv: the clock of its pose was aligned by (-?[\d.]+) s", said)
+    aligned = re.findall(
+        r"(\d).csv: the clock of its pose was aligned by (-?[\d.]+) s", said
+    )
     # Each is sought by the commands, and so includes the same lag of the robot.
     lags = [
-        float(offset) - sought for (_, offset), sought in zip(aligned, (-3.0, 40.0), strict=True)
+        float(offset) - sought
+        for (_, offset), sought in zip(aligned, (-3.0, 40.0), strict=True)
     ]
     assert np.abs(lags).max() < 0.3
     assert lags[0] == pytest.approx(lags[1], abs=0.03)
@@ -139,11 +159,15 @@ def test_a_recording_that_alone_is_off_is_named():
     assert len(named) == 1
     assert named[0].startswith("slippery.csv alone is off: its predictions end")
     assert named[0] in conclude(found).doubts
-    assert "slippery.csv alone is off" in " ".join(fit_report("three", ROBOT, found).split())
+    assert "slippery.csv alone is off" in " ".join(
+        fit_report("three", ROBOT, found).split()
+    )
 
 
 def test_alike_recordings_are_listed_and_none_is_blamed():
     good = [driven(f"good{k}.csv", 0.8, 1.5, seed=k) for k in range(2)]
     found = identify(join_recordings(good, ROBOT), ROBOT)
     assert not [note for note in found.notes if isinstance(note, Alone)]
-    assert any(note.startswith("By recording, errors after 5 s") for note in found.notes)
+    assert any(
+        note.startswith("By recording, errors after 5 s") for note in found.notes
+    )

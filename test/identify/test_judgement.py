@@ -35,7 +35,9 @@ def found(recording):
 def test_all_horizons_that_fit_are_judged_beside_both_yardsticks(found):
     assert tuple(at.horizon_s for at in found.judgement) == HORIZONS_S
     after_5_s = found.judgement[3]
-    assert after_5_s.model.position_m == pytest.approx(found.held_out.mean_position_error_m)
+    assert after_5_s.model.position_m == pytest.approx(
+        found.held_out.mean_position_error_m
+    )
     assert after_5_s.path_m == pytest.approx(found.held_out.mean_path_m)
     assert after_5_s.textbook.position_m < 0.02 * after_5_s.path_m
     assert after_5_s.kept_twist.position_m > 0.3 * after_5_s.path_m
@@ -65,7 +67,9 @@ def test_the_judgement_is_kept_in_the_file_of_the_model(found):
 def test_a_model_that_does_not_beat_a_yardstick_says_so_on_top(found, yardstick, named):
     at = found.judgement[3]
     poor = EndErrors(0.05 * at.path_m, 0.1)  # too far from the yardstick for a tie
-    at = replace(at, model=poor, **({"textbook": poor} | {yardstick: EndErrors(1e-3, 0.1)}))
+    at = replace(
+        at, model=poor, **({"textbook": poor} | {yardstick: EndErrors(1e-3, 0.1)})
+    )
     (sentence,) = shortfall((at,))
     assert sentence.startswith(f"The model does not beat {named}: on unseen data")
     assert f"those of {named} 0.001 m" in sentence
@@ -90,11 +94,15 @@ def test_the_model_is_of_all_data_and_the_judgement_of_its_trial(found):
     assert not np.array_equal(found.model.coefficients, trial.model.coefficients)
     assert trial.held_out is found.held_out
     assert found.model.quality is trial.model.quality
-    assert any("fitted to all 40.0 s once it had been judged" in note for note in found.notes)
+    assert any(
+        "fitted to all 40.0 s once it had been judged" in note for note in found.notes
+    )
 
 
 @pytest.mark.slow
-def test_a_refit_that_knows_the_first_part_worse_is_not_believed(recording, monkeypatch):
+def test_a_refit_that_knows_the_first_part_worse_is_not_believed(
+    recording, monkeypatch
+):
     monkeypatch.setattr(verdict, "WORSE", 0.0)
     found = identify(recording, load_robot("differential"))
     assert found.model is found.trial.model

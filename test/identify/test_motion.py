@@ -21,7 +21,7 @@ from nics_drl_bridge.identify.motion import (
     samples_of,
     surrogate,
     with_motion,
-)  # fmt: skip
+)
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import load_robot, robot_from
@@ -38,22 +38,34 @@ def drive() -> Drive:
 def test_a_twist_that_was_not_measured_is_taken_from_the_pose(drive, car):
     assert by_motion(drive.spec, drive.recording)
     assert not by_motion(car, drive.recording)
-    measured = Stream(drive.recording.pose.t, np.zeros((len(drive.recording.pose.t), 3)))
+    measured = Stream(
+        drive.recording.pose.t, np.zeros((len(drive.recording.pose.t), 3))
+    )
     assert not by_motion(drive.spec, replace(drive.recording, state=measured))
 
 
 def test_noisier_poses_are_smoothed_over_longer(drive):
     assert half_width(drive) == WIDTHS_S[0]
-    noise = np.random.default_rng(0).normal(0.0, 0.01, drive.recording.pose.values.shape)
+    noise = np.random.default_rng(0).normal(
+        0.0, 0.01, drive.recording.pose.values.shape
+    )
     pose = replace(drive.recording.pose, values=drive.recording.pose.values + noise)
-    assert half_width(Drive(replace(drive.recording, pose=pose), drive.spec)) > WIDTHS_S[0]
+    assert (
+        half_width(Drive(replace(drive.recording, pose=pose), drive.spec)) > WIDTHS_S[0]
+    )
 
 
-@pytest.mark.parametrize(("every", "step"), [(0.01, 0.01), (0.0071, 0.01), (0.04, 0.02)])
-def test_the_step_divides_the_control_period_whatever_the_poses_rate(drive, every, step):
+@pytest.mark.parametrize(
+    ("every", "step"), [(0.01, 0.01), (0.0071, 0.01), (0.04, 0.02)]
+)
+def test_the_step_divides_the_control_period_whatever_the_poses_rate(
+    drive, every, step
+):
     pose = drive.recording.pose
     other = replace(pose, t=every * np.arange(len(pose.t)))
-    grid = grid_of(Drive(replace(drive.recording, pose=other), drive.spec), Calibration(), 0.1)
+    grid = grid_of(
+        Drive(replace(drive.recording, pose=other), drive.spec), Calibration(), 0.1
+    )
     assert np.diff(grid) == pytest.approx(step)
 
 
@@ -83,7 +95,9 @@ def test_a_surrogate_has_a_state_for_each_command(drive):
 def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
     pose, rng = drive.recording.pose, np.random.default_rng(3)
     lost = rng.random(len(pose.t)) < 0.2
-    values = pose.values + np.where(lost[:, None], rng.normal(0.0, 0.05, pose.values.shape), 0.0)
+    values = pose.values + np.where(
+        lost[:, None], rng.normal(0.0, 0.05, pose.values.shape), 0.0
+    )
     sigma = np.where(lost, 0.05, 0.0005)[:, None] * np.ones(3)
     grid, off = grid_of(drive, MOUNTED, 0.1), []
     truth = known_state(with_motion(drive, MOUNTED, grid, 0.07)).values
@@ -108,7 +122,10 @@ def test_commands_are_as_smooth_as_the_twist_so_that_they_begin_and_end_together
 def test_poses_ten_times_a_second_do_not_hide_when_a_robot_got_its_commands():
     spec = robot_from({"kind": "differential", "footprint_radius": 0.15})
     drive = record(load_robot("differential"), np.random.default_rng(2), 30.0, dt=0.02)
-    seen = [replace(s, t=s.t[::5], values=s.values[::5]) for s in (drive.command, drive.pose)]
+    seen = [
+        replace(s, t=s.t[::5], values=s.values[::5])
+        for s in (drive.command, drive.pose)
+    ]
     found = identify(Recording(*seen, source="ten a second"), spec)
     assert found.calibration.command_latency_s == pytest.approx(0.0, abs=0.03)
     ends = found.judgement[-1]

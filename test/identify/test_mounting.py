@@ -25,7 +25,9 @@ def test_the_spread_is_the_standard_error_of_a_mean(mecanum):
     driven = Drive(drive(mecanum, duration=40.0), mecanum)
     twists = driven.twists
     rng = np.random.default_rng(0)
-    noisy = TwistIntervals(twists.start, twists.end, rng.normal(size=twists.twist.shape))
+    noisy = TwistIntervals(
+        twists.start, twists.end, rng.normal(size=twists.twist.shape)
+    )
     expected = 1.0 / np.sqrt(len(noisy.start))
     found = jackknifed(driven, noisy, 0.0, mean_of_twists)
     assert found is not None
@@ -37,8 +39,12 @@ def test_the_spread_is_the_standard_error_of_a_mean(mecanum):
 def test_what_lasts_for_a_block_widens_the_uncertainty(mecanum):
     driven = Drive(drive(mecanum, duration=40.0), mecanum)
     twists = driven.twists
-    slip = np.repeat(np.random.default_rng(0).normal(size=8), -(-len(twists.start) // 8))
-    alike = TwistIntervals(twists.start, twists.end, np.tile(slip[: len(twists.start), None], 3))
+    slip = np.repeat(
+        np.random.default_rng(0).normal(size=8), -(-len(twists.start) // 8)
+    )
+    alike = TwistIntervals(
+        twists.start, twists.end, np.tile(slip[: len(twists.start), None], 3)
+    )
     found = jackknifed(driven, alike, 0.0, mean_of_twists)
     assert found is not None
     assert found.rotation_sigma == pytest.approx(slip.std() / np.sqrt(7.0), rel=0.3)
@@ -75,7 +81,9 @@ def test_the_lever_of_a_car_that_turned_little_both_ways_is_found_with_its_error
         motion, states = seen_by(car, np.repeat(bends, 10), (0.08, -0.03), seed)
         plain = mounting_without_lateral_motion(motion, states[:, 0])
         assert plain is not None
-        assert np.isnan(plain.lever_sigma[0])  # its noise is too large for the plain one
+        assert np.isnan(
+            plain.lever_sigma[0]
+        )  # its noise is too large for the plain one
         found = by_instruments(motion, states, states[:, 0], car)
         assert found is not None
         assert (found.lever_sigma < 0.008).all()
@@ -91,7 +99,9 @@ def test_the_lever_of_a_car_that_turned_little_both_ways_is_found_with_its_error
 
 @pytest.mark.parametrize("spread", [0.0, 0.005])
 def test_a_path_of_one_curvature_tells_no_lever(car, spread):
-    bends = 0.8 + spread * np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, 90), 10)
+    bends = 0.8 + spread * np.repeat(
+        np.random.default_rng(0).uniform(-1.0, 1.0, 90), 10
+    )
     motion, states = seen_by(car, bends, (0.08, 0.0))
     assert by_instruments(motion, states, states[:, 0], car) is None
 
@@ -110,7 +120,9 @@ def test_the_noise_of_a_heading_is_no_turning(bend, ways):
     rng, n = np.random.default_rng(0), np.arange(900)
     heading_noise = 0.005
     heading = heading_noise * rng.normal(size=901)
-    twist = np.stack([0.5 + 0.0 * n, 0.0 * n, 0.5 * bend + np.diff(heading) / 0.1], axis=1)
+    twist = np.stack(
+        [0.5 + 0.0 * n, 0.0 * n, 0.5 * bend + np.diff(heading) / 0.1], axis=1
+    )
     motion = TwistIntervals(0.1 * n, 0.1 * n + 0.1, twist)
     found = mounting_without_lateral_motion(motion, np.ones(900), heading_noise)
     assert found is not None

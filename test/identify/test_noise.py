@@ -62,11 +62,19 @@ def driven(model, seconds: float, seed: int) -> Recording:
     simulator, dt = FastSimulator(fast, field(400.0)), fast.control_period
     rng, spec = np.random.default_rng(seed), model.robot
     simulator.reset([seed], starts=np.zeros((1, 1, 3)))
-    rows: dict[str, list[np.ndarray]] = {"pose": [], "state": [], "command": [], "odometry": []}
+    rows: dict[str, list[np.ndarray]] = {
+        "pose": [],
+        "state": [],
+        "command": [],
+        "odometry": [],
+    }
     for n in range(round(seconds / dt)):
         if n % round(0.5 / dt) == 0:
             command = rng.uniform(spec.command_low, spec.command_high)
-        for name, values in (("pose", simulator.data.pose), ("state", simulator.data.state)):
+        for name, values in (
+            ("pose", simulator.data.pose),
+            ("state", simulator.data.state),
+        ):
             rows[name].append(values[0, 0].copy())
         rows["command"].append(command)
         simulator.step(command[None, None])
@@ -78,23 +86,31 @@ def driven(model, seconds: float, seed: int) -> Recording:
 
 
 def levels(noise: Noise) -> np.ndarray:
-    return np.array([*noise.odometry, noise.position_drift.std, noise.heading_drift.std])
+    return np.array(
+        [*noise.odometry, noise.position_drift.std, noise.heading_drift.std]
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
-def test_a_drive_of_known_noise_gives_it_back_and_so_does_its_simulator(differential, seed):
+def test_a_drive_of_known_noise_gives_it_back_and_so_does_its_simulator(
+    differential, seed
+):
     found = identify(drifting(differential, seed), differential)
     known = np.array([*ODOMETRY, *DRIFT])
     assert levels(found.noise) == pytest.approx(known, rel=TOLERANCE)
-    model = replace(builtin_model("differential"), kinematics=found.model, noise=found.noise)
+    model = replace(
+        builtin_model("differential"), kinematics=found.model, noise=found.noise
+    )
     again = identify(driven(model, 150.0, seed), differential)
     assert levels(again.noise) == pytest.approx(levels(found.noise), rel=TOLERANCE)
 
 
 @pytest.mark.campaign
 def test_the_uncertainty_of_a_level_covers_its_error(differential):
-    found = [identify(drifting(differential, seed, 90.0), differential) for seed in range(3)]
+    found = [
+        identify(drifting(differential, seed, 90.0), differential) for seed in range(3)
+    ]
     for name, known in (("position_drift", DRIFT[0]), ("heading_drift", DRIFT[1])):
         found_levels = [getattr(f.noise, name) for f in found]
         away = [(level.std - known) / level.uncertainty for level in found_levels]
@@ -104,7 +120,9 @@ def test_the_uncertainty_of_a_level_covers_its_error(differential):
 
 @pytest.mark.slow
 def test_noise_of_the_pose_is_no_drift_of_the_robot(differential):
-    found = identify(drive(differential, duration=90.0, noise=(0.005, 0.01)), differential).noise
+    found = identify(
+        drive(differential, duration=90.0, noise=(0.005, 0.01)), differential
+    ).noise
     assert found.pose_position.std == pytest.approx(0.005, rel=TOLERANCE)
     assert found.pose_heading.std == pytest.approx(0.01, rel=TOLERANCE)
     assert found.position_drift.std < 0.003
@@ -119,7 +137,9 @@ def test_the_drift_of_a_model_that_runs_away_is_assumed(car):
     coefficients[3:] *= -20.0
     unstable = replace(found.model, coefficients=coefficients)
     with np.errstate(all="ignore"):
-        noise = motion_noise(Noise(), found.drive, found.calibration, unstable, found.samples)
+        noise = motion_noise(
+            Noise(), found.drive, found.calibration, unstable, found.samples
+        )
     assert found.noise.position_drift.measured
     assert noise.position_drift == Noise().position_drift
     assert not noise.heading_drift.measured
@@ -182,7 +202,8 @@ def test_covariances_leave_the_drift_that_was_measured():
     pose = recording.pose
     told = replace(pose, sigma=np.tile([0.5, 0.5, 0.26], (len(pose.t), 1)))
     plain, with_claims = (
-        identify(each, spec).noise for each in (recording, replace(recording, pose=told))
+        identify(each, spec).noise
+        for each in (recording, replace(recording, pose=told))
     )
     assert with_claims.pose == (0.5, 0.5, 0.26)
     assert plain.position_drift.measured

@@ -26,7 +26,10 @@ STEP = 1e-6
 def courses(request):
     """Model, drive, windows and their course; of some a step ends within the last window."""
     spec = builtin_model("mecanum").robot
-    model, driven = builtin_model("mecanum").kinematics, Drive(drive(spec, duration=20.0), spec)
+    model, driven = (
+        builtin_model("mecanum").kinematics,
+        Drive(drive(spec, duration=20.0), spec),
+    )
     chosen = windows(driven, MOUNTING, 0.0, 20.0, 1.0, 1.0)
     chosen = replace(chosen, end_t=chosen.start_t + request.param * 2.0)
     return model, driven, chosen, course_of(model, MOUNTING, driven, chosen)
@@ -54,8 +57,12 @@ def test_the_derivatives_are_those_of_finite_differences(courses):
             coefficients[d, k] += sign * STEP
             changed = replace(model, coefficients=coefficients)
             sides.append(
-                tracked_ends(course.chosen, MOUNTING, relative_ends(course, changed, free)[0])
+                tracked_ends(
+                    course.chosen, MOUNTING, relative_ends(course, changed, free)[0]
+                )
             )
         difference = sides[1] - sides[0]
         difference[:, 2] = (difference[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-        assert slope[:, :, p] == pytest.approx(difference / (2.0 * STEP), rel=1e-3, abs=2e-3)
+        assert slope[:, :, p] == pytest.approx(
+            difference / (2.0 * STEP), rel=1e-3, abs=2e-3
+        )

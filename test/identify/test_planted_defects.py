@@ -70,21 +70,36 @@ def without_state(defect: planted.Defect) -> planted.Defect:
 SOUND = set[str]()
 MEASURED: dict[str, tuple[planted.Defect, set[str]]] = {
     "nothing": (same, SOUND),
-    "heading counts clockwise": (planted.scaled_pose(heading=-1.0), {"an axis is reversed"}),
+    "heading counts clockwise": (
+        planted.scaled_pose(heading=-1.0),
+        {"an axis is reversed"},
+    ),
     "x points backwards": (planted.scaled_pose(x=-1.0), {"an axis is reversed"}),
     "x and y exchanged": (planted.swapped_axes, {"an axis is reversed"}),
     "pose in millimetres": (planted.scaled_pose(x=1e3, y=1e3), {"a unit is wrong"}),
     "pose in feet": (planted.scaled_pose(x=3.28, y=3.28), {"a scale is wrong"}),
-    "heading in degrees": (planted.scaled_pose(heading=180.0 / np.pi), {"a unit is wrong"}),
-    "turn in degrees": (planted.scaled_command(steering=180.0 / np.pi), {"a unit is wrong"}),
+    "heading in degrees": (
+        planted.scaled_pose(heading=180.0 / np.pi),
+        {"a unit is wrong"},
+    ),
+    "turn in degrees": (
+        planted.scaled_command(steering=180.0 / np.pi),
+        {"a unit is wrong"},
+    ),
     "speed at a third": (planted.scaled_command(speed=0.3), {"a scale is wrong"}),
     "turn to the other side": (
         planted.scaled_command(steering=-1.0),
         {"the turn has the wrong sign"},
     ),
-    "speed backwards": (planted.scaled_command(speed=-1.0), {"the speed has the wrong sign"}),
+    "speed backwards": (
+        planted.scaled_command(speed=-1.0),
+        {"the speed has the wrong sign"},
+    ),
     "commands exchanged": (planted.swapped_commands, {"commands are swapped"}),
-    "left encoder backwards": (planted.scaled_wheels(left=-1.0), {"an encoder counts backwards"}),
+    "left encoder backwards": (
+        planted.scaled_wheels(left=-1.0),
+        {"an encoder counts backwards"},
+    ),
     "both encoders backwards": (
         planted.scaled_wheels(left=-1.0, right=-1.0),
         {"an encoder counts backwards"},
@@ -130,7 +145,10 @@ def test_a_defect_is_named_where_only_commands_and_poses_are_known(name):
 DRIVES: dict[str, tuple[Callable[[], Recording], set[str]]] = {
     "15 values": (lambda: planted.wheeled_drive(levels=15), SOUND),
     "2 values": (lambda: planted.wheeled_drive(levels=2), {"two values"}),
-    "a short drive": (lambda: planted.wheeled_drive(duration=12.0), {"the drive is too short"}),
+    "a short drive": (
+        lambda: planted.wheeled_drive(duration=12.0),
+        {"the drive is too short"},
+    ),
     "a long drive": (lambda: planted.wheeled_drive(duration=267.0), SOUND),
 }
 

@@ -25,14 +25,18 @@ def found(real_drives, car):
 
 
 @pytest.mark.slow
-def test_its_recordings_show_bursts_offset_rotation_and_swapped_wheels(real_drives, car):
+def test_its_recordings_show_bursts_offset_rotation_and_swapped_wheels(
+    real_drives, car
+):
     calibration = calibrate(read_recording(real_drives / "random_drive_45s"), car)
     assert calibration.burst_period_s == pytest.approx(0.1, abs=0.005)
     assert 0.15 < calibration.clock_offset_s < 0.35
     assert 0.03 < calibration.command_latency_s < 0.15
     assert calibration.rotation_rad == pytest.approx(-1.48, abs=0.01)
     assert calibration.wheels_swapped is True
-    assert any("lies on the robot could not be learnt" in note for note in calibration.notes)
+    assert any(
+        "lies on the robot could not be learnt" in note for note in calibration.notes
+    )
     assert any("steering_command never changed" in note for note in calibration.notes)
 
 
@@ -93,8 +97,12 @@ def test_the_benchmark_prints_one_json_object(real_drives):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ahead", [*(pytest.param(t, marks=CAMPAIGN) for t in (7.0, -7.0)), 1.7e9])
-def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(real_drives, car, ahead):
+@pytest.mark.parametrize(
+    "ahead", [*(pytest.param(t, marks=CAMPAIGN) for t in (7.0, -7.0)), 1.7e9]
+)
+def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(
+    real_drives, car, ahead
+):
     recording = read_recording(real_drives / "random_drive_45s")
     pose = replace(recording.pose, t=recording.pose.t + ahead)
     held_out = identify(replace(recording, pose=pose), car).held_out

@@ -15,11 +15,21 @@ from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.repair import check_axes, check_commands, check_units, repaired
+from nics_drl_bridge.identify.repair import (
+    check_axes,
+    check_commands,
+    check_units,
+    repaired,
+)
 from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.readers import robot_and_drive
-from nics_drl_bridge.recording.recording import Recording, Samples, Stream, samples_on_one_clock
+from nics_drl_bridge.recording.recording import (
+    Recording,
+    Samples,
+    Stream,
+    samples_on_one_clock,
+)
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 
@@ -54,7 +64,9 @@ def same_motion(a, b, share: float) -> None:
     """The rates of two models differ by less than a share of their size, at clean samples."""
     rates, others = a.model.rates(b.samples.x), b.model.rates(b.samples.x)
     apart = np.sqrt(((rates - others) ** 2).mean(axis=0))
-    assert (apart <= share * np.maximum(np.sqrt((others**2).mean(axis=0)), 1e-2)).all(), apart
+    assert (
+        apart <= share * np.maximum(np.sqrt((others**2).mean(axis=0)), 1e-2)
+    ).all(), apart
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -79,9 +91,13 @@ def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
     found, (note,) = repaired(jumped)
     assert "jumps at 12.01 s (" in note
     assert "the drive is split there" in note
-    moved, true = (geometry.between(v[:-1], v[1:]) for v in (found.recording.pose.values, values))
+    moved, true = (
+        geometry.between(v[:-1], v[1:]) for v in (found.recording.pose.values, values)
+    )
     k = int(np.argmax(late)) - 1
-    assert np.delete(moved, k, axis=0) == pytest.approx(np.delete(true, k, axis=0), abs=1e-9)
+    assert np.delete(moved, k, axis=0) == pytest.approx(
+        np.delete(true, k, axis=0), abs=1e-9
+    )
     assert np.abs(moved[k, :2]).max() < 0.03
 
 
@@ -96,17 +112,24 @@ def test_steering_in_degrees_is_refused_though_the_limits_are_those_recorded():
     command = replace(plain.command, values=np.stack([0.0 * angles, angles], axis=1))
     limits = {"speed_command": (-1.0, 1.0), "steering_command": (-64.0, 64.0)}
     spec = robot_from({"kind": "tricycle", "footprint_radius": 0.6}, limits)
-    with pytest.raises(RecordingError, match=r"write `steering_command: {from: ..., unit: deg}`"):
+    with pytest.raises(
+        RecordingError, match=r"write `steering_command: {from: ..., unit: deg}`"
+    ):
         check_units(Drive(replace(plain, command=command), spec))
 
 
 @pytest.mark.parametrize("name", ["ackermann", "differential"])
 @pytest.mark.parametrize("ahead", [0.0, 0.4])
 def test_a_swapped_speed_and_turn_is_refused_by_what_they_move(name, ahead):
-    plain, spec = drive(load_robot(name), pose_clock_ahead=ahead, rotation=0.4), load_robot(name)
+    plain, spec = (
+        drive(load_robot(name), pose_clock_ahead=ahead, rotation=0.4),
+        load_robot(name),
+    )
     assert check_commands(Drive(plain, spec)) == ()
     command = replace(plain.command, values=plain.command.values[:, ::-1])
-    with pytest.raises(RecordingError, match="_command are swapped: each moves the robot as"):
+    with pytest.raises(
+        RecordingError, match="_command are swapped: each moves the robot as"
+    ):
         check_commands(Drive(replace(plain, command=command), spec))
 
 
@@ -120,7 +143,9 @@ def test_swapped_commands_of_a_robot_that_moves_sideways_are_refused(pair, rotat
     order[list(pair)] = pair[::-1]
     command = replace(plain.command, values=plain.command.values[:, order])
     one, other = (spec.command[k].name for k in pair)
-    with pytest.raises(RecordingError, match=f"{one} and {other} are swapped: each moves"):
+    with pytest.raises(
+        RecordingError, match=f"{one} and {other} are swapped: each moves"
+    ):
         check_commands(Drive(replace(plain, command=command), spec))
 
 
@@ -133,7 +158,9 @@ def test_a_reversed_command_of_a_robot_that_moves_sideways_is_told(place, rotati
     turned = Drive(replace(plain, command=replace(plain.command, values=values)), spec)
     (note,) = check_commands(turned)
     assert isinstance(note, Mistake)
-    assert note.startswith("The robot moves right where left_command is positive, or back where")
+    assert note.startswith(
+        "The robot moves right where left_command is positive, or back where"
+    )
     assert check_commands(Drive(plain, spec)) == ()
 
 
@@ -146,12 +173,20 @@ def test_poses_of_a_mount_that_is_turned_by_90_degrees_are_not_swapped_commands(
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_turn_that_moves_the_pose_sensor_aside_is_no_reversed_command(seed):
     random, t = np.random.default_rng(seed), np.arange(0.0, 60.0, 0.02)
-    asked = np.repeat(random.uniform(-1.0, 1.0, (len(t) // 50, 3)), 50, axis=0) * [0.5, 0.05, 1.0]
+    asked = np.repeat(random.uniform(-1.0, 1.0, (len(t) // 50, 3)), 50, axis=0) * [
+        0.5,
+        0.05,
+        1.0,
+    ]
     asked[:, 1] += 0.15 * asked[:, 2]
     heading = np.cumsum(asked[:, 2]) * 0.02
     place = np.cumsum(geometry.rotate(asked[:, :2] * 0.02, heading), axis=0)
-    pose = geometry.compose(np.column_stack([place, heading]), np.array([-0.4, 0.0, 0.0]))
-    made = Recording(Stream(t, asked, "robot"), Stream(t, pose, "robot"), source="drive")
+    pose = geometry.compose(
+        np.column_stack([place, heading]), np.array([-0.4, 0.0, 0.0])
+    )
+    made = Recording(
+        Stream(t, asked, "robot"), Stream(t, pose, "robot"), source="drive"
+    )
     assert check_commands(Drive(made, load_robot("mecanum"))) == ()
 
 
@@ -167,7 +202,9 @@ def test_a_reversed_heading_is_refused_though_noise_hides_short_ways(differentia
     made = Recording(Stream(t, np.stack([speed, turn], axis=1)), Stream(t, values))
     check_axes(Drive(made, differential))
     other = replace(made, pose=Stream(t, values * [1.0, 1.0, -1.0]))
-    with pytest.raises(RecordingError, match=r"write `heading: {from: ..., scale: -1}`"):
+    with pytest.raises(
+        RecordingError, match=r"write `heading: {from: ..., scale: -1}`"
+    ):
         check_axes(Drive(other, differential))
 
 
@@ -191,10 +228,14 @@ def test_the_speed_and_steering_of_a_real_car_are_refused_if_they_are_swapped(na
     mapping = load_mapping(ROOT / "examples" / "recordings" / "f110_folder.yaml")
     spec, plain = robot_and_drive(JUMPING.parent / name, None, TopicRoles(), mapping)
     assert check_commands(Drive(plain, spec)) == ()
-    columns = dict(zip(mapping.command, reversed(mapping.command.values()), strict=True))
+    columns = dict(
+        zip(mapping.command, reversed(mapping.command.values()), strict=True)
+    )
     swapped = mapping.model_copy(update={"command": columns})
     spec, drive = robot_and_drive(JUMPING.parent / name, None, TopicRoles(), swapped)
-    with pytest.raises(RecordingError, match="the column of `steering_command:` behind `speed_"):
+    with pytest.raises(
+        RecordingError, match="the column of `steering_command:` behind `speed_"
+    ):
         identify(drive, spec)
 
 
@@ -209,7 +250,9 @@ def test_a_throttle_and_a_steering_that_are_swapped_are_refused_beyond_their_lim
         identify(replace(plain, command=swapped), spec)
 
 
-@pytest.mark.parametrize(("column", "unit", "times"), [(0, "km/h", 3.6), (1, "deg/s", 57.3)])
+@pytest.mark.parametrize(
+    ("column", "unit", "times"), [(0, "km/h", 3.6), (1, "deg/s", 57.3)]
+)
 def test_a_speed_that_another_unit_explains_is_told(differential, column, unit, times):
     plain = drive(differential, latency=0.2)
     values = plain.command.values * np.where(np.arange(2) == column, times, 1.0)
@@ -234,7 +277,9 @@ def test_wheels_in_rpm_are_told_if_their_radius_is_known():
     known, unknown = robot_from(wheels | {"parameters": parameters}), robot_from(wheels)
     plain = drive(known, measured_state=False)
     assert check_commands(Drive(plain, known)) == ()
-    other = replace(plain, command=replace(plain.command, values=plain.command.values * 9.55))
+    other = replace(
+        plain, command=replace(plain.command, values=plain.command.values * 9.55)
+    )
     assert "write `unit: rpm` beside `from:`" in check_commands(Drive(other, known))[0]
     assert check_commands(Drive(other, unknown)) == ()
 
@@ -255,7 +300,10 @@ def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
     assert any("jump away" in note for note in faulty.notes)
     same_motion(faulty, clean, 0.02)
-    assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.01
+    assert (
+        faulty.held_out.mean_position_error_m
+        < clean.held_out.mean_position_error_m + 0.01
+    )
 
 
 @pytest.mark.slow
@@ -265,7 +313,10 @@ def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     plain = drive(spec, noise=(5e-4, 1e-3), rotation=0.3)
     clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
     same_motion(faulty, clean, 0.05)
-    assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.02
+    assert (
+        faulty.held_out.mean_position_error_m
+        < clean.held_out.mean_position_error_m + 0.02
+    )
 
 
 @pytest.mark.slow
@@ -327,7 +378,9 @@ def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
     terms, others = faulty.model.named.terms, clean.model.named.terms
     for dof in ("vx", "d_speed", "d_steering"):
         assert terms[dof] == pytest.approx(others[dof], rel=1e-5)
-    assert terms["wz"]["speed*steering"] == pytest.approx(others["wz"]["speed*steering"], rel=0.05)
+    assert terms["wz"]["speed*steering"] == pytest.approx(
+        others["wz"]["speed*steering"], rel=0.05
+    )
     assert 0.02 < faulty.outliers[0] < 0.12
     assert clean.outliers == pytest.approx(0.0)
 

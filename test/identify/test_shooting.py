@@ -22,14 +22,16 @@ def car() -> TaylorModel:
     """vx' = 4 throttle - 2 vx, wz' = 8 steering - 5 wz."""
     spec, _ = slipping_car(duration=1.0)
     names = ("vx", "wz", "throttle", "steering")
-    powers = np.array([[n == name for n in spec.variable_names] for name in names], dtype=np.int64)
+    powers = np.array(
+        [[n == name for n in spec.variable_names] for name in names], dtype=np.int64
+    )
     rows = np.zeros((6, 4))
     rows[0, 0] = rows[2, 1] = 1.0
     rows[3], rows[5] = [-2.0, 0.0, 4.0, 0.0], [0.0, -5.0, 0.0, 8.0]
     box = np.zeros(5)
     return TaylorModel(
         spec.variable_names, spec.dof_names, spec.dof_units, powers, rows, DT, box, box
-    )  # fmt: skip
+    )
 
 
 def equally(start, end):
@@ -50,7 +52,9 @@ def problem(car) -> Shooting:
 
     def commands(values):
         at = np.arange(STEPS + 1) - values[0] / DT
-        return np.stack([np.interp(at, np.arange(STEPS), column) for column in command.T], axis=1)
+        return np.stack(
+            [np.interp(at, np.arange(STEPS), column) for column in command.T], axis=1
+        )
 
     return Shooting(samples, commands, lambda model, values: model, equally)
 
@@ -59,20 +63,26 @@ DELAYS = Inputs(("latency",), *(np.array([value]) for value in (0.05, 0.05, 0.0,
 
 
 def test_coefficients_and_a_delay_are_found_together(car, problem):
-    off = replace(car, coefficients=car.coefficients * np.where(car.coefficients == 1.0, 1.0, 1.3))
+    off = replace(
+        car, coefficients=car.coefficients * np.where(car.coefficients == 1.0, 1.0, 1.3)
+    )
     free = (car.coefficients != 0.0) & (np.arange(6) >= 3)[:, None]
     found = fitted(problem, off, free, DELAYS)
-    assert found.model.coefficients[free] == pytest.approx(car.coefficients[free], rel=0.02)
+    assert found.model.coefficients[free] == pytest.approx(
+        car.coefficients[free], rel=0.02
+    )
     assert found.values[0] == pytest.approx(DELAY, abs=0.003)
     assert found.value_errors[0] < 0.01
 
 
 def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
     car = replace(
-        car, drag=np.array([0.3, 0.0, 0.1]), friction=np.array([0.2, 0.0, 0.0]),
+        car,
+        drag=np.array([0.3, 0.0, 0.1]),
+        friction=np.array([0.2, 0.0, 0.0]),
         limits=np.array([[-1.0, 1.5], [-np.inf, np.inf], [-6.0, 6.0]]),
         back_emf=np.outer([0.5, 0.0, 0.0], [1.0, 0.0]),
-    )  # fmt: skip
+    )
     first, steps = problem.starts()
     first, steps = first[::-1][:41], steps[::-1][:41]  # the last have shorter horizons
     free = (car.coefficients != 0.0) & (np.arange(6) >= 3)[:, None]
@@ -88,7 +98,9 @@ def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
 
 
 def test_a_value_between_equal_bounds_stays_and_has_no_error(car, problem):
-    known = replace(DELAYS, start=np.array([0.08]), low=np.array([0.08]), high=np.array([0.08]))
+    known = replace(
+        DELAYS, start=np.array([0.08]), low=np.array([0.08]), high=np.array([0.08])
+    )
     found = fitted(problem, car, car.coefficients == 4.0, known)
     assert found.values.tolist() == [0.08]
     assert np.isnan(found.value_errors).all()
@@ -128,11 +140,15 @@ def test_windows_between_doubtful_poses_bend_nothing(car, problem):
     free[0] = car.coefficients[0] != 0.0
 
     def doubtful(start, end):
-        return np.where((end > 0.5 * samples.t[-1])[..., None], 1e-6, equally(start, end))
+        return np.where(
+            (end > 0.5 * samples.t[-1])[..., None], 1e-6, equally(start, end)
+        )
 
     known = replace(problem, samples=replace(samples, q=wrong), fixed=np.array([DELAY]))
     off = [
-        np.abs(fitted(each, car, free, NOTHING_FREE).model.coefficients - car.coefficients).max()
+        np.abs(
+            fitted(each, car, free, NOTHING_FREE).model.coefficients - car.coefficients
+        ).max()
         for each in (known, replace(known, trust=doubtful))
     ]
     assert off[1] < 0.05 * off[0]

@@ -57,7 +57,9 @@ def disturbed(car) -> Drive:
     speed, steering = data["command"]
     held = {**steering, "min": -0.4 - 1e-9, "max": -0.4 + 1e-9}
     locked = RobotSpec.model_validate({**data, "command": [speed, held]})
-    recording = drive(locked, duration=21.0, latency=0.05, rotation=0.4, noise=(5e-4, 1e-3))
+    recording = drive(
+        locked, duration=21.0, latency=0.05, rotation=0.4, noise=(5e-4, 1e-3)
+    )
     command, pose = recording.command.values.copy(), recording.pose
     command[:, 1] = -0.4
     twice = np.sort(np.append(np.arange(len(pose.t)), 700))
@@ -91,11 +93,17 @@ def test_a_stage_adds_what_it_says_and_leaves_the_rest(road):
 @pytest.mark.parametrize(
     ("name", "missing"),
     [
-        ("repair", lambda found: found.repairs == () and 0.0 in np.diff(found.whole.sample_t)),
+        (
+            "repair",
+            lambda found: found.repairs == () and 0.0 in np.diff(found.whole.sample_t),
+        ),
         ("clocks", lambda found: found.calibration.command_latency_s == 0.0),
         ("mounting", lambda found: found.calibration.rotation_rad == 0.0),
         ("noise", lambda found: found.calibration.position_noise_m == 0.0),
-        ("refine", lambda found: not any("were refined" in note for note in found.notes)),
+        (
+            "refine",
+            lambda found: not any("were refined" in note for note in found.notes),
+        ),
         ("complete", lambda found: found.model.assumed == ()),
         ("judge", lambda found: found.notes == () and found.model.quality is None),
     ],
@@ -120,7 +128,10 @@ def inferred(car) -> tuple[Drive, Findings]:
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("responses", "the response of each state is missing; put the stage 'responses' before"),
+        (
+            "responses",
+            "the response of each state is missing; put the stage 'responses' before",
+        ),
         ("fit", "the fit of all terms is missing; put the stage 'fit' before"),
         ("prune", "the pruned fit is missing; put the stage 'prune' before"),
     ],
@@ -134,7 +145,9 @@ def test_without_a_stage_that_others_need_the_row_says_which(inferred, name, sen
 def test_the_bursts_of_a_drive_are_found_once(differential, monkeypatch):
     asked = []
     find = prepared.find_bursts
-    monkeypatch.setattr(prepared, "find_bursts", lambda t: asked.append(len(t)) or find(t))
+    monkeypatch.setattr(
+        prepared, "find_bursts", lambda t: asked.append(len(t)) or find(t)
+    )
     recording = drive(differential, duration=21.0, burst=0.1, noise=(5e-4, 1e-3))
     found = identify(recording, differential)
     assert found.drive.bursts is not None

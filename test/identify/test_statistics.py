@@ -33,8 +33,16 @@ KNOWN = {
     "differential": {
         "vx": {"left_wheel": 0.025, "right_wheel": 0.025},
         "wz": {"left_wheel": -0.25, "right_wheel": 0.25},
-        "d_left_wheel": {"left_wheel": -RATE, "forward_command": 190.3, "turn_command": -19.03},
-        "d_right_wheel": {"right_wheel": -RATE, "forward_command": 190.3, "turn_command": 19.03},
+        "d_left_wheel": {
+            "left_wheel": -RATE,
+            "forward_command": 190.3,
+            "turn_command": -19.03,
+        },
+        "d_right_wheel": {
+            "right_wheel": -RATE,
+            "forward_command": 190.3,
+            "turn_command": 19.03,
+        },
     },
     "mecanum": {
         "vx": {"front_left_wheel": 0.025, "front_right_wheel": 0.025},
@@ -51,7 +59,9 @@ def noisy_samples(spec, seed, alike=0.9, size=0.05):
     x = np.concatenate([drive.state.values, drive.command.values], axis=1)
     dq = np.zeros((len(x), len(spec.dof_names)))
     for dof, row in KNOWN[spec.name].items():
-        powers = np.array([taylor.parse_term(term, spec.variable_names) for term in row])
+        powers = np.array(
+            [taylor.parse_term(term, spec.variable_names) for term in row]
+        )
         d = spec.dof_names.index(dof)
         dq[:, d] = taylor.evaluate(x, powers) @ np.array(list(row.values()))
     noise = lfilter([1.0], [1.0, -alike], rng.normal(size=dq.shape), axis=0)
@@ -71,7 +81,9 @@ def test_known_coefficients_lie_within_three_standard_errors(name):
             if dof == "wz" and name == "ackermann":
                 continue
             for term, value in row.items():
-                off = abs(terms[dof].get(term, 0.0) - value) / errors[dof].get(term, 1e-12)
+                off = abs(terms[dof].get(term, 0.0) - value) / errors[dof].get(
+                    term, 1e-12
+                )
                 inside.append(off < 3.0)
                 short.append(off < 1.0)
     assert np.mean(inside) > 0.95
@@ -84,7 +96,9 @@ def test_the_known_product_of_a_car_lies_within_three_standard_errors():
     for seed in range(30):
         model = fit(noisy_samples(spec, seed), spec, noisy=True, alpha=0.9).model
         value = model.named.terms["wz"]["speed*steering"]
-        inside.append(abs(value - 5.0) < 3.0 * model.named_errors["wz"]["speed*steering"])
+        inside.append(
+            abs(value - 5.0) < 3.0 * model.named_errors["wz"]["speed*steering"]
+        )
     assert np.mean(inside) > 0.9
 
 

@@ -24,10 +24,12 @@ def samples(car) -> Samples:
     x = held + np.array([0.6, 0.0, 0.6, 0.0])
     noise = np.repeat(rng.normal(size=(200, 5)), 20, axis=0)
     turn = 5.0 * x[:, 0] * x[:, 1]
-    rates = np.stack([x[:, 0], 0.0 * turn, turn, x[:, 2] - x[:, 0], x[:, 3] - x[:, 1]], axis=1)
+    rates = np.stack(
+        [x[:, 0], 0.0 * turn, turn, x[:, 2] - x[:, 0], x[:, 3] - x[:, 1]], axis=1
+    )
     return Samples(
         STEP_S * np.arange(4000.0), np.zeros((4000, 5)), x, rates + 0.05 * noise, STEP_S
-    )  # fmt: skip
+    )
 
 
 def throttled() -> RobotSpec:
@@ -46,13 +48,23 @@ def motion_of(spec, friction=0.3, noise=0.05) -> tuple[TaylorModel, Samples]:
     first = np.eye(len(names), dtype=np.int64)
     rows = np.eye(6, len(names)) * (np.arange(6) < 3)[:, None]  # the twist is the state
     model = TaylorModel(
-        names, spec.dof_names, spec.dof_units, first, rows, STEP_S, low, high, bounded=True
+        names,
+        spec.dof_names,
+        spec.dof_units,
+        first,
+        rows,
+        STEP_S,
+        low,
+        high,
+        bounded=True,
     )
     model.coefficients[3, [names.index("vx"), names.index("throttle")]] = -2.0, 3.0
     model = replace(model, friction=np.array([friction, 0.0, 0.0]))
     rates = model.rates(x)
     rates += noise * np.repeat(rng.normal(size=(200, 6)), 20, axis=0)
-    return model, Samples(STEP_S * np.arange(4000.0), np.zeros((4000, 6)), x, rates, STEP_S)
+    return model, Samples(
+        STEP_S * np.arange(4000.0), np.zeros((4000, 6)), x, rates, STEP_S
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -65,9 +77,13 @@ def test_noise_alone_is_no_structure(samples, car, seed):
 
 def test_a_term_of_the_next_order_is_named_with_what_to_try(samples, car):
     x = samples.x
-    slips = replace(samples, dq=samples.dq - 2.0 * np.outer(x[:, 0] * x[:, 1] ** 2, np.eye(5)[0]))
+    slips = replace(
+        samples, dq=samples.dq - 2.0 * np.outer(x[:, 0] * x[:, 1] ** 2, np.eye(5)[0])
+    )
     (sentence,) = structures(fit(slips, car, 2).model, slips, car)
-    assert sentence.startswith("What the model leaves of vx depends on speed*steering^2 (")
+    assert sentence.startswith(
+        "What the model leaves of vx depends on speed*steering^2 ("
+    )
     assert "try order 3" in sentence
 
 
@@ -90,7 +106,9 @@ def test_noise_of_a_state_that_never_moved_is_no_structure():
     spec = throttled()
     model, samples = motion_of(spec)
     wz = samples.x[:, 2]
-    samples.dq[:, 5] += 3.0 * wz**3 / wz.std() ** 2  # noise beyond what a line through it takes
+    samples.dq[:, 5] += (
+        3.0 * wz**3 / wz.std() ** 2
+    )  # noise beyond what a line through it takes
     model.coefficients[5, 2] = 1.0
     assert len(list(structures(model, samples, spec))) == 1
     assert list(structures(model, samples, spec, unmoved=("wz",))) == []
@@ -98,6 +116,8 @@ def test_noise_of_a_state_that_never_moved_is_no_structure():
 
 def test_an_order_that_was_tried_is_not_advised(samples, car):
     x = samples.x
-    slips = replace(samples, dq=samples.dq - 2.0 * np.outer(x[:, 0] * x[:, 1] ** 2, np.eye(5)[0]))
+    slips = replace(
+        samples, dq=samples.dq - 2.0 * np.outer(x[:, 0] * x[:, 1] ** 2, np.eye(5)[0])
+    )
     (sentence,) = structures(fit(slips, car, 2).model, slips, car, tried=4)
     assert "no order that was tried predicts better with it" in sentence

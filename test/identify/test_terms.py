@@ -49,7 +49,8 @@ def off(calibration: Calibration, mounting: tuple[float, float, float]) -> np.nd
     names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
     sigma = [max(calibration.uncertainty[name], 1e-4) for name in names]
     return (
-        np.array([*calibration.lever_arm_m, calibration.rotation_rad]) - [x, y, -heading]
+        np.array([*calibration.lever_arm_m, calibration.rotation_rad])
+        - [x, y, -heading]
     ) / sigma
 
 
@@ -68,7 +69,9 @@ def test_a_tricycle_that_steers_far_gets_its_order_and_mounting_by_itself():
 
 @pytest.mark.slow
 def test_a_car_that_steers_little_keeps_the_second_order():
-    recording = servoed(car_like, seed=2, steering=0.15, steering_servo=MOTOR, duration=40.0)
+    recording = servoed(
+        car_like, seed=2, steering=0.15, steering_servo=MOTOR, duration=40.0
+    )
     found = identify(recording, tricycle(), alpha="auto")
     assert found.model.powers.sum(axis=1).max() == 2
     assert share(found) < 0.02
@@ -78,9 +81,13 @@ def test_a_car_that_steers_little_keeps_the_second_order():
 @pytest.mark.parametrize("seed", [3, 4])
 def test_a_dead_zone_is_not_taken_for_a_mounting(seed):
     mounting = (0.0, 0.0, 0.0)
-    recording = servoed(seed=seed, dead=0.15, steering=0.5, mounting=mounting, duration=40.0)
+    recording = servoed(
+        seed=seed, dead=0.15, steering=0.5, mounting=mounting, duration=40.0
+    )
     settings = Settings(order=2, alpha="auto", train_until_s=40.0)
-    found = run(STAGES[: STAGES.index(complete)], Drive(recording, tricycle(), settings))
+    found = run(
+        STAGES[: STAGES.index(complete)], Drive(recording, tricycle(), settings)
+    )
     assert np.abs(off(found.calibration, mounting)).max() < 3.0
     assert found.calibration.rotation_rad == pytest.approx(0.0, abs=0.003)
 
@@ -90,7 +97,9 @@ def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
     powers = taylor.exponents(4, 4)
     allowed = through_state(powers, spec, centred=True)
     names = [taylor.term_name(row, spec.variable_names) for row in powers]
-    along, across = ([n for n, each in zip(names, allowed[d], strict=True) if each] for d in (0, 2))
+    along, across = (
+        [n for n, each in zip(names, allowed[d], strict=True) if each] for d in (0, 2)
+    )
     assert "speed*steering^2" in along
     assert "speed*steering" not in along
     assert {"speed", "speed*steering", "speed*steering^3"} <= set(across)
@@ -131,19 +140,35 @@ def test_two_models_are_put_together_over_the_terms_of_both():
     spec, _ = slipping_car(duration=1.0)
     one, other = (model_of(spec, names) for names in (["vx", "throttle"], ["wz", "vx"]))
     base, first = together(one, other)
-    at = {taylor.term_name(row, spec.variable_names): k for k, row in enumerate(base.powers)}
+    at = {
+        taylor.term_name(row, spec.variable_names): k
+        for k, row in enumerate(base.powers)
+    }
     assert set(at) == {"vx", "throttle", "wz"}
-    assert base.coefficients[0, [at["vx"], at["throttle"], at["wz"]]].tolist() == [1.0, 2.0, 0.0]
+    assert base.coefficients[0, [at["vx"], at["throttle"], at["wz"]]].tolist() == [
+        1.0,
+        2.0,
+        0.0,
+    ]
     assert first[0, [at["vx"], at["throttle"], at["wz"]]].tolist() == [2.0, 0.0, 1.0]
 
 
 def model_of(spec, names):
-    powers = np.array([[n == name for n in spec.variable_names] for name in names]).astype(np.int64)
+    powers = np.array(
+        [[n == name for n in spec.variable_names] for name in names]
+    ).astype(np.int64)
     rows = np.tile(1.0 + np.arange(len(names)), (len(spec.dof_names), 1))
     box = np.zeros(len(spec.variable_names))
     return taylor.TaylorModel(
-        spec.variable_names, spec.dof_names, spec.dof_units, powers, rows, 0.01, box, box
-    )  # fmt: skip
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers,
+        rows,
+        0.01,
+        box,
+        box,
+    )
 
 
 def held_throttle(**given):
@@ -157,7 +182,9 @@ def test_a_command_held_at_one_value_pushes_as_a_constant():
     spec, samples = held_throttle()
     model = linear_fit(samples, spec, 3, by_textbook).model
     assert model.rates(np.zeros(5))[3] == pytest.approx(9.0 * 0.15, rel=0.2)
-    assert model.rates([0.0, 0, 0, 0, 0.5])[5] == pytest.approx(0.0, abs=0.1)  # it steers only
+    assert model.rates([0.0, 0, 0, 0, 0.5])[5] == pytest.approx(
+        0.0, abs=0.1
+    )  # it steers only
 
 
 def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
@@ -174,20 +201,32 @@ def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
 def test_wheels_that_always_move_together_share_what_they_do():
     four = {"kind": "mecanum", "footprint_radius": 0.4, "state": []}
     names = ("front_left", "front_right", "rear_left", "rear_right")
-    spec = robot_from(four, dict.fromkeys((f"{name}_wheel" for name in names), (-9.0, 9.0)))
+    spec = robot_from(
+        four, dict.fromkeys((f"{name}_wheel" for name in names), (-9.0, 9.0))
+    )
     rng = np.random.default_rng(2)
     three = rng.uniform(-8.0, 8.0, (400, 3))
-    wheels = np.column_stack([three, three[:, 0] + three[:, 1] - three[:, 2]])[:, [0, 2, 3, 1]]
+    wheels = np.column_stack([three, three[:, 0] + three[:, 1] - three[:, 2]])[
+        :, [0, 2, 3, 1]
+    ]
     powers = np.eye(4, dtype=np.int64)[:3]  # the last wheel does nothing
     alone = taylor.TaylorModel(
-        spec.variable_names, spec.dof_names, spec.dof_units, powers,
-        rng.normal(size=(3, 3)), 0.05, wheels.min(axis=0), wheels.max(axis=0),
-    )  # fmt: skip
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers,
+        rng.normal(size=(3, 3)),
+        0.05,
+        wheels.min(axis=0),
+        wheels.max(axis=0),
+    )
     still = np.zeros((400, 3))
     samples = samples_on_one_clock(0.05 * np.arange(400), still, still[:, :0], wheels)
     model = shared(alone, spec, samples)
     assert model.rates(wheels) == pytest.approx(alone.rates(wheels))
-    assert (model.coefficients @ model.powers @ [1.0, -1.0, -1.0, 1.0]) == pytest.approx(0.0)
+    assert (
+        model.coefficients @ model.powers @ [1.0, -1.0, -1.0, 1.0]
+    ) == pytest.approx(0.0)
     assert np.abs(model.coefficients).min() > 0.0
 
 

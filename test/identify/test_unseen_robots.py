@@ -28,7 +28,9 @@ def recorded(spec, target, twist, noise=(0.0, 0.0), latency=0.0, seconds=60.0, s
     """A drive of a robot whose state follows `target(command)` and that moves by `twist(state)`."""
     rng = np.random.default_rng(seed)
     count = int(seconds / DT)
-    held = rng.uniform(spec.command_low, spec.command_high, (count // HOLD, len(spec.command)))
+    held = rng.uniform(
+        spec.command_low, spec.command_high, (count // HOLD, len(spec.command))
+    )
     commands = np.repeat(held, HOLD, axis=0)
     decay = np.exp(-np.arange(FINE)[:, None] * DT / FINE / LAG)
     state, states = np.zeros(target(commands[:1]).shape[1]), []
@@ -38,11 +40,15 @@ def recorded(spec, target, twist, noise=(0.0, 0.0), latency=0.0, seconds=60.0, s
     moved = geometry.exp(twist(np.concatenate(states)) * DT / FINE)
     heading = np.cumsum(moved[:, 2]) - moved[:, 2]
     path = np.cumsum(geometry.rotate(moved[:, :2], heading), axis=0)
-    poses = np.concatenate([path - geometry.rotate(moved[:, :2], heading), heading[:, None]], 1)
+    poses = np.concatenate(
+        [path - geometry.rotate(moved[:, :2], heading), heading[:, None]], 1
+    )
     poses = poses[::FINE] + rng.normal(size=(count, 3)) * [noise[0], *noise]
     t = np.arange(count) * DT
     return Recording(
-        Stream(t - latency, commands), Stream(t, poses), Stream(t, np.array(states)[:, 0])
+        Stream(t - latency, commands),
+        Stream(t, poses),
+        Stream(t, np.array(states)[:, 0]),
     )
 
 
@@ -53,13 +59,19 @@ def car_twist(state):
 
 def skid_twist(state):
     right, left = state.T
-    forward, turn = RADIUS * (right + left) / 2, RADIUS * (right - left) / (TRACK * SLIP)
+    forward, turn = (
+        RADIUS * (right + left) / 2,
+        RADIUS * (right - left) / (TRACK * SLIP),
+    )
     return np.stack([forward, 0.0 * forward, turn], axis=1)
 
 
 def skid_target(command):
     forward, turn = command.T
-    return np.stack([forward + turn * TRACK / 2, forward - turn * TRACK / 2], axis=1) / RADIUS
+    return (
+        np.stack([forward + turn * TRACK / 2, forward - turn * TRACK / 2], axis=1)
+        / RADIUS
+    )
 
 
 def omni_twist(state):
@@ -75,9 +87,14 @@ def terms(found):
 def test_a_car_of_another_wheelbase_with_its_steering_first(noise):
     spec = robot("long_car")
     found = identify(recorded(spec, lambda c: c, car_twist, noise), spec)
-    assert sum(v for k, v in terms(found)["wz"].items() if k.startswith("wheel_angle*pa")) > 1.5
+    assert (
+        sum(v for k, v in terms(found)["wz"].items() if k.startswith("wheel_angle*pa"))
+        > 1.5
+    )
     x = np.array([0.3, 1.0, 0.3, 1.0])
-    assert found.model.rates(x)[:3] == pytest.approx([1.0, 0.0, np.tan(0.3) / WHEELBASE], abs=0.05)
+    assert found.model.rates(x)[:3] == pytest.approx(
+        [1.0, 0.0, np.tan(0.3) / WHEELBASE], abs=0.05
+    )
     assert found.held_out.mean_position_error_m < 0.06
     assert found.model.quality.held_out_r2["wz"] > 0.99
 
@@ -88,8 +105,12 @@ def test_the_same_car_without_its_state_measured():
     recording = recorded(spec, lambda c: c, car_twist, (5e-4, 1e-3), latency=0.06)
     found = identify(replace(recording, state=None), spec)
     assert found.calibration.command_latency_s == pytest.approx(0.06, abs=0.01)
-    assert [r.lag_s for r in found.calibration.responses] == pytest.approx([LAG, LAG], abs=0.02)
-    assert terms(found)["wz"]["wheel_angle*pace"] == pytest.approx(1.0 / WHEELBASE, rel=0.08)
+    assert [r.lag_s for r in found.calibration.responses] == pytest.approx(
+        [LAG, LAG], abs=0.02
+    )
+    assert terms(found)["wz"]["wheel_angle*pace"] == pytest.approx(
+        1.0 / WHEELBASE, rel=0.08
+    )
     assert found.held_out.mean_position_error_m < 0.06
 
 
@@ -98,7 +119,9 @@ def test_a_skid_steer_shows_its_slip(noise):
     spec = robot("skid_steer")
     found = identify(recorded(spec, skid_target, skid_twist, noise), spec)
     x = np.array([8.0, 4.0, *np.array([[0.6, 1.0]])[0]])
-    assert found.model.rates(x)[:3] == pytest.approx(skid_twist(x[None, :2])[0], abs=0.02)
+    assert found.model.rates(x)[:3] == pytest.approx(
+        skid_twist(x[None, :2])[0], abs=0.02
+    )
     assert found.held_out.mean_position_error_m < 0.03
 
 
@@ -118,7 +141,9 @@ def test_the_latency_of_a_robot_without_state_is_exact(latency):
     spec = robot("stateless")
     rng = np.random.default_rng(3)
     t = np.arange(3000) * DT
-    command = rng.uniform(spec.command_low, spec.command_high, (3000 // HOLD, len(spec.command)))
+    command = rng.uniform(
+        spec.command_low, spec.command_high, (3000 // HOLD, len(spec.command))
+    )
     command = np.repeat(command, HOLD, axis=0)
     steps = geometry.exp(omni_twist(command) * DT)
     pose = np.zeros((len(t), 3))
@@ -134,7 +159,9 @@ def test_the_uncertainty_of_the_latency_covers_the_step_of_the_model():
     spec = robot("long_car")
     recording = recorded(spec, lambda c: c, car_twist, (5e-4, 1e-3), latency=0.15)
     for wheels in (None, Stream(recording.state.t, recording.state.values[:, [1, 1]])):
-        pose = recording.pose if wheels is None else replace(recording.pose, clock="mocap")
+        pose = (
+            recording.pose if wheels is None else replace(recording.pose, clock="mocap")
+        )
         drive = replace(recording, state=None, wheels=wheels, pose=pose)
         found = identify(drive, spec).calibration
         sigma = found.uncertainty["command_latency_s"]

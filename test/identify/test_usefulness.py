@@ -29,15 +29,24 @@ def coarse(spec: RobotSpec, every: int, duration: float = 60.0) -> Recording:
         for stream in (fine.pose, fine.state)
     )
     return replace(
-        fine, command=replace(fine.command, t=fine.command.t + 0.003), pose=pose, state=state
+        fine,
+        command=replace(fine.command, t=fine.command.t + 0.003),
+        pose=pose,
+        state=state,
     )
 
 
 def held_up(recording: Recording, start: float, end: float) -> Recording:
     """The robot stands between two times, whatever it is told, and then drives on from there."""
-    t, pose, state = recording.pose.t, recording.pose.values.copy(), recording.state.values.copy()
+    t, pose, state = (
+        recording.pose.t,
+        recording.pose.values.copy(),
+        recording.state.values.copy(),
+    )
     first, after = np.searchsorted(t, (start, end))
-    pose[after:] = geometry.compose(pose[first], geometry.between(pose[after], pose[after:]))
+    pose[after:] = geometry.compose(
+        pose[first], geometry.between(pose[after], pose[after:])
+    )
     pose[first:after], state[first:after] = pose[first], 0.0
     return replace(
         recording,
@@ -77,7 +86,9 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
     along = 0.2 * recording.pose.t
     straight = np.stack([3.0 + 0.6 * along, 0.8 * along, 0.0 * along], axis=1)
     found = identify(recording, car)
-    moved = Drive(replace(recording, pose=replace(recording.pose, values=straight)), car)
+    moved = Drive(
+        replace(recording, pose=replace(recording.pose, values=straight)), car
+    )
     result = open_loop_error(found.model, found.calibration, moved, 0.0, 20.0)
     assert result.median_displacement_m == pytest.approx(1.0)
     assert result.mean_path_m == pytest.approx(1.0)

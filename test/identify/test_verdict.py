@@ -31,7 +31,9 @@ def throttled():
 
 def told(spec, *unmoved: str) -> str:
     regression = SimpleNamespace(excitation=Excitation(unmoved, (), {}), dependent=())
-    return " ".join(unlearnt(SimpleNamespace(regression=regression), Calibration(), spec, {}))
+    return " ".join(
+        unlearnt(SimpleNamespace(regression=regression), Calibration(), spec, {})
+    )
 
 
 def test_a_driver_is_asked_to_move_commands_and_no_states(throttled):
@@ -49,9 +51,13 @@ def test_only_a_robot_that_moves_sideways_is_told_that_it_never_did(throttled):
 
 def test_a_car_that_never_moves_sideways_is_not_refused(throttled, car):
     refuse_unexcited(Excitation(("vy",), (), {}), throttled)
-    with pytest.raises(FitError, match="steering never moved; drive with steering changing"):
+    with pytest.raises(
+        FitError, match="steering never moved; drive with steering changing"
+    ):
         refuse_unexcited(Excitation(("vy", "wz", "steering"), (), {}), throttled)
-    with pytest.raises(FitError, match="steering never moved"):  # a sensor that is stuck
+    with pytest.raises(
+        FitError, match="steering never moved"
+    ):  # a sensor that is stuck
         refuse_unexcited(Excitation(("steering",), (), {}), car)
 
 
@@ -73,12 +79,18 @@ def test_a_lever_arm_that_was_not_learnt_has_one_reason(throttled):
 
 def test_a_lever_arm_that_predictions_told_is_learnt(throttled):
     learnt = {"lever_arm_x_m": 0.001, "lever_arm_y_m": 0.002}
-    assert "could not be learnt" not in of_mounting(throttled, (0.001, np.nan), **learnt)
+    assert "could not be learnt" not in of_mounting(
+        throttled, (0.001, np.nan), **learnt
+    )
 
 
-@pytest.mark.parametrize(("sigma", "told"), [(0.0343, False), (0.0001, False), (0.00005, True)])
+@pytest.mark.parametrize(
+    ("sigma", "told"), [(0.0343, False), (0.0001, False), (0.00005, True)]
+)
 def test_a_latency_below_three_standard_errors_is_not_told(car, sigma, told):
     tried = Drive(drive(car, duration=10.0), car)
-    calibration = Calibration(command_latency_s=0.0003, uncertainty={"command_latency_s": sigma})
+    calibration = Calibration(
+        command_latency_s=0.0003, uncertainty={"command_latency_s": sigma}
+    )
     sentences = " ".join(about_clocks(tried, calibration, timing_of(tried)))
     assert ("Commands take effect 0.0003 s" in sentences) == told

@@ -57,7 +57,9 @@ def test_it_finds_the_latency_and_the_place_of_the_tracked_body():
     disturbed = drive(spec, latency=0.05, rotation=0.4, lever=(0.1, -0.05), noise=MOCAP)
     found = fit_yardstick(Drive(disturbed, spec), LEARNT_S).response
     assert found.mounting == pytest.approx([0.1, -0.05, -0.4], abs=0.005)
-    assert found.delay_s == pytest.approx(0.05, abs=0.03)  # the rest of the lag is a lag
+    assert found.delay_s == pytest.approx(
+        0.05, abs=0.03
+    )  # the rest of the lag is a lag
     assert found.gain[0].tolist() == pytest.approx([1.0, 0.0], abs=0.02)
 
 
@@ -73,7 +75,9 @@ def test_a_robot_that_keeps_its_twist_is_predicted_by_it():
     t = np.arange(0.0, 10.0, 0.02)
     pose = np.stack([np.sin(0.5 * t), 1.0 - np.cos(0.5 * t), 0.5 * t], axis=1)
     spec = load_robot("differential")
-    driven = Drive(Recording(Stream(t[:1], np.array([[0.5, 0.5]])), Stream(t, pose)), spec)
+    driven = Drive(
+        Recording(Stream(t[:1], np.array([[0.5, 0.5]])), Stream(t, pose)), spec
+    )
     chosen = windows(driven, Calibration(), 1.0, 10.0, 5.0, 0.1)
     assert twists_before(driven, chosen.start_t) == pytest.approx(
         np.tile([0.5, 0.0, 0.5], (len(chosen.start_t), 1)), abs=1e-3
@@ -83,7 +87,9 @@ def test_a_robot_that_keeps_its_twist_is_predicted_by_it():
 
 def test_a_drive_too_short_to_learn_from_is_refused():
     spec = load_robot("differential")
-    with pytest.raises(RecordingError, match="hold no window of 5 s; record a longer drive"):
+    with pytest.raises(
+        RecordingError, match="hold no window of 5 s; record a longer drive"
+    ):
         fit_yardstick(Drive(drive(spec, duration=6.0), spec), 4.0)
 
 
@@ -96,7 +102,9 @@ def test_a_drive_too_short_to_learn_from_is_refused():
         ("f110_frictionmaps/DS4", "f110_folder", 0.248),
     ],
 )
-def test_it_is_as_good_as_models_made_by_hand_on_real_drives(source, mapping, hand_made):
+def test_it_is_as_good_as_models_made_by_hand_on_real_drives(
+    source, mapping, hand_made
+):
     if not (RECORDINGS / source).exists():
         pytest.skip(f"the recordings of others are not at {RECORDINGS}")
     mapping = ROOT / "examples" / "recordings" / f"{mapping}.yaml"

@@ -10,7 +10,9 @@ from nics_drl_bridge.lidar.shapes import convex_hull
 
 @pytest.mark.parametrize("corners", [3, 4, 7, 50, 1000])
 @pytest.mark.parametrize("make", [convex, star])
-def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(make, corners):
+def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(
+    make, corners
+):
     rng = np.random.default_rng(corners)
     hull = convex_hull(make(rng, corners).outline)
     twice = np.concatenate([hull, hull])
@@ -18,14 +20,19 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(ma
     for _ in range(100):
         distance = radius * (1.0 + 10.0 ** rng.uniform(-6.0, 1.0))
         turn, skip = rng.uniform(-np.pi, np.pi), int(rng.integers(count + 1))
-        first, stride = int(rng.integers(count)), int(2 ** rng.integers(np.log2(count) + 1))
+        first, stride = (
+            int(rng.integers(count)),
+            int(2 ** rng.integers(np.log2(count) + 1)),
+        )
         cos, sin = distance * np.cos(turn), distance * np.sin(turn)
         along = distance**2 + twice[skip : skip + count] @ [cos, -sin]
         across = twice[skip : skip + count] @ [sin, cos]
         angles = np.arctan2(across, along)
         for side, edge in ((1.0, angles.min()), (-1.0, angles.max())):
             seen = kernels.Seen(distance**2, cos, sin)
-            x, y = kernels.outermost(twice, skip, count, first, min(stride, count - 1), seen, side)
+            x, y = kernels.outermost(
+                twice, skip, count, first, min(stride, count - 1), seen, side
+            )
             assert np.arctan2(y, x) == pytest.approx(edge, abs=1e-9)
 
 

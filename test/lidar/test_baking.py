@@ -21,7 +21,9 @@ def at_the_grid(table, shape, t, d):
     grid = table.grid[0]
     distance = np.linspace(shape.radius, grid[0], table.density.distances)[d]
     turns = grid[1] * table.outlines.orders[0]
-    return np.array([(distance * (1.0 + 1e-6 * (d == 0)), 0.0, t * 2.0 * np.pi / turns)])
+    return np.array(
+        [(distance * (1.0 + 1e-6 * (d == 0)), 0.0, t * 2.0 * np.pi / turns)]
+    )
 
 
 @pytest.mark.parametrize("shape", [Circle(radius=0.25), SQUARE, STRIP])
@@ -33,7 +35,9 @@ def test_on_the_grid_a_look_up_is_the_exact_scan(shape):
             body = exact.place([shape], at_the_grid(table, shape, t, d))
             one, other = baked.scan(HERE, body)[0], exact.scan(HERE, body)[0]
             differ = np.isfinite(one) != np.isfinite(other)
-            assert differ.sum() <= 2  # only beams that graze a corner, decided by rounding
+            assert (
+                differ.sum() <= 2
+            )  # only beams that graze a corner, decided by rounding
             both = np.isfinite(one) & np.isfinite(other)
             assert (np.abs(one[both] - other[both]) > 2e-4).sum() <= 2
             assert both.any() or d == 10
@@ -70,18 +74,32 @@ def test_shapes_are_added_at_the_density_of_the_table():
     assert more.density == SMALL
 
 
-@pytest.mark.parametrize("density", [Density(distances=10_000, rotations=100_000, phases=8)])
+@pytest.mark.parametrize(
+    "density", [Density(distances=10_000, rotations=100_000, phases=8)]
+)
 def test_a_table_that_no_index_can_reach_is_refused(density, monkeypatch):
     monkeypatch.setattr("nics_drl_bridge.lidar.bake.MOST_NUMBERS", 1000)
     with pytest.raises(ConfigError, match="is too large; lower `distances`"):
-        bake(SPEC, [SQUARE], density.model_copy(update={"distances": 50, "rotations": 40}))
+        bake(
+            SPEC,
+            [SQUARE],
+            density.model_copy(update={"distances": 50, "rotations": 40}),
+        )
 
 
 def test_the_points_of_a_row_are_near_each_other_whatever_the_beams():
     def phases(beams):
         return Density.for_beams(2.0 * np.pi / beams).phases
 
-    assert [phases(beams) for beams in (2048, 720, 360, 180, 90, 36, 1)] == [1, 1, 2, 4, 8, 8, 8]
+    assert [phases(beams) for beams in (2048, 720, 360, 180, 90, 36, 1)] == [
+        1,
+        1,
+        2,
+        4,
+        8,
+        8,
+        8,
+    ]
     assert bake(lidar(beams=180), [SQUARE]).density.phases == 4
 
 
@@ -92,7 +110,9 @@ def test_a_shape_beyond_all_measure_is_refused():
 
 def test_a_shape_that_covers_more_beams_than_a_row_has_is_refused_with_the_way_out():
     narrow = lidar(beams=100_000, angle_min=-0.5, angle_max=0.7)
-    with pytest.raises(ConfigError, match=r"radius 0.2 m covers too many beams .* 1.2e-05 rad"):
+    with pytest.raises(
+        ConfigError, match=r"radius 0.2 m covers too many beams .* 1.2e-05 rad"
+    ):
         bake(narrow, [Circle(radius=0.2)])
 
 

@@ -6,14 +6,27 @@ from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.sector_kernels import resample
-from nics_drl_bridge.lidar.sectors import LAYOUTS, Reader, ScanLayout, layout_of, plan_of, reader_of
+from nics_drl_bridge.lidar.sectors import (
+    LAYOUTS,
+    Reader,
+    ScanLayout,
+    layout_of,
+    plan_of,
+    reader_of,
+)
 from nics_drl_bridge.lidar.spec import ScanHeader, load_lidar
 
 AROUND = ScanLayout(sectors=72, range_max=3.0)
 SHIPPED = (
-    "paper", "paper_12m", "rplidar_a1", "rplidar_a2", "hokuyo_ust_10lx", "jackal_hokuyo",
-    "sick_tim571", "turtlebot3_lds_02",
-)  # fmt: skip
+    "paper",
+    "paper_12m",
+    "rplidar_a1",
+    "rplidar_a2",
+    "hokuyo_ust_10lx",
+    "jackal_hokuyo",
+    "sick_tim571",
+    "turtlebot3_lds_02",
+)
 
 
 def room(origin, angles, half=(2.0, 1.5)):
@@ -50,7 +63,9 @@ def header(spec, **changes):
 @pytest.mark.parametrize("heading", [0.0, 0.3, -2.0, np.pi])
 @pytest.mark.parametrize("angles", [(-np.pi, np.pi), (0.0, 2.0 * np.pi)])
 def test_a_sector_holds_the_nearest_return_of_its_beams(heading, angles):
-    spec = lidar(beams=720, angle_min=angles[0], angle_max=angles[1], mount=(0.0, 0.0, heading))
+    spec = lidar(
+        beams=720, angle_min=angles[0], angle_max=angles[1], mount=(0.0, 0.0, heading)
+    )
     rng = np.random.default_rng(1)
     ranges = rng.uniform(0.1, 3.0, 720).astype(np.float32)
     ranges[rng.random(720) < 0.4] = rng.choice([np.nan, np.inf, -np.inf], 1)
@@ -80,7 +95,12 @@ def test_a_coarse_lidar_gives_a_sector_the_nearer_of_the_beams_beside_it():
 def test_what_was_not_measured_stays_unknown_and_what_is_too_close_wins():
     ranges = np.full(720, 2.0, np.float32)
     plan = plan_of(lidar(beams=720), AROUND)
-    ranges[0:11], ranges[100], ranges[200], ranges[305] = np.nan, -np.inf, np.nan, np.inf
+    ranges[0:11], ranges[100], ranges[200], ranges[305] = (
+        np.nan,
+        -np.inf,
+        np.nan,
+        np.inf,
+    )
     seen = resampled(plan, ranges)
     assert np.isnan(seen[0])
     assert seen[10] == -np.inf
@@ -92,7 +112,9 @@ def test_what_was_not_measured_stays_unknown_and_what_is_too_close_wins():
 @pytest.mark.parametrize("mount", [(0.2, 0.0, 0.0), (-0.15, 0.1, 1.0)])
 def test_a_lidar_mounted_elsewhere_sees_what_one_at_the_viewpoint_does(mount):
     spec = lidar(beams=1440, range_max=6.0, mount=mount)
-    seen = resampled(plan_of(spec, AROUND), room(np.array(mount[:2]), spec.angles + mount[2]))
+    seen = resampled(
+        plan_of(spec, AROUND), room(np.array(mount[:2]), spec.angles + mount[2])
+    )
     fine = np.linspace(-AROUND.width / 2, AROUND.width / 2, 201)
     exact = room(np.zeros(2), AROUND.angles[:, None] + fine).min(axis=1)
     assert np.abs(seen - exact).max() < 0.03
@@ -186,7 +208,9 @@ def test_a_lidar_that_hangs_upside_down_turns_the_other_way():
     below = room(np.array([0.3, 0.4]), -spec.angles)
     found = reader_of(spec.header, 720, spec, upside_down=True)
     upright = room(np.array([0.3, 0.4]), spec.angles)
-    assert reader_sees(found, below) == pytest.approx(resampled(plan_of(spec, AROUND), upright))
+    assert reader_sees(found, below) == pytest.approx(
+        resampled(plan_of(spec, AROUND), upright)
+    )
 
 
 @pytest.mark.parametrize(
@@ -225,5 +249,7 @@ def test_a_lidar_with_a_blind_side_fills_the_sectors_that_it_sees():
     spec = load_lidar("sick_tim571")
     plan = plan_of(spec, LAYOUTS["front"])
     assert plan.hits.min() >= 1
-    with pytest.raises(ConfigError, match=r"looks from -135 to 135 deg.*say `scan: front`"):
+    with pytest.raises(
+        ConfigError, match=r"looks from -135 to 135 deg.*say `scan: front`"
+    ):
         plan_of(spec, LAYOUTS["around"])

@@ -46,10 +46,14 @@ def test_bodies_that_moved_since_are_found_if_the_cells_know_how_far():
         kernels.sort(0, bodies, 100, cells)
         bodies[:, :2] += 2.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
         spot = rng.uniform(-10.0, 10.0, 2)
-        missed = within(bodies, spot, 1.0) - {*cells.found[: kernels.around(0, *spot, 1.0, cells)]}
+        missed = within(bodies, spot, 1.0) - {
+            *cells.found[: kernels.around(0, *spot, 1.0, cells)]
+        }
         late += len(missed)
         cells.frame[0, kernels.MOVED] = 2.0
-        assert within(bodies, spot, 1.0) <= {*cells.found[: kernels.around(0, *spot, 1.0, cells)]}
+        assert within(bodies, spot, 1.0) <= {
+            *cells.found[: kernels.around(0, *spot, 1.0, cells)]
+        }
     assert late > 0
 
 
@@ -59,7 +63,9 @@ def test_bodies_are_found_as_they_are_added():
     bodies[:, RADIUS] = np.where(np.arange(30) % 7, 0.1, 5.0)
     kernels.cover(0, -10.0, -10.0, 20.0, cells)
     for k in range(30):
-        assert k not in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
+        assert (
+            k not in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
+        )
         kernels.add(0, k, bodies[k], cells)
         assert k in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
     kernels.clear(0, cells)

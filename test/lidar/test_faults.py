@@ -54,12 +54,17 @@ def test_a_draw_depends_on_seed_and_counter_alone(faults):
     one = reported(ranges, seed=5, counter=9, **faults)
     assert reported(ranges, seed=5, counter=9, **faults).tobytes() == one.tobytes()
     for seed, counter in ((6, 9), (5, 10)):
-        assert reported(ranges, seed=seed, counter=counter, **faults).tobytes() != one.tobytes()
+        assert (
+            reported(ranges, seed=seed, counter=counter, **faults).tobytes()
+            != one.tobytes()
+        )
 
 
 @pytest.mark.parametrize("distance", [0.5, 2.0])
 def test_noise_has_its_mean_and_deviation_at_each_range(distance):
-    error = reported(scan_at(distance), noise_std=0.01, noise_proportional=0.02) - distance
+    error = (
+        reported(scan_at(distance), noise_std=0.01, noise_proportional=0.02) - distance
+    )
     std = 0.01 + 0.02 * distance
     assert abs(error.mean()) < 4.0 * std / np.sqrt(BEAMS)
     assert error.std() == pytest.approx(std, rel=4.0 / np.sqrt(2 * BEAMS))
@@ -78,7 +83,9 @@ def test_noise_stays_within_the_limits_and_off_what_is_no_return():
 
 @pytest.mark.parametrize("distance", [0.3, 3.0])
 def test_dropouts_have_their_share_which_grows_with_the_square_of_the_range(distance):
-    lost = np.isposinf(reported(scan_at(distance), dropout=0.05, dropout_far=0.2)).mean()
+    lost = np.isposinf(
+        reported(scan_at(distance), dropout=0.05, dropout_far=0.2)
+    ).mean()
     share = 0.05 + 0.2 * (distance / 3.0) ** 2
     assert lost == pytest.approx(share, abs=4.0 * np.sqrt(share / BEAMS))
 
@@ -124,7 +131,9 @@ def test_what_is_too_close_becomes_what_the_device_makes_of_it(too_close, value)
 def test_a_ghost_may_be_anywhere_within_the_limits():
     seen = reported(scan_at(-np.inf), too_close="ghost")
     assert (seen.min(), seen.max()) == pytest.approx(LIMITS, abs=0.01)
-    assert seen.mean() == pytest.approx(np.mean(LIMITS), abs=4.0 * 2.95 / np.sqrt(12 * BEAMS))
+    assert seen.mean() == pytest.approx(
+        np.mean(LIMITS), abs=4.0 * 2.95 / np.sqrt(12 * BEAMS)
+    )
 
 
 @pytest.mark.parametrize("noise_std", [0.0, 0.1])
@@ -140,7 +149,9 @@ def test_a_step_without_a_multiple_within_the_limits_coarsens_nothing(noise_std)
 @pytest.mark.parametrize("beams", [1, 2, 7, 1081])
 def test_a_scan_of_any_length_has_the_noise_of_each_of_its_beams(beams):
     ranges = scan_at(1.0, beams)
-    errors = np.array([reported(ranges, noise_std=0.1, counter=k) - 1.0 for k in range(200)])
+    errors = np.array(
+        [reported(ranges, noise_std=0.1, counter=k) - 1.0 for k in range(200)]
+    )
     assert errors.std(axis=0) == pytest.approx(np.full(beams, 0.1), rel=0.3)
     assert abs(np.mean(errors)) < 0.4 / np.sqrt(errors.size)
 
@@ -154,12 +165,20 @@ def test_a_quantised_range_is_the_single_number_nearest_to_its_multiple():
 
 def test_faults_act_in_the_order_of_the_device():
     close = reported(
-        scan_at(-np.inf), too_close="range_min", noise_std=0.05, quantisation=0.02, dropout=0.5
+        scan_at(-np.inf),
+        too_close="range_min",
+        noise_std=0.05,
+        quantisation=0.02,
+        dropout=0.5,
     )
-    assert np.isposinf(close).mean() == pytest.approx(0.5, abs=0.02)  # dropout after too_close
+    assert np.isposinf(close).mean() == pytest.approx(
+        0.5, abs=0.02
+    )  # dropout after too_close
     values = np.unique(close[np.isfinite(close)]) / 0.02
     assert len(values) > 3  # noise after too_close
-    assert values == pytest.approx(np.round(values), abs=1e-4)  # quantisation after noise
+    assert values == pytest.approx(
+        np.round(values), abs=1e-4
+    )  # quantisation after noise
 
 
 # In the simulator.
@@ -202,7 +221,10 @@ def test_faulty_scans_are_the_same_bits_in_a_batch_of_any_size():
     model = direct_model(sensor=lidar(faults=FAULTY, noise_std=0.01))
     together = scans(model, worlds=4)
     for n in range(4):
-        assert scans(model, worlds=1, first_seed=n)[:, 0].tobytes() == together[:, n].tobytes()
+        assert (
+            scans(model, worlds=1, first_seed=n)[:, 0].tobytes()
+            == together[:, n].tobytes()
+        )
 
 
 def test_each_robot_may_have_faults_of_its_own():
@@ -212,8 +234,12 @@ def test_each_robot_may_have_faults_of_its_own():
     rows[1, 0, fault_kernels.DROPOUT] = 1.0
     rows[2, 1, fault_kernels.NOISE_STD] = 0.05
     mixed = scans(model, rows)
-    changed = [(n, m) for n in range(4) for m in range(2)
-               if mixed[:, n, m].tobytes() != clean[:, n, m].tobytes()]  # fmt: skip
+    changed = [
+        (n, m)
+        for n in range(4)
+        for m in range(2)
+        if mixed[:, n, m].tobytes() != clean[:, n, m].tobytes()
+    ]
     assert changed == [(1, 0), (2, 1)]
     assert np.isposinf(mixed[:, 1, 0]).all()
 
@@ -221,7 +247,9 @@ def test_each_robot_may_have_faults_of_its_own():
 def test_the_noise_of_a_range_is_the_same_bits_however_the_other_faults_are():
     model = direct_model(sensor=lidar(noise_std=0.03))
     plain = scans(model)
-    dropping = scans(direct_model(sensor=lidar(noise_std=0.03, faults={"dropout": 0.3})))
+    dropping = scans(
+        direct_model(sensor=lidar(noise_std=0.03, faults={"dropout": 0.3}))
+    )
     kept = np.isfinite(dropping)
     assert 0 < kept.sum() < np.isfinite(plain).sum()
     assert np.array_equal(dropping[kept], plain[kept])
@@ -230,12 +258,16 @@ def test_the_noise_of_a_range_is_the_same_bits_however_the_other_faults_are():
 # Skew.
 
 
-@pytest.mark.parametrize("twist", [TWIST, TWIST * [1, 1, 0], TWIST * [1, 1, 1e-6], np.zeros(3)])
+@pytest.mark.parametrize(
+    "twist", [TWIST, TWIST * [1, 1, 0], TWIST * [1, 1, 1e-6], np.zeros(3)]
+)
 def test_slices_lie_on_the_exact_arc_that_ends_at_the_pose(twist):
     poses = slice_poses(POSE, twist, 0.1, 5, "counter_clockwise")
     for g, ago in enumerate([0.09, 0.07, 0.05, 0.03, 0.01]):
         expected = geometry.compose(POSE, geometry.exp(-twist * ago))
-        assert geometry.between(expected, poses[g]) == pytest.approx(np.zeros(3), abs=1e-9)
+        assert geometry.between(expected, poses[g]) == pytest.approx(
+            np.zeros(3), abs=1e-9
+        )
     assert (np.abs(poses[:, 2]) <= np.pi).all()
 
 
@@ -245,7 +277,9 @@ def test_a_device_that_turns_clockwise_has_its_newest_beam_first():
 
 
 def test_without_skew_all_slices_are_at_the_pose():
-    assert slice_poses(POSE, TWIST, 0.1, 3, "none") == pytest.approx(np.tile(POSE, (3, 1)))
+    assert slice_poses(POSE, TWIST, 0.1, 3, "none") == pytest.approx(
+        np.tile(POSE, (3, 1))
+    )
 
 
 @pytest.mark.parametrize("skew", ["counter_clockwise", "clockwise"])
@@ -265,5 +299,7 @@ def test_a_skewed_scan_sees_a_wall_from_where_each_beam_was_measured(skew):
     assert skewed == pytest.approx(expected, abs=1e-4)
     assert np.abs(skewed - render(pose)).max() > 0.1
     for slices in (12, 36):  # what is left is the motion within half a slice
-        coarse = scan_skewed(render, slice_poses(pose, twist, spec.sweep_time, slices, skew))
+        coarse = scan_skewed(
+            render, slice_poses(pose, twist, spec.sweep_time, slices, skew)
+        )
         assert np.abs(coarse - skewed).max() < 0.8 / slices

@@ -29,9 +29,14 @@ def cast(shape, poses, directions, high):
             ranges[n] = np.where((inside >= 0.0) & (hit > 0.0), hit, np.inf)
             continue
         corners = rotate(np.asarray(shape.outline), pose[2]) + pose[:2]
-        a, b = (corners[:1], corners[1:]) if len(corners) == 2 else (
-            corners, np.roll(corners, -1, axis=0),
-        )  # fmt: skip
+        a, b = (
+            (corners[:1], corners[1:])
+            if len(corners) == 2
+            else (
+                corners,
+                np.roll(corners, -1, axis=0),
+            )
+        )
         e = b - a
         cross = directions[:, :1] * e[:, 1] - directions[:, 1:] * e[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -51,8 +56,16 @@ def shapes_of(rng):
     )
     return [
         Segment(ends=((-length / 2.0, 0.0), (length / 2.0, 0.0))),
-        Rectangle(size=(10.0 ** rng.uniform(-1.0, 0.4), 10.0 ** rng.uniform(-2.3, -1.0))),
-        Polygon(points=((0.0, 0.0), (rng.uniform(0.2, 2.0), 0.02), (rng.uniform(0.1, 0.2), 0.05))),
+        Rectangle(
+            size=(10.0 ** rng.uniform(-1.0, 0.4), 10.0 ** rng.uniform(-2.3, -1.0))
+        ),
+        Polygon(
+            points=(
+                (0.0, 0.0),
+                (rng.uniform(0.2, 2.0), 0.02),
+                (rng.uniform(0.1, 0.2), 0.05),
+            )
+        ),
         Polygon(points=tuple(map(tuple, star))),
         Circle(radius=10.0 ** rng.uniform(-1.3, 0.3)),
     ]
@@ -68,11 +81,15 @@ def places(shape, high, number, rng):
     )
     bearing, heading = rng.uniform(-np.pi, np.pi, (2, len(gap)))
     away = shape.radius + gap
-    return gap, np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=1)
+    return gap, np.stack(
+        [away * np.cos(bearing), away * np.sin(bearing), heading], axis=1
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "paper_12m", "rplidar_a1", "hokuyo_ust_10lx"])
+@pytest.mark.parametrize(
+    "name", ["paper", "paper_12m", "rplidar_a1", "hokuyo_ust_10lx"]
+)
 @pytest.mark.timeout(600)  # a cold start compiles
 def test_auto_is_right_within_a_centimetre_in_every_band_for_every_shape(name):
     spec, rng = load_lidar(name), np.random.default_rng(11)
@@ -81,7 +98,9 @@ def test_auto_is_right_within_a_centimetre_in_every_band_for_every_shape(name):
         for shape in shapes_of(rng):
             scanner = make_scanner(spec, [shape])
             gap, poses = places(shape, spec.range_max, 800, rng)
-            found = scanner.scan(np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None]))
+            found = scanner.scan(
+                np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None])
+            )
             true = cast(shape, poses, spec.directions, spec.range_max)
             both = np.isfinite(found) & np.isfinite(true)
             error = np.where(both, found, 0.0) - np.where(both, true, 0.0)
@@ -100,7 +119,9 @@ def test_a_long_segment_near_the_lidar_is_scanned_exactly():
     spec, shape = load_lidar("paper"), Segment(ends=((-1.0, 0.0), (1.0, 0.0)))
     scanner, rng = make_scanner(spec, [shape]), np.random.default_rng(1)
     _, poses = places(shape, 3.0, 2000, rng)
-    found = scanner.scan(np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None]))
+    found = scanner.scan(
+        np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None])
+    )
     true = cast(shape, poses, spec.directions, spec.range_max)
     both = np.isfinite(found) & np.isfinite(true)
     assert np.abs(found[both] - true[both]).max() < 1e-4
@@ -112,12 +133,17 @@ def test_a_star_that_the_lidar_all_but_touches_is_right_where_few_places_err():
     star = np.where(np.arange(6) % 2, 0.176, 0.402)[:, None] * np.stack(
         [np.cos(corners), np.sin(corners)], axis=1
     )
-    spec, shape = load_lidar("turtlebot3_lds_02"), Polygon(points=tuple(map(tuple, star)))
+    spec, shape = (
+        load_lidar("turtlebot3_lds_02"),
+        Polygon(points=tuple(map(tuple, star))),
+    )
     scanner, rng = make_scanner(spec, [shape]), np.random.default_rng(2)
     away = shape.radius + rng.uniform(0.001, 0.008, 4000)
     bearing, heading = rng.uniform(-np.pi, np.pi, (2, len(away)))
     poses = np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=1)
-    found = scanner.scan(np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None]))
+    found = scanner.scan(
+        np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None])
+    )
     true = cast(shape, poses, spec.directions, spec.range_max)
     both = np.isfinite(found) & np.isfinite(true)
     assert np.sqrt(np.mean((found[both] - true[both]) ** 2)) <= BAR

@@ -25,9 +25,13 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     out = np.full(len(rays), before, np.float32)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
-    beams = beams_of(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True)
+    beams = beams_of(
+        np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True
+    )
     lidar = LidarPose(*map(float, pose[:2]), c, s)
-    map_kernels.map_into(out, beams, lidar, range_max, arrays, kernel == "exact", scan_lanes())
+    map_kernels.map_into(
+        out, beams, lidar, range_max, arrays, kernel == "exact", scan_lanes()
+    )
     return out
 
 
@@ -36,14 +40,18 @@ def random_map(seed):
     shape = rng.integers(1, 30, 2)
     cells = (rng.random(shape) < rng.choice([0.02, 0.1, 0.4])) * np.int8(100)
     origin = (*rng.uniform(-2.0, 2.0, 2), rng.uniform(-np.pi, np.pi))
-    return GridMap(cells.astype(np.int8), float(rng.choice([0.05, 0.1, 0.3])), origin), rng
+    return GridMap(
+        cells.astype(np.int8), float(rng.choice([0.05, 0.1, 0.3])), origin
+    ), rng
 
 
 def random_pose(grid, rng):
     """Anywhere in the map, or up to half its size outside."""
     size = np.array(grid.cells.shape)
     place = rng.uniform(-0.5, 1.5, 2) if rng.random() < 0.3 else rng.random(2)
-    return np.array([*grid.cell_to_world(place * size - 0.5), rng.uniform(-np.pi, np.pi)])
+    return np.array(
+        [*grid.cell_to_world(place * size - 0.5), rng.uniform(-np.pi, np.pi)]
+    )
 
 
 def by_shapely(grid, pose):
@@ -72,7 +80,8 @@ def by_shapely(grid, pose):
     rays = shapely.linestrings([[here, end] for end in ends])
     lines = np.array(lines, dtype=float) * grid.resolution
     hits = shapely.distance(
-        shapely.points(here), shapely.intersection(rays[:, None], shapely.linestrings(lines)[None])
+        shapely.points(here),
+        shapely.intersection(rays[:, None], shapely.linestrings(lines)[None]),
     )
     corners = shapely.points(np.unique(lines.reshape(-1, 2), axis=0))
     clear = (shapely.distance(rays[:, None], corners[None]) > EDGE).all(axis=1)
@@ -120,7 +129,9 @@ def test_both_ways_agree_from_the_corners_edges_and_centres_of_cells():
     for shift in ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5)):
         for place in np.argwhere(~grid.blocked)[::7]:
             at = np.array([*(place[::-1] + shift) * 0.125, turn])
-            one, other = (scan(kernel, grid, at, rays=directions(720)) for kernel in KERNELS)
+            one, other = (
+                scan(kernel, grid, at, rays=directions(720)) for kernel in KERNELS
+            )
             touching = one == 0.0  # a lidar on the corner of a solid, looking past it
             assert (np.isclose(one, other, atol=1e-5) | (one == other) | touching).all()
 
@@ -138,7 +149,9 @@ def test_beams_exactly_along_the_axes_meet_the_faces_of_cells(kernel):
 def test_a_lidar_in_a_solid_cell_sees_where_the_solid_ends(kernel):
     cells = np.zeros((1, 6), np.int8)
     cells[0, 2:5] = 100
-    found = scan(kernel, GridMap(cells, 1.0), (2.5, 0.5, 0.0), rays=[[1.0, 0.0], [-1.0, 0.0]])
+    found = scan(
+        kernel, GridMap(cells, 1.0), (2.5, 0.5, 0.0), rays=[[1.0, 0.0], [-1.0, 0.0]]
+    )
     assert found == pytest.approx([2.5, 0.5], abs=1e-6)
 
 
@@ -156,8 +169,14 @@ def test_a_return_at_range_max_is_kept_and_one_beyond_is_not(kernel):
 def test_a_map_is_fused_by_the_minimum(kernel):
     grid = GridMap(np.full((1, 1), 100, np.int8), 1.0, (1.0, -0.5, 0.0))
     ahead = [[1.0, 0.0], [-1.0, 0.0]]
-    assert list(scan(kernel, grid, (0.0, 0.0, 0.0), rays=ahead, before=0.5)) == [0.5, 0.5]
-    assert list(scan(kernel, grid, (0.0, 0.0, 0.0), rays=ahead, before=2.0)) == [1.0, 2.0]
+    assert list(scan(kernel, grid, (0.0, 0.0, 0.0), rays=ahead, before=0.5)) == [
+        0.5,
+        0.5,
+    ]
+    assert list(scan(kernel, grid, (0.0, 0.0, 0.0), rays=ahead, before=2.0)) == [
+        1.0,
+        2.0,
+    ]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

@@ -31,7 +31,11 @@ def save(tmp_path):
             (tmp_path / name).write_bytes(image)
         elif image is not None:
             Image.fromarray(image).save(tmp_path / name)
-        keys = {key: v for key, v in (KEYS | {"image": name} | changes).items() if key not in drop}
+        keys = {
+            key: v
+            for key, v in (KEYS | {"image": name} | changes).items()
+            if key not in drop
+        }
         lines = [f"{key}: {value}\n" for key, value in keys.items()]
         (tmp_path / "map.yaml").write_text("".join(lines))
         return tmp_path / "map.yaml"
@@ -71,7 +75,9 @@ def test_a_scaled_map_spreads_what_lies_between_the_thresholds(save):
 def test_a_raw_map_holds_percentages(save):
     image = np.array([[0, 1, 99, 100, 101, 255]], np.uint8)
     for negate in (0, 1):
-        assert cells(save(image, mode="raw", negate=negate)) == [[0, 1, 99, 100, -1, -1]]
+        assert cells(save(image, mode="raw", negate=negate)) == [
+            [0, 1, 99, 100, -1, -1]
+        ]
 
 
 @pytest.mark.parametrize("mode", ["trinary", "scale"])
@@ -96,7 +102,9 @@ def test_colours_count_by_their_brightness(save):
 def test_palettes_and_bilevel_images_are_read(save, tmp_path):
     path = save(None, "map.png")
     for mode in ("P", "1", "L", "RGB", "RGBA", "LA"):
-        Image.fromarray(np.array([[0, 255]], np.uint8)).convert(mode).save(tmp_path / "map.png")
+        Image.fromarray(np.array([[0, 255]], np.uint8)).convert(mode).save(
+            tmp_path / "map.png"
+        )
         assert cells(path) == [[100, 0]], mode
 
 
@@ -106,7 +114,8 @@ def test_palettes_and_bilevel_images_are_read(save, tmp_path):
         b"P5\n# GIMP\n4 2\n# more\n255\n" + GREYS.tobytes(),
         b"P2\n# plain\n4 2\n255\n0 50 100 150\n200 205 254 255\n",
         b"P5 4 2 65535\n" + (GREYS.astype(">u2") * 257).tobytes(),
-        b"P2 4 2 65535\n" + " ".join(str(v * 257) for v in GREYS.ravel().tolist()).encode(),
+        b"P2 4 2 65535\n"
+        + " ".join(str(v * 257) for v in GREYS.ravel().tolist()).encode(),
     ],
     ids=["binary", "plain", "16 bit", "plain 16 bit"],
 )
@@ -115,7 +124,11 @@ def test_all_kinds_of_pgm_give_the_same_map(save, image):
 
 
 def test_16_bit_png_is_read(save):
-    assert cells(save(GREYS.astype(np.uint16) * 257, "map.png", mode="raw"))[0][:3] == [0, 50, 100]
+    assert cells(save(GREYS.astype(np.uint16) * 257, "map.png", mode="raw"))[0][:3] == [
+        0,
+        50,
+        100,
+    ]
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "RGBA", "palette", "grey"])
@@ -138,7 +151,9 @@ def test_no_kind_of_image_takes_many_bytes_for_a_pixel(save, tmp_path, kind):
     assert peak < 10 * side**2 + 2**26, f"{peak / side**2:.1f} bytes for a pixel"
 
 
-def test_the_image_may_be_named_absolutely_or_from_the_folder_of_the_yaml(save, tmp_path):
+def test_the_image_may_be_named_absolutely_or_from_the_folder_of_the_yaml(
+    save, tmp_path
+):
     path = save()
     there = tmp_path / "elsewhere.yaml"
     for image in (tmp_path / "map.pgm", "./map.pgm"):
@@ -150,8 +165,13 @@ def test_the_shipped_map_is_one_closed_room_with_doors():
     room = load_map("room")
     assert room.cells.shape == (160, 200)
     assert set(np.unique(room.cells)) == {-1, 0, 100}
-    rooms, _ = ndimage.label(room.free & (room.distance_field > 0.3))  # where a robot may go
-    places = [tuple(room.world_to_cell(place)) for place in ([0.0, 0.0], [4.0, -2.5], [5.0, 2.0])]
+    rooms, _ = ndimage.label(
+        room.free & (room.distance_field > 0.3)
+    )  # where a robot may go
+    places = [
+        tuple(room.world_to_cell(place))
+        for place in ([0.0, 0.0], [4.0, -2.5], [5.0, 2.0])
+    ]
     assert len({int(rooms[place]) for place in places} | {0}) == 2
 
 
@@ -159,15 +179,24 @@ def test_the_shipped_map_is_one_closed_room_with_doors():
     ("changes", "sentence"),
     [
         ({"drop": ["negate"]}, "map.yaml: the key 'negate' is missing; add it"),
-        ({"resolutoin": 1}, "map.yaml: unknown key 'resolutoin'; did you mean 'resolution'?"),
-        ({"resolution": 0}, "key 'resolution': input should be greater than or equal to 0.0001"),
+        (
+            {"resolutoin": 1},
+            "map.yaml: unknown key 'resolutoin'; did you mean 'resolution'?",
+        ),
+        (
+            {"resolution": 0},
+            "key 'resolution': input should be greater than or equal to 0.0001",
+        ),
         ({"origin": [0, 0]}, "key 'origin"),
         (
             {"mode": "trinery"},
             "key 'mode': input should be 'trinary', 'scale' or 'raw', not 'trinery'",
         ),
         ({"free_thresh": 0.7}, "free_thresh must be less than occupied_thresh"),
-        ({"occupied_thresh": 65}, "key 'occupied_thresh': input should be less than or equal to 1"),
+        (
+            {"occupied_thresh": 65},
+            "key 'occupied_thresh': input should be less than or equal to 1",
+        ),
         ({"negate": 2}, "key 'negate'"),
     ],
 )
@@ -181,7 +210,9 @@ def test_a_wrong_key_is_named_with_its_file(save, changes, sentence):
 def test_a_missing_image_is_named_with_the_nearest(save, tmp_path):
     path = save()
     (tmp_path / "map.pgm").rename(tmp_path / "mop.pgm")
-    with pytest.raises(ConfigError, match=r"key 'image'.*map\.pgm'; did you mean 'mop\.pgm'\?"):
+    with pytest.raises(
+        ConfigError, match=r"key 'image'.*map\.pgm'; did you mean 'mop\.pgm'\?"
+    ):
         load_map(path)
 
 
@@ -197,14 +228,18 @@ def test_a_missing_image_is_named_with_the_nearest(save, tmp_path):
     ],
 )
 def test_a_damaged_image_is_one_sentence(save, image):
-    with pytest.raises(ConfigError, match=r"map\.pgm: is no whole PGM, PNG or BMP image"):
+    with pytest.raises(
+        ConfigError, match=r"map\.pgm: is no whole PGM, PNG or BMP image"
+    ):
         load_map(save(image))
 
 
 @pytest.mark.parametrize("size", [b"9000 9000", b"99999 99999"])
 def test_an_image_that_is_too_large_is_refused_before_it_is_read(save, size):
     assert maps.MAX_CELLS < 9000 * 9000
-    with pytest.raises(ConfigError, match=r"map\.pgm: has too many pixels, a map may have 64"):
+    with pytest.raises(
+        ConfigError, match=r"map\.pgm: has too many pixels, a map may have 64"
+    ):
         load_map(save(b"P5 " + size + b" 255\n"))
 
 

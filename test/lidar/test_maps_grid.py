@@ -12,7 +12,9 @@ TURNED = (1.0, -2.0, 0.7)
 def grid(rows, **changes):
     """A map from its picture: the last line is row 0."""
     values = {".": 0, "#": 100, "?": -1, "5": 50}
-    cells = np.array([[values[letter] for letter in line] for line in rows[::-1]], np.int8)
+    cells = np.array(
+        [[values[letter] for letter in line] for line in rows[::-1]], np.int8
+    )
     return GridMap(cells, **{"resolution": 0.5} | changes)
 
 
@@ -39,8 +41,12 @@ def test_cells_come_back_from_their_centres():
 def test_what_is_unknown_stops_beams_when_asked():
     picture = [".?5#"]
     assert grid(picture).blocked.tolist() == [[False, False, False, True]]
-    assert grid(picture, unknown_stops=True).blocked.tolist() == [[False, True, True, True]]
-    assert grid(picture, occupied_from=50).blocked.tolist() == [[False, False, True, True]]
+    assert grid(picture, unknown_stops=True).blocked.tolist() == [
+        [False, True, True, True]
+    ]
+    assert grid(picture, occupied_from=50).blocked.tolist() == [
+        [False, False, True, True]
+    ]
     assert grid(picture).free.tolist() == [[True, False, False, False]]
 
 
@@ -51,7 +57,9 @@ def test_the_distance_field_is_the_distance_to_the_nearest_square():
         room = GridMap(cells, 0.05)
         low = np.argwhere(room.blocked)[:, ::-1] * 0.05
         squares = shapely.union_all(shapely.box(*low.T, *(low + 0.05).T))
-        centres = shapely.points(GridMap(cells, 0.05).cell_to_world(np.argwhere(cells > -9)))
+        centres = shapely.points(
+            GridMap(cells, 0.05).cell_to_world(np.argwhere(cells > -9))
+        )
         expected = shapely.distance(squares, centres).reshape(cells.shape)
         assert room.distance_field == pytest.approx(expected, abs=1e-6)
 

@@ -7,7 +7,13 @@ from robots import lidar
 from nics_drl_bridge.lidar.spec import from_device, load_lidar, to_device
 
 CONVENTIONS = {"inf": np.inf, "zero": 0.0, "nan": np.nan, "range_max": 3.0}
-DEVICES = ["rplidar_a1", "rplidar_a2", "hokuyo_ust_10lx", "sick_tim571", "turtlebot3_lds_02"]
+DEVICES = [
+    "rplidar_a1",
+    "rplidar_a2",
+    "hokuyo_ust_10lx",
+    "sick_tim571",
+    "turtlebot3_lds_02",
+]
 
 
 @pytest.mark.parametrize("no_return", CONVENTIONS)
@@ -44,7 +50,9 @@ def test_only_no_return_is_rewritten_on_the_way_out(no_return):
 )
 def test_what_a_device_says_is_taken_as_what_it_means(no_return, said, meant):
     spec = lidar(no_return=no_return)
-    assert np.array_equal(from_device([said], spec), np.array([meant], np.float32), equal_nan=True)
+    assert np.array_equal(
+        from_device([said], spec), np.array([meant], np.float32), equal_nan=True
+    )
     assert from_device([-np.inf], spec)[0] == -np.inf
 
 

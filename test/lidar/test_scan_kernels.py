@@ -54,11 +54,14 @@ for shape in shapes:
 @pytest.mark.process
 @pytest.mark.parametrize("side", ["before", "behind"])
 @pytest.mark.parametrize(
-    "beams", [48, *(pytest.param(n, marks=pytest.mark.campaign) for n in (36, 180, 360, 720))]
+    "beams",
+    [48, *(pytest.param(n, marks=pytest.mark.campaign) for n in (36, 180, 360, 720))],
 )
 def test_a_look_up_reads_nothing_outside_of_its_table(beams, side):
     command = [sys.executable, "-c", BETWEEN_FORBIDDEN_PAGES, str(beams), side]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -71,7 +74,9 @@ def looked_up(view: float, ahead: float, bearing: float) -> bool:
     body = scanner.place([disc], [[np.cos(turned), np.sin(turned), 0.0]])
     here = LidarPose(0.0, 0.0, np.cos(0.7), np.sin(0.7))
     lanes, near = scan_kernels.scan_lanes(), np.zeros(1, int)
-    found, computed = scan_kernels.select(0, near, body, -1, here, 0.7, 0, scanner.arguments, lanes)
+    found, computed = scan_kernels.select(
+        0, near, body, -1, here, 0.7, 0, scanner.arguments, lanes
+    )
     assert computed == 0
     return bool(found)
 
@@ -84,5 +89,7 @@ def test_of_bodies_only_those_wholly_behind_all_beams_are_not_looked_up(view, ah
     assert looked_up(view, ahead, ahead)
     assert looked_up(view, ahead, ahead + edge - 0.01)
     assert looked_up(view, ahead, ahead - edge + 0.01)
-    behind = np.pi - edge > view / 90.0  # the disc fits between the last beam and the first
+    behind = (
+        np.pi - edge > view / 90.0
+    )  # the disc fits between the last beam and the first
     assert looked_up(view, ahead, ahead + np.pi) != behind

@@ -2,7 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lidar_scenes import POLYGONS, Scene, by_plane_geometry, random_scene, random_shapes, ring
+from lidar_scenes import (
+    POLYGONS,
+    Scene,
+    by_plane_geometry,
+    random_scene,
+    random_shapes,
+    ring,
+)
 from plain_scan import scan_robot
 from robots import lidar
 
@@ -25,7 +32,9 @@ SENSORS = {
     "over the seam": lidar(beams=61, angle_min=HALF, angle_max=3.0 * HALF),
     "clockwise of zero": lidar(beams=61, angle_min=-6.0, angle_max=-1.0),
     "off-centre": lidar(beams=90, mount=(0.2, -0.1, 0.7)),
-    "half, off-centre": lidar(beams=45, angle_min=-HALF, angle_max=HALF, mount=(-0.3, 0.1, 3.0)),
+    "half, off-centre": lidar(
+        beams=45, angle_min=-HALF, angle_max=HALF, mount=(-0.3, 0.1, 3.0)
+    ),
     "short": lidar(beams=90, range_min=0.4, range_max=1.2),
     "one beam": lidar(beams=1),
     "one beam ahead": lidar(beams=1, angle_min=-0.1, angle_max=0.1),
@@ -59,7 +68,9 @@ def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
             scanner = Scanner(spec, bake(spec, shapes, COARSE), "exact")
         scene = random_scene(seed, shapes, far=1e4 if seed % 3 == 0 else 0.0)
         expected, clear = by_plane_geometry(spec, scene)
-        assert scan(scanner, scene)[clear] == pytest.approx(expected[clear], abs=1e-3), seed
+        assert scan(scanner, scene)[clear] == pytest.approx(
+            expected[clear], abs=1e-3
+        ), seed
         compared += np.isfinite(expected[clear]).sum()
     assert compared > 10 * spec.beams
 
@@ -75,9 +86,13 @@ def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says(render
         angle, part = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 0.999)
         away = part * shape.radius * np.array([np.cos(angle), np.sin(angle)])
         pose = np.array([*away, rng.uniform(-np.pi, np.pi)])
-        scene = Scene(np.array([0.0, 0.0, angle]), (shape,), pose[None], np.zeros((0, 4)))
+        scene = Scene(
+            np.array([0.0, 0.0, angle]), (shape,), pose[None], np.zeros((0, 4))
+        )
         expected, clear = by_plane_geometry(spec, scene)
-        assert scan(scanner, scene)[clear] == pytest.approx(expected[clear], abs=1e-3), seed
+        assert scan(scanner, scene)[clear] == pytest.approx(
+            expected[clear], abs=1e-3
+        ), seed
         compared += np.isfinite(expected[clear]).sum()
     assert compared > 1000
 
@@ -87,7 +102,9 @@ def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says(render
 def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
     spec = SENSORS[name]
     if spec.beams > 1000:
-        spec = lidar(beams=720)  # beams as narrow as these show the same, and bake sooner
+        spec = lidar(
+            beams=720
+        )  # beams as narrow as these show the same, and bake sooner
     errors, returns, wrong = [], 0, 0
     for seed in range(40):
         if seed % 20 == 0:
@@ -100,14 +117,22 @@ def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
         returns += np.isfinite(computed).sum()
         wrong += (np.isinf(looked_up) != np.isinf(computed)).sum()
     # The wider the beams, the coarser the points of a row: 1/4 of 10 degrees is 2 cm at 0.5 m.
-    limit = 0.01 if spec.angle_increment < 0.01 else 0.03 if spec.angle_increment < 0.2 else 0.05
+    limit = (
+        0.01
+        if spec.angle_increment < 0.01
+        else 0.03
+        if spec.angle_increment < 0.2
+        else 0.05
+    )
     assert np.sqrt(np.square(errors).mean()) < limit
     assert wrong <= 2 + 0.006 * returns
     assert returns > 0.1 * np.size(errors)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("density", [Density(), Density(distances=20, rotations=24, phases=1)])
+@pytest.mark.parametrize(
+    "density", [Density(), Density(distances=20, rotations=24, phases=1)]
+)
 @pytest.mark.parametrize("corners", [3, 8, 200])
 @pytest.mark.parametrize("make", POLYGONS)
 def test_silhouettes_of_any_polygon_are_exact_at_any_density(make, corners, density):
@@ -118,7 +143,9 @@ def test_silhouettes_of_any_polygon_are_exact_at_any_density(make, corners, dens
     # From touching on; not so far that the limit of range decides instead of the silhouette.
     distance = shape.radius * (1.0 + 1e-9) + rng.uniform(0.0, 1.0, 300) ** 3 * 1.5
     bearing, heading = rng.uniform(-np.pi, np.pi, (2, 300))
-    poses = np.stack([distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1)
+    poses = np.stack(
+        [distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1
+    )
     scans = [
         one.scan(np.zeros((300, 3)), one.place([shape], poses[:, None]))
         for one in (Scanner(spec, table, "baked"), Scanner(spec, table, "exact"))
@@ -135,7 +162,9 @@ def test_the_papers_scenes_are_off_by_less_than_3_mm():
     for shapes in ([Circle(radius=0.15)] * 10, [SQUARE] * 10, [STRIP] * 10):
         poses = rng.uniform(-1.0, 1.0, (200, 10, 3)) * [3.0, 3.0, np.pi]
         bodies = exact.place(shapes, poses)
-        one, other = (finite(s.scan(np.zeros((200, 3)), bodies), spec) for s in (baked, exact))
+        one, other = (
+            finite(s.scan(np.zeros((200, 3)), bodies), spec) for s in (baked, exact)
+        )
         assert (other < spec.range_max).mean() > 0.2
         assert np.sqrt(((one - other) ** 2).mean()) < 0.003
 
@@ -155,14 +184,20 @@ def test_ranges_beyond_the_limits_are_infinite_with_the_sign_of_rep_117(renderer
 def test_a_lidar_inside_a_circle_sees_its_far_side(renderer):
     spec = lidar(beams=36)
     scanner = make_scanner(spec, [Circle(radius=0.25)], renderer)
-    ranges = scanner.scan(HERE, scanner.place(scanner.table.shapes, [(0.1, 0.0, 0.0)]))[0]
+    ranges = scanner.scan(HERE, scanner.place(scanner.table.shapes, [(0.1, 0.0, 0.0)]))[
+        0
+    ]
     c, s = np.cos(spec.angles), np.sin(spec.angles)
-    assert ranges == pytest.approx(0.1 * c + np.sqrt(0.25**2 - (0.1 * s) ** 2), abs=1e-5)
+    assert ranges == pytest.approx(
+        0.1 * c + np.sqrt(0.25**2 - (0.1 * s) ** 2), abs=1e-5
+    )
 
 
 @pytest.mark.parametrize("part", [0.3, 0.8, 1.5])
 def test_an_outline_that_crosses_itself_is_seen_from_anywhere(part):
-    star = 0.5 * np.stack([f(0.8 * np.pi * np.arange(5)) for f in (np.cos, np.sin)], axis=1)
+    star = 0.5 * np.stack(
+        [f(0.8 * np.pi * np.arange(5)) for f in (np.cos, np.sin)], axis=1
+    )
     bow = np.array([(-0.5, -0.3), (0.5, 0.3), (0.5, -0.3), (-0.5, 0.3)])
     for outline in (star, bow):
         shape = Polygon(points=tuple(map(tuple, outline)))
@@ -171,9 +206,14 @@ def test_an_outline_that_crosses_itself_is_seen_from_anywhere(part):
         for angle in np.linspace(0.1, 6.2, 20):
             robot = [part * 0.5 * np.cos(angle), part * 0.5 * np.sin(angle), angle]
             bodies = scanner.place([shape], [(0.0, 0.0, 0.0)])
-            seen, walls = scanner.scan(robot, bodies)[0], scanner.scan(robot, [], ends)[0]
+            seen, walls = (
+                scanner.scan(robot, bodies)[0],
+                scanner.scan(robot, [], ends)[0],
+            )
             assert np.array_equal(np.isinf(seen), np.isinf(walls))
-            assert finite(seen, scanner.spec) == pytest.approx(finite(walls, scanner.spec))
+            assert finite(seen, scanner.spec) == pytest.approx(
+                finite(walls, scanner.spec)
+            )
 
 
 def test_a_wall_seen_edge_on_returns_nothing():
@@ -183,14 +223,22 @@ def test_a_wall_seen_edge_on_returns_nothing():
 
 def test_a_wall_in_line_with_the_lidar_but_for_rounding_hides_nothing():
     scanner = make_scanner(lidar(beams=360, range_min=0.05, range_max=10.0), ())
-    wall = [-0.19583694396573836, -4.404163056034261, -1.8221825406947976, -2.7778174593052025]
+    wall = [
+        -0.19583694396573836,
+        -4.404163056034261,
+        -1.8221825406947976,
+        -2.7778174593052025,
+    ]
     assert np.isinf(scanner.scan([-2.6, -2.0, -np.pi], [], [wall])[0]).all()
     assert (scanner.scan([-2.6, -2.0, -np.pi], [], [wall])[0] > 0.0).all()
 
 
 @pytest.mark.parametrize("beams", [40, 360, 1100])
 def test_a_wall_met_at_a_flat_angle_is_as_exact_as_another(beams):
-    scanner, rng = make_scanner(lidar(beams=beams, range_max=25.0), ()), np.random.default_rng(1)
+    scanner, rng = (
+        make_scanner(lidar(beams=beams, range_max=25.0), ()),
+        np.random.default_rng(1),
+    )
     for beam in range(beams):
         along, off = rng.uniform(-3.0, 3.0), rng.uniform(0.01, 0.2)
         heading = along + np.arcsin(off / 20.0) - scanner.spec.angles[beam]
@@ -218,8 +266,12 @@ def test_a_closed_room_returns_on_every_beam(renderer):
     sides = [[-1, -1, 1, -1], [1, -1, 1, 1], [1, 1, -1, 1], [-1, 1, -1, -1]]
     for pose in np.random.default_rng(2).uniform(-0.9, 0.9, (50, 3)):
         assert np.isfinite(scanner.scan(pose, [], sides)).all()
-        assert np.isfinite(scanner.scan(pose, scanner.place([room], [(0.0, 0.0, 0.3)]))).any()
-    assert np.isfinite(scanner.scan(HERE, scanner.place([room], [(0.1, 0.0, 0.3)]))).all()
+        assert np.isfinite(
+            scanner.scan(pose, scanner.place([room], [(0.0, 0.0, 0.3)]))
+        ).any()
+    assert np.isfinite(
+        scanner.scan(HERE, scanner.place([room], [(0.1, 0.0, 0.3)]))
+    ).all()
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
@@ -245,7 +297,9 @@ def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
     for n in range(40):
         assert np.array_equal(batch[n], scanner.scan(robots[n], bodies[n], walls)[0])
     order = np.random.default_rng(0).permutation(40)
-    assert np.array_equal(scanner.scan(robots[order], bodies[order], walls), batch[order])
+    assert np.array_equal(
+        scanner.scan(robots[order], bodies[order], walls), batch[order]
+    )
     into = np.full_like(batch, np.nan)
     assert scanner.scan(robots, bodies, walls, out=into) is into
     assert np.array_equal(into, batch)
@@ -258,7 +312,9 @@ def cross(a, b):
 @pytest.mark.parametrize("view", [4.0, 2.0 * np.pi])
 @pytest.mark.parametrize("beams", [1, 7, 47, 48, 49, 720, 1081])
 def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
-    spec = lidar(beams=beams, angle_min=-0.5 * view, angle_max=0.5 * view, range_max=6.0)
+    spec = lidar(
+        beams=beams, angle_min=-0.5 * view, angle_max=0.5 * view, range_max=6.0
+    )
     scanner, rng = make_scanner(spec, ()), np.random.default_rng(beams)
     for count in (1, 7, 8, 9, 20):
         robot, walls = rng.uniform(-1.0, 1.0, 3), rng.uniform(-5.0, 5.0, (count, 4))
@@ -280,7 +336,9 @@ def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("beams", [7, 20, 40, 720])
-def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(beams):
+def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(
+    beams,
+):
     scanner = make_scanner(lidar(beams=beams), random_shapes(5), "baked")
     rng, shapes = np.random.default_rng(beams), scanner.table.shapes
     count, worlds = 2 * LANES + 5, 3
@@ -288,7 +346,9 @@ def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bi
     bodies = scanner.place([shapes[k % len(shapes)] for k in range(count)], poses)
     robots = rng.uniform(-1.0, 1.0, (worlds, 3))
     for part in (1, 7, LANES - 1, LANES, LANES + 1):
-        pieces = [scanner.scan(robots, bodies[:, k : k + part]) for k in range(0, count, part)]
+        pieces = [
+            scanner.scan(robots, bodies[:, k : k + part]) for k in range(0, count, part)
+        ]
         assert np.array_equal(scanner.scan(robots, bodies), np.minimum.reduce(pieces))
 
 
@@ -329,14 +389,19 @@ def test_nobody_and_nothing_can_be_scanned(renderer):
         scanner = make_scanner(spec, shapes, renderer)
         assert scanner.scan(np.zeros((0, 3)), np.zeros((0, 4, 7))).shape == (0, 20)
         assert scanner.scan(np.zeros((0, 3)), []).shape == (0, 20)
-        assert scanner.scan(np.zeros((5, 3)), np.zeros((5, 0, 7))).tolist() == [[np.inf] * 20] * 5
+        assert (
+            scanner.scan(np.zeros((5, 3)), np.zeros((5, 0, 7))).tolist()
+            == [[np.inf] * 20] * 5
+        )
         assert np.isinf(scanner.scan(HERE, scanner.place([], np.zeros((0, 3))))).all()
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_a_body_without_radius_is_not_there(renderer):
     scanner = make_scanner(lidar(), [SQUARE, Circle(radius=0.2)], renderer)
-    bodies = scanner.place([SQUARE, Circle(radius=0.2)], [(0.1, 0.0, 0.0), (1.0, 0.0, 0.0)])
+    bodies = scanner.place(
+        [SQUARE, Circle(radius=0.2)], [(0.1, 0.0, 0.0), (1.0, 0.0, 0.0)]
+    )
     assert np.isfinite(scanner.scan(HERE, bodies)).any()
     bodies[:, 5] = 0.0
     assert np.isinf(scanner.scan(HERE, bodies)).all()
@@ -346,14 +411,18 @@ def test_a_body_without_radius_is_not_there(renderer):
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 @pytest.mark.parametrize("column", [0, 1, 2])
 @pytest.mark.filterwarnings("error")
-def test_a_pose_that_is_no_number_neither_hangs_nor_harms_the_others(renderer, wrong, column):
+def test_a_pose_that_is_no_number_neither_hangs_nor_harms_the_others(
+    renderer, wrong, column
+):
     scanner = make_scanner(lidar(), [SQUARE], renderer)
     good = np.array([(1.0, 0.2, 0.3), (-0.8, 0.1, 1.0)])
     bad = np.array([(0.0, 1.0, 0.1)])
     bad[0, column] = wrong
     bodies = scanner.place([SQUARE] * 3, np.concatenate([good, bad]))
     expected = scanner.scan(HERE, scanner.place([SQUARE] * 2, good))
-    assert np.array_equal(scanner.scan(HERE, bodies) <= expected, np.ones_like(expected, bool))
+    assert np.array_equal(
+        scanner.scan(HERE, bodies) <= expected, np.ones_like(expected, bool)
+    )
     robots = np.zeros((2, 3))
     robots[0, column] = wrong
     pair = scanner.place([SQUARE] * 2, np.stack([good, good]))
@@ -380,7 +449,10 @@ def test_auto_looks_up_all_but_huge_shapes_and_those_with_notches():
 
 
 def test_two_lidars_in_one_process_use_their_own_tables():
-    wide, narrow = lidar(beams=90), lidar(beams=30, angle_min=-1.0, angle_max=1.0, range_max=2.0)
+    wide, narrow = (
+        lidar(beams=90),
+        lidar(beams=30, angle_min=-1.0, angle_max=1.0, range_max=2.0),
+    )
     scanners = [make_scanner(wide, (SQUARE, STRIP)), make_scanner(narrow, (STRIP,))]
     for scanner in (*scanners, *scanners):
         exact = Scanner(scanner.spec, scanner.table, "exact")
@@ -396,17 +468,25 @@ def test_two_lidars_in_one_process_use_their_own_tables():
 
 def test_a_shape_that_was_not_baked_is_refused_by_its_description():
     scanner = make_scanner(lidar(), (Circle(radius=0.1), STRIP))
-    with pytest.raises(ModelError, match=r"circle of radius 0.3 m is not in the lidar table, .*"):
+    with pytest.raises(
+        ModelError, match=r"circle of radius 0.3 m is not in the lidar table, .*"
+    ):
         scanner.place([Circle(radius=0.3)], [(1.0, 0.0, 0.0)])
     triangle = Polygon(points=((0, 0), (1, 0), (0, 1)))
-    with pytest.raises(ModelError, match=r"polygon of 3 corners, radius 1 m .* 0.6 x 0.06 m; bake"):
+    with pytest.raises(
+        ModelError, match=r"polygon of 3 corners, radius 1 m .* 0.6 x 0.06 m; bake"
+    ):
         scanner.place([triangle], [(1.0, 0.0, 0.0)])
 
 
-@pytest.mark.parametrize("change", [{"beams": 73}, {"range_max": 4.0}, {"angle_max": 2.0}])
+@pytest.mark.parametrize(
+    "change", [{"beams": 73}, {"range_max": 4.0}, {"angle_max": 2.0}]
+)
 def test_the_table_of_another_lidar_is_refused(change):
     table = bake(lidar(), (SQUARE,), COARSE)
-    with pytest.raises(ModelError, match=r"table .*, not .*; bake one for the lidar 'lidar'"):
+    with pytest.raises(
+        ModelError, match=r"table .*, not .*; bake one for the lidar 'lidar'"
+    ):
         Scanner(lidar(**change), table)
     Scanner(lidar(**change), table, "exact")
     Scanner(lidar(range_max=2.0, range_min=0.3, mount=(0.1, 0.0, 1.0)), table)
@@ -438,12 +518,16 @@ def test_a_body_of_another_scanner_is_refused_before_it_is_looked_for(renderer, 
     scanner = make_scanner(lidar(), [SQUARE, STRIP], renderer)
     bodies = scanner.place([SQUARE], [(1.0, 0.0, 0.0)])
     bodies[0, -1] = index
-    with pytest.raises(ModelError, match="none of the 2 in the lidar table; make bodies by"):
+    with pytest.raises(
+        ModelError, match="none of the 2 in the lidar table; make bodies by"
+    ):
         scanner.scan(HERE, bodies)
 
 
 def test_an_unknown_renderer_is_refused_with_the_nearest():
-    with pytest.raises(ConfigError, match="unknown renderer 'backed'; did you mean 'baked'"):
+    with pytest.raises(
+        ConfigError, match="unknown renderer 'backed'; did you mean 'baked'"
+    ):
         make_scanner(lidar(), [SQUARE], "backed")
 
 
@@ -457,7 +541,9 @@ def rmse(spec, table):
     poses = np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=-1)
     bodies = exact.place([table.shapes[0]] * 10, poses)
     one, other = (
-        np.nan_to_num(each.scan(np.zeros((400, 3)), bodies), posinf=spec.range_max, neginf=0.0)
+        np.nan_to_num(
+            each.scan(np.zeros((400, 3)), bodies), posinf=spec.range_max, neginf=0.0
+        )
         for each in (baked, exact)
     )
     return np.sqrt(np.mean((one - other) ** 2))
@@ -478,10 +564,16 @@ def test_an_array_that_can_not_hold_the_scans_is_refused(out):
 
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_a_static_map_is_seen_beside_the_bodies_and_within_the_limits(renderer):
-    spec = lidar(beams=4, angle_min=0.0, angle_max=2.0 * np.pi, range_min=0.3, range_max=3.0)
+    spec = lidar(
+        beams=4, angle_min=0.0, angle_max=2.0 * np.pi, range_min=0.3, range_max=3.0
+    )
     cells = np.zeros((100, 100), np.int8)
-    cells[:, 70] = cells[98, :] = cells[48, 50] = 100  # east at 2 m, north at 4.8 m, south, near
-    scanner = make_scanner(spec, [SQUARE], renderer, GridMap(cells, 0.1, origin=(-5.0, -5.0, 0.0)))
+    cells[:, 70] = cells[98, :] = cells[48, 50] = (
+        100  # east at 2 m, north at 4.8 m, south, near
+    )
+    scanner = make_scanner(
+        spec, [SQUARE], renderer, GridMap(cells, 0.1, origin=(-5.0, -5.0, 0.0))
+    )
     bodies = scanner.place([SQUARE], [[-1.0, 0.05, 0.0]])
     ranges = scanner.scan([0.05, 0.05, 0.0], bodies)[0]
     assert ranges == pytest.approx([1.95, np.inf, 0.9, -np.inf], abs=1e-3)
@@ -491,7 +583,9 @@ def star_of(corners, depth):
     """Corners in turn on a circle of 0.4 m and inside of it."""
     angles = 2.0 * np.pi / corners * np.arange(corners)
     radii = 0.4 * (1.0 - depth * (np.arange(corners) % 2))
-    return Polygon(points=np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1))
+    return Polygon(
+        points=np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
+    )
 
 
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.3, -0.2, 2.5)])
@@ -502,7 +596,10 @@ def test_auto_looks_up_a_concave_shape_of_any_corners_where_that_errs_little(mou
         auto = make_scanner(spec, [shape])
         poses = rng.uniform(-1.0, 1.0, (300, 1, 3)) * [2.5, 2.5, np.pi]
         bodies, robots = auto.place([shape], poses), np.zeros((300, 3))
-        scans = {way: Scanner(spec, auto.table, way).scan(robots, bodies) for way in RENDERERS}
+        scans = {
+            way: Scanner(spec, auto.table, way).scan(robots, bodies)
+            for way in RENDERERS
+        }
         as_baked, as_exact = (
             (scans["auto"] == scans[way]).all(axis=1) for way in ("baked", "exact")
         )
@@ -511,7 +608,10 @@ def test_auto_looks_up_a_concave_shape_of_any_corners_where_that_errs_little(mou
         assert not np.array_equal(scans["baked"], scans["exact"])
         both = np.isfinite(scans["auto"]) & np.isfinite(scans["exact"])
         assert both.sum() > 1000
-        assert np.sqrt(np.square(scans["auto"][both] - scans["exact"][both]).mean()) < 0.012
+        assert (
+            np.sqrt(np.square(scans["auto"][both] - scans["exact"][both]).mean())
+            < 0.012
+        )
 
 
 @pytest.mark.parametrize(
@@ -522,10 +622,14 @@ def test_auto_computes_the_rays_of_few_and_wide_beams(beams, same):
     auto, disc = make_scanner(spec, [STRIP, Circle(radius=0.1)]), Circle(radius=0.1)
     poses = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 1, 3)) * [2.0, 2.0, np.pi]
     scans = {
-        way: Scanner(spec, auto.table, way).scan(np.zeros((300, 3)), auto.place([disc], poses))
+        way: Scanner(spec, auto.table, way).scan(
+            np.zeros((300, 3)), auto.place([disc], poses)
+        )
         for way in RENDERERS
     }
-    as_baked, as_exact = ((scans["auto"] == scans[way]).all(axis=1) for way in ("baked", "exact"))
+    as_baked, as_exact = (
+        (scans["auto"] == scans[way]).all(axis=1) for way in ("baked", "exact")
+    )
     assert (as_baked | as_exact).all()
     assert (~as_exact).any() == (same == "baked")
     assert not np.array_equal(scans["baked"], scans["exact"])
@@ -542,9 +646,13 @@ def test_a_lidar_of_the_most_beams_scans_exactly_without_a_table(view, few, ever
     poses = np.array([(1.5, 0.2, 0.3), (-0.8, 0.4, 1.0), (-1.2, -0.9, 0.2)])
     scene = Scene(np.zeros(3), shapes, poses, np.zeros((0, 4)))
     expected, clear = by_plane_geometry(spec.model_copy(update={"beams": few}), scene)
-    assert scan(scanner, scene)[::every][clear] == pytest.approx(expected[clear], abs=1e-3)
+    assert scan(scanner, scene)[::every][clear] == pytest.approx(
+        expected[clear], abs=1e-3
+    )
     assert np.isfinite(expected[clear]).sum() > 50
-    with pytest.raises(ModelError, match="no rows to look up with the renderer 'baked'; bake one"):
+    with pytest.raises(
+        ModelError, match="no rows to look up with the renderer 'baked'; bake one"
+    ):
         Scanner(spec, scanner.table, "baked")
 
 
@@ -555,10 +663,14 @@ def test_a_full_circle_of_the_most_beams_can_be_looked_up():
     assert table.widths.max() > 2**15
     baked, exact = Scanner(spec, table, "baked"), Scanner(spec, table, "exact")
     rng = np.random.default_rng(0)
-    away, (bearing, heading) = rng.uniform(0.213, 0.6, 10), rng.uniform(-np.pi, np.pi, (2, 10))
+    away, (bearing, heading) = (
+        rng.uniform(0.213, 0.6, 10),
+        rng.uniform(-np.pi, np.pi, (2, 10)),
+    )
     poses = np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=1)
     one, other = (
-        s.scan(np.zeros((10, 3)), s.place([SQUARE], poses[:, None])) for s in (baked, exact)
+        s.scan(np.zeros((10, 3)), s.place([SQUARE], poses[:, None]))
+        for s in (baked, exact)
     )
     assert (np.isfinite(one) != np.isfinite(other)).sum() < 20
     both = np.isfinite(one) & np.isfinite(other)

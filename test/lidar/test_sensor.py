@@ -63,8 +63,15 @@ class Nearest(Sensor):
 
 def rear(**changes) -> FurtherLidar:
     """A coarse lidar that looks back."""
-    back = {"beams": 31, "angle_min": -1.5, "angle_max": 1.5, "mount": (-0.1, 0.05, np.pi)}
-    return FurtherLidar(name="rear", lidar=lidar(**{**back, "frame": "back", **changes}))
+    back = {
+        "beams": 31,
+        "angle_min": -1.5,
+        "angle_max": 1.5,
+        "mount": (-0.1, 0.05, np.pi),
+    }
+    return FurtherLidar(
+        name="rear", lidar=lidar(**{**back, "frame": "back", **changes})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +86,9 @@ def sonar(tmp_path):
     return sensor_of({"kind": f"{file}:Nearest", "name": "sonar", "reach": 4.0})
 
 
-def test_a_yaml_file_names_a_kind_that_the_caller_imported_and_no_file_of_code(tmp_path):
+def test_a_yaml_file_names_a_kind_that_the_caller_imported_and_no_file_of_code(
+    tmp_path,
+):
     (tmp_path / "nearest.py").write_text(SONAR)
     file = tmp_path / "sonar.yaml"
     file.write_text("{kind: 'nearest.py:Nearest', name: sonar}\n")
@@ -113,7 +122,10 @@ def test_its_noise_is_its_own_and_the_same_in_any_batch(model):
         replace(model, sensors=(rear(), rear()))
     other = FurtherLidar(name="other", lidar=rear(noise_std=0.05, frame="other").lidar)
     noisy = replace(model, sensors=(rear(noise_std=0.05), other))
-    one, many = FastSimulator(noisy, field(6.0, 5)), FastSimulator(noisy, field(6.0, 5), 3)
+    one, many = (
+        FastSimulator(noisy, field(6.0, 5)),
+        FastSimulator(noisy, field(6.0, 5), 3),
+    )
     one.reset([7])
     many.reset([5, 6, 7])
     assert np.array_equal(one.readings["rear"][0], many.readings["rear"][2])
@@ -123,7 +135,9 @@ def test_its_noise_is_its_own_and_the_same_in_any_batch(model):
 @pytest.mark.parametrize("estimator", [False, True])
 def test_a_task_observes_it_alike_alone_and_among_many(model, estimator):
     options = {"sensors": ["rear"]}
-    env = BridgeEnv(model=model, world=field(6.0, 5), task_options=options, estimator=estimator)
+    env = BridgeEnv(
+        model=model, world=field(6.0, 5), task_options=options, estimator=estimator
+    )
     many = BridgeVectorEnv(3, model, field(6.0, 5), task_options=options)
     single, _ = env.reset(seed=0)
     batch, _ = many.reset(seed=0)
@@ -165,11 +179,15 @@ def test_a_kind_in_a_file_of_a_users_own_is_simulated_and_observed(sonar, tmp_pa
     model = replace(direct_model(), sensors=(sonar,))
     save_model(model, tmp_path / "model")
     assert load_model(tmp_path / "model").sensors == (sonar,)
-    env = BridgeEnv(model=model, world=field(6.0, 5), task_options={"sensors": ["sonar"]})
+    env = BridgeEnv(
+        model=model, world=field(6.0, 5), task_options={"sensors": ["sonar"]}
+    )
     observation, _ = env.reset(seed=1)
     simulator = env._backend.simulator
     bodies, pose = simulator.obstacles[0], simulator.data.pose[0, 0]
-    gap = (np.hypot(*(bodies[:, :2] - pose[:2]).T) - bodies[:, 5])[bodies[:, 5] > 0.0].min()
+    gap = (np.hypot(*(bodies[:, :2] - pose[:2]).T) - bodies[:, 5])[
+        bodies[:, 5] > 0.0
+    ].min()
     assert observation[-1] == pytest.approx(min(gap / 4.0, 1.0), abs=1e-6)
 
 

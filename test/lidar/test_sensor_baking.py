@@ -25,13 +25,17 @@ def ahead(table, shape, distance, walls=()):
 @pytest.mark.parametrize("greatest", [0.5, 1.0, 1.4])
 def test_of_a_circle_that_part_returns_which_is_met_steeply_enough(greatest):
     shape = Circle(radius=0.3)
-    table = bake(SPEC, [shape], sensor_model=[IncidenceDropout(greatest_incidence=greatest)])
+    table = bake(
+        SPEC, [shape], sensor_model=[IncidenceDropout(greatest_incidence=greatest)]
+    )
     for distance in (0.8, 1.23, 2.0):
         seen = np.isfinite(ahead(table, shape, distance))
         # A ray at angle a passes the centre at distance * sin(a) = radius * sin(incidence).
         edge = np.arcsin(shape.radius * np.sin(greatest) / distance)
         off = seen != (np.abs(SPEC.angles) < edge)
-        assert (np.abs(np.abs(SPEC.angles[off]) - edge) < 1.5 * SPEC.angle_increment).all()
+        assert (
+            np.abs(np.abs(SPEC.angles[off]) - edge) < 1.5 * SPEC.angle_increment
+        ).all()
         assert seen.sum() > 10
 
 
@@ -64,7 +68,9 @@ def test_two_models_together_lose_what_either_loses():
 
 def test_a_function_and_a_named_model_that_say_the_same_bake_the_same_rows():
     named = bake(SPEC, [STRIP], SMALL, [IncidenceDropout(greatest_incidence=1.0)])
-    free = bake(SPEC, [STRIP], SMALL, lambda r, incidence: np.where(incidence > 1.0, np.inf, r))
+    free = bake(
+        SPEC, [STRIP], SMALL, lambda r, incidence: np.where(incidence > 1.0, np.inf, r)
+    )
     assert np.array_equal(named.rows, free.rows)
     assert np.isinf(named.rows).any()
 

@@ -6,7 +6,12 @@ from pydantic import Field
 
 from nics_drl_bridge.config import Schema, load_yaml, parse_yaml, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity, SensorModels, returned
+from nics_drl_bridge.lidar.sensor_models import (
+    IncidenceDropout,
+    Intensity,
+    SensorModels,
+    returned,
+)
 from nics_drl_bridge.lidar.shapes import Circle, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.sim.world import Obstacles
@@ -59,19 +64,31 @@ def test_a_file_of_sensor_models_reads_to_what_it_says(tmp_path):
 @pytest.mark.parametrize(
     ("models", "sentence"),
     [
-        ("[{kind: intensity, treshold: 1}]", "unknown key 'sensor_model.0.intensity.treshold'; did "
-         "you mean 'threshold'?"),
+        (
+            "[{kind: intensity, treshold: 1}]",
+            "unknown key 'sensor_model.0.intensity.treshold'; did "
+            "you mean 'threshold'?",
+        ),
         ("[{kind: intensty}]", "unknown kind 'intensty'; did you mean 'intensity'?"),
         ("[{gain: 3}]", "the key 'sensor_model.0.kind' is missing; add it."),
-        ("[{kind: incidence_dropout, greatest_incidence: 75}]", "input should be less than "
-         "1.5707963267948966, not 75."),
-        ("[{kind: intensity}, {kind: intensity}]", "one model of the kind intensity; keep one"),
+        (
+            "[{kind: incidence_dropout, greatest_incidence: 75}]",
+            "input should be less than 1.5707963267948966, not 75.",
+        ),
+        (
+            "[{kind: intensity}, {kind: intensity}]",
+            "one model of the kind intensity; keep one",
+        ),
         ("[{kind: intensity, reflectivity: 0}]", "should be greater than 0, not 0."),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_sensor_model_is_one_sentence(models, sentence):
     with pytest.raises(ConfigError) as caught:
-        validate(parse_yaml(f"sensor_model: {models}", "mine.yaml"), SensorModelFile, "mine.yaml")
+        validate(
+            parse_yaml(f"sensor_model: {models}", "mine.yaml"),
+            SensorModelFile,
+            "mine.yaml",
+        )
     assert str(caught.value).startswith("mine.yaml: ")
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -79,11 +96,17 @@ def test_a_wrong_sensor_model_is_one_sentence(models, sentence):
 
 def test_a_lidar_names_its_sensor_model_and_has_none_by_default():
     about = {
-        "beams": 9, "angle_min": 0.0, "angle_max": 1.0, "range_min": 0.1, "range_max": 2.0,
+        "beams": 9,
+        "angle_min": 0.0,
+        "angle_max": 1.0,
+        "range_min": 0.1,
+        "range_max": 2.0,
         "rate": 10.0,
-    }  # fmt: skip
+    }
     assert LidarSpec.model_validate(about).sensor_model == ()
-    spec = LidarSpec.model_validate(about | {"sensor_model": [{"kind": "intensity", "gain": 3}]})
+    spec = LidarSpec.model_validate(
+        about | {"sensor_model": [{"kind": "intensity", "gain": 3}]}
+    )
     assert spec.sensor_model == (Intensity(gain=3.0),)
     assert LidarSpec.model_validate(spec.model_dump(mode="json")) == spec
 
@@ -95,5 +118,7 @@ def test_shapes_of_different_reflectivity_are_different_shapes():
     assert plain == Circle(radius=1.0)
     assert plain != dark
     assert describe(dark) == "circle of radius 1 m, reflectivity 0.1"
-    with pytest.raises(ConfigError, match=r"reflectivity': input should be greater than 0, not -1"):
+    with pytest.raises(
+        ConfigError, match=r"reflectivity': input should be greater than 0, not -1"
+    ):
         validate(parse_yaml(text.replace("0.1", "-1"), "s.yaml"), Obstacles, "s.yaml")

@@ -25,7 +25,9 @@ from nics_drl_bridge.sim.world import Obstacles
 
 def regular(corners, reach=0.3, shift=0.0):
     angles = np.arange(corners) * 2.0 * np.pi / corners + 0.3
-    return Polygon(points=reach * np.stack([np.cos(angles), np.sin(angles)], axis=1) + shift)
+    return Polygon(
+        points=reach * np.stack([np.cos(angles), np.sin(angles)], axis=1) + shift
+    )
 
 
 @pytest.mark.parametrize(
@@ -74,7 +76,10 @@ def test_hulls_are_those_of_plane_geometry(make):
 def test_a_hull_has_no_corner_on_its_edges_and_of_a_line_only_the_ends():
     square = np.array([(0, 0), (1, 0), (2, 0), (2, 2), (1, 2), (0, 2), (0, 1)], float)
     assert len(convex_hull(square)) == 4
-    assert convex_hull(np.array([(0, 0), (3, 3), (1, 1)], float)).tolist() == [[0, 0], [3, 3]]
+    assert convex_hull(np.array([(0, 0), (3, 3), (1, 1)], float)).tolist() == [
+        [0, 0],
+        [3, 3],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -109,7 +114,9 @@ def test_outlines_hold_all_shapes_one_after_the_other():
     assert np.array_equal(outlines.hulls[2:6], outlines.hulls[6:10])
     assert outlines.orders.tolist() == [1, 4, 5]
     assert [outlines.index_of(shape) for shape in shapes] == [0, 1, 2]
-    with pytest.raises(ModelError, match=r"rectangle of 0.6 x 0.06 m is not in .* bake it as well"):
+    with pytest.raises(
+        ModelError, match=r"rectangle of 0.6 x 0.06 m is not in .* bake it as well"
+    ):
         outlines.index_of(STRIP)
     assert Outlines.of(()).corners.shape == (0, 2)
 

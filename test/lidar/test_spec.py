@@ -19,9 +19,9 @@ def test_a_full_circle_has_no_double_beam(beams, start):
     directions = np.exp(1j * spec.angles)
     gaps = np.abs(directions[:, None] - directions) + 9.0 * np.eye(beams)
     assert gaps.min() > 1e-3
-    assert np.angle(directions[-1] * np.exp(1j * spec.angle_increment) / directions[0]) == (
-        pytest.approx(0.0, abs=1e-9)
-    )
+    assert np.angle(
+        directions[-1] * np.exp(1j * spec.angle_increment) / directions[0]
+    ) == (pytest.approx(0.0, abs=1e-9))
 
 
 @pytest.mark.parametrize("beams", [2, 3, 181])
@@ -57,7 +57,9 @@ DATA_SHEETS = {
 
 
 def test_every_shipped_lidar_has_a_row_of_its_data_sheet_and_names_its_source():
-    files = {path.stem: path for path in find_config("paper", "lidars").parent.glob("*.yaml")}
+    files = {
+        path.stem: path for path in find_config("paper", "lidars").parent.glob("*.yaml")
+    }
     assert set(files) == set(DATA_SHEETS)
     for path in files.values():
         assert path.read_text(encoding="utf-8").startswith("# ")
@@ -65,7 +67,9 @@ def test_every_shipped_lidar_has_a_row_of_its_data_sheet_and_names_its_source():
 
 @pytest.mark.parametrize("name", DATA_SHEETS)
 def test_a_shipped_lidar_is_that_of_its_data_sheet(name):
-    beams, view, resolution, range_min, range_max, rate, std, no_return = DATA_SHEETS[name]
+    beams, view, resolution, range_min, range_max, rate, std, no_return = DATA_SHEETS[
+        name
+    ]
     spec = load_lidar(name)
     assert spec.name == name
     assert spec.beams == beams
@@ -92,7 +96,9 @@ def test_the_papers_lidars_have_no_faults(name):
 @pytest.mark.parametrize("full", [True, False])
 @pytest.mark.parametrize("beams", [2, 3, 7, 360, 811, 1081, 7200, 100_000])
 def test_readers_of_the_header_count_the_beams_in_float32(beams, full, start):
-    spec = lidar(beams=beams, angle_min=start, angle_max=start + (2.0 * np.pi if full else 4.0))
+    spec = lidar(
+        beams=beams, angle_min=start, angle_max=start + (2.0 * np.pi if full else 4.0)
+    )
     low, high, step = (np.float32(value) for value in spec.header[:3])
     assert round(float((high - low) / step)) + 1 == beams
     assert round(float(high) - float(low), 12) < round(2.0 * np.pi, 12)
@@ -115,7 +121,9 @@ def test_a_turn_takes_one_scan_time_and_a_part_of_it_less():
     assert hokuyo.sweep_time == pytest.approx(0.025 * 1081 / 1440)
 
 
-@pytest.mark.parametrize(("skew", "sign"), [("counter_clockwise", 1.0), ("clockwise", -1.0)])
+@pytest.mark.parametrize(
+    ("skew", "sign"), [("counter_clockwise", 1.0), ("clockwise", -1.0)]
+)
 def test_the_time_increment_has_the_sign_of_the_turn(skew, sign):
     spec = lidar(beams=400, rate=4.0, faults={"skew": skew})
     assert spec.header.time_increment == pytest.approx(sign * 0.25 / 400)
@@ -128,13 +136,22 @@ def test_the_time_increment_has_the_sign_of_the_turn(skew, sign):
         ({"range_min": 3.0}, "range_min must be less than range_max"),
         ({"range_min": -0.1}, "key 'range_min'"),
         ({"angle_max": -np.pi}, "angle_max must exceed angle_min"),
-        ({"angle_min": -180.0, "angle_max": 180.0}, "by at most a full circle, in radians"),
+        (
+            {"angle_min": -180.0, "angle_max": 180.0},
+            "by at most a full circle, in radians",
+        ),
         ({"angle_min": 10.0, "angle_max": 12.0}, "within -2 pi and 2 pi"),
         ({"angle_min": -12.0, "angle_max": -10.0}, "within -2 pi and 2 pi"),
         ({"rate": 0.0}, "key 'rate'"),
         ({"mount": [0.0, 0.0]}, "key 'mount"),
-        ({"mount": [0.0, 0.0, 180.0]}, "'mount.2': must be in radians, within 2 pi (degrees look"),
-        ({"mount": [120.0, 0.0, 0.0]}, "'mount.0': must be in metres, within 10 (millimetres"),
+        (
+            {"mount": [0.0, 0.0, 180.0]},
+            "'mount.2': must be in radians, within 2 pi (degrees look",
+        ),
+        (
+            {"mount": [120.0, 0.0, 0.0]},
+            "'mount.0': must be in metres, within 10 (millimetres",
+        ),
         ({"noise_std": -1.0}, "key 'noise_std'"),
         ({"range_max": float("inf")}, "key 'range_max'"),
         ({"beem": 3}, "did you mean 'beams'"),

@@ -15,7 +15,13 @@ from nics_drl_bridge.files import SUMS, write_sums
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, Circle, Polygon
-from nics_drl_bridge.lidar.table import ABOUT_FILE, ARRAYS, TABLE_FILES, Density, LidarTable
+from nics_drl_bridge.lidar.table import (
+    ABOUT_FILE,
+    ARRAYS,
+    TABLE_FILES,
+    Density,
+    LidarTable,
+)
 
 SPEC = lidar(beams=90)
 TRIANGLE = Polygon(points=((0.0, 0.0), (0.4, 0.0), (0.1, 0.2)))
@@ -23,7 +29,9 @@ TRIANGLE = Polygon(points=((0.0, 0.0), (0.4, 0.0), (0.1, 0.2)))
 
 @pytest.fixture(scope="module")
 def table():
-    return bake(SPEC, (Circle(radius=0.25), SQUARE, TRIANGLE), Density(distances=9, rotations=8))
+    return bake(
+        SPEC, (Circle(radius=0.25), SQUARE, TRIANGLE), Density(distances=9, rotations=8)
+    )
 
 
 @pytest.fixture
@@ -63,7 +71,9 @@ def test_a_table_is_a_folder_of_arrays_that_numpy_and_sha256sum_read(table, fold
     assert set(contents(folder)) == {*TABLE_FILES, SUMS}
     assert np.array_equal(np.load(folder / "rows.npy"), table.rows)
     assert json.loads((folder / ABOUT_FILE).read_text())["density"]["distances"] == 9
-    done = subprocess.run(["sha256sum", "--strict", "-c", SUMS], cwd=folder, capture_output=True)
+    done = subprocess.run(
+        ["sha256sum", "--strict", "-c", SUMS], cwd=folder, capture_output=True
+    )
     assert (done.returncode, done.stdout.count(b": OK")) == (0, len(TABLE_FILES))
 
 
@@ -72,7 +82,9 @@ def test_a_table_read_back_gives_the_same_scans(table, folder):
     scans = []
     for one in (table, LidarTable.load(folder)):
         scanner = Scanner(SPEC, one, "baked")
-        scans.append(scanner.scan(np.zeros((50, 3)), scanner.place(table.shapes, poses)))
+        scans.append(
+            scanner.scan(np.zeros((50, 3)), scanner.place(table.shapes, poses))
+        )
     assert np.array_equal(*scans)
     assert np.isfinite(scans[0]).any()
 
@@ -113,7 +125,10 @@ for key in ("Shared_Clean", "Private_Dirty"):
 """
     pair = [
         subprocess.Popen(
-            [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", script],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         for _ in range(2)
     ]
@@ -139,7 +154,11 @@ def test_every_flipped_bit_and_every_cut_is_refused(folder, name):
     for trial in range(60):
         damaged = bytearray(content)
         # The head of an array makes up little of the content; half of the trials go there.
-        place = rng.integers(min(128, len(content))) if trial % 2 else rng.integers(len(content))
+        place = (
+            rng.integers(min(128, len(content)))
+            if trial % 2
+            else rng.integers(len(content))
+        )
         damaged[place] ^= 1 << rng.integers(8)
         path.write_bytes(damaged if trial % 4 else content[: place - 1])
         assert refused(folder)
@@ -163,7 +182,9 @@ def test_a_crash_while_saving_leaves_the_old_table(folder, monkeypatch):
 
 def npy(descr, shape, data=b"", order="False"):
     """The content of an `.npy` file with a header that need not be true."""
-    head = f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}".encode()
+    head = (
+        f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}".encode()
+    )
     head += b" " * (-(len(head) + 11) % 64) + b"\n"
     return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + data
 

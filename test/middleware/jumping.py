@@ -46,7 +46,9 @@ def noisy_model(robot):
     """The built-in robot; its state drifts by two per cent of its range within a second."""
     model = builtin_model(robot)
     states = {
-        v.name: Level(std=0.02 * (v.max - v.min), unit=f"{v.unit}/sqrt(s)", source="measured")
+        v.name: Level(
+            std=0.02 * (v.max - v.min), unit=f"{v.unit}/sqrt(s)", source="measured"
+        )
         for v in model.robot.state
     }
     return replace(model, noise=NOISE.model_copy(update={"state_drift": states}))
@@ -101,6 +103,8 @@ def campaign(robot, drives, settings, seed=0):
     model = noisy_model(robot)
     simulator, rows = FastSimulator(model, field(200.0)), []
     for k in range(drives):
-        errors, nees, _ = errors_after(model, simulator, seed + k, settings[k % len(settings)])
+        errors, nees, _ = errors_after(
+            model, simulator, seed + k, settings[k % len(settings)]
+        )
         rows.append((errors[0], nees[0], errors[-1], nees[-1]))
     return [np.array(each) for each in zip(*rows, strict=True)]

@@ -20,4 +20,6 @@ def state(middleware, now=20 * SECOND):
 
 
 def assert_same(one, other):
-    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
+    assert all(
+        np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True)
+    )

@@ -41,7 +41,9 @@ def test_after_a_jump_the_estimate_is_off_by_no_more_than_it_claims(robot, jumps
     late = (Setting(jump, latency=1, lost=0.05) for jump in jumps)
     settings = [*(Setting(jump) for jump in jumps), *late]
     first, nees, last, nees_at_end = campaign(robot, 2 * len(settings), settings)
-    assert np.hypot(*first[:, :2].T).max() < 0.6  # the drift of some seconds, and no way on top
+    assert (
+        np.hypot(*first[:, :2].T).max() < 0.6
+    )  # the drift of some seconds, and no way on top
     assert np.median(np.hypot(*first[:, :2].T)) < 0.2
     assert np.mean(nees) < 5.0  # chi-squared of some fifteen drives
     assert max(nees) < CHI2_999
@@ -50,12 +52,12 @@ def test_after_a_jump_the_estimate_is_off_by_no_more_than_it_claims(robot, jumps
 
 
 BROKEN = {
-    "begun anew at zero": lambda k, odom: odom if k < 0 else geometry.between(
-        [30.0, -20.0, 1.0], odom
+    "begun anew at zero": lambda k, odom: (
+        odom if k < 0 else geometry.between([30.0, -20.0, 1.0], odom)
     ),
     "never told": lambda k, odom: np.zeros(3),
     "teleporting": lambda k, odom: np.add(odom, [0.0, 7.0 * (k % 2), 0.0]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
@@ -79,12 +81,16 @@ def test_the_same_drive_gives_the_same_bits(jump_s):
     assert one[2].health(0).noticed["clock: jump"] == 1
 
 
-def driven(middleware, periods=20, speed=1.0, shift_ns=0, begin=0, pose=lambda x: [x, 0.0, 0.0]):
+def driven(
+    middleware, periods=20, speed=1.0, shift_ns=0, begin=0, pose=lambda x: [x, 0.0, 0.0]
+):
     """Straight on; the odometry of each period is true, but for its clock."""
     for k in range(begin + 1, begin + periods + 1):
         now = SECOND + k * PERIOD
         middleware.command(None, [speed, 0.0, 0.0])
-        middleware.odometry(now + shift_ns, now, pose(speed * k * 0.1), [speed, 0.0, 0.0])
+        middleware.odometry(
+            now + shift_ns, now, pose(speed * k * 0.1), [speed, 0.0, 0.0]
+        )
 
 
 def started():
@@ -103,7 +109,9 @@ def test_what_was_driven_while_the_clock_was_set_is_not_lost(jump_s):
     driven(middleware)
     driven(middleware, 20, shift_ns=round(jump_s * SECOND), begin=20)
     assert way(middleware) == pytest.approx(4.0, abs=0.02)
-    assert middleware.view(middleware.estimator.time_ns).twist[0] == pytest.approx(1.0, abs=0.01)
+    assert middleware.view(middleware.estimator.time_ns).twist[0] == pytest.approx(
+        1.0, abs=0.01
+    )
     assert middleware.health(0).noticed["clock: jump"] == 1
 
 
@@ -111,7 +119,9 @@ def test_the_first_command_after_a_jump_need_not_be_waited_for():
     middleware = started()
     driven(middleware)
     driven(middleware, 10, shift_ns=3600 * SECOND, begin=20)
-    assert middleware.view(middleware.estimator.time_ns).twist[0] == pytest.approx(1.0, abs=0.01)
+    assert middleware.view(middleware.estimator.time_ns).twist[0] == pytest.approx(
+        1.0, abs=0.01
+    )
 
 
 @pytest.mark.parametrize("jump_s", [-500.0, -0.3, 0.3, 3600.0])
@@ -135,7 +145,9 @@ def test_scans_of_the_new_clock_are_taken_and_those_of_the_old_one_forgotten():
     middleware.scan(3 * SECOND, 3 * SECOND, RANGES)
     driven(middleware, 1, shift_ns=-SECOND // 2, begin=20)
     assert np.isnan(middleware.view(3 * SECOND).ranges).all()
-    assert middleware.scan(SECOND + 21 * PERIOD - SECOND // 2, SECOND + 21 * PERIOD, RANGES)
+    assert middleware.scan(
+        SECOND + 21 * PERIOD - SECOND // 2, SECOND + 21 * PERIOD, RANGES
+    )
 
 
 def test_data_that_come_late_or_after_a_gap_or_in_a_burst_are_no_jump():
@@ -146,7 +158,9 @@ def test_data_that_come_late_or_after_a_gap_or_in_a_burst_are_no_jump():
         stamp = SECOND + k * PERIOD
         held = 7 * PERIOD if 50 <= k < 56 or 120 <= k < 123 else 0
         late = int(rng.integers(0, 3)) * PERIOD
-        middleware.odometry(stamp, stamp + max(late, held), [0.1 * k, 0.0, 0.0], [1.0, 0.0, 0.0])
+        middleware.odometry(
+            stamp, stamp + max(late, held), [0.1 * k, 0.0, 0.0], [1.0, 0.0, 0.0]
+        )
     assert "clock: jump" not in middleware.health(0).noticed
 
 
@@ -164,7 +178,9 @@ def silent(seconds, pose=None, twist=0.0, robot="differential"):
     middleware.reset(SECOND, np.zeros(3))
     middleware.odometry(SECOND, SECOND, np.zeros(3), np.zeros(3))
     for k in range(1, 6):
-        middleware.odometry(SECOND + k * PERIOD, SECOND + k * PERIOD, np.zeros(3), np.zeros(3))
+        middleware.odometry(
+            SECOND + k * PERIOD, SECOND + k * PERIOD, np.zeros(3), np.zeros(3)
+        )
     now = SECOND + round(seconds * SECOND)
     if pose is not None:
         assert middleware.odometry(now, now, pose, [twist, 0.0, 0.0])
@@ -177,7 +193,9 @@ def test_in_a_long_silence_the_robot_may_have_driven_as_far_as_it_can():
     seconds = LONGEST_GAP_S + 5.0
     far = greatest_twist(builtin_model("differential"))[0] * (seconds - 0.5 + JITTER_S)
     covariance = silent(seconds).estimator.covariance
-    assert np.sqrt(covariance[:2, :2].diagonal()) == pytest.approx(far / np.sqrt(3), rel=0.02)
+    assert np.sqrt(covariance[:2, :2].diagonal()) == pytest.approx(
+        far / np.sqrt(3), rel=0.02
+    )
     assert covariance[2, 2] == pytest.approx(np.pi**2 / 3, rel=0.02)
 
 

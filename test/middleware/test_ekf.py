@@ -126,7 +126,9 @@ def test_a_command_acts_one_latency_after_it_was_sent(latency):
     for tenths in range(10):
         pose, twist = estimator.at(tenths * PERIOD)
         now = tenths * 0.1
-        assert pose[0] == pytest.approx(np.clip(now - 0.1 - latency, 0.0, 0.3), abs=1e-9)
+        assert pose[0] == pytest.approx(
+            np.clip(now - 0.1 - latency, 0.0, 0.3), abs=1e-9
+        )
         moving = 0.1 + latency < now - 1e-9 <= 0.4 + latency
         assert twist[0] == pytest.approx(float(moving))
 
@@ -246,7 +248,9 @@ def test_the_covariance_stays_positive_definite_over_thousands_of_random_steps(r
         if kind in (1, 2):
             estimator.update(Kind.TWIST, rng.normal(size=3))
         elif kind == 3:
-            estimator.update(Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-4.0, 1.0, 3))
+            estimator.update(
+                Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-4.0, 1.0, 3)
+            )
         if step % 100 == 99:
             covariance = estimator.covariance
             assert np.isfinite(estimator.at(now)[0]).all()
@@ -268,14 +272,21 @@ def noisy_model(robot):
     """The built-in robot; its state drifts by two per cent of its range within a second."""
     model = builtin_model(robot)
     states = {
-        v.name: Level(std=0.02 * (v.max - v.min), unit=f"{v.unit}/sqrt(s)", source="measured")
+        v.name: Level(
+            std=0.02 * (v.max - v.min), unit=f"{v.unit}/sqrt(s)", source="measured"
+        )
         for v in model.robot.state
     }
     return replace(model, noise=NOISY.model_copy(update={"state_drift": states}))
 
 
 CORNERS = [("ackermann", None), ("mecanum", 0.02)]
-REST = [(robot, std) for robot in ROBOTS for std in (None, 0.02) if (robot, std) not in CORNERS]
+REST = [
+    (robot, std)
+    for robot in ROBOTS
+    for std in (None, 0.02)
+    if (robot, std) not in CORNERS
+]
 
 
 @pytest.mark.parametrize(
@@ -299,7 +310,9 @@ def test_the_estimate_is_as_uncertain_as_it_claims(robot, pose_std):
 def test_a_model_that_is_a_little_wrong_does_not_lead_the_estimate_astray(robot):
     model = builtin_model(robot)
     wrong = Randomisation(name="wrong", kinematics={"scale": [0.95, 1.05]})
-    backend = SimBackend(model, load_world("empty"), estimator=True, randomisation=wrong)
+    backend = SimBackend(
+        model, load_world("empty"), estimator=True, randomisation=wrong
+    )
     start, command = np.array([0.0, -1.0, 0.0]), np.zeros(len(model.robot.command))
     command[0], command[-1] = 0.5, 0.3 if model.robot.steers else 0.5
     for seed in range(3):
@@ -347,7 +360,11 @@ def test_odometry_of_four_times_the_noise_that_was_told_is_followed(robot):
 @pytest.mark.parametrize("glitch", [0.2, 1.0, 1e9])
 def test_odometry_with_glitches_is_not_given_up_for_a_wrong_model(glitch):
     """The robot is slower than its model; each twentieth twist is off to the side."""
-    estimator, odom, twist = Estimator(builtin_model("differential")), np.zeros(3), np.zeros(3)
+    estimator, odom, twist = (
+        Estimator(builtin_model("differential")),
+        np.zeros(3),
+        np.zeros(3),
+    )
     estimator.reset(0, odom)
     rng = np.random.default_rng(0)
     for k in range(1, 300):
@@ -408,14 +425,18 @@ def test_an_outlier_after_a_silence_is_where_the_next_way_begins():
 def test_a_car_that_obeys_later_than_its_model_is_where_odometry_is(response):
     """At a reversal the model is far off, and steering can't be told from a twist near zero."""
     late = Randomisation(
-        name="late", kinematics={"response": [response, response]}, action_latency=(1.0, 1.0)
+        name="late",
+        kinematics={"response": [response, response]},
+        action_latency=(1.0, 1.0),
     )
     given = {"estimator": True, "randomisation": late}
     backend = SimBackend(builtin_model("ackermann"), field(60.0), **given)
     for seed in range(3):
         backend.reset(Start(seed, np.zeros(3)))
         for step in range(60):
-            view, _ = backend.step(np.array([-0.5, -0.5] if step % 30 < 8 else [1.0, 0.5]))
+            view, _ = backend.step(
+                np.array([-0.5, -0.5] if step % 30 < 8 else [1.0, 0.5])
+            )
         odometry = backend.simulator.data.odom[0, 0]
         assert np.abs(geometry.between(odometry, view.pose)).max() < 0.1
 
@@ -484,7 +505,9 @@ def test_to_foresee_changes_no_bit_whatever_comes_instead(robot):
             one.predict(moment)
             spreads.append(one.twist_covariance)
             corrected = (
-                one.update(Kind.TWIST, twist) if event < 0.9 else one.update(Kind.POSE, pose)
+                one.update(Kind.TWIST, twist)
+                if event < 0.9
+                else one.update(Kind.POSE, pose)
             )
             outcomes.add(corrected.outcome)
         for mine, other in zip(plain.belief, foreseeing.belief, strict=True):
@@ -569,7 +592,9 @@ def test_impossible_twists_are_believed_from_the_third_in_a_row_until_one_fits_a
     estimator = driven()
     outcomes = [estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome for _ in range(5)]
     assert outcomes == [Acceptance.OUTLIER] * 2 + [Acceptance.JUMP] * 3
-    assert estimator.update(Kind.TWIST, [0.5, 0.0, 0.0]).outcome is not Acceptance.OUTLIER
+    assert (
+        estimator.update(Kind.TWIST, [0.5, 0.0, 0.0]).outcome is not Acceptance.OUTLIER
+    )
     assert estimator.belief.outliers == (0, 0, 0)
     assert estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome is Acceptance.OUTLIER
 
@@ -587,8 +612,14 @@ def test_what_is_beyond_all_bounds_is_never_believed_however_often_it_comes(valu
     estimator = driven()
     before = estimator.belief
     for _ in range(20):
-        assert estimator.update(Kind.TWIST, [value, 0.0, 0.0]).outcome is Acceptance.OUTLIER
-        assert estimator.update(Kind.POSE, [0.0, -value, 0.0]).outcome is Acceptance.OUTLIER
+        assert (
+            estimator.update(Kind.TWIST, [value, 0.0, 0.0]).outcome
+            is Acceptance.OUTLIER
+        )
+        assert (
+            estimator.update(Kind.POSE, [0.0, -value, 0.0]).outcome
+            is Acceptance.OUTLIER
+        )
         assert estimator.update(Kind.YAW_RATE, value).outcome is Acceptance.OUTLIER
     assert np.array_equal(estimator.belief.mean, before.mean)
     assert np.array_equal(estimator.belief.covariance, before.covariance)
@@ -612,7 +643,9 @@ def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     estimator = driven()
     before, far = estimator.belief, [30.0, 2.0, -3.0]
     for _ in range(4):
-        assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.OUTLIER
+        assert (
+            estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.OUTLIER
+        )
         assert np.array_equal(estimator.belief.mean, before.mean)
         assert np.array_equal(estimator.belief.covariance, before.covariance)
     assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.JUMP
@@ -640,12 +673,17 @@ def test_outliers_are_counted_in_a_row_only():
     good, far = estimator.at(estimator.time_ns)[0], [30.0, 2.0, 1.0]
     for _ in range(5):
         for _ in range(4):
-            assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.OUTLIER
+            assert (
+                estimator.update(Kind.POSE, far, [0.02] * 3).outcome
+                is Acceptance.OUTLIER
+            )
         assert estimator.update(Kind.POSE, good, [0.02] * 3).outcome is Acceptance.USED
 
 
 @pytest.mark.parametrize("robot", ["ackermann", "differential"])
-def test_a_yaw_rate_moves_nothing_by_itself_and_is_refused_beyond_the_robots_reach(robot):
+def test_a_yaw_rate_moves_nothing_by_itself_and_is_refused_beyond_the_robots_reach(
+    robot,
+):
     estimator = driven(robot)
     before = estimator.belief
     assert estimator.update(Kind.YAW_RATE, 0.03, 0.01).outcome is Acceptance.USED
@@ -663,7 +701,10 @@ def test_a_gate_refuses_one_good_measurement_in_a_thousand():
     for _ in range(20_000):
         estimator.belief = belief
         measured = belief.mean[:3] + spread @ rng.normal(size=3)
-        refused += estimator.update(Kind.POSE, measured, [0.05] * 3).outcome is Acceptance.OUTLIER
+        refused += (
+            estimator.update(Kind.POSE, measured, [0.05] * 3).outcome
+            is Acceptance.OUTLIER
+        )
     assert 8 <= refused <= 36  # 20 are expected; 99.9 % of such counts
 
 
@@ -671,7 +712,10 @@ def test_an_unknown_start_is_mended_by_the_first_pose():
     estimator = Estimator(builtin_model("differential"))
     estimator.reset(0, np.zeros(3), [100.0, 100.0, np.pi])
     estimator.predict(SECOND)
-    assert estimator.update(Kind.POSE, [40.0, -70.0, 2.0], [0.01] * 3).outcome is Acceptance.USED
+    assert (
+        estimator.update(Kind.POSE, [40.0, -70.0, 2.0], [0.01] * 3).outcome
+        is Acceptance.USED
+    )
     assert estimator.at(SECOND)[0] == pytest.approx([40.0, -70.0, 2.0], abs=1e-3)
 
 

@@ -145,7 +145,11 @@ def test_late_odometry_counts_but_the_newest_stays_the_newest(middleware):
     middleware.odometry(3 * SECOND, 7, [3.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     assert middleware.odometry(3 * SECOND - PERIOD, 9, [2.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     newest = middleware.cache.newest["odom"]
-    assert (newest.stamp_ns, newest.arrival_ns, newest.value[0][0]) == (3 * SECOND, 7, 3.0)
+    assert (newest.stamp_ns, newest.arrival_ns, newest.value[0][0]) == (
+        3 * SECOND,
+        7,
+        3.0,
+    )
     assert middleware.health(9).topics["odom"].received == 2
 
 
@@ -155,18 +159,25 @@ def test_health_tells_rates_ages_refusals_and_innovations(middleware):
         middleware.imu(now, now + 7, 0.0)
         if k % 5 == 0:
             middleware.odometry(now, now + 7, *STILL)
-            middleware.pose(now, now + 7, [1.0, 2.0, 0.5] if k < 100 else [8.0, 2.0, 0.5])
+            middleware.pose(
+                now, now + 7, [1.0, 2.0, 0.5] if k < 100 else [8.0, 2.0, 0.5]
+            )
     middleware.scan(3 * SECOND, 3 * SECOND, RANGES)
     health = middleware.health(4 * SECOND + 7)
     rates = {topic: each.rate_hz for topic, each in health.topics.items()}
     # A second after the last: 32 arrivals of the gyro in 1.62 s, 20 of the others in 2.9 s.
     slow = {"imu": 32 / 1.62, "odom": 20 / 2.9, "pose": 20 / 2.9, "scan": 0.0}
     assert rates == pytest.approx(slow)
-    assert middleware.health(3 * SECOND + 7).topics["imu"].rate_hz == pytest.approx(50.0)
+    assert middleware.health(3 * SECOND + 7).topics["imu"].rate_hz == pytest.approx(
+        50.0
+    )
     assert health.topics["odom"].age_s == pytest.approx(1.0)
     assert {t: each.received for t, each in health.topics.items()} == {
-        "imu": 100, "odom": 20, "pose": 20, "scan": 1
-    }  # fmt: skip
+        "imu": 100,
+        "odom": 20,
+        "pose": 20,
+        "scan": 1,
+    }
     assert health.topics["odom"].innovation == pytest.approx(0.0)
     assert health.topics["pose"].innovation > 1000.0
     assert np.isnan(health.topics["scan"].innovation)
@@ -176,7 +187,12 @@ def test_health_tells_rates_ages_refusals_and_innovations(middleware):
 
 def test_without_data_nothing_is_healthy_or_ill(middleware):
     health = middleware.health(SECOND)
-    assert (health.topics, health.rejected, health.noticed, health.replayed) == ({}, {}, {}, 0)
+    assert (health.topics, health.rejected, health.noticed, health.replayed) == (
+        {},
+        {},
+        {},
+        0,
+    )
 
 
 def test_a_rehearsal_ends_with_a_robot_that_stands_still_in_the_open():
@@ -216,7 +232,9 @@ print(sorted(name for name, _ in known() - rehearsed))
 
 @pytest.mark.process
 def test_what_is_rehearsed_is_all_that_a_moving_robot_calls():
-    done = subprocess.run([sys.executable, "-c", USED], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", USED], capture_output=True, text=True, check=True
+    )
     assert done.stdout == "[]\n"
 
 
@@ -230,7 +248,9 @@ def test_after_a_change_of_lidar_only_scans_of_its_beams_are_taken(middleware):
 
 
 SENSORS = {
-    "odom": lambda m, stamp, value: m.odometry(stamp, 0, np.zeros(3), np.full(3, value)),
+    "odom": lambda m, stamp, value: m.odometry(
+        stamp, 0, np.zeros(3), np.full(3, value)
+    ),
     "pose": lambda m, stamp, value: m.pose(stamp, 0, np.full(3, value)),
     "imu": lambda m, stamp, value: m.imu(stamp, 0, value),
 }
@@ -319,12 +339,16 @@ def test_a_command_of_another_robot_is_refused(middleware):
 
 
 @pytest.mark.parametrize("jump", [-500, 3600])
-def test_a_clock_that_was_set_is_followed_and_the_robot_stays_where_it_was(middleware, jump):
+def test_a_clock_that_was_set_is_followed_and_the_robot_stays_where_it_was(
+    middleware, jump
+):
     for k in range(1, 31):
         middleware.odometry(SECOND + k * PERIOD, k * PERIOD, *STILL)
     middleware.scan(4 * SECOND, 3 * SECOND, RANGES)
     for k in range(31, 41):
-        assert not middleware.odometry((1 + jump) * SECOND + k * PERIOD, k * PERIOD, *STILL)
+        assert not middleware.odometry(
+            (1 + jump) * SECOND + k * PERIOD, k * PERIOD, *STILL
+        )
     for k in range(41, 51):
         assert middleware.odometry((1 + jump) * SECOND + k * PERIOD, k * PERIOD, *STILL)
     assert middleware.scan((1 + jump) * SECOND + 50 * PERIOD, 50 * PERIOD, RANGES)
@@ -351,7 +375,12 @@ def test_only_newer_data_replace_the_newest():
     assert not cache.put("scan", 150, 202, "late")
     assert not cache.put("scan", 200, 203, "copy")
     held = cache.newest["scan"]
-    assert (held.value, held.stamp_ns, held.arrival_ns, held.sequence) == ("b", 200, 201, 1)
+    assert (held.value, held.stamp_ns, held.arrival_ns, held.sequence) == (
+        "b",
+        200,
+        201,
+        1,
+    )
 
 
 def test_refusals_are_counted_by_topic_and_reason():

@@ -23,21 +23,33 @@ STEP = 0.05
 
 
 def odometry(t, shift=0.0):
-    inner = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36))
-    twist = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36))
+    inner = bags.new(
+        "geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36)
+    )
+    twist = bags.new(
+        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36)
+    )
     stamp = None if shift is None else t + shift
-    return bags.new("nav_msgs/msg/Odometry", bags.header(stamp, "odom"), "base_link", inner, twist)
+    return bags.new(
+        "nav_msgs/msg/Odometry", bags.header(stamp, "odom"), "base_link", inner, twist
+    )
 
 
 def drive(**changed):
     """Half a circle."""
     topics = {
         "/odom": [(t + 0.01, odometry(t)) for t in bags.times(STEP, DURATION_S)],
-        "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.1)) for t in bags.times(0.1, DURATION_S)],
-        "/pose": [
-            (t + 0.08, bags.pose_stamped(t, *bags.place_at(t))) for t in bags.times(0.1, DURATION_S)
+        "/cmd_vel": [
+            (t, bags.twist(0.5, 0.0, 0.1)) for t in bags.times(0.1, DURATION_S)
         ],
-        "/imu": [(t + 0.01, bags.imu(t, 0.0, 0.0, 0.25)) for t in bags.times(STEP, DURATION_S)],
+        "/pose": [
+            (t + 0.08, bags.pose_stamped(t, *bags.place_at(t)))
+            for t in bags.times(0.1, DURATION_S)
+        ],
+        "/imu": [
+            (t + 0.01, bags.imu(t, 0.0, 0.0, 0.25))
+            for t in bags.times(STEP, DURATION_S)
+        ],
     }
     return topics | changed
 
@@ -105,15 +117,25 @@ def test_an_estimate_is_written_exactly(bag, tmp_path):
 @pytest.mark.parametrize(
     ("changed", "topics", "said"),
     [
-        ({"/odom": [(t, odometry(t, None)) for t in bags.times(STEP, 3.0)]}, {}, "not stamped"),
         (
-            {"/pose": [(t, bags.pose_stamped(t + 70.0, 0.0, 0.0, 0.0)) for t in bags.times()]},
-            {"pose": "/pose"}, "of two clocks",
+            {"/odom": [(t, odometry(t, None)) for t in bags.times(STEP, 3.0)]},
+            {},
+            "not stamped",
+        ),
+        (
+            {
+                "/pose": [
+                    (t, bags.pose_stamped(t + 70.0, 0.0, 0.0, 0.0))
+                    for t in bags.times()
+                ]
+            },
+            {"pose": "/pose"},
+            "of two clocks",
         ),
         ({}, {"pose": "/mocap"}, "has no topic '/mocap'"),
         ({}, {"odom": "/pose"}, "odom needs messages of nav_msgs/msg/Odometry"),
     ],
-)  # fmt: skip
+)
 def test_a_bag_that_gives_no_estimate_is_refused(tmp_path, changed, topics, said):
     bag = bags.write(tmp_path / "bag", drive(**changed))
     with pytest.raises(RecordingError, match=said):

@@ -47,7 +47,9 @@ def messages(model, rng, seconds=6.0, latest_ns=HISTORY_NS):
     stamps = {}
     for topic, period_ms in zip(TOPICS, PERIODS_MS, strict=True):
         ticks = np.arange(1, int(seconds * 1000 / period_ms)) * period_ms
-        moved = ticks + rng.integers(0, period_ms, len(ticks)) * (rng.random(len(ticks)) < 0.3)
+        moved = ticks + rng.integers(0, period_ms, len(ticks)) * (
+            rng.random(len(ticks)) < 0.3
+        )
         stamps[topic] = [int(ms) * MILLISECOND for ms in moved]
     truth, made = Estimator(model), []
     truth.reset(0, START)
@@ -89,12 +91,18 @@ def fed(model, drive):
 def numbers(middleware):
     belief = middleware.estimator.belief
     pose, twist = middleware.estimator.at(belief.time_ns + SECOND // 3)
-    return belief.time_ns, np.concatenate([belief.mean, belief.covariance.ravel(), pose, twist])
+    return belief.time_ns, np.concatenate(
+        [belief.mean, belief.covariance.ravel(), pose, twist]
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("robot", "seed"), [(robot, k) for k, robot in enumerate(ROBOTS)])
-def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robot, seed):
+@pytest.mark.parametrize(
+    ("robot", "seed"), [(robot, k) for k, robot in enumerate(ROBOTS)]
+)
+def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(
+    robot, seed
+):
     model, rng = builtin_model(robot), np.random.default_rng(seed)
     drive = messages(model, rng)
     late = sorted(drive, key=lambda m: m.stamp_ns + m.underway_ns)
@@ -105,7 +113,9 @@ def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robo
     assert found == pytest.approx(expected, abs=1e-9)
     one, other = ordered.health(0), shuffled.health(0)
     assert (one.rejected, one.noticed) == (other.rejected, other.noticed)
-    assert all(one.rejected[f"{topic}: outlier"] >= 2 for topic in ("odom", "imu", "pose"))
+    assert all(
+        one.rejected[f"{topic}: outlier"] >= 2 for topic in ("odom", "imu", "pose")
+    )
     assert all(one.topics[topic].received > 50 for topic in ("odom", "imu", "pose"))
     assert sum(one.rejected.values()) < 120
     assert one.replayed == 0
@@ -145,7 +155,9 @@ def test_a_late_command_counts_from_when_it_was_sent(latency):
         middleware.odometry(tenth * SECOND // 10, 0, np.zeros(3), np.zeros(3))
     assert middleware.estimator.at(SECOND)[0][0] == 0.0
     assert middleware.command(SECOND // 10, [1.0, 0.0, 0.0])
-    assert middleware.estimator.at(SECOND)[0][0] == pytest.approx(0.9 - latency, abs=1e-9)
+    assert middleware.estimator.at(SECOND)[0][0] == pytest.approx(
+        0.9 - latency, abs=1e-9
+    )
 
 
 def test_copies_change_nothing_even_late_ones():
@@ -188,20 +200,32 @@ def twist(speed=0.0):
         (0, BEFORE_START),
     ],
 )
-def test_what_is_later_than_a_second_is_refused_with_the_reason(timeline, stamp, reason):
+def test_what_is_later_than_a_second_is_refused_with_the_reason(
+    timeline, stamp, reason
+):
     for k in range(1, 9):
         assert timeline.measure(SECOND + k * SECOND // 2, twist()) == ""
     assert timeline.newest_ns == 5 * SECOND
-    assert timeline.measure(stamp, Measurement(Kind.TWIST, np.zeros(3))) in (reason, DUPLICATE)
+    assert timeline.measure(stamp, Measurement(Kind.TWIST, np.zeros(3))) in (
+        reason,
+        DUPLICATE,
+    )
     if reason and reason is not DUPLICATE:
         assert timeline.measure(stamp, twist()) == reason
 
 
 @pytest.mark.parametrize(
     ("stamp", "reason"),
-    [(SECOND - 1, BEFORE_START), (2 * SECOND, TOO_OLD), (5 * SECOND, ""), (9 * SECOND, "")],
+    [
+        (SECOND - 1, BEFORE_START),
+        (2 * SECOND, TOO_OLD),
+        (5 * SECOND, ""),
+        (9 * SECOND, ""),
+    ],
 )
-def test_commands_that_are_too_late_are_refused_with_the_reason(timeline, stamp, reason):
+def test_commands_that_are_too_late_are_refused_with_the_reason(
+    timeline, stamp, reason
+):
     for k in range(1, 5):
         timeline.measure(SECOND + k * SECOND, twist())
     assert timeline.command(stamp, [0.5, 0.0]) == reason
@@ -223,7 +247,9 @@ def test_a_late_command_after_a_silence_finds_the_commands_before_it():
     middleware.reset(0, np.zeros(3))
     middleware.odometry(SECOND, 0, np.zeros(3), np.zeros(3))
     for k in range(1, 400):
-        middleware.command(SECOND + k * 5 * MILLISECOND, [0.5 if k < 200 else 0.0, 0.0, 0.0])
+        middleware.command(
+            SECOND + k * 5 * MILLISECOND, [0.5 if k < 200 else 0.0, 0.0, 0.0]
+        )
     middleware.odometry(3 * SECOND, 2 * SECOND, np.zeros(3), np.zeros(3))
     expected = middleware.estimator.at(3 * SECOND)[0]
     assert expected[0] == pytest.approx(0.5 * 0.995, abs=1e-9)
@@ -275,7 +301,9 @@ def test_old_stamps_do_not_change_what_is_due():
 
 def test_a_row_of_refusals_means_that_the_clock_was_set():
     stamps = heard()
-    assert [stamps.refuse() for _ in range(CLOCK_JUMP)] == [False] * (CLOCK_JUMP - 1) + [True]
+    assert [stamps.refuse() for _ in range(CLOCK_JUMP)] == [False] * (
+        CLOCK_JUMP - 1
+    ) + [True]
 
 
 def test_one_datum_that_is_used_ends_the_row():

@@ -14,7 +14,13 @@ NS = 1_000_000_000
 
 
 def believed(
-    drive, gyro=None, commands=1.0, variance=None, turn_variance=None, model=None, every=1
+    drive,
+    gyro=None,
+    commands=1.0,
+    variance=None,
+    turn_variance=None,
+    model=None,
+    every=1,
 ):
     """Feeds a drive to a middleware; returns it, its poses, and the true ones at these times."""
     middleware = Middleware(model or builtin_model("differential"))
@@ -55,7 +61,9 @@ def slipping():
 @pytest.mark.slow
 @pytest.mark.parametrize("variance", [None, 0.004**2, 1e-12, 1e6])
 @pytest.mark.parametrize("commands", [1.0 / OVER_REPORTED, 1.0])
-def test_after_two_minutes_the_belief_is_close_to_the_truth(slipping, commands, variance):
+def test_after_two_minutes_the_belief_is_close_to_the_truth(
+    slipping, commands, variance
+):
     """Whether the model predicts the true turns or those of the wheels, whatever is claimed."""
     middleware, poses, truths = believed(slipping, commands=commands, variance=variance)
     far, turned = off(poses, truths)
@@ -77,7 +85,9 @@ def test_without_the_gyro_the_same_drive_ends_far_from_the_truth(slipping):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn_variance", [None, 1e-9, 1e3, 0.05])
-def test_the_covariance_of_odometry_is_not_believed_where_the_wheels_slip(slipping, turn_variance):
+def test_the_covariance_of_odometry_is_not_believed_where_the_wheels_slip(
+    slipping, turn_variance
+):
     _, poses, truths = believed(slipping, turn_variance=turn_variance)
     far, turned = off(poses, truths)
     assert turned < 0.1
@@ -117,7 +127,9 @@ def test_an_exact_gyro_that_turns_steadily_is_not_taken_for_stuck():
 @pytest.mark.slow
 def test_the_error_is_within_what_the_estimate_says_of_its_uncertainty(slipping):
     middleware, poses, truths = believed(slipping, commands=1.0 / OVER_REPORTED)
-    error = np.append((poses - truths)[-1, :2], geometry.wrap_angle(poses[-1, 2] - truths[-1, 2]))
+    error = np.append(
+        (poses - truths)[-1, :2], geometry.wrap_angle(poses[-1, 2] - truths[-1, 2])
+    )
     covariance = middleware.estimator.covariance[:3, :3]
     assert error @ np.linalg.solve(covariance, error) < 20.0
 
@@ -133,7 +145,9 @@ FAULTS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_gyro_that_is_faulty_leaves_the_heading_to_the_wheels(fault):
-    drive = drive_skid_steer(np.random.default_rng(4), duration=60.0, over_reported=1.0, bias=0.0)
+    drive = drive_skid_steer(
+        np.random.default_rng(4), duration=60.0, over_reported=1.0, bias=0.0
+    )
     _, poses, truths = believed(drive, gyro=FAULTS[fault](drive))
     _, turned = off(poses, truths)
     assert turned < 0.25
@@ -185,7 +199,9 @@ def test_a_robot_that_is_turned_by_hand_turns_in_the_estimate_too():
 
 def test_the_order_of_arrival_does_not_matter():
     drive = drive_skid_steer(np.random.default_rng(8), duration=5.0, rest_s=1.0)
-    events = [("imu", k) for k in range(1, 450)] + [("odom", 5 * k) for k in range(2, 45)]
+    events = [("imu", k) for k in range(1, 450)] + [
+        ("odom", 5 * k) for k in range(2, 45)
+    ]
 
     def run(order):
         middleware = Middleware(builtin_model("differential"))

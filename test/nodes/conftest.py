@@ -25,8 +25,12 @@ def pytest_runtest_makereport() -> Iterator[None]:
     report = yield
     if report.failed:
         for each in LAUNCHED:
-            said = each.log.read_text(encoding="utf-8", errors="replace")[-LOG_CHARACTERS:]
-            report.sections.append((f"{each.log}, ended with {each._process.poll()}", said))
+            said = each.log.read_text(encoding="utf-8", errors="replace")[
+                -LOG_CHARACTERS:
+            ]
+            report.sections.append(
+                (f"{each.log}, ended with {each._process.poll()}", said)
+            )
     return report
 
 
@@ -44,7 +48,9 @@ def model() -> SimulatorModel:
 
 
 @pytest.fixture(scope="session")
-def model_folder(model: SimulatorModel, tmp_path_factory: pytest.TempPathFactory) -> str:
+def model_folder(
+    model: SimulatorModel, tmp_path_factory: pytest.TempPathFactory
+) -> str:
     folder = tmp_path_factory.mktemp("model") / "ackermann"
     save_model(model, folder)
     return str(folder)
@@ -82,7 +88,11 @@ def starter(
         ) -> Any:
             folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
             stamped = "stamped" if node == "record_node" else "enable_stamped_cmd_vel"
-            own = {"robot": "ackermann"} if node == "record_node" else {"model": model_folder}
+            own = (
+                {"robot": "ackermann"}
+                if node == "record_node"
+                else {"model": model_folder}
+            )
             parameters = {**own, stamped: False} | parameters
             LAUNCHED.append(kind(node, folder, parameters, domain_id, namespace, remap))
             return started.enter_context(LAUNCHED[-1])

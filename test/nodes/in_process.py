@@ -36,7 +36,9 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
         words: Sequence[str] = (),
     ) -> None:
         file = folder / f"{node}.yaml"
-        file.write_text(dump_yaml({"/**": {"ros__parameters": parameters}}), encoding="utf-8")
+        file.write_text(
+            dump_yaml({"/**": {"ros__parameters": parameters}}), encoding="utf-8"
+        )
         self.arguments = [node, "--ros-args", "--params-file", str(file)]
         if namespace:
             self.arguments += ["-r", f"__ns:=/{namespace.strip('/')}"]
@@ -86,7 +88,9 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
             pass
 
     def check(self) -> None:
-        assert self._thread.is_alive(), f"{self.node} ended with {self.returncode}: {self.lines}"
+        assert self._thread.is_alive(), (
+            f"{self.node} ended with {self.returncode}: {self.lines}"
+        )
 
     def close(self) -> int | None:
         while self.handler is None and self._thread.is_alive():
@@ -125,7 +129,11 @@ def _stderr() -> Any:
 
 def _set_handler() -> Any:
     node = RUNNING.get(threading.get_ident())
-    return signal.signal if node is None else lambda _, handler: setattr(node, "handler", handler)
+    return (
+        signal.signal
+        if node is None
+        else lambda _, handler: setattr(node, "handler", handler)
+    )
 
 
 def _log() -> Any:

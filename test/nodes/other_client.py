@@ -50,7 +50,9 @@ def rosless(domain: int) -> None:
 
     with (
         library.subscribe("/scan", domain=domain, wait=PATIENCE_S) as scans,
-        library.advertise("/cmd_vel", "geometry_msgs/msg/Twist", domain=domain) as commands,
+        library.advertise(
+            "/cmd_vel", "geometry_msgs/msg/Twist", domain=domain
+        ) as commands,
     ):
         drive(
             lambda: scans.read(timeout=PATIENCE_S).ranges,

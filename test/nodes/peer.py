@@ -41,7 +41,9 @@ class Peer:
         """Spins until a condition holds; returns how long that took [s]."""
         began = time.monotonic()
         while not condition():
-            assert time.monotonic() - began < deadline_s, f"not within {deadline_s} s: {what}"
+            assert time.monotonic() - began < deadline_s, (
+                f"not within {deadline_s} s: {what}"
+            )
             self._executor.spin_once(timeout_sec=0.05)
         return time.monotonic() - began
 
@@ -58,17 +60,22 @@ class Peer:
         self.until(lambda: len(messages) > known, f"another {what}")
         return messages[-1]
 
-    def listen(self, kind: Any, topic: str, quality: Any = qos.SENSOR_RELIABLE) -> list[Any]:
+    def listen(
+        self, kind: Any, topic: str, quality: Any = qos.SENSOR_RELIABLE
+    ) -> list[Any]:
         """A list that each message of a topic is appended to."""
         received: list[Any] = []
         self.node.create_subscription(kind, topic, received.append, quality)
         return received
 
-    def speak(self, kind: Any, topic: str, subscribers: int = 1, quality: Any = qos.COMMAND) -> Any:
+    def speak(
+        self, kind: Any, topic: str, subscribers: int = 1, quality: Any = qos.COMMAND
+    ) -> Any:
         """A publisher that the given number of subscribers have found."""
         publisher = self.node.create_publisher(kind, topic, quality)
         self.until(
-            lambda: publisher.get_subscription_count() >= subscribers, f"a subscriber of {topic}"
+            lambda: publisher.get_subscription_count() >= subscribers,
+            f"a subscriber of {topic}",
         )
         return publisher
 
@@ -89,10 +96,14 @@ class Peer:
             return [future.result() for future in futures if future.done()]
 
         for _ in range(times):
-            futures.append(client.call_async(kind.Request() if request is None else request))
+            futures.append(
+                client.call_async(kind.Request() if request is None else request)
+            )
             if self.within(each_s, answered):
                 break
-        assert answered(), f"not within {times} times {each_s} s: an answer of {service}"
+        assert answered(), (
+            f"not within {times} times {each_s} s: an answer of {service}"
+        )
         self.node.destroy_client(client)
         return answered()[0]
 
@@ -107,7 +118,8 @@ class Peer:
         """What a node says to new values of its parameters."""
         request = SetParametersAtomically.Request()
         request.parameters = [
-            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+            Parameter(name, value=value).to_parameter_msg()
+            for name, value in values.items()
         ]
         return self.call(
             SetParametersAtomically, f"{node}/set_parameters_atomically", request

@@ -40,8 +40,15 @@ def declared(domain_id):
 
     def declare(robot):
         words = ["--params-file", str(FILE)]
-        for argument in (f"model:={robot}", f"limits:={robot}", "e_stop_required:=false"):
-            words += ["-p", f"command_gate:{argument}"]  # as specific as those of `launch`
+        for argument in (
+            f"model:={robot}",
+            f"limits:={robot}",
+            "e_stop_required:=false",
+        ):
+            words += [
+                "-p",
+                f"command_gate:{argument}",
+            ]  # as specific as those of `launch`
         contexts.append(open_context(["node", "--ros-args", *words], domain_id))
         node = Node("command_gate", context=contexts[-1])
         config = declare_gate(node, builtin_model(robot))
@@ -74,9 +81,13 @@ class Standing:
         for tick in range(round(seconds / TICK_S)):
             self.now = tick * TICK_S
             while odometries * self.model.control_period <= self.now:
-                stamp = START_NS + round(odometries * self.model.control_period * NS_PER_S)
+                stamp = START_NS + round(
+                    odometries * self.model.control_period * NS_PER_S
+                )
                 self.give(inputs.Odometry(stamp, np.zeros(3), np.zeros(3)))
-                self.give(inputs.Estimate(np.zeros(3), np.zeros(3), np.diag([1e-4] * 3)))
+                self.give(
+                    inputs.Estimate(np.zeros(3), np.zeros(3), np.diag([1e-4] * 3))
+                )
                 odometries += 1
             while scans / lidar.rate <= self.now:
                 stamp = START_NS + round(scans / lidar.rate * NS_PER_S)
@@ -104,19 +115,26 @@ def test_the_shipped_file_sets_nothing_that_a_node_derives_from_the_robot(node):
 
 
 @pytest.mark.process
-def test_a_turtlebot_is_armed_as_it_is_launched(launch_process, meet, domain_id, tmp_path):
+def test_a_turtlebot_is_armed_as_it_is_launched(
+    launch_process, meet, domain_id, tmp_path
+):
     content = yaml.safe_load(Path(FILE).read_text(encoding="utf-8"))
 
     def start(node, **arguments):
         own = content[f"/**/{node}"]["ros__parameters"]
-        launch_process(node, domain_id, **own | {"model": "turtlebot3_burger"} | arguments)
+        launch_process(
+            node, domain_id, **own | {"model": "turtlebot3_burger"} | arguments
+        )
 
     start("simulator_node", world="empty")
     start("middleware_node", use_sim_time=True)
     start(
-        "command_gate", limits="turtlebot3_burger", use_sim_time=True, e_stop_required=False,
+        "command_gate",
+        limits="turtlebot3_burger",
+        use_sim_time=True,
+        e_stop_required=False,
         black_box=str(tmp_path),
-    )  # fmt: skip
+    )
     peer = meet(domain_id)
     answers = []
 

@@ -58,7 +58,11 @@ def connect(simulator, model, arena):
 
     def make(**options):
         options = {"domain_id": simulator[0], "timeout_s": TIMEOUT_S} | options
-        made.append(DdsBackend(options.pop("model", model), options.pop("world", arena), **options))
+        made.append(
+            DdsBackend(
+                options.pop("model", model), options.pop("world", arena), **options
+            )
+        )
         return made[-1]
 
     yield make
@@ -69,7 +73,9 @@ def connect(simulator, model, arena):
 @pytest.fixture
 def own_simulator(launch_process, domain_id, model, arena):
     """A backend on a simulator that the test may harm, in a namespace."""
-    process = launch_process("simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep")
+    process = launch_process(
+        "simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep"
+    )
     backend = DdsBackend(
         model, arena, namespace=NAMESPACE, domain_id=domain_id, timeout_s=TIMEOUT_S
     )
@@ -90,7 +96,9 @@ def episodes(env, seeds, steps, rng):
     told = []
     for seed in seeds:
         observation, info = env.reset(seed=seed)
-        told.append((observation, 0.0, False, info["pose"], np.zeros((3, 3)), info["start"]))
+        told.append(
+            (observation, 0.0, False, info["pose"], np.zeros((3, 3)), info["start"])
+        )
         for _ in range(steps):
             observation, reward, ended, _, info = env.step(
                 rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
@@ -110,7 +118,9 @@ def zero_follows(commands_heard, step, act):
     """Waits until the last command that is heard after an act is zero."""
     peer, heard = commands_heard
     heard.clear()
-    peer.until(lambda: step() and heard, "a command: the listener has found the backend")
+    peer.until(
+        lambda: step() and heard, "a command: the listener has found the backend"
+    )
     act()
     peer.until(lambda: heard and heard[-1] == Twist(), "a zero command")
 
@@ -135,13 +145,19 @@ def test_it_gives_the_numbers_of_the_simulator_in_process(simulator, model, aren
     finally:
         there.close()
     assert len(told_here[0]) == len(seeds) * (steps + 1)
-    *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
-    assert seen == [0.0] * 5  # observation, reward, end, estimate and covariance, to the bit
+    *seen, truth = (
+        np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True)
+    )
+    assert (
+        seen == [0.0] * 5
+    )  # observation, reward, end, estimate and covariance, to the bit
     assert truth < 1e-12  # a quaternion rounds its heading
 
 
 @pytest.mark.parametrize("name", ["crowd", "room"])
-def test_moving_obstacles_and_maps_are_the_same_over_topics(launch, domain_id, model, name):
+def test_moving_obstacles_and_maps_are_the_same_over_topics(
+    launch, domain_id, model, name
+):
     launch("simulator_node", domain_id, mode="lockstep", world=name)
     options = {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S}
     here = BridgeEnv("sim", model, name, estimator=True)
@@ -152,16 +168,23 @@ def test_moving_obstacles_and_maps_are_the_same_over_topics(launch, domain_id, m
     finally:
         there.close()
     assert np.array_equal(here.scene.bodies, there.scene.bodies)
-    *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
+    *seen, truth = (
+        np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True)
+    )
     assert seen == [0.0] * 5
     assert truth < 1e-12
 
 
-def test_every_episode_over_topics_is_in_its_world_of_a_set(launch, domain_id, model, tmp_path):
+def test_every_episode_over_topics_is_in_its_world_of_a_set(
+    launch, domain_id, model, tmp_path
+):
     world = tmp_path / "mixed.yaml"
     world.write_text("name: mixed\nworlds: [crowd, room, corridor]\n")
     launch("simulator_node", domain_id, mode="lockstep", world=str(world))
-    options, seeds = {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S}, (0, 1, 2, 3)
+    options, seeds = (
+        {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S},
+        (0, 1, 2, 3),
+    )
     here = BridgeEnv("sim", model, str(world), estimator=True)
     there = BridgeEnv("dds", model, str(world), backend_options=options)
     assert {member_of(here.world, seed) for seed in seeds} == {0, 1, 2}
@@ -170,7 +193,9 @@ def test_every_episode_over_topics_is_in_its_world_of_a_set(launch, domain_id, m
         told_there = episodes(there, seeds, 8, np.random.default_rng(0))
     finally:
         there.close()
-    *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
+    *seen, truth = (
+        np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True)
+    )
     assert seen == [0.0] * 5
     assert truth < 1e-12
 
@@ -188,13 +213,17 @@ def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect,
 
     with pytest.raises(BackendError, match=r"refused the episode.*episode_seed"):
         backend.reset(Start(-1, START.pose))
-    with pytest.raises(BackendError, match=r"refused the episode.*three finite numbers"):
+    with pytest.raises(
+        BackendError, match=r"refused the episode.*three finite numbers"
+    ):
         backend.reset(Start(0, np.array([0.0, np.nan, 0.0])))
     drive(backend)
 
 
 @pytest.mark.parametrize("topic", ["odom", "scan"])
-def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(connect, monkeypatch, topic):
+def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(
+    connect, monkeypatch, topic
+):
     backend = connect()
     drive(backend)
     whole = backend.step(np.array([0.5, 0.1]))
@@ -242,7 +271,9 @@ def test_a_lost_asking_is_made_again(connect, monkeypatch):
 
 
 @pytest.mark.parametrize("topic", ["odom", "scan", "ground_truth"])
-def test_a_message_that_cant_be_read_is_told_with_its_topic(connect, monkeypatch, topic):
+def test_a_message_that_cant_be_read_is_told_with_its_topic(
+    connect, monkeypatch, topic
+):
     backend = connect(truth=True)
     drive(backend)
     put = backend._mail.put
@@ -262,9 +293,13 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
         return serialize_message(message)
 
     worked, got = [], []
-    mail = _Mailbox(("odom", "scan"), lambda stamp, *_: worked.append(stamp), slack_ns=0)
+    mail = _Mailbox(
+        ("odom", "scan"), lambda stamp, *_: worked.append(stamp), slack_ns=0
+    )
     assert mail.put("odom", stamped(1)) is mail.put("scan", stamped(1)) is None
-    caller = threading.Thread(target=lambda: got.append(mail.wait(2 * NS_PER_S, TIMEOUT_S)))
+    caller = threading.Thread(
+        target=lambda: got.append(mail.wait(2 * NS_PER_S, TIMEOUT_S))
+    )
     caller.start()
     while mail._awaited_ns < 0:
         os.sched_yield()
@@ -288,7 +323,9 @@ def test_another_world_is_refused_even_under_the_same_name(connect, arena):
         backend.reset(START)
 
 
-def test_without_a_simulator_the_error_names_all_that_is_missing(model, arena, domain_id):
+def test_without_a_simulator_the_error_names_all_that_is_missing(
+    model, arena, domain_id
+):
     with pytest.raises(BackendError) as caught:
         DdsBackend(model, arena, namespace="car", domain_id=domain_id, timeout_s=0.5)
     for missing in (
@@ -305,7 +342,9 @@ def test_without_a_simulator_the_error_names_all_that_is_missing(model, arena, d
 def test_close_leaves_a_zero_command_behind(connect, commands_heard):
     backend = connect()
     backend.reset(START)
-    zero_follows(commands_heard, lambda: backend.step(np.array([0.5, 0.0])), backend.close)
+    zero_follows(
+        commands_heard, lambda: backend.step(np.array([0.5, 0.0])), backend.close
+    )
     backend.close()  # twice does no harm
     with pytest.raises(BackendError, match="closed"):
         backend.step(np.zeros(2))
@@ -344,7 +383,9 @@ def test_an_error_in_a_step_leaves_a_zero_command_and_wants_a_reset(
     env.step(action)
 
 
-def test_garbage_collection_leaves_a_zero_command_behind(simulator, model, arena, commands_heard):
+def test_garbage_collection_leaves_a_zero_command_behind(
+    simulator, model, arena, commands_heard
+):
     env = BridgeEnv("dds", model, arena, backend_options={"domain_id": simulator[0]})
     env.myself = env  # a cycle, which only the collector ends
     env.reset(seed=3)
@@ -354,21 +395,31 @@ def test_garbage_collection_leaves_a_zero_command_behind(simulator, model, arena
         del env
         gc.collect()
 
-    zero_follows(commands_heard, lambda: env.step(np.array([1.0, 0.0], np.float32)), forget)
+    zero_follows(
+        commands_heard, lambda: env.step(np.array([1.0, 0.0], np.float32)), forget
+    )
 
 
-def test_somebody_else_who_moves_the_simulator_is_found_out(connect, commands_heard, monkeypatch):
+def test_somebody_else_who_moves_the_simulator_is_found_out(
+    connect, commands_heard, monkeypatch
+):
     peer, _ = commands_heard
     backend = connect()
     drive(backend)
-    intruder = peer.speak(Twist, "cmd_vel", subscribers=2)  # the simulator, and the listener
+    intruder = peer.speak(
+        Twist, "cmd_vel", subscribers=2
+    )  # the simulator, and the listener
     try:
         with monkeypatch.context() as patch:  # first by its deeds alone
             patch.setattr(backend._link, "others_command", lambda: False)
             backend.reset(START)
             intruder.publish(Twist())
-            peer.until(lambda: backend._mail.stamp_ns("odom") > backend._now_ns, "its effect")
-            with pytest.raises(BackendError, match=r"'odom': stamped \+0\.100 s off the step"):
+            peer.until(
+                lambda: backend._mail.stamp_ns("odom") > backend._now_ns, "its effect"
+            )
+            with pytest.raises(
+                BackendError, match=r"'odom': stamped \+0\.100 s off the step"
+            ):
                 backend.step(np.array([0.5, 0.0]))
         named = f"/{peer.node.get_name()} publishes /cmd_vel too"
         peer.until(lambda: named in complaint(backend), "the backend sees the intruder")
@@ -383,7 +434,9 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(connect, commands_he
 
 
 @pytest.mark.process
-def test_a_simulator_that_hangs_serves_again_when_it_wakes_and_its_death_is_noticed(own_simulator):
+def test_a_simulator_that_hangs_serves_again_when_it_wakes_and_its_death_is_noticed(
+    own_simulator,
+):
     backend, process, _ = own_simulator
     drive(backend)
     process._process.send_signal(signal.SIGSTOP)
@@ -427,14 +480,22 @@ def test_a_car_that_takes_turn_rates_moves_over_dds_as_in_process(
     launch, connect, arena, domain_id, tmp_path
 ):
     file = tmp_path / "kart.yaml"
-    file.write_text("kind: ackermann\nfootprint_radius: 0.2\nparameters: {wheelbase: 0.3}\n")
+    file.write_text(
+        "kind: ackermann\nfootprint_radius: 0.2\nparameters: {wheelbase: 0.3}\n"
+    )
     launch("simulator_node", domain_id, mode="lockstep", model=str(file))
     kart = open_model(file)
-    there, alone = connect(model=kart, domain_id=domain_id), SimBackend(kart, arena, estimator=True)
+    there, alone = (
+        connect(model=kart, domain_id=domain_id),
+        SimBackend(kart, arena, estimator=True),
+    )
     for backend in (there, alone):
         backend.reset(START)
     for command in ([0.9, 0.5], [0.9, -0.2], [-0.4, 0.3], [0.0, 0.5], [0.5, 0.1]):
-        poses = [backend.step(np.array(command))[0].pose.tolist() for backend in (there, alone)]
+        poses = [
+            backend.step(np.array(command))[0].pose.tolist()
+            for backend in (there, alone)
+        ]
         assert poses[0] == poses[1]
     assert poses[0] != START.pose.tolist()
 
@@ -465,7 +526,9 @@ def test_a_randomised_episode_over_dds_is_the_one_in_process(launch, model, doma
     here = BridgeEnv(model=model, randomisation="strong", estimator=True)
     with closing(BridgeEnv("dds", model, randomisation="strong", **options)) as there:
         for seed in (3, 4):
-            (mine, info), (theirs, told) = (env.reset(seed=seed) for env in (here, there))
+            (mine, info), (theirs, told) = (
+                env.reset(seed=seed) for env in (here, there)
+            )
             assert (mine == theirs).all()
             assert info["goal"].tolist() == told["goal"].tolist()
             for k in range(5):
@@ -482,15 +545,25 @@ def test_a_randomised_episode_over_dds_is_the_one_in_process(launch, model, doma
 def test_what_topics_can_not_give_is_refused(model):
     with pytest.raises(ConfigError, match="'dds' always estimates"):
         BridgeEnv("dds", model, estimator=False)
-    with pytest.raises(ConfigError, match="one robot in mode 'lockstep' alone can be randomised"):
-        BridgeEnv("dds", model, randomisation="mild", backend_options={"mode": "realtime"})
+    with pytest.raises(
+        ConfigError, match="one robot in mode 'lockstep' alone can be randomised"
+    ):
+        BridgeEnv(
+            "dds", model, randomisation="mild", backend_options={"mode": "realtime"}
+        )
 
 
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"domian_id": 3}, "backend 'dds': .*argument 'domian_id'; look at its arguments"),
-        ({"namespace": "ant 1"}, "namespace 'ant 1': must be words of letters, digits and _"),
+        (
+            {"domian_id": 3},
+            "backend 'dds': .*argument 'domian_id'; look at its arguments",
+        ),
+        (
+            {"namespace": "ant 1"},
+            "namespace 'ant 1': must be words of letters, digits and _",
+        ),
     ],
 )
 def test_an_option_that_a_backend_does_not_take_is_named(model, options, sentence):
@@ -500,5 +573,7 @@ def test_an_option_that_a_backend_does_not_take_is_named(model, options, sentenc
 
 @pytest.mark.parametrize("options", [{"mode": "realtime"}, {"namespaces": ["a"]}])
 def test_a_team_is_driven_in_lockstep_in_a_namespace_each(model, options):
-    with pytest.raises(ConfigError, match="a team of 2 robots is driven in mode 'lockstep'"):
+    with pytest.raises(
+        ConfigError, match="a team of 2 robots is driven in mode 'lockstep'"
+    ):
         dds_backend(model, load_world("arena"), robots=2, **options)

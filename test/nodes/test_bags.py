@@ -31,11 +31,16 @@ ENDS_S = 60.0
 def nics(domain_id, *words):
     """The command line, as a process in a DDS domain."""
     environment = os.environ | {
-        "ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }  # fmt: skip
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
     command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)]
     return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
 
 
@@ -51,16 +56,23 @@ def small_drive(path):
     topics = {
         "/odom": [(t + 0.01, odometry(t)) for t in bags.times(0.05, 2.0)],
         "/cmd_vel": [
-            (t + 0.013, bags.twist(0.5, 0.0, 0.1 * np.sin(t))) for t in bags.times(0.1, 2.0)
+            (t + 0.013, bags.twist(0.5, 0.0, 0.1 * np.sin(t)))
+            for t in bags.times(0.1, 2.0)
         ],
     }
     return bags.write(path, topics)
 
 
 def odometry(t):
-    inner = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36))
-    twist = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36))
-    return bags.new("nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", inner, twist)
+    inner = bags.new(
+        "geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36)
+    )
+    twist = bags.new(
+        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36)
+    )
+    return bags.new(
+        "nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", inner, twist
+    )
 
 
 class Robot:
@@ -93,7 +105,9 @@ def test_a_recorder_writes_a_whole_bag_at_ctrl_c(words, meet, domain_id, tmp_pat
     robot = Robot(meet(domain_id))
     recorder = nics(domain_id, "bag", "record", tmp_path / "drive", *words)
     robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
-    robot.until(lambda: robot.command.get_subscription_count() > 0, "a recorder of cmd_vel")
+    robot.until(
+        lambda: robot.command.get_subscription_count() > 0, "a recorder of cmd_vel"
+    )
     until = robot.sent + 40
     robot.until(lambda: robot.sent > until, "40 more messages")
     recorder.send_signal(signal.SIGINT)
@@ -117,7 +131,9 @@ def test_of_a_recorder_that_is_killed_the_drive_is_salvaged(meet, domain_id, tmp
     recorder = nics(domain_id, "bag", "record", tmp_path / "drive", "--topics", "odom")
     robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
     robot.until(
-        lambda: any(file.stat().st_size > 20_000 for file in tmp_path.glob(".drive.*/*/*.mcap")),
+        lambda: any(
+            file.stat().st_size > 20_000 for file in tmp_path.glob(".drive.*/*/*.mcap")
+        ),
         "a flush",
     )
     recorder.kill()
@@ -132,7 +148,9 @@ def test_of_a_recorder_that_is_killed_the_drive_is_salvaged(meet, domain_id, tmp
 
 @pytest.mark.campaign
 def test_nothing_heard_is_one_sentence_and_no_bag(domain_id, tmp_path):
-    _, err, code = ended(nics(domain_id, "bag", "record", tmp_path / "drive", "--duration", "1"))
+    _, err, code = ended(
+        nics(domain_id, "bag", "record", tmp_path / "drive", "--duration", "1")
+    )
     assert code == 2
     (told,) = (line for line in err.splitlines() if not line.startswith("[INFO]"))
     assert told.startswith("nics: nothing was heard")
@@ -150,7 +168,9 @@ def test_a_bag_is_published_with_its_time_on_the_clock(meet, domain_id, tmp_path
     out, err, code = ended(player)
     assert code == 0, err
     assert json.loads(out) == {"published": 60}
-    assert [stamp_ns(message) for message in odom] == [bags.ns(t) for t in bags.times(0.05, 2.0)]
+    assert [stamp_ns(message) for message in odom] == [
+        bags.ns(t) for t in bags.times(0.05, 2.0)
+    ]
     ticks = [conversions.stamp_from_ros(message.clock) for message in clock]
     assert ticks == sorted(ticks)
     assert bags.ns(0.0) <= ticks[0]
@@ -174,9 +194,15 @@ def test_a_replay_in_lock_step_gives_the_same_estimate_bit_for_bit(
         assert code == 0, err
         assert out.splitlines() == ["60 messages were published"]
         told.append(
-            [(stamp_ns(m), *conversions.odometry_from_ros(m)[1], m.pose.pose.position.x)
-             for m in filtered]
-        )  # fmt: skip
+            [
+                (
+                    stamp_ns(m),
+                    *conversions.odometry_from_ros(m)[1],
+                    m.pose.pose.position.x,
+                )
+                for m in filtered
+            ]
+        )
         filtered.clear()
         node.close()
     assert told[0] == told[1]
@@ -194,14 +220,30 @@ def test_the_doctor_finds_nothing_at_the_simulator_and_a_second_driver_beside_it
     scans = peer.listen(LaserScan, "scan")
     peer.until(lambda: scans, "a scan", ENDS_S)
     out, err, code = ended(
-        nics(module_domain_id, "doctor", "--model", model_folder, "--duration", "3", "--json")
+        nics(
+            module_domain_id,
+            "doctor",
+            "--model",
+            model_folder,
+            "--duration",
+            "3",
+            "--json",
+        )
     )
     assert json.loads(out)["findings"] == [], err
     assert code == 0
     for _ in range(2):
         peer.speak(Twist, "cmd_vel")
     out, err, code = ended(
-        nics(module_domain_id, "doctor", "--model", model_folder, "--duration", "6", "--json")
+        nics(
+            module_domain_id,
+            "doctor",
+            "--model",
+            model_folder,
+            "--duration",
+            "6",
+            "--json",
+        )
     )
     (finding,) = json.loads(out)["findings"]
     assert code == 1

@@ -33,7 +33,15 @@ from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
 
-GIVEN = ["gate", "--ros-args", "-p", "model:=ackermann", "-p", "limits:=ackermann", "-p"]
+GIVEN = [
+    "gate",
+    "--ros-args",
+    "-p",
+    "model:=ackermann",
+    "-p",
+    "limits:=ackermann",
+    "-p",
+]
 """The last one is followed by a parameter."""
 
 SOON_S = 0.5  # what the gate is made for, on a machine with time
@@ -43,9 +51,12 @@ MOST_ARMINGS = 3
 CORRIDOR_M = 1.5  # from the middle of it, on which the robot drives, to either wall
 WRITTEN_S = 5.0
 PATIENT = {
-    "scan_age": 1.0, "odom_age": 0.6, "command_age": 1.0, "rate_tolerance": 0.6,
+    "scan_age": 1.0,
+    "odom_age": 0.6,
+    "command_age": 1.0,
+    "rate_tolerance": 0.6,
     "e_stop_silence": 1.0,
-}  # fmt: skip
+}
 """This machine may be busy with other tests. Odometry that is silent for 0.75 s is `no_motion`."""
 
 
@@ -78,7 +89,11 @@ class Robot:
         # A busy machine leaves out some periods; the robot drives on all the same.
         self.x += speed * min((self.stamp_ns - before) / NS_PER_S, MOST_S)
         odometry = conversions.odometry_to_ros(
-            [self.x, 0.0, 0.0], [speed, 0.0, 0.0], self.stamp_ns, ("odom", "base_link"), (1e-4,) * 4
+            [self.x, 0.0, 0.0],
+            [speed, 0.0, 0.0],
+            self.stamp_ns,
+            ("odom", "base_link"),
+            (1e-4,) * 4,
         )
         # No two scans are the same; this is less than what counts as a motion.
         noise = self.stamp_ns % 7_000_000_000 * 1e-12
@@ -104,7 +119,9 @@ class Robot:
 
     def gets(self, *wanted):
         """Waits for a command to come out."""
-        assert self.comes(wanted, DEADLINE_S), f"{wanted} never came, but {self.passed[-1]}"
+        assert self.comes(wanted, DEADLINE_S), (
+            f"{wanted} never came, but {self.passed[-1]}"
+        )
 
     def comes(self, wanted, patience_s):
         """Whether a command comes out within a time."""
@@ -150,7 +167,9 @@ class Robot:
         """What the gate says next about itself."""
         said = self.peer.listen(DiagnosticArray, "/diagnostics")
         status = self.peer.another(said, "diagnostics").status[0]
-        return {value.key: value.value for value in status.values} | {"": status.message}
+        return {value.key: value.value for value in status.values} | {
+            "": status.message
+        }
 
 
 class Foreign(Robot):
@@ -170,7 +189,11 @@ def black_box(tmp_path_factory):
 @pytest.fixture(scope="module")
 def robot(launch, meet, module_domain_id, model, black_box):
     gate = launch(
-        "command_gate", module_domain_id, limits="ackermann", black_box=str(black_box), **PATIENT
+        "command_gate",
+        module_domain_id,
+        limits="ackermann",
+        black_box=str(black_box),
+        **PATIENT,
     )
     yield Robot(meet(module_domain_id), model.lidar)
     gate.check()
@@ -182,10 +205,18 @@ def test_it_imports_nothing_that_learns_or_infers():
         "import sys\nfrom nics_drl_bridge.nodes import command_gate\n"
         "print(*{name.partition('.')[0] for name in sys.modules})"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     loaded = set(done.stdout.split())
     assert "rclpy" in loaded
-    assert not loaded & {"torch", "onnxruntime", "onnx", "stable_baselines3", "gymnasium"}
+    assert not loaded & {
+        "torch",
+        "onnxruntime",
+        "onnx",
+        "stable_baselines3",
+        "gymnasium",
+    }
 
 
 @pytest.mark.process
@@ -199,7 +230,9 @@ node = CommandGate(open_context([], domain_id={domain_id}))
 node.destroy_node()
 node.context.try_shutdown()
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.split() == ["1"]
 
 
@@ -229,7 +262,9 @@ def test_a_motion_that_was_decided_on_before_a_freeze_is_never_published(
     assert [deserialize_message(one, TwistStamped).twist for one in said] == [Twist()]
 
 
-def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(domain_id, tmp_path, monkeypatch):
+def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(
+    domain_id, tmp_path, monkeypatch
+):
     """Whatever `safety` decides: here it is made to decide on NaN."""
     sent, wrong = [], np.array([0.5, math.nan, 0.1])
     context = open_context([*GIVEN, f"black_box:={tmp_path}"], domain_id)
@@ -269,7 +304,9 @@ def test_bytes_that_are_no_message_are_refused_and_counted(domain_id, tmp_path):
         for subscription in node.subscriptions:
             if subscription.raw:
                 takes_info = subscription.topic_name == "/cmd_vel_raw"
-                subscription.callback(b"\x00\x01\x00\x00\x01", *([{}] if takes_info else []))
+                subscription.callback(
+                    b"\x00\x01\x00\x00\x01", *([{}] if takes_info else [])
+                )
         facts = node._look().facts
         for topic in ("scan", "odom", "odometry/filtered", "cmd_vel_raw"):
             assert facts[f"refused, {topic}"] == 1
@@ -362,7 +399,8 @@ def test_another_publisher_of_commands_is_told_of_as_long_as_it_is_there(robot):
     robot.drives()
     other = robot.peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
     robot.peer.until(
-        lambda: "others publish on cmd_vel, too (1)" in robot.diagnosed()[""], "the warning"
+        lambda: "others publish on cmd_vel, too (1)" in robot.diagnosed()[""],
+        "the warning",
     )
     robot.peer.node.destroy_publisher(other)
     robot.peer.until(lambda: "others publish" not in robot.diagnosed()[""], "its end")
@@ -417,7 +455,9 @@ def test_the_e_stop_by_topic_stops_and_a_reset_alone_does_not_move(robot):
     robot.topics["e_stop"].publish(Bool(data=True))
     robot.stops()
     assert not robot.call("arm").success
-    robot.peer.until(lambda: robot.call("reset").success, "the e-stop is heard to be released")
+    robot.peer.until(
+        lambda: robot.call("reset").success, "the e-stop is heard to be released"
+    )
     known = len(robot.passed)
     robot.peer.until(lambda: len(robot.passed) > known + 20, "20 more commands")
     assert set(map(str, robot.passed[known:])) == {str(Twist())}
@@ -466,7 +506,9 @@ def test_after_a_burst_of_stops_it_ends_at_once_and_the_first_of_them_is_in_the_
     stops = int(robot.diagnosed()["stopped, command_malformed"])
     robot.wish = (math.nan, 0.0, 0.0)
     robot.stops()
-    assert gate.close() == 0  # by itself: who needs longer than NodeProcess waits is killed
+    assert (
+        gate.close() == 0
+    )  # by itself: who needs longer than NodeProcess waits is killed
     named = {path.name for path in tmp_path.iterdir()}
     (first,) = [name for name in named if name.endswith("_command_malformed.jsonl")]
     again = replay(tmp_path / first)
@@ -481,18 +523,28 @@ def test_after_a_burst_of_stops_it_ends_at_once_and_the_first_of_them_is_in_the_
 def test_as_shipped_it_stops_before_an_obstacle_and_counts_it(
     launch, meet, domain_id, model, tmp_path
 ):
-    gate = launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT)
+    gate = launch(
+        "command_gate",
+        domain_id,
+        limits="ackermann",
+        black_box=str(tmp_path),
+        **PATIENT,
+    )
     robot = Robot(meet(domain_id), model.lidar)
     robot.drives(0.2, 0.0, 0.0)
     cut = int(robot.diagnosed().get("cut by the shield", 0))
     robot.distance = 0.19
     robot.peer.until(
-        lambda: int(robot.diagnosed().get("cut by the shield", 0)) > cut, "the shield cuts"
+        lambda: int(robot.diagnosed().get("cut by the shield", 0)) > cut,
+        "the shield cuts",
     )
     robot.says("commands pass")
     robot.stops()
     said = gate.log.read_text(encoding="utf-8")
-    assert "the shield is on: latency 0.2, deceleration 2, margin 0.05, obstacle_speed 1" in said
+    assert (
+        "the shield is on: latency 0.2, deceleration 2, margin 0.05, obstacle_speed 1"
+        in said
+    )
     assert "config/limits/ackermann.yaml" in said
 
 
@@ -500,9 +552,13 @@ def test_without_its_shield_it_says_so_and_stops_before_nothing(
     launch, meet, domain_id, model, tmp_path
 ):
     gate = launch(
-        "command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), shield=False,
+        "command_gate",
+        domain_id,
+        limits="ackermann",
+        black_box=str(tmp_path),
+        shield=False,
         **PATIENT,
-    )  # fmt: skip
+    )
     robot = Robot(meet(domain_id), model.lidar)
     robot.distance = 0.3
     robot.drives(0.2, 0.0, 0.0)
@@ -546,9 +602,13 @@ def test_a_policy_that_dies_or_hangs_stops_the_robot(
     launch("simulator_node", domain_id, world="empty")
     launch("middleware_node", domain_id)
     launch(
-        "command_gate", domain_id, limits="ackermann", black_box=str(tmp_path),
-        use_sim_time=True, e_stop_required=False,
-    )  # fmt: skip
+        "command_gate",
+        domain_id,
+        limits="ackermann",
+        black_box=str(tmp_path),
+        use_sim_time=True,
+        e_stop_required=False,
+    )
     peer = meet(domain_id)
     passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
     # As far as the field goes, so that it does not arrive in between.
@@ -563,17 +623,27 @@ def test_a_policy_that_dies_or_hangs_stops_the_robot(
     policy._process.send_signal(how)
     began = time.monotonic()
     peer.until(lambda: passed[-1] == Twist(), "zero", LATE_S)
-    print(f"zero {time.monotonic() - began:.2f} s after the {how.name}, wanted within {SOON_S} s")
+    print(
+        f"zero {time.monotonic() - began:.2f} s after the {how.name}, wanted within {SOON_S} s"
+    )
     passed.clear()
     peer.until(lambda: len(passed) >= 5, "more commands")
     assert passed == [Twist()] * len(passed)
     if how == signal.SIGSTOP:
         policy._process.send_signal(signal.SIGCONT)
-        peer.until(lambda: passed[-1].linear.x > 0.0, "the robot drives on once it wakes")
+        peer.until(
+            lambda: passed[-1].linear.x > 0.0, "the robot drives on once it wakes"
+        )
 
 
 def test_it_leaves_a_zero_command_behind(launch, meet, domain_id, model, tmp_path):
-    gate = launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT)
+    gate = launch(
+        "command_gate",
+        domain_id,
+        limits="ackermann",
+        black_box=str(tmp_path),
+        **PATIENT,
+    )
     robot = Robot(meet(domain_id), model.lidar)
     robot.drives()
     assert gate.close() == 0

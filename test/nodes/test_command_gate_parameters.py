@@ -71,11 +71,15 @@ def test_a_typo_in_the_limits_is_one_sentence(declared, tmp_path):
     file = tmp_path / "limits.yaml"
     text = find_config("ackermann", "limits").read_text(encoding="utf-8")
     file.write_text(text.replace("max: 1.0", "max: 10.0"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"speed_command\.max': 10 m/s is beyond the robot's own"):
+    with pytest.raises(
+        ConfigError, match=r"speed_command\.max': 10 m/s is beyond the robot's own"
+    ):
         declared({"model": "ackermann", "limits": str(file)})
 
 
-@pytest.mark.parametrize(("rate", "age"), [(10.0, 0.3), (5.0, 0.35), (4.0, 0.4375), (40.0, 0.3)])
+@pytest.mark.parametrize(
+    ("rate", "age"), [(10.0, 0.3), (5.0, 0.35), (4.0, 0.4375), (40.0, 0.3)]
+)
 def test_scans_of_a_slow_lidar_may_get_older(declared, rate, age):
     model = builtin_model("ackermann")
     slow = replace(model, lidar=model.lidar.model_copy(update={"rate": rate}))
@@ -102,7 +106,8 @@ def test_each_namespace_has_a_black_box_of_its_own(domain_id, tmp_path):
 @pytest.mark.parametrize("simulated", [False, True])
 def test_the_clock_of_a_gate_that_runs_can_not_be_changed(domain_id, simulated):
     context = open_context(
-        ["node", "--ros-args", "-p", f"use_sim_time:={str(simulated).lower()}"], domain_id
+        ["node", "--ros-args", "-p", f"use_sim_time:={str(simulated).lower()}"],
+        domain_id,
     )
     node = Node("command_gate", context=context)
     try:
@@ -111,7 +116,10 @@ def test_the_clock_of_a_gate_that_runs_can_not_be_changed(domain_id, simulated):
         (other,) = node.set_parameters([Parameter("use_sim_time", value=not simulated)])
         assert same.successful
         assert not other.successful
-        assert "parameter 'use_sim_time' can't be changed while the gate runs" in other.reason
+        assert (
+            "parameter 'use_sim_time' can't be changed while the gate runs"
+            in other.reason
+        )
         assert node.get_parameter("use_sim_time").value is simulated
         assert node.get_clock().ros_time_is_active is simulated
     finally:
@@ -120,12 +128,16 @@ def test_the_clock_of_a_gate_that_runs_can_not_be_changed(domain_id, simulated):
 
 
 def test_the_parameter_that_was_split_names_the_two_that_it_is_now(declared):
-    with pytest.raises(ConfigError, match=r"'estimate_position' .* and 'estimate_heading'"):
+    with pytest.raises(
+        ConfigError, match=r"'estimate_position' .* and 'estimate_heading'"
+    ):
         declared({"estimate_std": 0.5})
 
 
 def test_metres_and_radians_of_the_estimate_have_parameters_of_their_own(declared):
-    config = declared({"estimate_position": 0.7, "estimate_heading": 0.2, "stop_when_held": False})
+    config = declared(
+        {"estimate_position": 0.7, "estimate_heading": 0.2, "stop_when_held": False}
+    )
     assert (config.estimate_position, config.estimate_heading) == (0.7, 0.2)
     assert not config.stop_when_held
     assert declared().stop_when_held

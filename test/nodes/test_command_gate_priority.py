@@ -29,8 +29,10 @@ def asked(priority):
     """What a process of two threads is and is told after it asked for a priority."""
     done = subprocess.run(
         [sys.executable, "-c", CODE.format(priority=priority)],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     return done.stdout.splitlines()
 
 

@@ -30,7 +30,9 @@ def over_the_wire(message):
     return deserialize_message(serialize_message(message), type(message))
 
 
-@pytest.mark.parametrize("time_ns", [0, 1, 999_999_999, 1_000_000_000, 1_795_234_830_123_456_789])
+@pytest.mark.parametrize(
+    "time_ns", [0, 1, 999_999_999, 1_000_000_000, 1_795_234_830_123_456_789]
+)
 def test_stamps_come_back_to_the_nanosecond(time_ns):
     stamp = conversions.stamp_to_ros(time_ns)
     assert 0 <= stamp.nanosec < 1_000_000_000
@@ -44,7 +46,9 @@ def yaw(q):
 @pytest.mark.parametrize("heading", [-math.pi, -2.0, -0.0, 1e-9, 0.5, 3.1415])
 def test_headings_come_back(heading):
     turned = yaw(conversions.heading_to_ros(heading))
-    assert math.remainder(turned - heading, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-12)
+    assert math.remainder(turned - heading, 2.0 * math.pi) == pytest.approx(
+        0.0, abs=1e-12
+    )
 
 
 def test_a_heading_is_the_yaw_of_a_tilted_quaternion_too():
@@ -57,13 +61,21 @@ def test_a_heading_is_the_yaw_of_a_tilted_quaternion_too():
 def test_twists_come_back_and_leave_the_other_fields_zero():
     message = conversions.twist_to_ros([0.5, -0.25, 1.5])
     assert (message.linear.z, message.angular.x, message.angular.y) == (0.0, 0.0, 0.0)
-    assert conversions.twist_from_ros(over_the_wire(message)).tolist() == [0.5, -0.25, 1.5]
+    assert conversions.twist_from_ros(over_the_wire(message)).tolist() == [
+        0.5,
+        -0.25,
+        1.5,
+    ]
 
 
 def test_odometry_comes_back_with_its_frames_and_covariance():
     message = over_the_wire(
         conversions.odometry_to_ros(
-            [1.0, -2.0, 3.0], [0.1, 0.2, 0.3], 5_000_000_007, ("odom", "base_link"), VARIANCE
+            [1.0, -2.0, 3.0],
+            [0.1, 0.2, 0.3],
+            5_000_000_007,
+            ("odom", "base_link"),
+            VARIANCE,
         )
     )
     pose, twist = conversions.odometry_from_ros(message)
@@ -73,12 +85,24 @@ def test_odometry_comes_back_with_its_frames_and_covariance():
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
     # x, y, z, roll, pitch, yaw: what a planar robot does not measure is as good as unknown.
     unknown = [conversions.UNUSED_VARIANCE] * 3
-    assert np.diag(message.pose.covariance.reshape(6, 6)).tolist() == [0.01, 0.01, *unknown, 0.02]
-    assert np.diag(message.twist.covariance.reshape(6, 6)).tolist() == [0.03, 0.03, *unknown, 0.04]
+    assert np.diag(message.pose.covariance.reshape(6, 6)).tolist() == [
+        0.01,
+        0.01,
+        *unknown,
+        0.02,
+    ]
+    assert np.diag(message.twist.covariance.reshape(6, 6)).tolist() == [
+        0.03,
+        0.03,
+        *unknown,
+        0.04,
+    ]
     assert np.count_nonzero(message.pose.covariance) == 6
 
 
-@pytest.mark.parametrize("spec", [load_lidar("paper"), FORWARD], ids=["full circle", "forward"])
+@pytest.mark.parametrize(
+    "spec", [load_lidar("paper"), FORWARD], ids=["full circle", "forward"]
+)
 def test_every_header_field_of_a_scan_follows_from_the_lidar(spec):
     ranges = np.full(spec.beams, 1.5, np.float32)
     message = over_the_wire(conversions.scan_to_ros(spec, ranges, 42, "laser"))
@@ -92,7 +116,9 @@ def test_every_header_field_of_a_scan_follows_from_the_lidar(spec):
     assert beams == pytest.approx(len(message.ranges), abs=1e-3)
     assert message.time_increment == 0.0  # all beams are measured at once
     assert message.scan_time == pytest.approx(1.0 / spec.rate)
-    assert (message.range_min, message.range_max) == pytest.approx((spec.range_min, spec.range_max))
+    assert (message.range_min, message.range_max) == pytest.approx(
+        (spec.range_min, spec.range_max)
+    )
 
 
 def test_ranges_keep_their_infinities_nan_and_bits():
@@ -123,9 +149,12 @@ def test_ranges_taken_from_a_message_are_a_copy():
 
 
 @pytest.mark.parametrize(
-    ("no_return", "wire"), [("inf", math.inf), ("zero", 0.0), ("range_max", 8.0), ("nan", math.nan)]
+    ("no_return", "wire"),
+    [("inf", math.inf), ("zero", 0.0), ("range_max", 8.0), ("nan", math.nan)],
 )
-def test_no_return_travels_in_the_words_of_the_device_and_comes_back_as_inf(no_return, wire):
+def test_no_return_travels_in_the_words_of_the_device_and_comes_back_as_inf(
+    no_return, wire
+):
     spec = FORWARD.model_copy(update={"no_return": no_return})
     ranges = np.full(spec.beams, np.inf, np.float32)
     ranges[0], ranges[1] = 1.5, -np.inf
@@ -136,7 +165,9 @@ def test_no_return_travels_in_the_words_of_the_device_and_comes_back_as_inf(no_r
 
 
 def test_a_device_that_turns_while_it_measures_says_so_in_the_header():
-    spec = FORWARD.model_validate(FORWARD.model_dump() | {"faults": {"skew": "counter_clockwise"}})
+    spec = FORWARD.model_validate(
+        FORWARD.model_dump() | {"faults": {"skew": "counter_clockwise"}}
+    )
     message = conversions.scan_to_ros(spec, np.ones(spec.beams, np.float32), 0, "laser")
     # 3 rad of a turn that takes 50 ms, in 180 steps.
     assert message.time_increment == pytest.approx(0.05 * 3.0 / (2.0 * math.pi) / 180)
@@ -158,7 +189,11 @@ def test_a_measured_pose_comes_with_the_covariance_of_x_y_and_heading():
     message.pose.covariance = np.arange(36, dtype=np.float64)
     pose, covariance = conversions.pose_from_ros(over_the_wire(message))
     assert pose == pytest.approx([1.5, -2.0, -3.0])
-    assert covariance.tolist() == [[0.0, 1.0, 5.0], [6.0, 7.0, 11.0], [30.0, 31.0, 35.0]]
+    assert covariance.tolist() == [
+        [0.0, 1.0, 5.0],
+        [6.0, 7.0, 11.0],
+        [30.0, 31.0, 35.0],
+    ]
 
 
 def test_a_pose_without_covariance_says_so():
@@ -180,7 +215,9 @@ def test_an_imu_gives_its_yaw_rate_and_variance_unless_it_has_none():
 
 
 def test_a_planar_covariance_survives_the_way_through_a_message():
-    planar = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]])
+    planar = np.array(
+        [[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]]
+    )
     message = PoseWithCovarianceStamped()
     message.pose.covariance = conversions.covariance_to_ros(planar)
     assert conversions.pose_from_ros(message)[1] == pytest.approx(planar)
@@ -194,5 +231,9 @@ def test_an_orientation_that_was_never_filled_in_is_no_heading(kind):
     message = kind()
     inner = message.pose if kind is PoseStamped else message.pose.pose
     inner.orientation.w = 0.0
-    read = conversions.pose_from_ros if kind is PoseStamped else conversions.odometry_from_ros
+    read = (
+        conversions.pose_from_ros
+        if kind is PoseStamped
+        else conversions.odometry_from_ros
+    )
     assert np.isnan(read(message)[0]).all()

@@ -49,7 +49,9 @@ class Fleet:
                 return answer
             stamp = json.loads(answer.message)["stamp_ns"]
             try:
-                self.peer.until(lambda stamp=stamp: self.stamps() == {stamp}, "first data", 1.5)
+                self.peer.until(
+                    lambda stamp=stamp: self.stamps() == {stamp}, "first data", 1.5
+                )
             except AssertionError:
                 continue
             return answer
@@ -73,7 +75,11 @@ FACING = [0.0, 0.0, 0.0, 1.0, 0.0, np.pi]
 def fleet(launch, meet, module_domain_id):
     peer = meet(module_domain_id)
     process = launch(
-        "simulator_node", module_domain_id, mode="lockstep", world="empty", robots=list(NAMES)
+        "simulator_node",
+        module_domain_id,
+        mode="lockstep",
+        world="empty",
+        robots=list(NAMES),
     )
     robots = Fleet(peer)
     assert robots.reset(FACING).success
@@ -89,7 +95,9 @@ def test_a_fleet_moves_when_each_of_its_robots_has_a_command(fleet):
         assert fleet.peer.set_parameters("simulator_node", episode_seed=0).successful
     assert fleet.stamps() == {now}
     fleet.command("right", 0.0)
-    fleet.peer.until(lambda: fleet.stamps() == {now + NS_PER_S // 10}, "a step of the fleet")
+    fleet.peer.until(
+        lambda: fleet.stamps() == {now + NS_PER_S // 10}, "a step of the fleet"
+    )
     assert fleet.x("left") > 0.0
 
 
@@ -103,7 +111,10 @@ def test_the_frames_of_a_fleet_begin_with_the_namespace_of_each_robot(fleet):
     for name in NAMES:
         scan, odom = fleet.scans[name][-1], fleet.odoms[name][-1]
         assert scan.header.frame_id == f"{name}/laser"
-        assert (odom.header.frame_id, odom.child_frame_id) == (f"{name}/odom", f"{name}/base_link")
+        assert (odom.header.frame_id, odom.child_frame_id) == (
+            f"{name}/odom",
+            f"{name}/base_link",
+        )
 
 
 def test_a_fleet_that_gets_starts_for_other_robots_says_how_many_it_needs(fleet):
@@ -121,7 +132,10 @@ class Stamped:
         self.order = []
         for kind, topic in ((LaserScan, "scan"), (Odometry, "odom")):
             peer.node.create_subscription(
-                kind, topic, lambda m, topic=topic: self.order.append((topic, stamp_ns(m))), 10
+                kind,
+                topic,
+                lambda m, topic=topic: self.order.append((topic, stamp_ns(m))),
+                10,
             )
         peer.node.create_subscription(
             Clock,
@@ -138,7 +152,9 @@ class Stamped:
     def drive(self, age_ns):
         message = TwistStamped(twist=conversions.twist_to_ros([0.5, 0.0, 0.0]))
         if age_ns is not None:
-            message.header.stamp = conversions.stamp_to_ros(stamp_ns(self.odom[-1]) - age_ns)
+            message.header.stamp = conversions.stamp_to_ros(
+                stamp_ns(self.odom[-1]) - age_ns
+            )
         self.commands.publish(message)
         return self.peer.another(self.odom, "odometry").twist.twist.linear.x
 
@@ -172,7 +188,9 @@ def test_scan_and_odometry_have_rates_of_their_own(stamped):
         assert np.median(steps) == steps.min() == 1.0
 
 
-def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_measured(stamped):
+def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_measured(
+    stamped,
+):
     known = len(stamped.stamps("scan"))
     stamped.peer.until(lambda: len(stamped.stamps("scan")) > known + 5, "scans")
     clock, late = 0, []
@@ -189,7 +207,11 @@ def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_meas
     ("given", "scan_ns", "odom_ns"),
     [
         ({}, (12_000_000, 10_000_000), (3_000_000, 0)),
-        ({"scan_latency": 0.0, "odom_latency": 0.0, "latency_jitter": 0.0}, (0, 0), (0, 0)),
+        (
+            {"scan_latency": 0.0, "odom_latency": 0.0, "latency_jitter": 0.0},
+            (0, 0),
+            (0, 0),
+        ),
         ({"scan_latency": 0.05}, (50_000_000, 10_000_000), (3_000_000, 0)),
         ({"latency_jitter": 0.002}, (12_000_000, 2_000_000), (3_000_000, 2_000_000)),
         ({"mode": "lockstep"}, (0, 0), (0, 0)),
@@ -198,8 +220,12 @@ def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_meas
 def test_a_device_is_as_late_as_was_measured_unless_told_otherwise_and_never_in_lockstep(
     model, domain_id, given, scan_ns, odom_ns
 ):
-    latency = Latency(scan=Delay(least=0.012, jitter=0.01), odom=Delay(least=0.003, jitter=0.0))
-    asked = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+    latency = Latency(
+        scan=Delay(least=0.012, jitter=0.01), odom=Delay(least=0.003, jitter=0.0)
+    )
+    asked = [
+        word for name, value in given.items() for word in ("-p", f"{name}:={value}")
+    ]
     context = open_context(["node", "--ros-args", *asked], domain_id)
     try:
         node = Node("device", context=context)
@@ -221,7 +247,9 @@ def test_a_stamped_command_drives_the_robot(stamped, age_ns):
     raise AssertionError(f"it goes at {speed} m/s")
 
 
-def test_a_command_whose_stamp_is_older_than_the_timeout_is_ignored_and_said_to_be(stamped):
+def test_a_command_whose_stamp_is_older_than_the_timeout_is_ignored_and_said_to_be(
+    stamped,
+):
     for _ in range(300):
         if abs(stamped.drive(2 * NS_PER_S)) < 0.05:
             break
@@ -234,15 +262,22 @@ def test_a_publisher_of_the_other_type_is_named_with_both_types(stamped):
 
     def said():
         text = stamped.process.log.read_text()
-        return "publishes geometry_msgs/msg/Twist, but geometry_msgs/msg/TwistStamped" in text
+        return (
+            "publishes geometry_msgs/msg/Twist, but geometry_msgs/msg/TwistStamped"
+            in text
+        )
 
     stamped.peer.until(said, "a warning")
 
 
-HAS_TF, HAS_ACKERMANN = (find_spec(name) is not None for name in ("tf2_msgs", "ackermann_msgs"))
+HAS_TF, HAS_ACKERMANN = (
+    find_spec(name) is not None for name in ("tf2_msgs", "ackermann_msgs")
+)
 
 
-@pytest.mark.skipif(not HAS_ACKERMANN, reason="needs ackermann_msgs: make test-messages")
+@pytest.mark.skipif(
+    not HAS_ACKERMANN, reason="needs ackermann_msgs: make test-messages"
+)
 def test_a_car_is_driven_by_speed_and_steering_angle(stamped):
     kind = import_module("ackermann_msgs.msg").AckermannDriveStamped
     topic = stamped.stranger.speak(kind, "ackermann_cmd")
@@ -258,14 +293,19 @@ def test_a_car_is_driven_by_speed_and_steering_angle(stamped):
 
 
 @pytest.mark.skipif(not HAS_TF, reason="needs tf2_msgs: make test-messages")
-def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comers(stamped):
+def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comers(
+    stamped,
+):
     kind = import_module("tf2_msgs.msg").TFMessage
     moving = stamped.peer.listen(kind, "/tf", qos.TRANSFORMS)
     fixed = stamped.peer.listen(kind, "/tf_static", qos.LATCHED)
     stamped.peer.until(lambda: moving and fixed, "transforms")
     (odom,), (mount,) = moving[-1].transforms, fixed[-1].transforms
     assert (odom.header.frame_id, odom.child_frame_id) == ("car/odom", "car/base_link")
-    assert (mount.header.frame_id, mount.child_frame_id) == ("car/base_link", "car/laser")
+    assert (mount.header.frame_id, mount.child_frame_id) == (
+        "car/base_link",
+        "car/laser",
+    )
 
 
 @pytest.mark.skipif(HAS_TF, reason="tf2_msgs is installed")

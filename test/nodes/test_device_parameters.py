@@ -13,7 +13,9 @@ def due(pace, seconds, step=STEP):
 
 
 def test_where_the_step_divides_the_period_messages_are_regular():
-    assert due(TopicPace(NS_PER_S // 10, STEP), 1) == list(range(0, NS_PER_S, NS_PER_S // 10))
+    assert due(TopicPace(NS_PER_S // 10, STEP), 1) == list(
+        range(0, NS_PER_S, NS_PER_S // 10)
+    )
 
 
 def test_where_it_does_not_the_mean_rate_is_still_the_asked_one():
@@ -31,7 +33,8 @@ def test_after_a_reset_a_message_is_due_at_once():
 
 
 @pytest.mark.parametrize(
-    ("periods", "steps"), [((0.1, 0.02), 2), ((0.1, 0.1), 10), ((0.025, 0.02), 2), ((0.001,), 1)]
+    ("periods", "steps"),
+    [((0.1, 0.02), 2), ((0.1, 0.1), 10), ((0.025, 0.02), 2), ((0.001,), 1)],
 )
 def test_the_world_moves_by_the_longest_step_that_meets_all_periods(periods, steps):
     assert common_step(0.01, periods) == steps

@@ -2,7 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from nics_drl_bridge.nodes.e_stop_queue import LONGEST_SLEEP_S, QUEUE_MESSAGES, EStopQueue
+from nics_drl_bridge.nodes.e_stop_queue import (
+    LONGEST_SLEEP_S,
+    QUEUE_MESSAGES,
+    EStopQueue,
+)
 
 
 def heard_at(rate, seconds=2.0):

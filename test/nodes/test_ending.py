@@ -36,9 +36,18 @@ runner.run_node(make)
 ending.leave(0)
 """
 ENDS = [
-    signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGALRM,
-    signal.SIGTERM, signal.SIGXCPU, signal.SIGIO, signal.SIGRTMIN, signal.SIGRTMAX,
-]  # fmt: skip
+    signal.SIGHUP,
+    signal.SIGINT,
+    signal.SIGQUIT,
+    signal.SIGUSR1,
+    signal.SIGUSR2,
+    signal.SIGALRM,
+    signal.SIGTERM,
+    signal.SIGXCPU,
+    signal.SIGIO,
+    signal.SIGRTMIN,
+    signal.SIGRTMAX,
+]
 
 
 def usual_signals():
@@ -51,9 +60,12 @@ def usual_signals():
 def node(domain_id):
     """A node that says when it runs, and when it is stopped in order."""
     process = subprocess.Popen(
-        [sys.executable, "-c", NODE], env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
-        stdout=subprocess.PIPE, text=True, preexec_fn=usual_signals,
-    )  # fmt: skip
+        [sys.executable, "-c", NODE],
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=usual_signals,
+    )
     assert process.stdout.readline() == "runs\n"
     yield process
     process.kill()
@@ -75,10 +87,12 @@ def test_a_reader_that_has_gone_does_not_end_it(node):
 
 def test_a_lost_terminal_does_not_end_what_was_started_by_nohup(domain_id):
     process = subprocess.Popen(
-        [sys.executable, "-c", NODE], env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
-        stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-c", NODE],
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+        stdout=subprocess.PIPE,
+        text=True,
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
-    )  # fmt: skip
+    )
     assert process.stdout.readline() == "runs\n"
     process.send_signal(signal.SIGHUP)
     assert [process.stdout.readline() for _ in range(5)] == ["runs\n"] * 5
@@ -86,14 +100,20 @@ def test_a_lost_terminal_does_not_end_what_was_started_by_nohup(domain_id):
     assert "stopped\n" in process.communicate(timeout=DEADLINE_S)[0]
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGALRM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGALRM]
+)
 def test_a_gate_that_lets_a_robot_drive_leaves_a_zero_behind(
     launch_process, meet, domain_id, model, tmp_path, number
 ):
     if signal.getsignal(number) is signal.SIG_IGN:
         pytest.skip("the shell that started the tests ignores it")
     gate = launch_process(
-        "command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT
+        "command_gate",
+        domain_id,
+        limits="ackermann",
+        black_box=str(tmp_path),
+        **PATIENT,
     )
     robot = Robot(meet(domain_id), model.lidar)
     robot.drives()

@@ -55,7 +55,13 @@ def simulators(launch, domains):
     for mode in ("realtime", "lockstep"):
         found[mode] = domains.enter_context(claimed_domain())
         # A command holds for an hour: what stops the robot is the env.
-        launch("simulator_node", found[mode], mode=mode, world="empty", command_timeout=3600.0)
+        launch(
+            "simulator_node",
+            found[mode],
+            mode=mode,
+            world="empty",
+            command_timeout=3600.0,
+        )
     return found
 
 
@@ -63,8 +69,10 @@ def simulators(launch, domains):
 def listeners(simulators, meet):
     """What is heard on `cmd_vel` of each mode."""
     peers = {mode: meet(domain_id) for mode, domain_id in simulators.items()}
-    return {mode: (peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND))
-            for mode, peer in peers.items()}  # fmt: skip
+    return {
+        mode: (peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND))
+        for mode, peer in peers.items()
+    }
 
 
 @pytest.fixture
@@ -78,13 +86,21 @@ def driving(simulators, listeners):
         options = {"mode": mode, "domain_id": simulators[mode]}
         options |= {"stale_after_s": PATIENCE_S} if mode == "realtime" else {}
         env = gymnasium.make(
-            NAVIGATION, backend="dds", model="ackermann", world="empty", task=Thrower,
-            max_episode_steps=100_000, backend_options=options, **arguments,
-        )  # fmt: skip
+            NAVIGATION,
+            backend="dds",
+            model="ackermann",
+            world="empty",
+            task=Thrower,
+            max_episode_steps=100_000,
+            backend_options=options,
+            **arguments,
+        )
         made.append(env)
         env.reset(seed=1)
         heard.clear()
-        peer.until(lambda: step(env) and heard and heard[-1].linear.x > 0.0, "that it drives")
+        peer.until(
+            lambda: step(env) and heard and heard[-1].linear.x > 0.0, "that it drives"
+        )
         return env, peer, heard
 
     yield start
@@ -139,24 +155,36 @@ def close_fails(env):
 
 
 CASES = {
-    "step with NaN": (lambda env: env.step(AHEAD * np.nan), gymnasium.error.InvalidAction),
-    "step with a wrong shape": (lambda env: env.step(AHEAD[:1]), gymnasium.error.InvalidAction),
+    "step with NaN": (
+        lambda env: env.step(AHEAD * np.nan),
+        gymnasium.error.InvalidAction,
+    ),
+    "step with a wrong shape": (
+        lambda env: env.step(AHEAD[:1]),
+        gymnasium.error.InvalidAction,
+    ),
     "a task whose command raises": (task_raises, ZeroDivisionError),
     "reset with a bad seed": (lambda env: env.reset(seed=-1), ConfigError),
     "reset with bad options": (
-        lambda env: env.reset(options={"start": "there"}), ConfigError,
+        lambda env: env.reset(options={"start": "there"}),
+        ConfigError,
     ),
-    "reset with an unknown option": (lambda env: env.reset(options={"x": 1}), ConfigError),
+    "reset with an unknown option": (
+        lambda env: env.reset(options={"x": 1}),
+        ConfigError,
+    ),
     "reset with a great seed": (lambda env: env.reset(seed=2**63), ConfigError),
     "a task whose command is NaN": (task_says_nan, ConfigError),
     "a task whose reset raises": (task_raises_in_reset, ZeroDivisionError),
     "Ctrl-C in step": (interrupted, KeyboardInterrupt),
     "render that raises": (picture_fails, OSError),
     "close whose picture raises": (close_fails, ZeroDivisionError),
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize("mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.campaign)]
+)
 @pytest.mark.parametrize("case", list(CASES))
 def test_a_zero_is_the_last_that_cmd_vel_hears(driving, mode, case):
     act, error = CASES[case]
@@ -171,7 +199,10 @@ def test_a_zero_is_the_last_that_cmd_vel_hears(driving, mode, case):
             env.step(AHEAD)
         env.reset(seed=2)
         heard.clear()
-        peer.until(lambda: step(env) and heard and heard[-1].linear.x > 0.0, "that it drives on")
+        peer.until(
+            lambda: step(env) and heard and heard[-1].linear.x > 0.0,
+            "that it drives on",
+        )
 
 
 def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(driving):
@@ -187,7 +218,9 @@ def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(driving):
     peer.until(lambda: heard[-1] == Twist(), "another zero command")
 
 
-def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(driving, monkeypatch):
+def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(
+    driving, monkeypatch
+):
     spin_once = link.StandingExecutor.spin_once
 
     def dies(*given, **options):
@@ -200,7 +233,9 @@ def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(driving, monk
     env.step(AHEAD)
     monkeypatch.setattr(link.StandingExecutor, "spin_once", dies)
     peer.until(lambda: heard[-1] == Twist(), "a zero command")
-    peer.until(lambda: not env.unwrapped._backend._link._context.ok(), "the thread's end")
+    peer.until(
+        lambda: not env.unwrapped._backend._link._context.ok(), "the thread's end"
+    )
     with pytest.raises(BackendError, match="closed"):
         env.step(AHEAD)
 
@@ -213,9 +248,13 @@ def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_movin
     peer = meet(domain_id)
     heard = [peer.listen(Twist, f"{name}/cmd_vel", qos.EVERY_COMMAND) for name in names]
     env = gymnasium.make(
-        COOPERATIVE_REACHING, backend="dds", model="ackermann", world="empty",
-        task_options={"robots": 3}, backend_options={"domain_id": domain_id, "namespaces": names},
-    ).unwrapped  # fmt: skip
+        COOPERATIVE_REACHING,
+        backend="dds",
+        model="ackermann",
+        world="empty",
+        task_options={"robots": 3},
+        backend_options={"domain_id": domain_id, "namespaces": names},
+    ).unwrapped
 
     def drive():
         ended = env.step(np.tile(AHEAD, 3))[2]
@@ -236,13 +275,17 @@ def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_movin
                 with pytest.raises(BackendError, match="can't be halted"):
                     env.step(np.tile(AHEAD, 3) * np.nan)
             others = [each for k, each in enumerate(heard) if k != deaf]
-            peer.until(lambda others=others: all(x[-1] == Twist() for x in others), "zeros")
+            peer.until(
+                lambda others=others: all(x[-1] == Twist() for x in others), "zeros"
+            )
             env.reset(seed=0)
         peer.until(drive, "that all drive")
         monkeypatch.setattr(robots[0], "close", refuses)
         with pytest.raises(BackendError, match="can't be halted"):
             env.close()
-        peer.until(lambda: all(each[-1] == Twist() for each in heard), "zeros at the end")
+        peer.until(
+            lambda: all(each[-1] == Twist() for each in heard), "zeros at the end"
+        )
     finally:
         for robot in robots:
             robot._link.close()
@@ -258,13 +301,22 @@ def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
     mode, raising = "realtime", []
     told = {"say": say, "vehicle": True, "start": "present"}
     peer, heard = listeners[mode]
-    options = {"mode": mode, "domain_id": simulators[mode], "stale_after_s": PATIENCE_S, **told}
+    options = {
+        "mode": mode,
+        "domain_id": simulators[mode],
+        "stale_after_s": PATIENCE_S,
+        **told,
+    }
     env = BridgeEnv("dds", "ackermann", "empty", backend_options=options)
     try:
         env.reset(seed=0)
         heard.clear()
-        peer.until(lambda: env.step(AHEAD) and heard and heard[-1].linear.x > 0.0, "driving")
-        monkeypatch.setattr(env._backend, "_missing", lambda _: "nothing, but somebody says so")
+        peer.until(
+            lambda: env.step(AHEAD) and heard and heard[-1].linear.x > 0.0, "driving"
+        )
+        monkeypatch.setattr(
+            env._backend, "_missing", lambda _: "nothing, but somebody says so"
+        )
         raising.append(True)
         with pytest.raises(ValueError, match="of the user"):
             env.reset(seed=0)
@@ -278,7 +330,10 @@ def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
     "command",
     [
         [np.nan, -np.inf],
-        *(pytest.param(c, marks=pytest.mark.campaign) for c in ([np.nan, 0.0], [0.5, np.inf])),
+        *(
+            pytest.param(c, marks=pytest.mark.campaign)
+            for c in ([np.nan, 0.0], [0.5, np.inf])
+        ),
     ],
 )
 def test_a_backend_publishes_nothing_that_is_not_finite(
@@ -291,8 +346,12 @@ def test_a_backend_publishes_nothing_that_is_not_finite(
         backend.reset(Start(seed=3, pose=np.zeros(3)))
         heard.clear()
         moves = lambda: heard and heard[-1].linear.x > 0.0  # noqa: E731
-        peer.until(lambda: backend.step(np.array([0.5, 0.1])) and moves(), "that it drives")
-        with pytest.raises(BackendError, match="must be finite, a zero was sent instead"):
+        peer.until(
+            lambda: backend.step(np.array([0.5, 0.1])) and moves(), "that it drives"
+        )
+        with pytest.raises(
+            BackendError, match="must be finite, a zero was sent instead"
+        ):
             backend.step(np.array(command))
         peer.until(lambda: heard[-1] == Twist(), "a zero command")
         assert all(np.isfinite([each.linear.x, each.angular.z]).all() for each in heard)

@@ -50,7 +50,9 @@ def test_entities_that_come_and_go_are_noticed(node, executor):
     spin_until(executor, lambda: one == [Int32(data=1)], "the first message")
     node.create_subscription(Int32, "count", two.append, 10)
     node.destroy_subscription(first)
-    spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched anew")
+    spin_until(
+        executor, lambda: publisher.get_subscription_count() == 1, "matched anew"
+    )
     publisher.publish(Int32(data=2))
     spin_until(executor, lambda: two == [Int32(data=2)], "the message of the second")
     assert one == [Int32(data=1)]
@@ -71,7 +73,9 @@ def test_services_clients_timers_and_guard_conditions_are_served_beside(node, ex
     called_back = []
     future.add_done_callback(called_back.append)
     guard.trigger()
-    spin_until(executor, lambda: called_back and triggered and len(ticks) > 5, "all served")
+    spin_until(
+        executor, lambda: called_back and triggered and len(ticks) > 5, "all served"
+    )
     assert future.result().success
 
 
@@ -92,8 +96,9 @@ def test_a_context_that_is_shut_down_ends_the_spin(node, executor):
 
 def test_a_callback_that_asks_for_it_is_told_about_the_message(node, executor):
     publisher, told = node.create_publisher(Int32, "count", 10), []
-    node.create_subscription(Int32, "count", lambda data, info: told.append((data, info)), 10,
-                             raw=True)  # fmt: skip
+    node.create_subscription(
+        Int32, "count", lambda data, info: told.append((data, info)), 10, raw=True
+    )
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
     publisher.publish(Int32(data=1))
     spin_until(executor, lambda: told, "the message")
@@ -144,13 +149,17 @@ def test_it_rests_after_a_callback_that_woke_another_thread_and_after_no_other(
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
     for number, answer in enumerate(answers):
         publisher.publish(Int32(data=number))
-        spin_until(executor, lambda number=number: heard[-1:] == [number], "the message")
+        spin_until(
+            executor, lambda number=number: heard[-1:] == [number], "the message"
+        )
         assert bool(rests) == (answer is HANDED_OVER)
         rests.clear()
 
 
 @pytest.mark.parametrize("part", ["take_message", "wait set", "entities"])
-def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(node, executor, part, monkeypatch, capfd):
+def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(
+    node, executor, part, monkeypatch, capfd
+):
     class Lacking:
         def __getattr__(self, name):
             raise AttributeError(f"no {name}")
@@ -160,12 +169,18 @@ def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(node, executor, part, 
     node.create_timer(0.01, lambda: ticks.append(1))
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
     if part == "take_message":
-        monkeypatch.setattr(executor_module._Entities, "taken", lambda _: Lacking().take_message)
+        monkeypatch.setattr(
+            executor_module._Entities, "taken", lambda _: Lacking().take_message
+        )
     elif part == "wait set":
         monkeypatch.setattr(executor_module, "rclpy_implementation", Lacking())
-        node.create_timer(0.01, lambda: None)  # another entity, so that a new wait set is made
+        node.create_timer(
+            0.01, lambda: None
+        )  # another entity, so that a new wait set is made
     else:
-        monkeypatch.setattr(executor_module, "_entities_of", lambda nodes: Lacking().guards)
+        monkeypatch.setattr(
+            executor_module, "_entities_of", lambda nodes: Lacking().guards
+        )
         node.create_timer(0.01, lambda: None)
     publisher.publish(Int32(data=1))
     spin_until(executor, lambda: heard and len(ticks) > 3, "served by rclpy's")
@@ -183,11 +198,15 @@ def test_a_timer_ticks_as_often_as_it_is_due_beside_messages(node, executor):
 
     node.create_subscription(Int32, "count", heard.append, 10)
     timer = node.create_timer(0.005, tick)
-    spin_until(executor, lambda: len(ticks) > 20 and len(heard) > 5, "ticks and messages")
+    spin_until(
+        executor, lambda: len(ticks) > 20 and len(heard) > 5, "ticks and messages"
+    )
     assert timer.time_until_next_call() <= 5_000_000
 
 
-def test_a_timer_that_is_cancelled_or_destroyed_by_another_does_not_tick(node, executor):
+def test_a_timer_that_is_cancelled_or_destroyed_by_another_does_not_tick(
+    node, executor
+):
     ticks, others = [], []
 
     def first():

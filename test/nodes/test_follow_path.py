@@ -10,7 +10,12 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("nav2_msgs", reason="nav2_msgs is not installed")
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Twist,
+    TwistStamped,
+)
 from nav2_msgs.action import FollowPath, NavigateToPose
 from nav2_msgs.msg import SpeedLimit
 from nav_msgs.msg import Odometry, Path
@@ -40,11 +45,17 @@ class Tree:
         self.raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
         self.commands = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         peer.node.create_subscription(
-            TwistStamped, "cmd_vel_raw", lambda m: self.commands.publish(m.twist), qos.EVERY_COMMAND
+            TwistStamped,
+            "cmd_vel_raw",
+            lambda m: self.commands.publish(m.twist),
+            qos.EVERY_COMMAND,
         )
         self.clients = {
             kind: ActionClient(peer.node, kind, name)
-            for kind, name in ((FollowPath, "follow_path"), (NavigateToPose, "navigate_to_pose"))
+            for kind, name in (
+                (FollowPath, "follow_path"),
+                (NavigateToPose, "navigate_to_pose"),
+            )
         }
 
     @property
@@ -66,7 +77,9 @@ class Tree:
         message.pose.pose = conversions.pose_to_ros(self.pose, 0, "map").pose
         known = self.policy.log.read_text().count(told)
         self.poses.publish(message)
-        self.until(lambda: self.policy.log.read_text().count(told) > known, "the pose is heard")
+        self.until(
+            lambda: self.policy.log.read_text().count(told) > known, "the pose is heard"
+        )
 
     def send(self, goal):
         kind = FollowPath if isinstance(goal, FollowPath.Goal) else NavigateToPose
@@ -96,9 +109,15 @@ def path(*points, frame="map"):
 @pytest.fixture(scope="module")
 def tree(launch, meet, module_domain_id):
     start = {"episode_start": [-2.0, -2.0, 0.0], "episode_start_given": True}
-    simulator = launch("simulator_node", module_domain_id, mode="lockstep", world="empty", **start)
+    simulator = launch(
+        "simulator_node", module_domain_id, mode="lockstep", world="empty", **start
+    )
     policy = launch(
-        "policy_node", module_domain_id, rate=0.0, deadline=30.0, costmap_update_timeout=60.0
+        "policy_node",
+        module_domain_id,
+        rate=0.0,
+        deadline=30.0,
+        costmap_update_timeout=60.0,
     )
     made = Tree(meet(module_domain_id))
     made.goals = made.peer.speak(PoseStamped, "goal_pose")
@@ -132,9 +151,21 @@ def by(**names):
 REFUSED = [
     (path(), CODES.INVALID_PATH, "the path is empty"),
     (path((math.nan, 0.0)), CODES.INVALID_PATH, "no number"),
-    (path((0.0, 0.0), (9.0, 0.0)), CODES.INVALID_PATH, "(9.00, 0.00) m, is off the map"),
-    (path((0.0, 0.0), frame="kitchen"), CODES.TF_ERROR, "'kitchen' is refused, which is not known"),
-    (by(controller_id="DWB"), CODES.INVALID_CONTROLLER, "'DWB'; name one of 'FollowPath'"),
+    (
+        path((0.0, 0.0), (9.0, 0.0)),
+        CODES.INVALID_PATH,
+        "(9.00, 0.00) m, is off the map",
+    ),
+    (
+        path((0.0, 0.0), frame="kitchen"),
+        CODES.TF_ERROR,
+        "'kitchen' is refused, which is not known",
+    ),
+    (
+        by(controller_id="DWB"),
+        CODES.INVALID_CONTROLLER,
+        "'DWB'; name one of 'FollowPath'",
+    ),
     (by(goal_checker_id="exact"), CODES.UNKNOWN, "no goal checker 'exact'"),
     (by(path_handler_id="exact"), CODES.UNKNOWN, "no path handler 'exact'"),
     (path((1e5, 0.0), frame="base_link"), CODES.INVALID_PATH, "pose 0 of the path"),
@@ -202,7 +233,9 @@ def test_a_robot_that_stands_is_given_up_although_its_path_is_planned_again(tree
     way, since_s, codes = path(tree.pose[:2].tolist(), (-2.0, 2.0)), now_s(), []
     while not codes and now_s() - since_s < 30.0:
         future, sent_s = tree.send(way).get_result_async(), now_s()
-        tree.until(lambda f=future, s=sent_s: f.done() or now_s() - s > 3.0, "3 s, or an end")
+        tree.until(
+            lambda f=future, s=sent_s: f.done() or now_s() - s > 3.0, "3 s, or an end"
+        )
         if future.done():
             codes.append(future.result().result.error_code)
     assert codes == [CODES.FAILED_TO_MAKE_PROGRESS]
@@ -213,7 +246,9 @@ def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(tree):
     goal = NavigateToPose.Goal()
     goal.pose.header.frame_id, goal.behavior_tree = "map", "mine.xml"
     result = tree.ended(goal)
-    assert result.result.error_code == NavigateToPose.Result.FAILED_TO_LOAD_BEHAVIOR_TREE
+    assert (
+        result.result.error_code == NavigateToPose.Result.FAILED_TO_LOAD_BEHAVIOR_TREE
+    )
     goal.behavior_tree, goal.pose.pose.position.x = "", -1.5
     tree.feedback.clear()
     tree.tells_where_it_is()
@@ -221,25 +256,35 @@ def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(tree):
     assert (result.status, result.result.error_code) == (SUCCEEDED, 0)
     assert math.dist(tree.pose[:2], (-1.5, 0.0)) < 0.35
     assert (
-        tree.feedback[0].feedback.distance_remaining > tree.feedback[-1].feedback.distance_remaining
+        tree.feedback[0].feedback.distance_remaining
+        > tree.feedback[-1].feedback.distance_remaining
     )
 
 
 def test_navigate_to_pose_is_left_to_another_node_that_serves_it(tree):
-    other = ActionServer(tree.peer.node, NavigateToPose, "navigate_to_pose", lambda _: None)
+    other = ActionServer(
+        tree.peer.node, NavigateToPose, "navigate_to_pose", lambda _: None
+    )
     log = tree.policy.log
-    tree.until(lambda: "another node serves navigate_to_pose" in log.read_text(), "a sentence")
+    tree.until(
+        lambda: "another node serves navigate_to_pose" in log.read_text(), "a sentence"
+    )
     other.destroy()
 
 
 @pytest.mark.parametrize("driven", [NAVIGATE, FOLLOW])
 def test_a_goal_that_is_driven_to_keeps_its_server_until_its_end(driven):
     dropped, run = [], SimpleNamespace(goal=SimpleNamespace(name=driven))
-    server, logger = SimpleNamespace(destroy=lambda: dropped.append(1)), SimpleNamespace(info=str)
+    server, logger = (
+        SimpleNamespace(destroy=lambda: dropped.append(1)),
+        SimpleNamespace(info=str),
+    )
     actions = SimpleNamespace(
-        _servers={NAVIGATE: server}, led=True, _run=run,
+        _servers={NAVIGATE: server},
+        led=True,
+        _run=run,
         _node=SimpleNamespace(get_logger=lambda: logger),
-    )  # fmt: skip
+    )
     PathActions._look(actions)
     assert bool(dropped) == (driven == FOLLOW)
 
@@ -249,14 +294,18 @@ def test_a_node_that_ends_while_others_are_asked_is_none_that_leads():
         raise NodeNameNonExistentError("it has ended")
 
     node = SimpleNamespace(
-        resolve_topic_name=str, get_name=lambda: "policy_node", get_namespace=lambda: "/",
+        resolve_topic_name=str,
+        get_name=lambda: "policy_node",
+        get_namespace=lambda: "/",
         get_node_names_and_namespaces=lambda: [("echo", "/")],
         get_service_names_and_types_by_node=ended,
-    )  # fmt: skip
+    )
     assert not PathActions.led.fget(SimpleNamespace(_node=node))
 
 
-@pytest.mark.skipif(not ARCHIVE.is_file(), reason="the sources of Nav2 do not lie there")
+@pytest.mark.skipif(
+    not ARCHIVE.is_file(), reason="the sources of Nav2 do not lie there"
+)
 def test_nav2s_own_parameter_file_is_taken_under_the_name_of_its_controller_server(
     domain_id, tmp_path
 ):
@@ -288,39 +337,56 @@ def test_the_progress_checker_of_humble_is_taken_by_its_own_name(domain_id, tmp_
     node = PolicyNode(context)
     assert unknown(node) == []
     assert node._nav2.names["progress_checker"] == ("progress",)
-    assert node._nav2.checks("general_goal_checker", "progress")[1].movement_time_allowance == 7.0
+    assert (
+        node._nav2.checks("general_goal_checker", "progress")[1].movement_time_allowance
+        == 7.0
+    )
     node.destroy_node()
     context.try_shutdown()
 
 
 def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(domain_id):
     words = [
-        "goal_checker_plugins:=[exact,near]", "near.plugin:=nav2_controller::PositionGoalChecker",
-        "progress_checker_plugins:=[slow,turning]", "slow.required_movement_angle:=0.1",
+        "goal_checker_plugins:=[exact,near]",
+        "near.plugin:=nav2_controller::PositionGoalChecker",
+        "progress_checker_plugins:=[slow,turning]",
+        "slow.required_movement_angle:=0.1",
         "turning.plugin:=nav2_controller::PoseProgressChecker",
-        "turning.required_movement_angle:=0.1", "action_server_result_timeout:=10.0",
-    ]  # fmt: skip
+        "turning.required_movement_angle:=0.1",
+        "action_server_result_timeout:=10.0",
+    ]
     given = [part for word in words for part in ("-p", word)]
     context = open_context(["node", "--ros-args", *given], domain_id)
     node = PolicyNode(context)
     assert unknown(node) == []
-    found = [node._nav2.checks(*names) for names in (("exact", "slow"), ("near", "turning"))]
+    found = [
+        node._nav2.checks(*names) for names in (("exact", "slow"), ("near", "turning"))
+    ]
     assert [goal.yaw_goal_tolerance for goal, _ in found] == [0.25, math.inf]
-    assert [progress.required_movement_angle for _, progress in found] == [math.inf, 0.1]
+    assert [progress.required_movement_angle for _, progress in found] == [
+        math.inf,
+        0.1,
+    ]
     node.destroy_node()
     context.try_shutdown()
 
 
-@pytest.mark.parametrize("kind", ["controller", "goal_checker", "progress_checker", "path_handler"])
+@pytest.mark.parametrize(
+    "kind", ["controller", "goal_checker", "progress_checker", "path_handler"]
+)
 def test_an_empty_list_of_plugins_is_one_sentence(domain_id, kind):
     words = ["-p", f"{kind}_plugins:=[]"]
     context = open_context(["node", "--ros-args", *words], domain_id)
-    with pytest.raises(ConfigError, match=f"parameter '{kind}_plugins' is empty; give one name"):
+    with pytest.raises(
+        ConfigError, match=f"parameter '{kind}_plugins' is empty; give one name"
+    ):
         PolicyNode(context)
     context.try_shutdown()
 
 
-def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(tree, monkeypatch):
+def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(
+    tree, monkeypatch
+):
     begun = []
     monkeypatch.setattr(policy_node, "begin", begun.append)
     first = tree.send(path((-2.0, -2.0), (1.0, 1.0)))

@@ -15,18 +15,25 @@ LAYOUT = Path(__file__).resolve().parents[2] / "config" / "foxglove" / "bridge.j
 PANELS = json.loads(LAYOUT.read_text(encoding="utf-8"))["configById"]
 # Of others: robot_state_publisher, and a commander that says where to.
 FOREIGN = {"/robot_description", "/goal_pose"}
-STAMPS = {"Twist": "TwistStamped", "TwistStamped": "Twist"}  # a parameter of the nodes chooses
+STAMPS = {
+    "Twist": "TwistStamped",
+    "TwistStamped": "Twist",
+}  # a parameter of the nodes chooses
 
 
 def paths():
     """Every message path that is plotted."""
-    return [path["value"] for panel in PANELS.values() for path in panel.get("paths", ())]
+    return [
+        path["value"] for panel in PANELS.values() for path in panel.get("paths", ())
+    ]
 
 
 def shown():
     """Every topic that is shown."""
     listed = {topic for panel in PANELS.values() for topic in panel.get("topics", ())}
-    rendered = {panel["topicToRender"] for panel in PANELS.values() if "topicToRender" in panel}
+    rendered = {
+        panel["topicToRender"] for panel in PANELS.values() if "topicToRender" in panel
+    }
     return listed | rendered | {path.partition(".")[0] for path in paths()}
 
 
@@ -44,7 +51,11 @@ def graph(launch, meet, module_domain_id):
     def services():
         return dict(peer.node.get_service_names_and_types())
 
-    peer.until(lambda: wanted <= topics().keys() and served <= services().keys(), "the graph", 240)
+    peer.until(
+        lambda: wanted <= topics().keys() and served <= services().keys(),
+        "the graph",
+        240,
+    )
     yield topics(), services()
     for node in nodes:
         node.check()
@@ -64,7 +75,9 @@ def test_every_path_of_the_layout_leads_to_a_number(graph):
         (kind,) = topics[topic]
         package, _, name = kind.rpartition("/")
         kinds = [kind, *([f"{package}/{STAMPS[name]}"] if name in STAMPS else [])]
-        assert any(field_of(each, fields) in ("double", "float") for each in kinds), path
+        assert any(field_of(each, fields) in ("double", "float") for each in kinds), (
+            path
+        )
 
 
 def field_of(kind, fields):
@@ -77,14 +90,20 @@ def field_of(kind, fields):
 
 def test_a_goal_is_published_where_the_policy_listens(graph):
     topics, _ = graph
-    assert topics[PANELS["3D!robot"]["publish"]["poseTopic"]] == ["geometry_msgs/msg/PoseStamped"]
+    assert topics[PANELS["3D!robot"]["publish"]["poseTopic"]] == [
+        "geometry_msgs/msg/PoseStamped"
+    ]
 
 
 def test_every_button_calls_a_service_without_a_request(graph):
     _, services = graph
-    called = [panel["serviceName"] for panel in PANELS.values() if "serviceName" in panel]
+    called = [
+        panel["serviceName"] for panel in PANELS.values() if "serviceName" in panel
+    ]
     assert called
-    assert {kind for name in called for kind in services[name]} == {"std_srvs/srv/Trigger"}
+    assert {kind for name in called for kind in services[name]} == {
+        "std_srvs/srv/Trigger"
+    }
 
 
 def test_every_panel_is_in_the_picture():

@@ -47,7 +47,9 @@ class Operator:
     def __init__(self, gate, peer, beside):
         self.gate, self.peer = gate, peer
         self.button = peer.speak(Bool, "e_stop", quality=qos.COMMAND)
-        self.beside = peer.speak(Bool, "e_stop", quality=qos.COMMAND) if beside else None
+        self.beside = (
+            peer.speak(Bool, "e_stop", quality=qos.COMMAND) if beside else None
+        )
         self.said = peer.listen(DiagnosticArray, "/diagnostics")
 
     def finding(self):
@@ -84,7 +86,9 @@ class Operator:
 
 @pytest.fixture(params=[False, True], ids=["button_alone", "1_kHz_beside"])
 def operator(request, launch_process, meet, domain_id):
-    gate = launch_process("command_gate", domain_id, limits="ackermann", e_stop_silence=5.0)
+    gate = launch_process(
+        "command_gate", domain_id, limits="ackermann", e_stop_silence=5.0
+    )
     made = Operator(gate, meet(domain_id), beside=request.param)
     yield made
     gate.check()
@@ -116,16 +120,22 @@ def test_a_short_press_while_the_gate_is_stalled_stops_the_robot(operator, stall
             operator.stall_gate(stall_s, press=True)
         with beating(operator):
             operator.peer.until(
-                lambda: operator.finding().startswith("e_stop_pressed"), "the press", 10.0
+                lambda: operator.finding().startswith("e_stop_pressed"),
+                "the press",
+                10.0,
             )
 
 
 def test_a_stall_that_the_queue_outlasts_is_no_press(launch_process, meet, domain_id):
-    gate = launch_process("command_gate", domain_id, limits="ackermann", e_stop_silence=5.0)
+    gate = launch_process(
+        "command_gate", domain_id, limits="ackermann", e_stop_silence=5.0
+    )
     operator = Operator(gate, meet(domain_id), beside=False)
     for _ in range(4):
         with beating(operator):
             operator.release()
         operator.stall_gate(0.15, press=False)
         with beating(operator):
-            operator.peer.until(lambda: operator.finding().startswith("disarmed"), "no press")
+            operator.peer.until(
+                lambda: operator.finding().startswith("disarmed"), "no press"
+            )

@@ -99,7 +99,9 @@ def written(log, folder, count):
     """The files, once there are so many."""
     deadline = time.monotonic() + DEADLINE_S
     while len(files(folder)) < count:
-        assert time.monotonic() < deadline, f"{len(files(folder))} of {count} files came"
+        assert time.monotonic() < deadline, (
+            f"{len(files(folder))} of {count} files came"
+        )
         log._writer._flush()  # as the gate does at its next tick
         time.sleep(0.01)
     return files(folder)
@@ -127,8 +129,11 @@ def test_a_stop_is_written_whole_and_replays(tmp_path, recorded, log, logger):
 def test_a_file_holds_what_there_was_at_the_stop_and_nothing_of_later(tmp_path, log):
     rig = Recorded(log).drive()
     rig.run(0.5, without="scan")
-    stopped = next(i for i, one in enumerate(rig.entries[-30:], len(rig.entries) - 30)
-                   if one.decision.cause is not None)  # fmt: skip
+    stopped = next(
+        i
+        for i, one in enumerate(rig.entries[-30:], len(rig.entries) - 30)
+        if one.decision.cause is not None
+    )
     rig.run(5.0)
     (file,) = written(log, tmp_path, 1)
     assert replay(file).entries[-1].now == rig.entries[stopped].now
@@ -157,8 +162,9 @@ def test_another_rule_is_written_though_a_burst_goes_on(tmp_path, log):
     rig.run(1.0, without="scan")
     names = [file.name for file in written(log, tmp_path, 2)]
     assert [name.split("_", 3)[3] for name in names] == [
-        "command_malformed.jsonl", "scan_silent.jsonl",
-    ]  # fmt: skip
+        "command_malformed.jsonl",
+        "scan_silent.jsonl",
+    ]
 
 
 @pytest.mark.slow
@@ -171,7 +177,9 @@ def test_a_stop_after_commands_have_passed_for_long_is_written_again(tmp_path, l
     assert log.counters["stops of a burst, not in the black box"] == 0
 
 
-def test_a_burst_does_not_flood_the_log_and_each_line_says_how_many_it_stands_for(log, logger):
+def test_a_burst_does_not_flood_the_log_and_each_line_says_how_many_it_stands_for(
+    log, logger
+):
     rig = Recorded(log).drive()
     logger.warnings.clear()
     began = rig.now
@@ -179,7 +187,11 @@ def test_a_burst_does_not_flood_the_log_and_each_line_says_how_many_it_stands_fo
         rig.stop_by_nonsense()
         rig.go_on(0.3)
     lasted = rig.now - began
-    stops = [line for line in logger.warnings if line.startswith("stopped by command_malformed")]
+    stops = [
+        line
+        for line in logger.warnings
+        if line.startswith("stopped by command_malformed")
+    ]
     assert 2 <= len(stops) <= lasted / LINE_S + 1
     assert len(logger.warnings) <= 2 * len(stops)
     assert " more since the last such line)" in stops[1]
@@ -194,11 +206,15 @@ def test_stops_that_alternate_for_long_are_told_of_ever_more_rarely(log, logger)
         rig.run(0.1)
     lines = [*logger.warnings, *logger.info_lines]
     assert 6 <= len(lines) <= 30
-    told = [int(found[1]) for line in lines if (found := re.search(r"\((\d+) more", line))]
+    told = [
+        int(found[1]) for line in lines if (found := re.search(r"\((\d+) more", line))
+    ]
     assert max(told) > 8 * min(told)
 
 
-def test_what_is_the_case_is_said_in_the_end_though_it_was_kept_back_at_first(log, logger):
+def test_what_is_the_case_is_said_in_the_end_though_it_was_kept_back_at_first(
+    log, logger
+):
     rig = Recorded(log).drive()
     for _ in range(2):
         rig.stop_by_nonsense()
@@ -219,10 +235,14 @@ def test_a_writer_that_is_frozen_delays_neither_a_decision_nor_the_end(log, logg
     log.close()
     assert time.monotonic() - began < LONG_S / 3
     assert log.counters["not written"] == 3
-    assert "the black box could not be written: the disk does not answer" in logger.errors
+    assert (
+        "the black box could not be written: the disk does not answer" in logger.errors
+    )
 
 
-def test_a_file_that_can_not_be_written_is_told_of_in_the_log_and_the_diagnostics(tmp_path, logger):
+def test_a_file_that_can_not_be_written_is_told_of_in_the_log_and_the_diagnostics(
+    tmp_path, logger
+):
     (tmp_path / "file").touch()
     log = GateLog(config(), tmp_path / "file", "car", logger)
     rig = Recorded(log).drive()
@@ -240,7 +260,9 @@ def test_a_writer_that_was_killed_is_told_of_and_the_next_stop_is_written(
     killed = log._writer._process
     killed.kill()
     until(lambda: log.finding(rig.state) and logger.errors)
-    assert logger.errors == ["the black box could not be written: its writer ended with -9"]
+    assert logger.errors == [
+        "the black box could not be written: its writer ended with -9"
+    ]
     rig.run(1.0)
     rig.stop_by_nonsense()
     (file,) = written(log, tmp_path, 1)
@@ -289,7 +311,9 @@ def test_a_clock_that_was_set_back_does_not_make_the_newest_file_the_oldest(tmp_
 
 
 @pytest.mark.slow
-def test_writing_a_stop_needs_little_more_memory_than_one_of_its_lines(tmp_path, recorded):
+def test_writing_a_stop_needs_little_more_memory_than_one_of_its_lines(
+    tmp_path, recorded
+):
     path = tmp_path / "stop.jsonl"
     tracemalloc.start()
     write(recorded.config, tuple(recorded.entries), path)
@@ -340,7 +364,9 @@ def test_there_are_never_more_files_at_work_than_a_few(tmp_path, answers, hung):
     disk = Disk(answers, hung.write)
     for number in range(MOST_AT_WORK + 2):
         disk.write(str(tmp_path / f"{number}.jsonl"), [], [b"line\n"])
-    assert [*answers.failed.values()] == ["the files before it are still being written"] * 2
+    assert [*answers.failed.values()] == [
+        "the files before it are still being written"
+    ] * 2
     hung.release()
     assert disk.finish(DEADLINE_S)
     assert len(files(tmp_path)) == MOST_AT_WORK
@@ -361,7 +387,9 @@ def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path, answers):
     assert os.listdir(tmp_path) == []
 
 
-def test_an_error_is_told_by_its_sentence_and_the_next_file_is_written(tmp_path, answers):
+def test_an_error_is_told_by_its_sentence_and_the_next_file_is_written(
+    tmp_path, answers
+):
     (tmp_path / "file").touch()
     disk = Disk(answers)
     bad, good = str(tmp_path / "file" / "1.jsonl"), str(tmp_path / "2.jsonl")

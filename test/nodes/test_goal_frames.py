@@ -29,7 +29,11 @@ class Topics:
     """Of a robot that drives at 1 m/s, whose odometry has another origin than the map."""
 
     def __init__(self):
-        self.frames, self.located, self.newest_ns = ("bot/odom", "bot/base"), True, 200_000_000
+        self.frames, self.located, self.newest_ns = (
+            ("bot/odom", "bot/base"),
+            True,
+            200_000_000,
+        )
         self.reported = geometry.compose(REPORTED, [0.1, 0.0, 0.0])
 
     def in_odom(self):
@@ -83,7 +87,9 @@ def test_a_goal_of_the_odometry_lies_as_far_from_the_robot_as_there(frames):
     assert wanted == pytest.approx([2.0, 2.9])
 
 
-def test_with_a_localiser_a_goal_of_the_map_lies_as_far_from_the_robot_as_in_its_map(frames):
+def test_with_a_localiser_a_goal_of_the_map_lies_as_far_from_the_robot_as_in_its_map(
+    frames,
+):
     other = TransformStamped(child_frame_id="bot/odom")
     other.header.frame_id, other.transform.translation.x = "map", -5.0
     other.transform.rotation.w = 1.0
@@ -101,7 +107,9 @@ def test_a_goal_of_a_mounted_frame_follows_its_transforms(frames):
 
 
 def test_an_unknown_frame_is_refused_with_the_known_ones(frames):
-    with pytest.raises(ConfigError, match=r"'kitchen'.*'base_link', 'bot/base', 'bot/odom', 'map'"):
+    with pytest.raises(
+        ConfigError, match=r"'kitchen'.*'base_link', 'bot/base', 'bot/odom', 'map'"
+    ):
         frames.in_map(goal("kitchen", 1.0, 0.0))
 
 

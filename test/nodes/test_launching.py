@@ -16,25 +16,35 @@ pytestmark = pytest.mark.ros
 
 
 def setup_of(**given):
-    values = {"params_file": str(find_config("bridge", "nodes")), "simulator": "simulator"}
+    values = {
+        "params_file": str(find_config("bridge", "nodes")),
+        "simulator": "simulator",
+    }
     return Setup(values | given)
 
 
 @pytest.mark.parametrize(
     ("robots", "names"),
     [
-        ("1", ()), (1, ()), ("", ()),
-        ("2", ("robot1", "robot2")), (3, ("robot1", "robot2", "robot3")),
-        ("[ant, bee]", ("ant", "bee")), ("ant bee", ("ant", "bee")), ("['ant']", ("ant",)),
+        ("1", ()),
+        (1, ()),
+        ("", ()),
+        ("2", ("robot1", "robot2")),
+        (3, ("robot1", "robot2", "robot3")),
+        ("[ant, bee]", ("ant", "bee")),
+        ("ant bee", ("ant", "bee")),
+        ("['ant']", ("ant",)),
         (["ant", "bee"], ("ant", "bee")),
     ],
-)  # fmt: skip
+)
 def test_robots_are_a_count_or_names(robots, names):
     assert names_of(robots) == names
 
 
 def test_no_robots_at_all_are_refused():
-    with pytest.raises(ConfigError, match="launch argument 'robots' is 0; give a count from 1"):
+    with pytest.raises(
+        ConfigError, match="launch argument 'robots' is 0; give a count from 1"
+    ):
         names_of("0")
 
 
@@ -45,9 +55,15 @@ def test_a_robot_that_is_named_twice_is_refused():
 
 @pytest.mark.parametrize("name", launching.FLAGS)
 def test_a_flag_that_is_neither_true_nor_false_is_refused_before_any_node_starts(name):
-    with pytest.raises(ConfigError, match=f"launch argument '{name}' is 'maybe'; give true or"):
+    with pytest.raises(
+        ConfigError, match=f"launch argument '{name}' is 'maybe'; give true or"
+    ):
         setup_of(**{name: "maybe"})
-    assert [setup_of(**{name: one})[name] for one in ("True", "0", "")] == ["true", "false", ""]
+    assert [setup_of(**{name: one})[name] for one in ("True", "0", "")] == [
+        "true",
+        "false",
+        "",
+    ]
 
 
 def test_a_missing_file_of_the_robot_is_one_sentence():
@@ -55,7 +71,9 @@ def test_a_missing_file_of_the_robot_is_one_sentence():
         setup_of(urdf="/nope.urdf").description()
 
 
-def test_one_robot_of_an_argument_goes_before_the_fleet_of_a_file(tmp_path, monkeypatch):
+def test_one_robot_of_an_argument_goes_before_the_fleet_of_a_file(
+    tmp_path, monkeypatch
+):
     file = tmp_path / "fleet.yaml"
     file.write_text("simulator_node:\n  ros__parameters:\n    robots: [ant, bee]\n")
     monkeypatch.setattr(launching, "Node", dict)
@@ -84,7 +102,9 @@ def test_a_start_is_three_numbers_in_any_spelling(start):
 
 @pytest.mark.parametrize("start", ["1", "here", "1 2 3 4", "1 2 x"])
 def test_another_start_is_refused_with_an_example(start):
-    with pytest.raises(ConfigError, match=r"launch argument 'start' is .*x, y, heading"):
+    with pytest.raises(
+        ConfigError, match=r"launch argument 'start' is .*x, y, heading"
+    ):
         numbers_of(start)
 
 
@@ -95,7 +115,10 @@ def test_no_start_leaves_it_to_the_seed():
 def test_one_robot_lies_in_the_namespace_and_a_fleet_below_it():
     assert setup_of(namespace="/hall", robots="").robots == [Robot("hall", "", "hall")]
     fleet = setup_of(namespace="hall", robots="[ant, bee]").robots
-    assert fleet == [Robot("hall/ant", "ant/", "hall"), Robot("hall/bee", "bee/", "hall")]
+    assert fleet == [
+        Robot("hall/ant", "ant/", "hall"),
+        Robot("hall/bee", "bee/", "hall"),
+    ]
 
 
 def test_the_limits_are_those_of_the_model_that_is_given():
@@ -125,7 +148,9 @@ def test_the_robot_is_drawn_with_the_frames_of_the_file_of_parameters(tmp_path, 
         model = str(tmp_path / "model")
         save_model(builtin_model("mecanum"), tmp_path / "model")
     file = tmp_path / "own.yaml"
-    file.write_text("/**:\n  ros__parameters: {base_frame: chassis, laser_frame: front_laser}\n")
+    file.write_text(
+        "/**:\n  ros__parameters: {base_frame: chassis, laser_frame: front_laser}\n"
+    )
     drawn = setup_of(model=model, params_file=str(file)).description()
     assert '<link name="chassis">' in drawn
     assert '<link name="front_laser">' in drawn

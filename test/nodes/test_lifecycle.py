@@ -35,7 +35,9 @@ def lead(peer, node, transition):
     request = ChangeState.Request()
     request.transition.label = transition
     # To configure may mean to compile.
-    return peer.call(ChangeState, f"{node}/change_state", request, times=1, each_s=200.0).success
+    return peer.call(
+        ChangeState, f"{node}/change_state", request, times=1, each_s=200.0
+    ).success
 
 
 def state(peer, node):
@@ -46,7 +48,9 @@ def test_a_policy_is_silent_until_it_is_active(managed):
     raw = managed.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
     odom = managed.listen(Odometry, "odom")
     assert state(managed, "policy_node") == "unconfigured"
-    assert not lead(managed, "policy_node", "activate")  # there is no such transition yet
+    assert not lead(
+        managed, "policy_node", "activate"
+    )  # there is no such transition yet
     assert lead(managed, "policy_node", "configure")
     assert state(managed, "policy_node") == "inactive"
     known = len(odom)
@@ -92,7 +96,9 @@ def test_a_policy_that_is_shut_down_while_it_drives_stops_its_robot(managed):
     managed.until(lambda: raw[-1].twist.linear.x == 0.0, "a zero command")
 
 
-def test_a_middleware_publishes_its_estimate_only_while_active_and_its_health_always(managed):
+def test_a_middleware_publishes_its_estimate_only_while_active_and_its_health_always(
+    managed,
+):
     filtered = managed.listen(Odometry, "odometry/filtered")
     diagnostics = managed.listen(DiagnosticArray, "/diagnostics")
 
@@ -122,7 +128,9 @@ def mistaken(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_mistake_in_configure_ends_a_node_that_leads_itself(launch, domain_id, mistaken):
+def test_a_mistake_in_configure_ends_a_node_that_leads_itself(
+    launch, domain_id, mistaken
+):
     node = launch("policy_node", domain_id)
     assert node.wait() == 1
     assert "TypeError: a mistake of ours" in node.read_text()

@@ -52,7 +52,9 @@ def fail(*_, **__):
     raise KeyboardInterrupt
 
 
-def test_a_link_whose_publisher_can_not_be_made_leaves_nothing_open(opened, monkeypatch, domain_id):
+def test_a_link_whose_publisher_can_not_be_made_leaves_nothing_open(
+    opened, monkeypatch, domain_id
+):
     monkeypatch.setattr(link, "CommandTimeout", fail)
     with pytest.raises(KeyboardInterrupt):
         Link(domain_id=domain_id)
@@ -68,7 +70,9 @@ def test_a_link_that_is_interrupted_while_it_looks_for_listeners_leaves_nothing_
     assert nothing_is_open(opened)
 
 
-@pytest.mark.parametrize("make", [DdsBackend, lambda *a, **o: FleetBackend(*a, ["a", "b"], **o)])
+@pytest.mark.parametrize(
+    "make", [DdsBackend, lambda *a, **o: FleetBackend(*a, ["a", "b"], **o)]
+)
 def test_a_backend_whose_services_can_not_be_made_leaves_nothing_open(
     opened, monkeypatch, domain_id, model, make
 ):
@@ -78,7 +82,9 @@ def test_a_backend_whose_services_can_not_be_made_leaves_nothing_open(
     assert nothing_is_open(opened)
 
 
-def test_a_backend_that_finds_no_simulator_leaves_nothing_open(opened, domain_id, model):
+def test_a_backend_that_finds_no_simulator_leaves_nothing_open(
+    opened, domain_id, model
+):
     with pytest.raises(BackendError, match="there is still no"):
         DdsBackend(model, load_world("empty"), domain_id=domain_id, timeout_s=0.2)
     assert nothing_is_open(opened)

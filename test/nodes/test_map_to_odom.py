@@ -11,7 +11,11 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_from_ros, transform_to_ros
+from nics_drl_bridge.nodes.map_to_odom import (
+    odom_in_map,
+    transform_from_ros,
+    transform_to_ros,
+)
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -40,7 +44,9 @@ def placed(launch, meet, domain_id):
         stamp = next(numbers) * 100_000_000
         pose, twist = [x, 0.0, 0.0], [0.2, 0.0, 0.0]
         odom.publish(
-            conversions.odometry_to_ros(pose, twist, stamp, ("odom", "base_link"), (1e-4,) * 4)
+            conversions.odometry_to_ros(
+                pose, twist, stamp, ("odom", "base_link"), (1e-4,) * 4
+            )
         )
         if peer.within(5.0, lambda: filtered and stamp_ns(filtered[-1]) >= stamp):
             return conversions.odometry_from_ros(filtered[-1])[0]
@@ -66,7 +72,9 @@ def test_an_initial_pose_puts_the_estimate_there_and_it_goes_on_from_there(place
     for k in range(1, 5):
         drive(0.02 * k)
     poses.publish(to(5.0, -1.0, np.pi / 2))
-    peer.until(lambda: "the robot is at (5.00, -1.00) m" in middleware.log.read_text(), "heard")
+    peer.until(
+        lambda: "the robot is at (5.00, -1.00) m" in middleware.log.read_text(), "heard"
+    )
     last = [drive(0.08 + 0.02 * k) for k in range(1, 11)][-1]
     assert last == pytest.approx([5.0, -0.8, np.pi / 2], abs=0.03)
     assert peer.call(Trigger, "middleware_node/reset").success
@@ -88,7 +96,9 @@ def test_map_to_odom_follows_from_the_estimate_until_another_node_publishes_it(p
     assert (parent, child) == ("map", "odom")
     assert home == pytest.approx([5.0, -1.0, np.pi / 2], abs=0.15)
     stamp = one.header.stamp  # as of a localiser that stamps as this one does
-    others.publish(TFS(transforms=[transform_to_ros("map", "odom", [9.0, 0.0, 0.0], stamp)]))
+    others.publish(
+        TFS(transforms=[transform_to_ros("map", "odom", [9.0, 0.0, 0.0], stamp)])
+    )
     told = "another node publishes map -> odom"
     peer.until(lambda: told in middleware.log.read_text(), "yielding")
     known = len(transforms)

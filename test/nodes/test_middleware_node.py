@@ -36,7 +36,9 @@ def driven(launch, meet, module_domain_id, tmp_path_factory):
     """A middleware beside a simulator that the test drives, and all that is said."""
     world = open_field(tmp_path_factory.mktemp("world"))
     simulator = launch("simulator_node", module_domain_id, mode="lockstep", world=world)
-    middleware = launch("middleware_node", module_domain_id, map_frame="site", base_frame="car")
+    middleware = launch(
+        "middleware_node", module_domain_id, map_frame="site", base_frame="car"
+    )
     peer = meet(module_domain_id)
     said = {
         topic: peer.listen(kind, topic)
@@ -56,20 +58,30 @@ def driven(launch, meet, module_domain_id, tmp_path_factory):
         after = {}
         for topic in ("odom", "ground_truth", "odometry/filtered"):
             heard = said[topic]
-            peer.until(lambda heard=heard: heard and stamp_ns(heard[-1]) > now, f"new {topic}", 5.0)
+            peer.until(
+                lambda heard=heard: heard and stamp_ns(heard[-1]) > now,
+                f"new {topic}",
+                5.0,
+            )
             after[topic] = heard[-1]
         return after["odometry/filtered"], after["ground_truth"]
 
     def newest_ns():
-        return max((stamp_ns(estimate) for estimate in said["odometry/filtered"]), default=-1)
+        return max(
+            (stamp_ns(estimate) for estimate in said["odometry/filtered"]), default=-1
+        )
 
     def begin():
         """Resets both, and steps until all have found each other."""
         for _ in range(10):
             assert peer.call(Trigger, "middleware_node/reset").success
-            stamp = json.loads(peer.call(Trigger, "simulator_node/reset").message)["stamp_ns"]
+            stamp = json.loads(peer.call(Trigger, "simulator_node/reset").message)[
+                "stamp_ns"
+            ]
             try:
-                peer.until(lambda stamp=stamp: newest_ns() >= stamp, "the first estimate", 2.0)
+                peer.until(
+                    lambda stamp=stamp: newest_ns() >= stamp, "the first estimate", 2.0
+                )
                 return
             except AssertionError:
                 continue
@@ -107,16 +119,21 @@ def test_the_estimate_names_its_frames_and_its_doubt(driven):
     assert doubts[1][0] > doubts[0][0]
 
 
-def test_the_estimates_twist_is_doubted_more_than_not_at_all_and_less_than_the_odometry(driven):
+def test_the_estimates_twist_is_doubted_more_than_not_at_all_and_less_than_the_odometry(
+    driven,
+):
     _, said, step, begin, _ = driven
     begin()
     for _ in range(10):
         last, _ = step(0.5)
     twist, measured = (
-        np.diag(np.reshape(m.twist.covariance, (6, 6)))[[0, 5]] for m in (last, said["odom"][-1])
+        np.diag(np.reshape(m.twist.covariance, (6, 6)))[[0, 5]]
+        for m in (last, said["odom"][-1])
     )
     assert (twist > 0.0).all()
-    assert (twist < measured + 1e-6 + 1e-12).all()  # no twist is trusted to less than 1e-3
+    assert (
+        twist < measured + 1e-6 + 1e-12
+    ).all()  # no twist is trusted to less than 1e-3
 
 
 def test_a_command_of_nan_does_not_reach_the_estimate(driven):
@@ -143,7 +160,9 @@ def test_diagnostics_come_once_a_second(driven):
     assert np.diff(stamps()[-3:]) * 1e-9 == pytest.approx(1.0, abs=0.5)
 
 
-def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_id, model):
+def test_what_it_can_not_use_is_counted_in_the_diagnostics(
+    launch, meet, domain_id, model
+):
     launch("middleware_node", domain_id, namespace="car")
     peer = meet(domain_id, "car")
     diagnostics = peer.listen(DiagnosticArray, "/diagnostics")
@@ -161,9 +180,11 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
 
     def drive(x, second):
         stamp = int(second * NS_PER_S)
-        odom.publish(conversions.odometry_to_ros(
-            [x, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "car"), VARIANCE
-        ))  # fmt: skip
+        odom.publish(
+            conversions.odometry_to_ros(
+                [x, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "car"), VARIANCE
+            )
+        )
 
     def counts():
         return {pair.key: pair.value for pair in status().values}
@@ -171,14 +192,20 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
     drive(math.nan, 1)  # must not become where the map is
     drive(1.0, 2)
     peer.until(lambda: filtered, "an estimate")
-    assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx([1.0, 0.0, 0.0])
+    assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx(
+        [1.0, 0.0, 0.0]
+    )
     ranges = np.ones(model.lidar.beams, np.float32)
     for stamp, beams in ((3, model.lidar.beams), (3, model.lidar.beams), (4, 7)):
-        message = conversions.scan_to_ros(model.lidar, ranges[:beams], stamp * NS_PER_S, "laser")
+        message = conversions.scan_to_ros(
+            model.lidar, ranges[:beams], stamp * NS_PER_S, "laser"
+        )
         scan.publish(message)
     for x, second in ((math.nan, 3), (1.0, 2.75), (1.0, 2.75)):
         drive(x, second)
-    peer.until(lambda: stamp_ns(filtered[-1]) == 2.75 * NS_PER_S, "the estimate at 2.75 s")
+    peer.until(
+        lambda: stamp_ns(filtered[-1]) == 2.75 * NS_PER_S, "the estimate at 2.75 s"
+    )
     for second in (2.5, 3.5, 2.25):
         drive(1.0, second)
     wanted = {
@@ -192,7 +219,13 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
         "odom received": "4",
     }
     peer.until(lambda: wanted.items() <= counts().items(), f"the counts {wanted}")
-    told = {"scan rate [Hz]", "scan age [s]", "odom rate [Hz]", "odom age [s]", "odom innovation"}
+    told = {
+        "scan rate [Hz]",
+        "scan age [s]",
+        "odom rate [Hz]",
+        "odom age [s]",
+        "odom innovation",
+    }
     assert counts().keys() == wanted.keys() | told
     assert status().level == DiagnosticStatus.OK
     assert status().message == "receiving"
@@ -200,8 +233,12 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
     # After a reset an odometry from before counts, as after a restart of the robot.
     assert peer.call(Trigger, "middleware_node/reset").success
     drive(5.0, 1)
-    peer.until(lambda: stamp_ns(filtered[-1]) == NS_PER_S, "an estimate after the reset")
-    assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx([5.0, 0.0, 0.0])
+    peer.until(
+        lambda: stamp_ns(filtered[-1]) == NS_PER_S, "an estimate after the reset"
+    )
+    assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx(
+        [5.0, 0.0, 0.0]
+    )
 
 
 @pytest.fixture
@@ -224,9 +261,11 @@ def sensed(launch, meet, domain_id):
     def stand(tenths, deadline_s=30.0):
         """An odometry of a robot that stands; returns the estimate after it."""
         stamp = tenths * NS_PER_S // 10
-        speakers["odom"].publish(conversions.odometry_to_ros(
-            [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "base_link"), VARIANCE
-        ))  # fmt: skip
+        speakers["odom"].publish(
+            conversions.odometry_to_ros(
+                [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "base_link"), VARIANCE
+            )
+        )
         heard = said["filtered"]
         peer.until(
             lambda: heard and stamp_ns(heard[-1]) == stamp,
@@ -244,7 +283,9 @@ def sensed(launch, meet, domain_id):
         raise AssertionError("no estimate")
 
     def facts():
-        return {pair.key: pair.value for pair in said["diagnostics"][-1].status[0].values}
+        return {
+            pair.key: pair.value for pair in said["diagnostics"][-1].status[0].values
+        }
 
     peer.until(lambda: said["diagnostics"], "diagnostics")
     meet_it()
@@ -276,7 +317,10 @@ def test_pose_and_gyro_correct_the_estimate_and_are_told_of_in_the_diagnostics(s
     peer, said, speakers, stand, facts = sensed
     first = stand(10)
     peer.until(
-        lambda: said["diagnostics"][-1].status[0].message == "nothing on scan, pose, imu yet",
+        lambda: (
+            said["diagnostics"][-1].status[0].message
+            == "nothing on scan, pose, imu yet"
+        ),
         "the missing topics",
     )
     assert first.pose.covariance[0] == pytest.approx(1e4)  # anywhere in the map
@@ -306,7 +350,9 @@ def test_pose_and_gyro_correct_the_estimate_and_are_told_of_in_the_diagnostics(s
     # A pose that was measured before the newest odometry still counts.
     speakers["pose"].publish(measured_pose(30.1, -20.0, 2.0, 12, 0.02))
     peer.until(lambda: facts()["pose received"] == "3", "a late pose")
-    assert conversions.odometry_from_ros(stand(16))[0][0] == pytest.approx(30.085, abs=0.005)
+    assert conversions.odometry_from_ros(stand(16))[0][0] == pytest.approx(
+        30.085, abs=0.005
+    )
 
 
 def test_odometry_turns_by_the_gyro_if_the_model_was_made_with_one(
@@ -327,26 +373,37 @@ def test_odometry_turns_by_the_gyro_if_the_model_was_made_with_one(
         for _ in range(10):
             hundredths += 1
             message = Imu()
-            message.header.stamp = conversions.stamp_to_ros(hundredths * NS_PER_S // 100)
+            message.header.stamp = conversions.stamp_to_ros(
+                hundredths * NS_PER_S // 100
+            )
             message.angular_velocity.z = rate + 0.002 * (-1) ** hundredths
             gyro.publish(message)
         speak.heading += 0.1 * 1.6 * rate
         stamp = hundredths * NS_PER_S // 100
-        wheels.publish(conversions.odometry_to_ros(
-            [0.0, 0.0, speak.heading], [0.0, 0.0, 1.6 * rate], stamp, ("odom", "base_link"),
-            VARIANCE,
-        ))  # fmt: skip
+        wheels.publish(
+            conversions.odometry_to_ros(
+                [0.0, 0.0, speak.heading],
+                [0.0, 0.0, 1.6 * rate],
+                stamp,
+                ("odom", "base_link"),
+                VARIANCE,
+            )
+        )
         return stamp
 
     speak.heading = 0.0
     for _ in range(30):  # at rest, until both are heard
         stamp = speak(0.0)
         with contextlib.suppress(AssertionError):
-            peer.until(lambda s=stamp: filtered and stamp_ns(filtered[-1]) == s, "it", 1.0)
+            peer.until(
+                lambda s=stamp: filtered and stamp_ns(filtered[-1]) == s, "it", 1.0
+            )
     assert filtered
     for rate in [0.25] * 40:
         stamp = speak(rate)
-        peer.until(lambda s=stamp: stamp_ns(filtered[-1]) == s, f"the estimate at {stamp}")
+        peer.until(
+            lambda s=stamp: stamp_ns(filtered[-1]) == s, f"the estimate at {stamp}"
+        )
     heading = conversions.odometry_from_ros(filtered[-1])[0][2]
     assert heading == pytest.approx(1.0, abs=0.06)
     middleware.check()
@@ -359,7 +416,11 @@ def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(launch, dom
 
 
 def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
-    counts = {"scan: duplicate": 1, "scan: shape (7,), not (720,)": 40, "scans: other": 9}
+    counts = {
+        "scan: duplicate": 1,
+        "scan: shape (7,), not (720,)": 40,
+        "scans: other": 9,
+    }
     expected, heard = ("scan", "odom"), TopicHealth(1, 10.0, 0.1)
     told = "scan: 41 refused, the last: shape (7,), not (720,)"
     first = Health({}, counts)
@@ -373,22 +434,33 @@ def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
     assert not silence(Health(dict.fromkeys(expected, heard), counts), expected, before)
 
 
-def test_data_that_are_refused_are_told_of_in_its_log_once(launch, meet, domain_id, model):
+def test_data_that_are_refused_are_told_of_in_its_log_once(
+    launch, meet, domain_id, model
+):
     middleware = launch("middleware_node", domain_id)
     peer = meet(domain_id)
     diagnostics = peer.listen(DiagnosticArray, "/diagnostics")
     scan, sent = peer.speak(LaserScan, "scan"), itertools.count(1)
 
     def refused():
-        message = conversions.scan_to_ros(model.lidar, np.ones(7, np.float32), 0, "laser")
+        message = conversions.scan_to_ros(
+            model.lidar, np.ones(7, np.float32), 0, "laser"
+        )
         message.header.stamp = conversions.stamp_to_ros(next(sent) * NS_PER_S // 10)
         scan.publish(message)
         told = [status.message for each in diagnostics for status in each.status]
         return (
-            sum("scan: " in each and "refused, the last: shape (7,)" in each for each in told) > 2
+            sum(
+                "scan: " in each and "refused, the last: shape (7,)" in each
+                for each in told
+            )
+            > 2
         )
 
     peer.until(refused, "what is refused, several times")
     assert (
-        middleware.read_text().count("not used, but counted in /diagnostics: scan: shape (7,)") == 1
+        middleware.read_text().count(
+            "not used, but counted in /diagnostics: scan: shape (7,)"
+        )
+        == 1
     )

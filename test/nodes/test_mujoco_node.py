@@ -56,13 +56,20 @@ def node(launch, module_domain_id, robot):
 
 
 def options(domain_id):
-    return {"domain_id": domain_id, "simulator": NODE, "truth": True, "timeout_s": TIMEOUT_S}
+    return {
+        "domain_id": domain_id,
+        "simulator": NODE,
+        "truth": True,
+        "timeout_s": TIMEOUT_S,
+    }
 
 
 def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robot):
     model, world = robot[0], load_world("arena")
     arguments = {"model": model, "world": world}
-    there = gymnasium.make(NAVIGATION, backend="dds", backend_options=options(node), **arguments)
+    there = gymnasium.make(
+        NAVIGATION, backend="dds", backend_options=options(node), **arguments
+    )
     here = gymnasium.wrappers.TimeLimit(
         BridgeEnv(MujocoBackend(model, world), **arguments), MAX_EPISODE_STEPS
     )
@@ -94,8 +101,13 @@ def test_without_mujoco_the_node_ends_with_one_sentence():
         "import sys; sys.modules['mujoco'] = None; sys.argv = ['mujoco_node']\n"
         "from nics_drl_bridge.nodes.start import mujoco_node; mujoco_node()"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=200
+    )
     assert done.returncode == 2
     first, sentence = done.stderr.strip().splitlines()
     assert first.endswith("[mujoco_node]: starting")
-    assert sentence == "MuJoCo is not installed; run pip install 'nics_drl_bridge[mujoco]'."
+    assert (
+        sentence
+        == "MuJoCo is not installed; run pip install 'nics_drl_bridge[mujoco]'."
+    )

@@ -9,7 +9,14 @@ from sensor_msgs.msg import LaserScan
 pytestmark = pytest.mark.ros
 
 NODES = ("simulator_node", "middleware_node", "policy_node", "command_gate")
-ABSOLUTE = {"/clock", "/tf", "/tf_static", "/diagnostics", "/rosout", "/parameter_events"}
+ABSOLUTE = {
+    "/clock",
+    "/tf",
+    "/tf_static",
+    "/diagnostics",
+    "/rosout",
+    "/parameter_events",
+}
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +28,10 @@ def spaced(launch, meet, module_domain_id):
     ]
     peer = meet(module_domain_id)
     scans = peer.listen(LaserScan, "/car/front/scan")
-    peer.until(lambda: len(peer.node.get_publishers_info_by_topic("/car/cmd_vel")) == 1, "the gate")
+    peer.until(
+        lambda: len(peer.node.get_publishers_info_by_topic("/car/cmd_vel")) == 1,
+        "the gate",
+    )
     peer.until(lambda: scans and len(names(peer)) >= len(NODES), "all nodes")
     yield peer
     for process in started:
@@ -29,7 +39,9 @@ def spaced(launch, meet, module_domain_id):
 
 
 def names(peer):
-    found = {f"{space}/{name}" for name, space in peer.node.get_node_names_and_namespaces()}
+    found = {
+        f"{space}/{name}" for name, space in peer.node.get_node_names_and_namespaces()
+    }
     return {name for name in found if not name.split("/")[-1].startswith("peer_")}
 
 
@@ -40,7 +52,12 @@ def test_every_node_lies_in_the_namespace(spaced):
 def test_every_topic_is_relative_but_those_that_are_absolute_by_convention(spaced):
     topics = {name for name, _ in spaced.node.get_topic_names_and_types()}
     assert all(name.startswith("/car/") for name in topics - ABSOLUTE)
-    assert {"/car/cmd_vel", "/car/cmd_vel_raw", "/car/odom", "/car/odometry/filtered"} <= topics
+    assert {
+        "/car/cmd_vel",
+        "/car/cmd_vel_raw",
+        "/car/odom",
+        "/car/odometry/filtered",
+    } <= topics
 
 
 def test_every_service_is_relative(spaced):

@@ -34,15 +34,22 @@ def test_a_client_without_ros_reads_scans_and_drives(library, launch, meet, doma
     if not installed(library):
         pytest.skip(f"{library} is not installed; run make test-clients")
     # The wall ahead is within the lidar's reach.
-    start = {"world": "empty", "episode_start": [1.0, 0.0, 0.0], "episode_start_given": True}
+    start = {
+        "world": "empty",
+        "episode_start": [1.0, 0.0, 0.0],
+        "episode_start_given": True,
+    }
     simulator = launch("simulator_node", domain_id, **start)
     peer = meet(domain_id)
     scans = peer.listen(LaserScan, "scan")
     peer.until(lambda: scans, "a scan")
     done = subprocess.run(
         [PYTHON, CLIENT, library, str(domain_id)],
-        env=ENVIRONMENT, capture_output=True, text=True, timeout=90,
-    )  # fmt: skip
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["beams"] == len(scans[-1].ranges)

@@ -64,7 +64,9 @@ def read_all(descriptor):
 def test_all_lines_arrive_in_order_where_somebody_reads_them():
     talker = start(TALKER, "50", stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     lines = talker.communicate(timeout=DEADLINE_S)[0].decode().splitlines()
-    assert [line.split(" .")[0] for line in lines] == [f"line {k}" for k in range(50)] + ["over"]
+    assert [line.split(" .")[0] for line in lines] == [
+        f"line {k}" for k in range(50)
+    ] + ["over"]
     assert talker.returncode == 3
 
 
@@ -93,7 +95,11 @@ def test_a_pipe_that_nobody_reads_delays_nothing_and_the_dropped_lines_are_told(
     assert talker.wait(DEADLINE_S) == 3
     lines = read_all(exit_).splitlines()
     os.close(exit_)
-    dropped = [int(found[1]) for line in lines if (found := re.match(r"\((\d+) lines were", line))]
+    dropped = [
+        int(found[1])
+        for line in lines
+        if (found := re.match(r"\((\d+) lines were", line))
+    ]
     arrived = [line for line in lines if line.startswith("line ")]
     assert dropped
     assert len(arrived) + sum(dropped) == count
@@ -111,18 +117,24 @@ def test_a_terminal_that_was_halted_delays_nothing():
 
 def test_all_lines_are_in_the_log_file_though_nobody_reads_the_output(tmp_path):
     exit_, entrance = full_pipe()
-    talker = start(TALKER, "50", str(tmp_path / "log" / "file"), stdout=entrance, stderr=entrance)
+    talker = start(
+        TALKER, "50", str(tmp_path / "log" / "file"), stdout=entrance, stderr=entrance
+    )
     os.close(entrance)
     assert talker.wait(DEADLINE_S) == 3
     lines = (tmp_path / "log" / "file").read_text().splitlines()
-    assert [line.split(" .")[0] for line in lines] == [f"line {k}" for k in range(50)] + ["over"]
+    assert [line.split(" .")[0] for line in lines] == [
+        f"line {k}" for k in range(50)
+    ] + ["over"]
     os.close(exit_)
 
 
 def test_a_log_file_that_hangs_delays_nothing(tmp_path):
     os.mkfifo(tmp_path / "file")  # nobody opens it for reading
     log = str(tmp_path / "file")
-    talker = start(TALKER, "30000", log, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    talker = start(
+        TALKER, "30000", log, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
     assert talker.communicate(timeout=DEADLINE_S)[1].count(b"line ") > 0
     assert talker.returncode == 3
 
@@ -143,7 +155,9 @@ def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
         "output._forwarder.kill()\nos._exit(3)"
     )
     for name in ("SIGSTOP", "SIGKILL"):
-        talker = start(code.format(name), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        talker = start(
+            code.format(name), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         assert talker.wait(DEADLINE_S) == 3
 
 
@@ -154,16 +168,27 @@ class TestGate:
     def gate(self, domain_id, tmp_path):
         pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
         exit_, entrance = full_pipe()
-        variables = {"ROS_DOMAIN_ID": str(domain_id), "ROS_LOG_DIR": str(tmp_path / "log")}
+        variables = {
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_LOG_DIR": str(tmp_path / "log"),
+        }
         words = ["-p", "limits:=differential", "-p", f"black_box:={tmp_path}"]
         gate = subprocess.Popen(
             [
-                sys.executable, "-m", "nics_drl_bridge.nodes.start", "command_gate", "--ros-args",
-                "-p", "enable_stamped_cmd_vel:=false", *words,
+                sys.executable,
+                "-m",
+                "nics_drl_bridge.nodes.start",
+                "command_gate",
+                "--ros-args",
+                "-p",
+                "enable_stamped_cmd_vel:=false",
+                *words,
             ],
             env=os.environ | variables,
-            stdin=subprocess.DEVNULL, stdout=entrance, stderr=entrance,
-        )  # fmt: skip
+            stdin=subprocess.DEVNULL,
+            stdout=entrance,
+            stderr=entrance,
+        )
         os.close(entrance)
         yield gate, exit_
         gate.kill()
@@ -189,9 +214,14 @@ class TestGate:
         assert passed == [Twist()] * len(passed)
         button.publish(Bool(data=True))
         peer.until(
-            lambda: peer.another(said, "diagnostics").status[0].message.startswith("e_stop_press"),
-            "the e-stop is heeded", 10.0,
-        )  # fmt: skip
+            lambda: (
+                peer.another(said, "diagnostics")
+                .status[0]
+                .message.startswith("e_stop_press")
+            ),
+            "the e-stop is heeded",
+            10.0,
+        )
         process.send_signal(signal.SIGTERM)
         assert process.wait(10.0) == 0
         told = read_all(exit_)

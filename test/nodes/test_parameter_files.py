@@ -22,7 +22,9 @@ from nics_drl_bridge.nodes.simulator_node import simulator_node
 
 pytestmark = pytest.mark.ros
 
-FILES = sorted((Path(__file__).resolve().parents[2] / "config" / "nodes").glob("*.yaml"))
+FILES = sorted(
+    (Path(__file__).resolve().parents[2] / "config" / "nodes").glob("*.yaml")
+)
 
 
 def record_node(context):
@@ -48,12 +50,16 @@ def test_a_node_has_every_parameter_that_a_shipped_file_gives_it(
 ):
     monkeypatch.chdir(tmp_path)
     section = yaml.safe_load(file.read_text(encoding="utf-8")).get(f"/**/{name}", {})
-    context = open_context(["node", "--ros-args", "--params-file", str(file)], domain_id)
+    context = open_context(
+        ["node", "--ros-args", "--params-file", str(file)], domain_id
+    )
     try:
         node = MAKERS[name](context)
         assert runner.unknown(node) == []
         for key, value in section.get("ros__parameters", {}).items():
-            assert node.get_parameter(key).value == pytest.approx(value, nan_ok=True), key
+            assert node.get_parameter(key).value == pytest.approx(value, nan_ok=True), (
+                key
+            )
             assert node.describe_parameter(key).description
         node.destroy_node()
     finally:

@@ -61,13 +61,21 @@ def test_help_tells_the_topics_and_services_of_a_node(node):
         (facts.publishes, made.get_publisher_names_and_types_by_node(*place)),
         (facts.subscribes, made.get_subscriber_names_and_types_by_node(*place)),
     ):
-        words = {f"/{word.strip('/,')}" for each in told for word in each.partition("(")[0].split()}
+        words = {
+            f"/{word.strip('/,')}"
+            for each in told
+            for word in each.partition("(")[0].split()
+        }
         topics = {topic for topic, _ in there if not topic.endswith(RCLPY_TOPICS)}
         assert topics <= words
         # A drive speaks once somebody listens.
         assert topics or (name, told) == ("record_node", facts.publishes)
-    services = {service for service, _ in made.get_service_names_and_types_by_node(*place)}
-    always = {each for each in facts.services if "(" not in each}  # whatever is installed
+    services = {
+        service for service, _ in made.get_service_names_and_types_by_node(*place)
+    }
+    always = {
+        each for each in facts.services if "(" not in each
+    }  # whatever is installed
     assert {each.replace("~", f"/{made.get_name()}") for each in always} <= services
 
 
@@ -79,23 +87,37 @@ def given(values):
 @pytest.mark.parametrize("frame", ["", "a b", "/map", "map ", "m\n", "x" * 5000, "\t"])
 def test_a_frame_that_tf_does_not_know_is_one_short_sentence(frame):
     told = frame_fault(given({"map_frame": "map", "base_frame": frame, "rate": 1.0}))
-    assert told.startswith("parameter 'base_frame': must be 1 to 255 characters, without blanks")
+    assert told.startswith(
+        "parameter 'base_frame': must be 1 to 255 characters, without blanks"
+    )
     assert len(told) < 250
 
 
 def test_the_frame_of_the_robot_is_its_own_and_a_footprint_may_be_none():
-    good = {"map_frame": "map", "odom_frame": "odom", "base_frame": "r/base", "footprint_frame": ""}
+    good = {
+        "map_frame": "map",
+        "odom_frame": "odom",
+        "base_frame": "r/base",
+        "footprint_frame": "",
+    }
     assert not frame_fault(given(good))
-    assert not frame_fault(given(good) + given({"map_frame": "odom"}))  # without localisation
+    assert not frame_fault(
+        given(good) + given({"map_frame": "odom"})
+    )  # without localisation
     told = frame_fault(given(good) + given({"base_frame": "odom"}))
-    assert told == "parameter 'base_frame': is 'odom', as 'odom_frame' is; they must differ."
+    assert (
+        told
+        == "parameter 'base_frame': is 'odom', as 'odom_frame' is; they must differ."
+    )
 
 
 @pytest.mark.parametrize("name", ["simulator_node", "middleware_node", "policy_node"])
 def test_a_node_with_such_a_frame_ends_with_code_2(name, domain_id, tmp_path):
     node = NodeThread(name, tmp_path, {}, domain_id, words=["-p", "base_frame:=map"])
     assert node.wait() == 2
-    assert node.lines == [line for line in node.lines if "they must differ" in line] != []
+    assert (
+        node.lines == [line for line in node.lines if "they must differ" in line] != []
+    )
 
 
 @pytest.mark.parametrize("frame", ["a b", "map"])
@@ -115,7 +137,13 @@ def test_a_running_node_refuses_such_a_frame_and_keeps_its_own(frame, domain_id)
 
 @pytest.mark.parametrize(
     ("distribution", "stamped"),
-    [("humble", False), ("jazzy", False), ("kilted", True), ("lyrical", True), ("rolling", True)],
+    [
+        ("humble", False),
+        ("jazzy", False),
+        ("kilted", True),
+        ("lyrical", True),
+        ("rolling", True),
+    ],
 )
 def test_commands_are_stamped_since_kilted(monkeypatch, distribution, stamped):
     monkeypatch.setenv("ROS_DISTRO", distribution)

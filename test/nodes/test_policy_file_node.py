@@ -89,7 +89,10 @@ class Robot:
 
         def answered():
             stamps.add(self.says(scan))
-            return len([raw for raw in self.raw[known:] if stamp_ns(raw) in stamps]) >= count
+            return (
+                len([raw for raw in self.raw[known:] if stamp_ns(raw) in stamps])
+                >= count
+            )
 
         self.peer.until(answered, "commands")
         return conversions.twist_from_ros(self.raw[-1].twist)
@@ -99,7 +102,9 @@ class Robot:
 def file(model, tmp_path_factory):
     path = tmp_path_factory.mktemp("policy") / "car.onnx"
     task = make_task("navigation", model, {"scan": "around"})
-    task.judge(rehearse(model), {"goal": np.zeros(2)})  # so that the node finds it compiled
+    task.judge(
+        rehearse(model), {"goal": np.zeros(2)}
+    )  # so that the node finds it compiled
     export_policy(network(78, len(model.robot.command)), task, model, path)
     return path
 
@@ -122,7 +127,9 @@ def wanted(file, model):
     """What the policy commands in process, in the same place."""
     policy = load_policy(file)
     task = policy.make_task(model)
-    view = RobotView(np.zeros(3), np.zeros(3), ranges_of(model.lidar.angles), 0.0, 0.0, 0.0)
+    view = RobotView(
+        np.zeros(3), np.zeros(3), ranges_of(model.lidar.angles), 0.0, 0.0, 0.0
+    )
     action = policy.act(task.observation(view, {"goal": np.array(GOAL)}))
     return task.robot.to_cmd_vel(task.command(action))
 
@@ -139,7 +146,9 @@ def test_it_commands_what_the_file_does_in_process(driving, file, model):
     [(around(360), False), (around(1440), True), (around(720) + np.pi, False)],
     ids=["coarser", "finer-clockwise", "from-zero"],
 )
-def test_scans_of_another_lidar_give_the_same_command(driving, file, model, angles, backwards):
+def test_scans_of_another_lidar_give_the_same_command(
+    driving, file, model, angles, backwards
+):
     robot, _ = driving
     command = robot.hears(scan_of(angles, backwards))
     assert command == pytest.approx(wanted(file, model), abs=0.02)
@@ -165,7 +174,9 @@ def test_a_foreign_policy_commands_what_it_does_in_process(
     launch, meet, domain_id, model, tmp_path
 ):
     foreign = foreign_nets.write(tmp_path, "three", robot=None)
-    node = launch("policy_node", domain_id, policy=str(foreign), goal=GOAL, deadline=5.0)
+    node = launch(
+        "policy_node", domain_id, policy=str(foreign), goal=GOAL, deadline=5.0
+    )
     command = Robot(meet(domain_id)).hears(scan_of(model.lidar.angles))
     (expected,) = driven_in_process(foreign, model, [0.0], GOAL[0])
     assert np.abs(expected[[0, 2]]).min() > 0.01
@@ -197,10 +208,14 @@ def test_a_fallback_commands_over_dds_what_it_does_in_process_and_is_counted(
         commands[fallback] = task.robot.to_cmd_vel(task.command(action))
     assert np.abs(commands[""] - commands["dynamic_window"]).max() > 0.1
     assert robot.hears(scan) == pytest.approx(commands["dynamic_window"], abs=1e-4)
-    robot.peer.until(lambda: int(facts(robot).get("by the fallback", 0)) > 0, "diagnostics")
+    robot.peer.until(
+        lambda: int(facts(robot).get("by the fallback", 0)) > 0, "diagnostics"
+    )
 
 
-def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(driving, model):
+def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(
+    driving, model
+):
     robot, node = driving
     narrow = scan_of(np.linspace(-1.0, 1.0, 200))
 
@@ -238,11 +253,22 @@ def test_what_cannot_be_driven_ends_it_with_one_sentence(
     assert "Traceback" not in node.log.read_text(encoding="utf-8")
 
 
-def test_inferences_that_are_late_every_time_command_zero(launch, meet, domain_id, file, model):
-    launch("policy_node", domain_id, policy=str(file), goal=GOAL, deadline=1e-9, late_limit=3)
+def test_inferences_that_are_late_every_time_command_zero(
+    launch, meet, domain_id, file, model
+):
+    launch(
+        "policy_node",
+        domain_id,
+        policy=str(file),
+        goal=GOAL,
+        deadline=1e-9,
+        late_limit=3,
+    )
     robot = Robot(meet(domain_id))
     assert robot.hears(scan_of(model.lidar.angles)).tolist() == [0.0, 0.0, 0.0]
-    assert all(conversions.twist_from_ros(raw.twist).tolist() == [0.0] * 3 for raw in robot.raw)
+    assert all(
+        conversions.twist_from_ros(raw.twist).tolist() == [0.0] * 3 for raw in robot.raw
+    )
 
 
 def test_a_policy_that_fails_when_it_runs_leaves_a_zero_and_ends_with_a_sentence(
@@ -290,7 +316,9 @@ def stateful(launch, meet, domain_id, remembering):
     node = launch("policy_node", domain_id, **given)
     robot = Robot(meet(domain_id))
     robot.goals = robot.peer.speak(PoseStamped, "goal_pose")
-    robot.peer.until(lambda: robot.raw or robot.says(scan_of(around(720))) is None, "a command")
+    robot.peer.until(
+        lambda: robot.raw or robot.says(scan_of(around(720))) is None, "a command"
+    )
     yield robot, node
     node.check()
 

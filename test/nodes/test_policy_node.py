@@ -36,10 +36,15 @@ def driving(launch, meet, module_domain_id):
     }
     commands = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
     peer.node.create_subscription(
-        TwistStamped, "cmd_vel_raw", lambda raw: commands.publish(raw.twist), qos.COMMAND
+        TwistStamped,
+        "cmd_vel_raw",
+        lambda raw: commands.publish(raw.twist),
+        qos.COMMAND,
     )
     start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
-    simulator = launch("simulator_node", module_domain_id, world="empty", rate=RATE, **start)
+    simulator = launch(
+        "simulator_node", module_domain_id, world="empty", rate=RATE, **start
+    )
     policy = launch("policy_node", module_domain_id, base_frame="car", rate=0.0)
     goals = peer.speak(PoseStamped, "goal_pose")
     peer.until(lambda: all(said.values()), "all topics")
@@ -57,7 +62,9 @@ def test_each_command_is_stamped_with_the_scan_it_was_computed_from(driving):
     peer.until(lambda: len(said["cmd_vel_raw"]) >= known + 10, "10 commands")
     commands = [stamp_ns(raw) for raw in said["cmd_vel_raw"]]
     scans = {stamp_ns(scan) for scan in said["scan"]}
-    answers = {stamp for stamp in commands if stamp >= min(scans)}  # this node may hear late
+    answers = {
+        stamp for stamp in commands if stamp >= min(scans)
+    }  # this node may hear late
     assert len(answers) >= 5
     assert len(answers - scans) <= 1  # best effort
     assert (np.diff(commands) > 0).all()  # one for each scan at most
@@ -66,7 +73,9 @@ def test_each_command_is_stamped_with_the_scan_it_was_computed_from(driving):
 
 def test_without_a_goal_it_stands_still(driving):
     _, said, _, _ = driving
-    assert [raw.twist for raw in said["cmd_vel_raw"]] == [Twist()] * len(said["cmd_vel_raw"])
+    assert [raw.twist for raw in said["cmd_vel_raw"]] == [Twist()] * len(
+        said["cmd_vel_raw"]
+    )
 
 
 def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
@@ -83,7 +92,9 @@ def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
     assert [raw.twist for raw in said["cmd_vel_raw"][known:]] == [Twist()] * 10
 
 
-def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_is_refused(driving):
+def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_is_refused(
+    driving,
+):
     peer, said, goals, policy = driving
     before = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
     ahead = PoseStamped()
@@ -122,7 +133,9 @@ def test_it_leaves_a_zero_command_behind(driving):
     assert "Traceback" not in policy.log.read_text(encoding="utf-8")
 
 
-def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(launch, meet, domain_id):
+def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(
+    launch, meet, domain_id
+):
     peer = meet(domain_id)
     start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
     simulator = launch("simulator_node", domain_id, world="empty", **start)
@@ -145,7 +158,9 @@ def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(launc
     policy.check()
 
 
-def test_it_goes_on_after_a_simulation_has_set_the_clock_back(launch, meet, domain_id, model):
+def test_it_goes_on_after_a_simulation_has_set_the_clock_back(
+    launch, meet, domain_id, model
+):
     policy, peer = launch("policy_node", domain_id, rate=0.0), meet(domain_id)
     commands = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
     odom, scans = peer.speak(Odometry, "odom"), peer.speak(LaserScan, "scan")
@@ -158,7 +173,9 @@ def test_it_goes_on_after_a_simulation_has_set_the_clock_back(launch, meet, doma
         """A tenth of a second of a robot that stands; True once it is commanded to drive."""
         stamp = next(tenths) * NS_PER_S // 10
         frames, spread = ("odom", "base_link"), (1e-4,) * 4
-        odom.publish(conversions.odometry_to_ros(np.zeros(3), np.zeros(3), stamp, frames, spread))
+        odom.publish(
+            conversions.odometry_to_ros(np.zeros(3), np.zeros(3), stamp, frames, spread)
+        )
         scans.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
         peer.within(0.05, lambda: False)
         return commands and commands[-1].twist.linear.x > 0.0
@@ -166,17 +183,23 @@ def test_it_goes_on_after_a_simulation_has_set_the_clock_back(launch, meet, doma
     peer.until(drives, "it drives")
     tenths = itertools.count(1)
     commands.clear()
-    peer.until(lambda: drives() and stamp_ns(commands[-1]) < 100 * NS_PER_S, "it drives on")
+    peer.until(
+        lambda: drives() and stamp_ns(commands[-1]) < 100 * NS_PER_S, "it drives on"
+    )
     policy.check()
 
 
-@pytest.mark.parametrize("goal", [[math.nan, 1.0], [1e308, 0.0], [0.0, -math.inf], [1.0]])
+@pytest.mark.parametrize(
+    "goal", [[math.nan, 1.0], [1e308, 0.0], [0.0, -math.inf], [1.0]]
+)
 def test_a_goal_that_is_no_place_is_refused_when_it_is_configured(goal, domain_id):
     context = open_context(["node", "--ros-args", "-p", "autostart:=false"], domain_id)
     node = PolicyNode(context)
     try:
         node.set_parameters([Parameter("goal", value=goal)])
-        with pytest.raises(ConfigError, match=r"^parameter 'goal': must be \[x, y\] within 1e8 m"):
+        with pytest.raises(
+            ConfigError, match=r"^parameter 'goal': must be \[x, y\] within 1e8 m"
+        ):
             node.configure()
     finally:
         node.destroy_node()

@@ -36,14 +36,21 @@ with NodeProcess("command_gate", Path(sys.argv[1]), {}, int(sys.argv[2])) as nod
 def alive(pid):
     """Whether a process runs; one that ended and was not waited for does not."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+        state = (
+            Path(f"/proc/{pid}/stat")
+            .read_text(encoding="utf-8")
+            .rpartition(")")[2]
+            .split()[0]
+        )
     except (FileNotFoundError, ProcessLookupError):
         return False
     return state != "Z"
 
 
 @pytest.mark.parametrize("first", [0, pytest.param(1, marks=pytest.mark.campaign)])
-def test_every_node_starts_and_ends_in_order_at_a_signal(launch_process, meet, domain_id, first):
+def test_every_node_starts_and_ends_in_order_at_a_signal(
+    launch_process, meet, domain_id, first
+):
     """At SIGINT and SIGTERM in turn; and its names can be remapped."""
     peer = meet(domain_id)
     scans = peer.listen(LaserScan, "robot/lidar/front")
@@ -100,8 +107,12 @@ def test_leaving_the_block_ends_a_node_that_runs_and_one_that_hangs(
     assert node.close() == -signal.SIGKILL
 
 
-def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(tmp_path, domain_id, meet):
-    with NodeProcess("policy_node", tmp_path, {"policy": "dynamic_widow"}, domain_id) as node:
+def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
+    tmp_path, domain_id, meet
+):
+    with NodeProcess(
+        "policy_node", tmp_path, {"policy": "dynamic_widow"}, domain_id
+    ) as node:
         meet(domain_id).until(lambda: node._process.poll() is not None, "its end")
         expected = (
             "policy_node ended with code 2: unknown policy 'dynamic_widow'; did you mean "
@@ -127,7 +138,9 @@ def test_a_wrong_domain_id_of_the_environment_is_one_sentence(monkeypatch, given
         free_domain_id()
 
 
-def test_the_working_folder_holds_no_modules_for_a_node(tmp_path, monkeypatch, domain_id):
+def test_the_working_folder_holds_no_modules_for_a_node(
+    tmp_path, monkeypatch, domain_id
+):
     """`python -m` looks for modules in the working folder first, which may be that of a model."""
     canary = tmp_path / "canary"
     for name in ("yaml", "numpy", "numba", "rclpy"):

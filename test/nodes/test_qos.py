@@ -29,7 +29,9 @@ def watched(domain_id, meet, capfd):
 
     def warned() -> str:
         executor.spin_once(timeout_sec=0.05)
-        lines.extend(line for line in capfd.readouterr().err.splitlines() if "[car.gate]" in line)
+        lines.extend(
+            line for line in capfd.readouterr().err.splitlines() if "[car.gate]" in line
+        )
         return lines[-1] if lines else ""
 
     yield node, peer, warned
@@ -38,21 +40,26 @@ def watched(domain_id, meet, capfd):
     context.try_shutdown()
 
 
-def test_a_publisher_that_offers_too_little_is_named_with_both_sides_and_a_cure(watched):
+def test_a_publisher_that_offers_too_little_is_named_with_both_sides_and_a_cure(
+    watched,
+):
     node, peer, warned = watched
     peer.node.create_publisher(Bool, "e_stop", qos.SENSOR)
     node.create_subscription(Bool, "e_stop", lambda _: None, qos.EVERY_COMMAND)
     peer.until(warned, "a warning")
     line = warned()
     assert (
-        f"/car/e_stop: no message passes between this node and /car/{peer.node.get_name()}" in line
+        f"/car/e_stop: no message passes between this node and /car/{peer.node.get_name()}"
+        in line
     )
     assert "the reliability that the publisher offers (best effort)" in line
     assert "what the subscription asks for (reliable)" in line
     assert f"let /car/{peer.node.get_name()} offer reliable" in line
 
 
-def test_a_subscription_that_asks_for_too_much_is_named_with_both_sides_and_a_cure(watched):
+def test_a_subscription_that_asks_for_too_much_is_named_with_both_sides_and_a_cure(
+    watched,
+):
     node, peer, warned = watched
     keeping = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     peer.node.create_subscription(Bool, "scan", lambda _: None, keeping)
@@ -108,7 +115,9 @@ def test_an_override_of_one_topic_leaves_the_others_as_they_are(overridden):
     node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
     other = node.create_publisher(Bool, "odom", qos.SENSOR_RELIABLE)
     assert other.qos_profile.depth == qos.SENSOR_RELIABLE.depth == 10
-    assert not [name for name in node._parameters if name.startswith("qos_overrides./odom")]
+    assert not [
+        name for name in node._parameters if name.startswith("qos_overrides./odom")
+    ]
 
 
 @pytest.mark.parametrize("topic", qos.FIXED_TOPICS)
@@ -118,7 +127,9 @@ def test_the_quality_of_service_that_a_stop_depends_on_can_not_be_overridden(
 ):
     final = topic if name == "same" else name
     node = overridden(f"/{final}.subscription.depth:=1", remap=[f"{topic}:={final}"])
-    with pytest.raises(ConfigError, match=rf"qos_overrides./{final}.subscription.depth.*leave it"):
+    with pytest.raises(
+        ConfigError, match=rf"qos_overrides./{final}.subscription.depth.*leave it"
+    ):
         node.create_subscription(Bool, topic, lambda _: None, qos.EVERY_COMMAND)
 
 
@@ -145,11 +156,19 @@ def test_nodes_honour_what_a_file_overrides_and_refuse_it_for_the_emergency_stop
 ):
     chosen = {"qos_overrides": {"/odometry/filtered": {"publisher": {"depth": 7}}}}
     launch("middleware_node", domain_id, **chosen)
-    fixed = {"qos_overrides": {"/e_stop": {"subscription": {"reliability": "best_effort"}}}}
+    fixed = {
+        "qos_overrides": {"/e_stop": {"subscription": {"reliability": "best_effort"}}}
+    }
     gate = launch("command_gate", domain_id, **fixed)
     assert gate.wait() == 2
-    assert "'qos_overrides./e_stop.subscription.reliability': can't be" in gate.read_text()
+    assert (
+        "'qos_overrides./e_stop.subscription.reliability': can't be" in gate.read_text()
+    )
     peer = meet(domain_id)
-    request = GetParameters.Request(names=["qos_overrides./odometry/filtered.publisher.depth"])
-    (depth,) = peer.call(GetParameters, "middleware_node/get_parameters", request).values
+    request = GetParameters.Request(
+        names=["qos_overrides./odometry/filtered.publisher.depth"]
+    )
+    (depth,) = peer.call(
+        GetParameters, "middleware_node/get_parameters", request
+    ).values
     assert depth.integer_value == 7

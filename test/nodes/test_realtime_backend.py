@@ -73,7 +73,10 @@ def vehicle(meet, domain_id, model):
             scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
         measured = PoseStamped()
         measured.header.stamp = conversions.stamp_to_ros(stamp)
-        measured.pose.position.x, measured.pose.position.y = float(pose[0]), float(pose[1])
+        measured.pose.position.x, measured.pose.position.y = (
+            float(pose[0]),
+            float(pose[1]),
+        )
         measured.pose.orientation = conversions.heading_to_ros(pose[2])
         sensor.publish(measured)
 
@@ -86,8 +89,14 @@ def drive_on(backend):
 
 
 def test_gymnasium_make_drives_a_simulator_in_real_time(simulator):
-    options = {"domain_id": simulator[0], "mode": "realtime", "stale_after_s": PATIENCE_S}
-    env = gymnasium.make(NAVIGATION, backend="dds", model="ackermann", backend_options=options)
+    options = {
+        "domain_id": simulator[0],
+        "mode": "realtime",
+        "stale_after_s": PATIENCE_S,
+    }
+    env = gymnasium.make(
+        NAVIGATION, backend="dds", model="ackermann", backend_options=options
+    )
     try:
         _, info = env.reset(seed=3)
         before = info["pose"]
@@ -103,7 +112,9 @@ def test_gymnasium_make_drives_a_simulator_in_real_time(simulator):
         assert 0.0 <= info["scan_silence_s"] <= PATIENCE_S
 
 
-def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(connect, simulator, meet):
+def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(
+    connect, simulator, meet
+):
     backend = connect(stale_after_s=2.0)
     backend.reset(START)
     backend.step(FORWARD)
@@ -120,7 +131,9 @@ def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(connect, s
 
 @pytest.mark.process
 @pytest.mark.campaign
-def test_a_simulator_that_hangs_is_silent_until_it_wakes(connect, launch_process, domain_id):
+def test_a_simulator_that_hangs_is_silent_until_it_wakes(
+    connect, launch_process, domain_id
+):
     simulator = launch_process("simulator_node", domain_id, mode="realtime")
     backend = connect(stale_after_s=2.0, domain_id=domain_id)
     backend.reset(START)
@@ -139,7 +152,9 @@ def test_a_simulator_whose_services_are_found_late_is_no_vehicle(connect, monkey
     unseen = iter([False] * 20)
     seen = EpisodeServices.there.fget
     monkeypatch.setattr(
-        EpisodeServices, "there", property(lambda self: next(unseen, True) and seen(self))
+        EpisodeServices,
+        "there",
+        property(lambda self: next(unseen, True) and seen(self)),
     )
     elsewhere = Start(seed=4, pose=np.array([-0.5, 0.5, 0.0]))
     backend = connect(stale_after_s=PATIENCE_S)
@@ -151,7 +166,9 @@ def test_missed_deadlines_are_counted_and_not_made_up_for(connect, monkeypatch):
     backend.reset(START)
     period, clock = backend._period_ns, SimpleNamespace(now=time.monotonic_ns())
     clock.monotonic_ns = lambda: clock.now
-    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + round(seconds * 1e9))
+    clock.sleep = lambda seconds: setattr(
+        clock, "now", clock.now + round(seconds * 1e9)
+    )
     monkeypatch.setattr(realtime_backend, "time", clock)
     backend._deadline_ns = (began := clock.now) + period
 
@@ -183,13 +200,19 @@ def test_a_vehicle_is_awaited_at_its_start_and_what_is_missing_is_said(
             vehicle.stand(START.pose)
 
     backend = connect(
-        domain_id=vehicle.domain_id, say=say, stale_after_s=PATIENCE_S, stamped=True,
-        tolerance=(0.2, 0.2), pose_type="PoseStamped",
-    )  # fmt: skip
+        domain_id=vehicle.domain_id,
+        say=say,
+        stale_after_s=PATIENCE_S,
+        stamped=True,
+        tolerance=(0.2, 0.2),
+        pose_type="PoseStamped",
+    )
     view = backend.reset(START)
     assert np.hypot(*(view.pose - START.pose)[:2]) < 0.2
     assert said[0].startswith("no ")
-    assert "it is 1.00 m and 29 deg off its start (0.50 m, -0.50 m, 57 deg)" in said, said
+    assert "it is 1.00 m and 29 deg off its start (0.50 m, -0.50 m, 57 deg)" in said, (
+        said
+    )
     assert "it is still moving" in said
     backend.step(FORWARD)
     heard = "a command stamped with its scan"
@@ -222,9 +245,11 @@ def test_a_drive_goes_on_after_the_clock_of_the_stamps_was_set_back(connect, sta
     heard = standing.peer.listen(TwistStamped, "cmd_vel_raw")
     standing.peer.listen(TwistStamped, "cmd_vel")
     backend = connect(
-        domain_id=standing.domain_id, command_topic="cmd_vel_raw", start="present",
+        domain_id=standing.domain_id,
+        command_topic="cmd_vel_raw",
+        start="present",
         stale_after_s=PATIENCE_S,
-    )  # fmt: skip
+    )
     view = backend.reset(START)
     standing.clock.offset_ns -= 50 * 10**9
     deadline = time.monotonic() + PATIENCE_S
@@ -238,7 +263,9 @@ def test_a_drive_goes_on_after_the_clock_of_the_stamps_was_set_back(connect, sta
         stamps = [conversions.stamp_from_ros(one.header.stamp) for one in heard]
         return any(stamp <= view.stamp_s * 1e9 for stamp in stamps if stamp)
 
-    standing.peer.until(answers_the_new_clock, "a command with the stamp of a scan after the jump")
+    standing.peer.until(
+        answers_the_new_clock, "a command with the stamp of a scan after the jump"
+    )
 
 
 def test_no_scan_after_a_clock_jump_is_one_sentence_with_its_age(connect, standing):
@@ -267,7 +294,9 @@ def test_a_vehicle_that_does_not_come_ends_the_reset_and_the_present_pose_would_
         "say": lambda _: vehicle.stand(np.zeros(3)),
     }
     waiting = connect(**options, start_timeout_s=0.5)
-    with pytest.raises(BackendError, match=r"not ready: it is 0.71 m and 57 deg off.*'present'"):
+    with pytest.raises(
+        BackendError, match=r"not ready: it is 0.71 m and 57 deg off.*'present'"
+    ):
         waiting.reset(START)
     waiting.close()
     present = connect(**options, start="present")

@@ -122,7 +122,9 @@ def test_an_odometry_that_is_the_pose_is_not_compared_with_itself():
 
 def test_measured_wheels_are_the_state():
     drive = Drive(WHEELED).goes(0, 5)
-    with pytest.raises(BackendError, match="'joint_states': nothing has arrived, but left_wheel"):
+    with pytest.raises(
+        BackendError, match="'joint_states': nothing has arrived, but left_wheel"
+    ):
         drive.log.check()
     for k in range(5, 30):
         drive.goes(k, k + 1)
@@ -136,7 +138,9 @@ def test_stamps_at_another_pace_than_the_receipt_are_a_simulators():
     drive = Drive()
     for k in range(10):
         drive.hears(k, stamp_ns=START_NS + 5 * k * PERIOD_NS)
-    with pytest.raises(BackendError, match=r"stamps went on by 4.50 s within 0.90 s.*use_sim_time"):
+    with pytest.raises(
+        BackendError, match=r"stamps went on by 4.50 s within 0.90 s.*use_sim_time"
+    ):
         drive.log.check()
 
 

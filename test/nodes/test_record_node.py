@@ -51,7 +51,9 @@ class FakeRobot:
                 self.sent = time.monotonic()
                 stamp = self.peer.node.get_clock().now().nanoseconds
                 self.odom.publish(
-                    conversions.odometry_to_ros(self.pose, np.zeros(3), stamp, FRAMES, VARIANCE)
+                    conversions.odometry_to_ros(
+                        self.pose, np.zeros(3), stamp, FRAMES, VARIANCE
+                    )
                 )
             return condition()
 
@@ -115,18 +117,23 @@ def test_silence_of_odometry_stops_the_robot(launch, meet, domain_id, tmp_path):
     robot.peer.until(lambda: code_of(node) is not None, "it ends without odometry")
     assert code_of(node) == 2
     robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
-    sentence = f"topic '/odom' (namespace '/', ROS domain {domain_id}): nothing new for 0."
+    sentence = (
+        f"topic '/odom' (namespace '/', ROS domain {domain_id}): nothing new for 0."
+    )
     assert sentence in said(node)
     assert seconds(out) > 0.5
 
 
-def test_odometry_that_only_repeats_itself_is_silence(launch, meet, domain_id, tmp_path):
+def test_odometry_that_only_repeats_itself_is_silence(
+    launch, meet, domain_id, tmp_path
+):
     robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
     node = launch("record_node", domain_id, out=str(out))
     robot.until(lambda: robot.driven, "it drives")
     frozen = conversions.odometry_to_ros(robot.pose, np.zeros(3), 1, FRAMES, VARIANCE)
     robot.peer.until(
-        lambda: robot.odom.publish(frozen) or code_of(node) is not None, "it ends all the same"
+        lambda: robot.odom.publish(frozen) or code_of(node) is not None,
+        "it ends all the same",
     )
     assert "nothing new for 0." in said(node)
 
@@ -147,14 +154,18 @@ def test_leaving_the_bound_stops_the_robot(launch, meet, domain_id, tmp_path):
     assert seconds(out) > 0.5
 
 
-def test_without_odometry_or_a_listener_it_says_where_it_looked(launch, meet, domain_id, tmp_path):
+def test_without_odometry_or_a_listener_it_says_where_it_looked(
+    launch, meet, domain_id, tmp_path
+):
     out = str(tmp_path / "drive.npz")
     silent = launch("record_node", domain_id, "bot", {"odom": "wheel_odom"}, out=out)
     peer = meet(domain_id)
     unheard = FakeRobot(peer)
     peer.node.destroy_subscription(next(iter(peer.node.subscriptions)))
     deaf = launch("record_node", domain_id, out=out)
-    unheard.until(lambda: None not in (code_of(silent), code_of(deaf)), "both end", 90.0)
+    unheard.until(
+        lambda: None not in (code_of(silent), code_of(deaf)), "both end", 90.0
+    )
     assert (code_of(silent), code_of(deaf)) == (2, 2)
     where = f"(namespace '/bot', ROS domain {domain_id}): nothing arrived within 10 s"
     assert f"topic '/bot/wheel_odom' {where}" in said(silent)
@@ -163,7 +174,9 @@ def test_without_odometry_or_a_listener_it_says_where_it_looked(launch, meet, do
     assert os.listdir(tmp_path) == []
 
 
-def test_it_does_not_drive_a_robot_that_somebody_else_drives(launch, meet, domain_id, tmp_path):
+def test_it_does_not_drive_a_robot_that_somebody_else_drives(
+    launch, meet, domain_id, tmp_path
+):
     robot = FakeRobot(meet(domain_id))
     robot.peer.speak(Twist, "cmd_vel", 1)
     node = launch("record_node", domain_id, out=str(tmp_path / "drive.npz"))
@@ -172,7 +185,9 @@ def test_it_does_not_drive_a_robot_that_somebody_else_drives(launch, meet, domai
     assert robot.heard == []
 
 
-def test_a_simulator_that_is_faster_than_the_clock_is_noticed(launch, meet, domain_id, tmp_path):
+def test_a_simulator_that_is_faster_than_the_clock_is_noticed(
+    launch, meet, domain_id, tmp_path
+):
     launch("simulator_node", domain_id, world="empty", rate=4.0)
     peer = meet(domain_id)
     odom = peer.listen(Odometry, "odom")
@@ -191,7 +206,13 @@ class Nics:
             "ROS_DOMAIN_ID": str(domain_id),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         }
-        command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", "--yes"]
+        command = [
+            sys.executable,
+            "-m",
+            "nics_drl_bridge.commands.cli",
+            "record",
+            "--yes",
+        ]
         with self._said.open("wb") as log:
             self.process = subprocess.Popen(
                 [*command, *map(str, options)],
@@ -214,7 +235,11 @@ class Nics:
 def nics(tmp_path, domain_id):
     """Starts `nics record`; it has ended after the test."""
     started = []
-    yield lambda *options: started.append(Nics(tmp_path, domain_id, *options)) or started[-1]
+    yield (
+        lambda *options: (
+            started.append(Nics(tmp_path, domain_id, *options)) or started[-1]
+        )
+    )
     for each in started:
         each.process.kill()
         each.process.wait()
@@ -246,7 +271,9 @@ def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
     [
         ("differential", {"rate": 1.0}, FAST),
         pytest.param("differential", {"rate": 3.0}, FAST, marks=pytest.mark.campaign),
-        pytest.param("ackermann", {"rate": 1.0}, ("--duration", 20), marks=pytest.mark.campaign),
+        pytest.param(
+            "ackermann", {"rate": 1.0}, ("--duration", 20), marks=pytest.mark.campaign
+        ),
     ],
     ids=["differential-1.0", "differential-3.0", "ackermann-1.0"],
 )
@@ -255,13 +282,24 @@ def test_a_recorded_drive_of_a_simulator_generates_it_again(
 ):
     save_model(builtin_model(name), tmp_path / "model")
     namespace = "bot" if "bot" in options else ""
-    parameters = {"model": str(tmp_path / "model"), "world": open_field(tmp_path), **pace}
+    parameters = {
+        "model": str(tmp_path / "model"),
+        "world": open_field(tmp_path),
+        **pace,
+    }
     launch("simulator_node", domain_id, namespace, **parameters)
     peer = meet(domain_id, namespace)
-    odom, heard = peer.listen(Odometry, "odom"), peer.listen(Twist, "cmd_vel", qos.COMMAND)
+    odom, heard = (
+        peer.listen(Odometry, "odom"),
+        peer.listen(Twist, "cmd_vel", qos.COMMAND),
+    )
     peer.until(lambda: odom, "the simulator runs")
     spec = load_robot(name)
-    for out in ("drive", "again", "third"):  # a busy machine may hold up odometry or commands
+    for out in (
+        "drive",
+        "again",
+        "third",
+    ):  # a busy machine may hold up odometry or commands
         odom.clear()
         command = nics("--robot", name, "--out", f"{out}.npz", *options)
         peer.until(lambda: command.ended, "the drive ends", LONG_S)  # noqa: B023
@@ -270,7 +308,9 @@ def test_a_recorded_drive_of_a_simulator_generates_it_again(
         assert command.process.returncode == 0, command.said
         drive = recorded(tmp_path / f"{out}.npz", spec)
         held_out = identify(drive, spec).held_out
-        print(f"{name}: {held_out.mean_position_error_m:.4f} m of {held_out.mean_path_m:.2f} m")
+        print(
+            f"{name}: {held_out.mean_position_error_m:.4f} m of {held_out.mean_path_m:.2f} m"
+        )
         if held_out.mean_position_error_m < SHARE_OF_PATH * held_out.mean_path_m:
             break
     else:

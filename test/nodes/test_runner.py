@@ -52,7 +52,9 @@ def test_what_speaks_to_topics_refuses_a_robot_without_cmd_vel(started, tmp_path
         lambda: DdsBackend(open_model(file), load_world("empty")),
         lambda: RealtimeBackend(open_model(file), load_world("empty")),
     ):
-        with pytest.raises(ConfigError, match="the command 'throttle' names no field of cmd_vel"):
+        with pytest.raises(
+            ConfigError, match="the command 'throttle' names no field of cmd_vel"
+        ):
             drive()
 
 
@@ -65,12 +67,18 @@ def test_a_whole_number_is_taken_for_a_floating_point_parameter(started):
 
 
 def test_an_argument_that_ros_does_not_know_is_one_sentence(domain_id):
-    with pytest.raises(BackendError, match=r"ROS 2 knows no argument .*--wait.*; write them as in"):
+    with pytest.raises(
+        BackendError, match=r"ROS 2 knows no argument .*--wait.*; write them as in"
+    ):
         open_context(["node", "--ros-args", "--wait"], domain_id)
 
 
-@pytest.mark.parametrize("value", ["0", "0.05", "11", ".nan", ".inf", "fast", "true", "[1.0]"])
-def test_a_value_that_can_not_be_used_is_refused_with_the_parameters_name(started, value):
+@pytest.mark.parametrize(
+    "value", ["0", "0.05", "11", ".nan", ".inf", "fast", "true", "[1.0]"]
+)
+def test_a_value_that_can_not_be_used_is_refused_with_the_parameters_name(
+    started, value
+):
     node = started(f"rate:={value}")
     with pytest.raises(ParameterException, match="rate"):
         declare(node, "rate", 1.0, "Of time.", span=(0.1, 10.0))

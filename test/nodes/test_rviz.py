@@ -28,9 +28,15 @@ def test_every_topic_of_the_picture_is_led_to_those_of_the_robot_and_the_map_to_
     from nics_drl_bridge.config import find_config
     from nics_drl_bridge.nodes import launching
 
-    arguments = {"params_file": str(find_config("bridge", "nodes")), "simulator": "simulator"}
-    for given, place in (({}, "/map"), ({"namespace": "car"}, "/car/map"),
-                         ({"namespace": "hall", "robots": "[a, b]"}, "/hall/map")):  # fmt: skip
+    arguments = {
+        "params_file": str(find_config("bridge", "nodes")),
+        "simulator": "simulator",
+    }
+    for given, place in (
+        ({}, "/map"),
+        ({"namespace": "car"}, "/car/map"),
+        ({"namespace": "hall", "robots": "[a, b]"}, "/hall/map"),
+    ):
         setup = launching.Setup(arguments | {"rviz_config": str(FILE)} | given)
         setup.node = lambda *given, **_: given
         *_, (*_, topics) = launching.description(setup)

@@ -51,24 +51,34 @@ def allowed(file: str) -> dict[str, set[tuple[str, str]]]:
 
 def test_only_the_gate_may_publish_cmd_vel_and_only_the_policy_what_it_listens_to():
     rights = allowed("policy.xml")
-    for topic, sole in (("/cmd_vel", {"command_gate"}), ("/cmd_vel_raw", {"policy_node"})):
+    for topic, sole in (
+        ("/cmd_vel", {"command_gate"}),
+        ("/cmd_vel_raw", {"policy_node"}),
+    ):
         assert {node for node in rights if ("publish", topic) in rights[node]} == sole
     assert not any("*" in name for own in rights.values() for _, name in own)
     assert {
-        n for n in rights if ("publish", "/cmd_vel") in allowed("recording.xml").get(n, ())
+        n
+        for n in rights
+        if ("publish", "/cmd_vel") in allowed("recording.xml").get(n, ())
     } <= {"record_node"}
 
 
 def test_nobody_but_the_operator_may_arm_or_reset_the_gate():
     rights = allowed("policy.xml")
     for service in ("arm", "reset", "e_stop"):
-        may = {n for n in rights if ("request", f"/command_gate/{service}") in rights[n]}
+        may = {
+            n for n in rights if ("request", f"/command_gate/{service}") in rights[n]
+        }
         assert may == {"operator"}
         assert ("reply", f"/command_gate/{service}") in rights["command_gate"]
 
 
 def test_the_shares_hold_both_policies():
-    assert {file.name for file in Path(FOLDER).iterdir()} == {"policy.xml", "recording.xml"}
+    assert {file.name for file in Path(FOLDER).iterdir()} == {
+        "policy.xml",
+        "recording.xml",
+    }
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +153,8 @@ class TestWhatTheNodesDo:
         rights = allowed("policy.xml")
 
         def of(node):
-            return {(what, name.replace(f"/{node}/", "/~/")) for what, name in rights[node]}
+            return {
+                (what, name.replace(f"/{node}/", "/~/")) for what, name in rights[node]
+            }
 
         assert of("mujoco_node") == of("simulator_node")

@@ -40,7 +40,9 @@ def two_lidars(model, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def simulator(launch, module_domain_id, two_lidars):
-    process = launch("simulator_node", module_domain_id, model=two_lidars[1], mode="lockstep")
+    process = launch(
+        "simulator_node", module_domain_id, model=two_lidars[1], mode="lockstep"
+    )
     yield module_domain_id
     process.check()
 
@@ -49,9 +51,12 @@ def test_an_env_over_dds_sees_both_lidars_as_the_one_in_process(simulator, two_l
     model = two_lidars[0]
     here = BridgeEnv(model=model, world="arena", task_options=TASK, estimator=True)
     there = BridgeEnv(
-        model=model, world="arena", task_options=TASK, backend="dds",
+        model=model,
+        world="arena",
+        task_options=TASK,
+        backend="dds",
         backend_options={"domain_id": simulator},
-    )  # fmt: skip
+    )
     try:
         for seed in (1, 2):
             one, _ = here.reset(seed=seed)
@@ -75,7 +80,10 @@ def test_its_scan_and_its_place_are_published(simulator, meet, two_lidars):
     peer = meet(simulator)
     scans = peer.listen(LaserScan, "rear_scan", qos.SENSOR)
     env = BridgeEnv(
-        model=two_lidars[0], world="arena", backend="dds", backend_options={"domain_id": simulator}
+        model=two_lidars[0],
+        world="arena",
+        backend="dds",
+        backend_options={"domain_id": simulator},
     )
     try:
         # Again, as the first may be published before the peer's subscription is known.
@@ -87,13 +95,17 @@ def test_its_scan_and_its_place_are_published(simulator, meet, two_lidars):
     assert sensor.read(scans[-1]).shape == (91,)
 
 
-def test_a_simulator_without_the_sensor_is_of_another_model(launch, domain_id, model, two_lidars):
+def test_a_simulator_without_the_sensor_is_of_another_model(
+    launch, domain_id, model, two_lidars
+):
     launch("simulator_node", domain_id, mode="lockstep")
     with pytest.raises(BackendError, match="rear_scan"):
         BridgeEnv(
-            model=two_lidars[0], world=load_world("arena"), backend="dds",
+            model=two_lidars[0],
+            world=load_world("arena"),
+            backend="dds",
             backend_options={"domain_id": domain_id, "timeout_s": 5.0},
-        )  # fmt: skip
+        )
 
 
 def test_the_gate_reads_where_a_sensor_shows_something(two_lidars):

@@ -32,7 +32,12 @@ from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
 
-FRAMES = {"map_frame": "field", "odom_frame": "wheels", "base_frame": "car", "laser_frame": "eye"}
+FRAMES = {
+    "map_frame": "field",
+    "odom_frame": "wheels",
+    "base_frame": "car",
+    "laser_frame": "eye",
+}
 READY_S = 5.0
 TOPICS = {"scan": LaserScan, "odom": Odometry, "ground_truth": Odometry}
 
@@ -61,7 +66,9 @@ class Watched:
     def has(self, stamp, patience_s=30.0):
         """Whether all topics come to a stamp."""
         try:
-            self.peer.until(lambda: min(self.newest()) >= stamp, f"data of {stamp}", patience_s)
+            self.peer.until(
+                lambda: min(self.newest()) >= stamp, f"data of {stamp}", patience_s
+            )
         except AssertionError:
             return False
         return True
@@ -79,7 +86,10 @@ class Watched:
         now = stamp_ns(self.said["odom"][-1])
         self.command(speed, steering)
         assert self.has(now + 1), "nothing came of a command"
-        return {topic: [stamp_ns(m) for m in self.said[topic][n:]] for topic, n in known.items()}
+        return {
+            topic: [stamp_ns(m) for m in self.said[topic][n:]]
+            for topic, n in known.items()
+        }
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +108,9 @@ def lockstep(launch, meet, module_domain_id):
 @pytest.fixture(scope="module")
 def realtime(launch, meet):
     with claimed_domain() as domain_id:
-        process = launch("simulator_node", domain_id, rate=2.0, world="empty", use_sim_time=True)
+        process = launch(
+            "simulator_node", domain_id, rate=2.0, world="empty", use_sim_time=True
+        )
         watched = Watched(meet(domain_id), 0.0)
         assert watched.has(0), "the simulator says nothing"
         yield watched
@@ -112,10 +124,14 @@ def period_ns(model):
 
 def test_it_is_ready_within_seconds(lockstep):
     print(f"ready {lockstep.ready_s:.2f} s after its start, wanted within {READY_S} s")
-    assert lockstep.ready_s < 6 * READY_S  # an idle machine takes a quarter of the wanted time
+    assert (
+        lockstep.ready_s < 6 * READY_S
+    )  # an idle machine takes a quarter of the wanted time
 
 
-def test_each_command_brings_exactly_one_scan_and_odometry_one_period_later(lockstep, period_ns):
+def test_each_command_brings_exactly_one_scan_and_odometry_one_period_later(
+    lockstep, period_ns
+):
     now = lockstep.reset()["stamp_ns"]
     for k in range(1, 31):
         expected = [now + k * period_ns]
@@ -157,7 +173,8 @@ def test_it_tells_its_present_again_when_asked(lockstep):
     known = {topic: len(lockstep.said[topic]) for topic in TOPICS}
     assert lockstep.peer.call(Trigger, "simulator_node/repeat").success
     lockstep.peer.until(
-        lambda: all(len(lockstep.said[topic]) > known[topic] for topic in TOPICS), "it again"
+        lambda: all(len(lockstep.said[topic]) > known[topic] for topic in TOPICS),
+        "it again",
     )
     assert {topic: lockstep.said[topic][-1] for topic in TOPICS} == told
 
@@ -170,7 +187,9 @@ def test_a_reset_answers_with_the_first_stamp_and_what_it_runs(lockstep, model):
 
 
 def test_a_reset_begins_where_the_parameters_say(lockstep):
-    lockstep.reset(episode_seed=3, episode_start=[0.5, -0.25, 1.0], episode_start_given=True)
+    lockstep.reset(
+        episode_seed=3, episode_start=[0.5, -0.25, 1.0], episode_start_given=True
+    )
     for topic in ("odom", "ground_truth"):
         pose, twist = conversions.odometry_from_ros(lockstep.said[topic][-1])
         assert pose == pytest.approx([0.5, -0.25, 1.0])
@@ -190,11 +209,18 @@ def test_a_start_that_it_is_started_with_alone_holds(launch, meet, domain_id):
     launch("simulator_node", domain_id, world="empty", episode_start=[1.0, -1.5, 0.5])
     peer.until(lambda: truths, "the robot")
     pose = conversions.odometry_from_ros(truths[0])[0]
-    assert pose == pytest.approx([1.0, -1.5, 0.5], abs=0.1)  # the first one that is heard
+    assert pose == pytest.approx(
+        [1.0, -1.5, 0.5], abs=0.1
+    )  # the first one that is heard
 
 
 def test_commands_are_as_old_as_before_when_time_is_put_back(domain_id, model_folder):
-    given = ["mode:=realtime", "world:=empty", "command_timeout:=0.5", f"model:={model_folder}"]
+    given = [
+        "mode:=realtime",
+        "world:=empty",
+        "command_timeout:=0.5",
+        f"model:={model_folder}",
+    ]
     words = [word for each in given for word in ("-p", each)]
     context = open_context(["node", "--ros-args", *words], domain_id)
     node = simulator_node.simulator_node(context)
@@ -254,7 +280,9 @@ def test_a_command_that_is_no_number_is_ignored(lockstep, period_ns, bad):
     lockstep.command(bad)
     lockstep.command(0.0, bad)
     assert lockstep.step(0.5) == {topic: [now + period_ns] for topic in TOPICS}
-    assert np.isfinite(conversions.odometry_from_ros(lockstep.said["odom"][-1])[0]).all()
+    assert np.isfinite(
+        conversions.odometry_from_ros(lockstep.said["odom"][-1])[0]
+    ).all()
 
 
 def test_a_command_that_can_not_be_read_is_ignored_and_told(lockstep, period_ns):
@@ -272,7 +300,9 @@ def test_a_command_beyond_what_its_model_was_fitted_to_is_said_in_its_log(lockst
     sentence = "speed_command is 9, but the model was fitted to"
     said = lockstep.log.read_text().count(sentence)
     lockstep.step(9.0)
-    lockstep.peer.until(lambda: lockstep.log.read_text().count(sentence) > said, "a warning")
+    lockstep.peer.until(
+        lambda: lockstep.log.read_text().count(sentence) > said, "a warning"
+    )
 
 
 def test_the_header_of_its_scan_equals_the_lidar(lockstep, model):
@@ -282,18 +312,24 @@ def test_the_header_of_its_scan_equals_the_lidar(lockstep, model):
     assert scan.angle_min == pytest.approx(lidar.angles[0])
     assert scan.angle_max == pytest.approx(lidar.angles[-1])
     assert scan.angle_increment == pytest.approx(lidar.angle_increment)
-    assert (scan.range_min, scan.range_max) == pytest.approx((lidar.range_min, lidar.range_max))
+    assert (scan.range_min, scan.range_max) == pytest.approx(
+        (lidar.range_min, lidar.range_max)
+    )
     assert scan.scan_time == pytest.approx(1.0 / lidar.rate)
 
 
 def test_its_ranges_are_returns_within_the_limits_or_infinite(lockstep, model):
-    lockstep.reset(episode_seed=0, episode_start=[0.0, 0.0, 0.0], episode_start_given=True)
+    lockstep.reset(
+        episode_seed=0, episode_start=[0.0, 0.0, 0.0], episode_start_given=True
+    )
     ranges = np.array(lockstep.said["scan"][-1].ranges)
     returns = ranges[np.isfinite(ranges)]
     assert len(returns) > 10
     assert returns.min() >= np.float32(model.lidar.range_min)
     assert returns.max() <= np.float32(model.lidar.range_max)
-    assert (ranges[~np.isfinite(ranges)] == np.inf).all()  # the walls are 3 m away and more
+    assert (
+        ranges[~np.isfinite(ranges)] == np.inf
+    ).all()  # the walls are 3 m away and more
 
 
 def test_a_wall_nearer_than_the_least_range_is_reported_as_minus_infinity(lockstep):
@@ -312,8 +348,12 @@ def test_all_frames_are_those_of_the_parameters(lockstep):
 def test_the_covariance_of_its_odometry_is_filled_and_grows_on_the_way(lockstep):
     def variance():
         odom = lockstep.said["odom"][-1]
-        return np.array([np.diag(np.reshape(part.covariance, (6, 6))) for part in
-                         (odom.pose, odom.twist)])  # fmt: skip
+        return np.array(
+            [
+                np.diag(np.reshape(part.covariance, (6, 6)))
+                for part in (odom.pose, odom.twist)
+            ]
+        )
 
     lockstep.reset()
     before = variance()
@@ -326,22 +366,36 @@ def test_the_covariance_of_its_odometry_is_filled_and_grows_on_the_way(lockstep)
     assert (after[1] == before[1]).all()
 
 
-def test_the_true_twist_is_how_the_true_pose_moves(launch, meet, domain_id, model, tmp_path):
-    save_model(replace(model, noise=Noise()), tmp_path / "still")  # one that does not drift
+def test_the_true_twist_is_how_the_true_pose_moves(
+    launch, meet, domain_id, model, tmp_path
+):
+    save_model(
+        replace(model, noise=Noise()), tmp_path / "still"
+    )  # one that does not drift
     peer = meet(domain_id)
-    launch("simulator_node", domain_id, mode="lockstep", model=str(tmp_path / "still"), **FRAMES)
+    launch(
+        "simulator_node",
+        domain_id,
+        mode="lockstep",
+        model=str(tmp_path / "still"),
+        **FRAMES,
+    )
     robot = Watched(peer, 0.0)
     robot.reset(episode_seed=0, episode_start=[0.0, 0.0, 0.0], episode_start_given=True)
     robot.step(0.6)
     before = conversions.odometry_from_ros(robot.said["ground_truth"][-1])[0]
     robot.step(0.6)
     after, twist = conversions.odometry_from_ros(robot.said["ground_truth"][-1])
-    assert twist[0] * model.control_period == pytest.approx(math.dist(after[:2], before[:2]))
+    assert twist[0] * model.control_period == pytest.approx(
+        math.dist(after[:2], before[:2])
+    )
     assert twist[0] > 0.1
 
 
 def test_listeners_of_best_effort_hear_it_too(lockstep):
-    heard = [lockstep.peer.listen(kind, topic, qos.SENSOR) for topic, kind in TOPICS.items()]
+    heard = [
+        lockstep.peer.listen(kind, topic, qos.SENSOR) for topic, kind in TOPICS.items()
+    ]
     lockstep.reset()
     for _ in range(50):
         lockstep.step(0.0)
@@ -356,14 +410,19 @@ def test_in_real_time_it_publishes_at_about_the_rate(realtime, period_ns):
     realtime.peer.until(lambda: len(scans) >= known + 40, "40 scans")
     span_s = time.monotonic() - began
     print(f"{40 / span_s:.1f} scans/s, wanted 20")
-    assert 20.0 * (span_s / 2.0) < 40 <= 20.0 * (span_s + 0.5) + 1  # half a second is made up for
+    assert (
+        20.0 * (span_s / 2.0) < 40 <= 20.0 * (span_s + 0.5) + 1
+    )  # half a second is made up for
     stamps = [stamp_ns(scan) for scan in scans[known:]]
     assert set(np.diff(stamps)) == {period_ns}
 
 
 def test_in_real_time_the_next_data_come_anyway(realtime):
     answer = realtime.peer.call(Trigger, "simulator_node/repeat")
-    assert (answer.success, answer.message) == (False, "data are repeated in lock-step alone")
+    assert (answer.success, answer.message) == (
+        False,
+        "data are repeated in lock-step alone",
+    )
 
 
 def test_in_real_time_it_stops_the_robot_when_commands_end(realtime):
@@ -375,7 +434,9 @@ def test_in_real_time_it_stops_the_robot_when_commands_end(realtime):
     while abs(speed) > 0.05:
         speed = realtime.peer.another(odom, "odometry").twist.twist.linear.x
         assert stamp_ns(odom[-1]) - ended < 10 * NS_PER_S
-    assert 0.4 < (stamp_ns(odom[-1]) - ended) * 1e-9 < 2.0  # simulated; the limit is 0.5 s
+    assert (
+        0.4 < (stamp_ns(odom[-1]) - ended) * 1e-9 < 2.0
+    )  # simulated; the limit is 0.5 s
 
 
 def test_nan_does_not_keep_the_last_command_alive(realtime):
@@ -390,7 +451,11 @@ def test_nan_does_not_keep_the_last_command_alive(realtime):
         raise AssertionError(what)
 
     repeat(0.5, lambda speed: speed > 0.3, "driving")
-    repeat(math.nan, lambda speed: abs(speed) < 0.05, "standing still although NaN keeps coming")
+    repeat(
+        math.nan,
+        lambda speed: abs(speed) < 0.05,
+        "standing still although NaN keeps coming",
+    )
 
 
 def test_as_fast_as_possible_it_outruns_the_clock(launch, meet, domain_id):
@@ -406,18 +471,27 @@ def test_as_fast_as_possible_it_outruns_the_clock(launch, meet, domain_id):
     process.close()
 
 
-def test_its_joints_tell_the_state_at_the_stamps_of_its_odometry(launch, meet, domain_id):
+def test_its_joints_tell_the_state_at_the_stamps_of_its_odometry(
+    launch, meet, domain_id
+):
     launch("simulator_node", domain_id)
     peer = meet(domain_id)
-    joints, odom = peer.listen(JointState, "joint_states"), peer.listen(Odometry, "odom")
+    joints, odom = (
+        peer.listen(JointState, "joint_states"),
+        peer.listen(Odometry, "odom"),
+    )
     command = peer.speak(Twist, "cmd_vel")
     ahead = conversions.twist_to_ros([0.5, 0.0, 0.2])
     peer.until(
-        lambda: command.publish(ahead) or (joints and joints[-1].velocity[0] > 0.4), "driving"
+        lambda: command.publish(ahead) or (joints and joints[-1].velocity[0] > 0.4),
+        "driving",
     )
     assert joints[-1].name == ["speed", "steering"]
     assert joints[-1].position[1] > 0.1
-    peer.until(lambda: stamp_ns(joints[-1]) in {stamp_ns(each) for each in odom}, "its odometry")
+    peer.until(
+        lambda: stamp_ns(joints[-1]) in {stamp_ns(each) for each in odom},
+        "its odometry",
+    )
 
 
 REFUSED = {
@@ -441,28 +515,43 @@ def refusals(tmp_path_factory):
         started = {
             # In namespaces apart: a second node of the same name would be refused for that.
             parameter: NodeThread(
-                "simulator_node", tmp_path_factory.mktemp("refused"), {}, domain_id,
-                f"refused_{number}", words=["-p", parameter],
+                "simulator_node",
+                tmp_path_factory.mktemp("refused"),
+                {},
+                domain_id,
+                f"refused_{number}",
+                words=["-p", parameter],
             )
             for number, parameter in enumerate(REFUSED)
-        }  # fmt: skip
+        }
         codes = {each: node.wait() for each, node in started.items()}
         yield {each: (node.read_text(), codes[each]) for each, node in started.items()}
 
 
 @pytest.mark.parametrize(("parameter", "sentence"), REFUSED.items())
-def test_a_wrong_parameter_ends_it_with_code_2_and_one_sentence(refusals, parameter, sentence):
+def test_a_wrong_parameter_ends_it_with_code_2_and_one_sentence(
+    refusals, parameter, sentence
+):
     error, code = refusals[parameter]
     assert code == 2, error
     assert sentence in error
-    ours = [line for line in error.splitlines() if not line.startswith("[ERROR]")]  # rcl's own
+    ours = [
+        line for line in error.splitlines() if not line.startswith("[ERROR]")
+    ]  # rcl's own
     assert len(ours) == 1, error
 
 
 @pytest.fixture
 def fleet(domain_id, model_folder):
     """A node with two robots in lock-step, and its entities as the services know them."""
-    words = ["simulator_node", "--ros-args", "-p", f"model:={model_folder}", "-p", "world:=empty"]
+    words = [
+        "simulator_node",
+        "--ros-args",
+        "-p",
+        f"model:={model_folder}",
+        "-p",
+        "world:=empty",
+    ]
     words += ["-p", "robots:=[ant, bee]", "-p", "mode:=lockstep"]
     context = open_context(words, domain_id)
     node = simulator_node.simulator_node(context)

@@ -37,22 +37,30 @@ def ended(process):
 
 def way(odometry):
     """How far a robot has come [m]."""
-    places = [(told.pose.pose.position.x, told.pose.pose.position.y) for told in odometry]
+    places = [
+        (told.pose.pose.position.x, told.pose.pose.position.y) for told in odometry
+    ]
     return math.dist(places[0], places[-1]) if places else 0.0
 
 
 @pytest.mark.parametrize("node", ["command_gate", "middleware_node"])
-def test_a_second_node_in_the_same_namespace_refuses_to_start(launch, meet, domain_id, node):
+def test_a_second_node_in_the_same_namespace_refuses_to_start(
+    launch, meet, domain_id, node
+):
     first, peer = launch(node, domain_id, "one"), meet(domain_id)
     # Once it runs: the graph shows its probe before, when either may still come first.
     peer.until(lambda: "running" in first.log.read_text(), node)
     code, told = ended(launch(node, domain_id, "one"))
     assert code == 2
-    assert told.startswith(f"a node '/one/{node}' runs already in ROS domain {domain_id}; end it")
+    assert told.startswith(
+        f"a node '/one/{node}' runs already in ROS domain {domain_id}; end it"
+    )
     assert told.count("\n") == 1
     first.check()
     other = launch(node, domain_id, "two")
-    peer.until(lambda: (node, "/two") in peer.node.get_node_names_and_namespaces(), "the other")
+    peer.until(
+        lambda: (node, "/two") in peer.node.get_node_names_and_namespaces(), "the other"
+    )
     other.check()
 
 
@@ -69,11 +77,15 @@ def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(
     first._process.send_signal(signal.SIGKILL)
     first._process.wait()
     again = launch("command_gate", domain_id)
-    peer.until(lambda: gates() == 2, "the next gate beside the dead one, which is still listed")
+    peer.until(
+        lambda: gates() == 2, "the next gate beside the dead one, which is still listed"
+    )
     again.check()
 
 
-def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_id, meet):
+def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(
+    domain_id, meet
+):
     peer, other = meet(domain_id), meet(domain_id)
     name = peer.node.get_name()
     asked = other.node.create_client(GetParameters, f"{name}/get_parameters")
@@ -86,7 +98,10 @@ def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_
     spinning.start()
     try:
         other.until(lambda: asked.service_is_ready(), "it in the graph")
-        with pytest.raises(BackendError, match="runs already"), sole(other.context, name):
+        with (
+            pytest.raises(BackendError, match="runs already"),
+            sole(other.context, name),
+        ):
             pass
     finally:
         done.set()
@@ -109,7 +124,9 @@ def test_robots_in_one_domain_do_not_hear_each_other(launch, meet, domain_id, mo
         peer.another(scans[peer], "scan")
     for space, peer in (("one", one), ("two", two)):
         publishers = partial(peer.node.get_publishers_info_by_topic, f"/{space}/scan")
-        listeners = partial(peer.node.get_subscriptions_info_by_topic, f"/{space}/cmd_vel")
+        listeners = partial(
+            peer.node.get_subscriptions_info_by_topic, f"/{space}/cmd_vel"
+        )
         for ends in (publishers, listeners):
             peer.until(lambda ends=ends: named(ends()), "the names of ends")
         (info,), (heard,) = publishers(), listeners()
@@ -128,9 +145,13 @@ def test_robots_in_one_domain_do_not_hear_each_other(launch, meet, domain_id, mo
     assert way(odometry[two]) < 0.1
 
 
-def test_two_simulators_that_tell_the_time_in_one_domain_name_each_other(launch, meet, domain_id):
+def test_two_simulators_that_tell_the_time_in_one_domain_name_each_other(
+    launch, meet, domain_id
+):
     peer = meet(domain_id)
-    both = {space: launch("simulator_node", domain_id, space) for space in ("one", "two")}
+    both = {
+        space: launch("simulator_node", domain_id, space) for space in ("one", "two")
+    }
     others = {"one": "/two/simulator_node", "two": "/one/simulator_node"}
 
     def said():

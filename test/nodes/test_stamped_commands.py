@@ -45,19 +45,30 @@ def test_the_gate_sends_the_type_that_is_asked_for(launch, meet, domain_id, stam
     assert twist == Twist()
 
 
-def test_the_gate_sends_in_the_frame_of_the_robot_that_odometry_names(launch, meet, domain_id):
+def test_the_gate_sends_in_the_frame_of_the_robot_that_odometry_names(
+    launch, meet, domain_id
+):
     peer = meet(domain_id)
     heard = peer.listen(TwistStamped, "cmd_vel", qos.COMMAND)
     odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-    peer.node.create_timer(0.05, lambda: odom.publish(Odometry(child_frame_id="car_1/base")))
+    peer.node.create_timer(
+        0.05, lambda: odom.publish(Odometry(child_frame_id="car_1/base"))
+    )
     launch("command_gate", domain_id, enable_stamped_cmd_vel=True)
-    peer.until(lambda: heard and heard[-1].header.frame_id == "car_1/base", "the robot's frame")
+    peer.until(
+        lambda: heard and heard[-1].header.frame_id == "car_1/base", "the robot's frame"
+    )
 
 
 def test_the_gate_sends_in_the_frame_that_its_parameter_names(launch, meet, domain_id):
     peer = meet(domain_id)
     heard = peer.listen(TwistStamped, "cmd_vel", qos.COMMAND)
-    launch("command_gate", domain_id, enable_stamped_cmd_vel=True, base_frame="base_footprint")
+    launch(
+        "command_gate",
+        domain_id,
+        enable_stamped_cmd_vel=True,
+        base_frame="base_footprint",
+    )
     peer.until(lambda: heard, "a zero")
     assert heard[-1].header.frame_id == "base_footprint"
 
@@ -68,11 +79,18 @@ def test_a_frame_that_is_none_is_refused_by_the_gate_in_one_sentence(launch, dom
     assert "parameter 'base_frame': must be 1 to 255 characters" in gate.read_text()
 
 
-def test_an_env_sends_in_the_frame_of_the_robot_that_odometry_names(launch, meet, domain_id, model):
+def test_an_env_sends_in_the_frame_of_the_robot_that_odometry_names(
+    launch, meet, domain_id, model
+):
     simulator = launch(
-        "simulator_node", domain_id, mode="lockstep", world="empty",
-        enable_stamped_cmd_vel=True, base_frame="base_footprint", frame_prefix="car_1/",
-    )  # fmt: skip
+        "simulator_node",
+        domain_id,
+        mode="lockstep",
+        world="empty",
+        enable_stamped_cmd_vel=True,
+        base_frame="base_footprint",
+        frame_prefix="car_1/",
+    )
     peer = meet(domain_id)
     peer.until(lambda: simulator.handler is not None, "its start")
     heard = peer.listen(TwistStamped, "cmd_vel", qos.EVERY_COMMAND)
@@ -92,10 +110,16 @@ def test_an_env_follows_the_type_that_a_simulator_hears(
 ):
     name = f"stamped_{stamped}".lower()
     simulator = launch(
-        "simulator_node", module_domain_id, name,
-        enable_stamped_cmd_vel=stamped, mode="lockstep", world="empty",
-    )  # fmt: skip
-    meet(module_domain_id, name).until(lambda: simulator.handler is not None, "its start")
+        "simulator_node",
+        module_domain_id,
+        name,
+        enable_stamped_cmd_vel=stamped,
+        mode="lockstep",
+        world="empty",
+    )
+    meet(module_domain_id, name).until(
+        lambda: simulator.handler is not None, "its start"
+    )
     backend = DdsBackend(model, load_world("empty"), name, domain_id=module_domain_id)
     try:
         assert backend._link.stamped is stamped
@@ -158,19 +182,31 @@ def test_a_drive_whose_chosen_type_nobody_hears_names_who_hears_the_other(
     peer.node.create_timer(0.02, lambda: odom.publish(Odometry()))
     out = str(tmp_path / "d.npz")
     node = launch("record_node", domain_id, out=out, stamped=not other)
-    peer.until(lambda: f"set stamped:={str(other).lower()}" in node.read_text(), "the reason", 30.0)
+    peer.until(
+        lambda: f"set stamped:={str(other).lower()}" in node.read_text(),
+        "the reason",
+        30.0,
+    )
     assert "expects geometry_msgs/msg/" in node.read_text()
 
 
-def test_an_env_whose_chosen_type_nobody_hears_names_who_hears_the_other(meet, domain_id, model):
+def test_an_env_whose_chosen_type_nobody_hears_names_who_hears_the_other(
+    meet, domain_id, model
+):
     meet(domain_id).listen(Twist, "cmd_vel", qos.COMMAND)
     sentence = r"/cmd_vel: /peer_\d+ expects geometry_msgs/msg/Twist there.*set `stamped` to False"
     with pytest.raises(BackendError, match=sentence):
-        DdsBackend(model, load_world("empty"), domain_id=domain_id, stamped=True, timeout_s=3.0)
+        DdsBackend(
+            model, load_world("empty"), domain_id=domain_id, stamped=True, timeout_s=3.0
+        )
 
 
-def test_the_gate_names_who_publishes_raw_commands_of_the_other_type(launch, meet, domain_id):
+def test_the_gate_names_who_publishes_raw_commands_of_the_other_type(
+    launch, meet, domain_id
+):
     peer = meet(domain_id)
     gate = launch("command_gate", domain_id)
     peer.node.create_publisher(Twist, "cmd_vel_raw", qos.COMMAND)
-    peer.until(lambda: "set foreign_commands:=Twist" in gate.read_text(), "the warning", 20.0)
+    peer.until(
+        lambda: "set foreign_commands:=Twist" in gate.read_text(), "the warning", 20.0
+    )

@@ -32,7 +32,10 @@ def many(given):
     return pytest.param(given, marks=pytest.mark.campaign)
 
 
-NODES = ("command_gate", *map(many, ("simulator_node", "policy_node", "middleware_node")))
+NODES = (
+    "command_gate",
+    *map(many, ("simulator_node", "policy_node", "middleware_node")),
+)
 WARNING = "Fast DDS did not take on "
 
 
@@ -45,7 +48,9 @@ WARNING = "Fast DDS did not take on "
         ({"ROS_DISTRO": "humble", ONLY_LOCAL: "0"}, {RANGE: LOCAL, ONLY_LOCAL: "0"}),
     ],
 )
-def test_discovery_stays_on_this_machine_unless_the_environment_says_otherwise(given, wanted):
+def test_discovery_stays_on_this_machine_unless_the_environment_says_otherwise(
+    given, wanted
+):
     environment = dict(given)
     stay_on_this_machine(environment)
     assert environment == given | wanted
@@ -148,7 +153,9 @@ with open("/proc/self/maps", "rb") as maps:
 
 
 @pytest.mark.process
-def test_a_driver_that_has_shared_memory_is_heard_and_hears(launch_process, domain_id, tmp_path):
+def test_a_driver_that_has_shared_memory_is_heard_and_hears(
+    launch_process, domain_id, tmp_path
+):
     process = launch_process("simulator_node", domain_id, mode="lockstep")
     run(DRIVER, domain_id, tmp_path, **{RANGE: LOCAL})
     assert is_apart(process, domain_id)
@@ -196,7 +203,9 @@ def test_the_environment_is_left_as_it_was_found(domain_id, tmp_path):
 
 @pytest.mark.process
 @pytest.mark.campaign
-def test_the_environment_is_left_as_it_was_found_by_arguments_that_are_wrong(domain_id, tmp_path):
+def test_the_environment_is_left_as_it_was_found_by_arguments_that_are_wrong(
+    domain_id, tmp_path
+):
     code = "before = dict(os.environ)\ntry:\n    open_context(['node', '--ros-args', '-r', 'x'])\n"
     code += "except BackendError:\n    assert os.environ == before\n"
     code += "else:\n    raise AssertionError('x is no remapping')"
@@ -210,7 +219,9 @@ def test_after_a_node_of_somebody_else_discovery_stays_here_with_a_warning(
     domain_id, tmp_path, ended, transports
 ):
     code = f"other = plain()\n{ended}\nends = [ours(), ours()]\nassert not multicast()"
-    said = run(IN_ORDER + code, domain_id, tmp_path, **{RANGE: LOCAL, TRANSPORTS: transports})
+    said = run(
+        IN_ORDER + code, domain_id, tmp_path, **{RANGE: LOCAL, TRANSPORTS: transports}
+    )
     assert said.count(WARNING) == 1
 
 
@@ -229,7 +240,9 @@ def test_discovery_does_not_silently_stay_here_where_a_subnet_is_asked_for(
 ):
     code = f"first = ours()\nos.environ['{TRANSPORTS}'] = '{transports}'\n"
     code += "try:\n    ours('SUBNET')\nexcept BackendError as error:\n"
-    code += "    assert 'SUBNET, but an earlier node in this process keeps' in str(error)\n"
+    code += (
+        "    assert 'SUBNET, but an earlier node in this process keeps' in str(error)\n"
+    )
     code += "else:\n    raise AssertionError('a subnet that nobody sees')"
     run(IN_ORDER + code, domain_id, tmp_path)
 

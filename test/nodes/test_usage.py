@@ -20,7 +20,10 @@ start.start(sys.argv[1], sys.argv[1:])
 
 def run(*words):
     return subprocess.run(
-        [sys.executable, "-c", WITHOUT, *words], capture_output=True, text=True, timeout=100
+        [sys.executable, "-c", WITHOUT, *words],
+        capture_output=True,
+        text=True,
+        timeout=100,
     )
 
 
@@ -69,5 +72,7 @@ def test_a_parameter_without_ros_args_is_one_sentence():
     ],
 )
 def test_the_first_word_that_is_not_for_ros_is_named(words, wrong):
-    assert (f"there is no argument {wrong};" in wrong_with("policy_node", words)) == bool(wrong)
+    assert (
+        f"there is no argument {wrong};" in wrong_with("policy_node", words)
+    ) == bool(wrong)
     assert bool(wrong_with("policy_node", words)) == bool(wrong)

@@ -64,7 +64,9 @@ def test_live_topics_are_shown_and_a_goal_of_the_page_goes_out(watched, meet):
 def test_a_goal_goes_out_in_the_frame_that_the_estimate_names(meet, model, domain_id):
     peer = meet(domain_id)
     goals = peer.listen(PoseStamped, "goal_pose", qos.COMMAND)
-    estimates = peer.node.create_publisher(Odometry, "odometry/filtered", qos.SENSOR_RELIABLE)
+    estimates = peer.node.create_publisher(
+        Odometry, "odometry/filtered", qos.SENSOR_RELIABLE
+    )
     message = Odometry()
     message.header.frame_id = "hall"
     peer.node.create_timer(0.02, lambda: estimates.publish(message))

@@ -44,7 +44,9 @@ def test_an_odometry_is_read_as_rclpy_reads_it(frame, child):
 
 @pytest.mark.parametrize("child", TEXTS)
 @pytest.mark.parametrize("frame", TEXTS)
-def test_an_odometry_is_written_so_that_rclpy_reads_it_and_nothing_else_has_changed(frame, child):
+def test_an_odometry_is_written_so_that_rclpy_reads_it_and_nothing_else_has_changed(
+    frame, child
+):
     message = odometry(frame, child)
     content = wire.OdometryWriter(message).write(STAMP_NS, POSE, TWIST, COVARIANCE)
 
@@ -88,7 +90,11 @@ def test_a_scan_is_written_and_read_as_by_rclpy(frame, beams):
     content = wire.ScanWriter(message).write(STAMP_NS, ranges)
 
     read = deserialize_message(content, LaserScan)
-    assert conversions.stamp_from_ros(read.header.stamp) == wire.stamp_of(content) == STAMP_NS
+    assert (
+        conversions.stamp_from_ros(read.header.stamp)
+        == wire.stamp_of(content)
+        == STAMP_NS
+    )
     assert np.array_equal(np.array(read.ranges, np.float32), ranges, equal_nan=True)
     assert np.array_equal(wire.ranges_of(content), ranges, equal_nan=True)
     message.header.stamp, message.ranges = read.header.stamp, read.ranges

@@ -42,9 +42,14 @@ def simulated(launch, meet, module_domain_id):
     """A simulator, and what it says of its world."""
     peer = meet(module_domain_id)
     simulator = launch(
-        "simulator_node", module_domain_id, world="arena", episode_seed=SEED, odom_rate=10.0,
-        map_resolution=0.02, map_frame="site",
-    )  # fmt: skip
+        "simulator_node",
+        module_domain_id,
+        world="arena",
+        episode_seed=SEED,
+        odom_rate=10.0,
+        map_resolution=0.02,
+        map_frame="site",
+    )
     truths = peer.listen(Odometry, "ground_truth")
     odoms = peer.listen(Odometry, "odom")
     poses = peer.speak(PoseWithCovarianceStamped, "initialpose")
@@ -61,7 +66,9 @@ def begin_another_episode(simulated, seed):
     clocks = peer.listen(Clock, "/clock")
     peer.until(lambda: clocks, "the clock")
     now_ns = conversions.stamp_from_ros(clocks[0].clock)
-    peer.until(lambda: min(stamp_ns(truths[-1]), stamp_ns(odoms[-1])) > now_ns, "the episode")
+    peer.until(
+        lambda: min(stamp_ns(truths[-1]), stamp_ns(odoms[-1])) > now_ns, "the episode"
+    )
 
 
 def wanted(model, seed):
@@ -103,14 +110,25 @@ def test_the_clock_ticks_at_50_hz_in_real_time_and_never_back(simulated):
 
 def test_the_clock_ticks_so_often_also_in_slow_motion(launch, meet, domain_id):
     peer = meet(domain_id)
-    launch("simulator_node", domain_id, world="empty", rate=0.05, scan_rate=100.0, odom_rate=100.0)
+    launch(
+        "simulator_node",
+        domain_id,
+        world="empty",
+        rate=0.05,
+        scan_rate=100.0,
+        odom_rate=100.0,
+    )
     clocks = peer.listen(Clock, "/clock")
 
     def most_within_a_step():
-        steps = (conversions.stamp_from_ros(each.clock) // 10_000_000 for each in clocks)
+        steps = (
+            conversions.stamp_from_ros(each.clock) // 10_000_000 for each in clocks
+        )
         return max(Counter(steps).values(), default=0)
 
-    peer.until(lambda: most_within_a_step() > 5, "a clock that ticks within a step of 0.2 s")
+    peer.until(
+        lambda: most_within_a_step() > 5, "a clock that ticks within a step of 0.2 s"
+    )
 
 
 def test_the_map_has_the_simulated_time(simulated):
@@ -129,10 +147,14 @@ def test_an_initial_pose_puts_the_robot_there_and_its_odometry_goes_on(simulated
     peer, _, truths, odoms, poses = simulated
     before = conversions.odometry_from_ros(odoms[-1])[0]
     poses.publish(at(0.4, -2.2, 1.0, "site"))
-    peer.until(lambda: math.dist(stands_at(truths)[:2], (0.4, -2.2)) < 0.01, "the robot there")
+    peer.until(
+        lambda: math.dist(stands_at(truths)[:2], (0.4, -2.2)) < 0.01, "the robot there"
+    )
     assert stands_at(truths)[2] == pytest.approx(1.0, abs=0.01)
     peer.another(odoms, "odometry")
-    assert conversions.odometry_from_ros(odoms[-1])[0] == pytest.approx(before, abs=0.05)
+    assert conversions.odometry_from_ros(odoms[-1])[0] == pytest.approx(
+        before, abs=0.05
+    )
 
 
 def test_an_initial_pose_that_can_not_be_used_is_refused_with_a_sentence(simulated):

@@ -68,7 +68,10 @@ def robot(meet, domain_id, model):
     peer = meet(domain_id)
     odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
     scan = peer.node.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
-    ranges, stamps = np.full(model.lidar.beams, 2.0, np.float32), iter(range(10**9, 10**12, 10**8))
+    ranges, stamps = (
+        np.full(model.lidar.beams, 2.0, np.float32),
+        iter(range(10**9, 10**12, 10**8)),
+    )
 
     def tell():
         stamp = next(stamps)
@@ -90,8 +93,11 @@ def drive(domain_id):
         process = subprocess.Popen(
             [sys.executable, "-u", "-c", driver, what],
             env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         os.set_blocking(process.stdout.fileno(), False)
         started.append(process)
         return process
@@ -126,7 +132,9 @@ def said(process, text, told=""):
         many("garbage", "collected", [], None),
     ],
 )
-def test_the_last_command_of_a_process_is_zero(robot, drive, what, until, signals, code):
+def test_the_last_command_of_a_process_is_zero(
+    robot, drive, what, until, signals, code
+):
     peer, heard, tell = robot
     process = drive(what)
     peer.until(lambda: tell() or said(process, until), f"{what}: {until}", 60.0)
@@ -235,15 +243,18 @@ policy_node.main([sys.argv[0], "--ros-args", "-p", "goal:=[8.0, 5.0]", "-p", "mo
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    "error", ["ValueError('of the policy')", many("SystemExit(3)"), many("MemoryError()")]
+    "error",
+    ["ValueError('of the policy')", many("SystemExit(3)"), many("MemoryError()")],
 )
 def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, error):
     peer, _, tell = robot
     raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
     process = subprocess.Popen(
         [sys.executable, "-c", POLICY, error],
-        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)}, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         peer.until(lambda: tell() or process.poll() is not None, "its end", 200.0)
         peer.until(lambda: raw and raw[-1].twist == Twist(), "a zero command")
@@ -254,7 +265,11 @@ def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, err
             assert process.returncode == 2
             assert "Traceback" not in said
             name = error.partition("(")[0]
-            told = [line for line in said.splitlines() if f"'dynamic_window' raised {name}" in line]
+            told = [
+                line
+                for line in said.splitlines()
+                if f"'dynamic_window' raised {name}" in line
+            ]
             assert len(told) == 1
             assert "the robot is stopped" in told[0]
     finally:

@@ -26,9 +26,13 @@ def model_of(nodes, inputs, outputs, weights, opset=OPSET):
             }.items()
         ]
 
-    arrays = [numpy_helper.from_array(np.asarray(v), name) for name, v in weights.items()]
+    arrays = [
+        numpy_helper.from_array(np.asarray(v), name) for name, v in weights.items()
+    ]
     graph = helper.make_graph(nodes, "theirs", ends(inputs), ends(outputs), arrays)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
+    return helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8
+    )
 
 
 def three():
@@ -36,7 +40,11 @@ def three():
     towards = np.zeros((SECTORS + 4, 1), np.float32)
     towards[:SECTORS, 0] = 0.02 * np.sin(np.arange(SECTORS))
     towards[SECTORS + 1], towards[SECTORS + 3] = 4.0, -0.1  # by bearing and turn rate
-    weights = {"shape": np.int64([-1, SECTORS]), "towards": towards, "full": np.float32([[0.9]])}
+    weights = {
+        "shape": np.int64([-1, SECTORS]),
+        "towards": towards,
+        "full": np.float32([[0.9]]),
+    }
     nodes = [
         helper.make_node("Reshape", ["scan", "shape"], ["beams"]),
         helper.make_node("Concat", ["beams", "goal", "velocity"], ["seen"], axis=1),
@@ -65,10 +73,17 @@ def three_mapping():
                     {"of": "goal.bearing", "divide": float(np.pi)},
                 ]
             },
-            "velocity": {"parts": [{"of": "velocity.forward"}, {"of": "velocity.turn"}]},
+            "velocity": {
+                "parts": [{"of": "velocity.forward"}, {"of": "velocity.turn"}]
+            },
         },
         "outputs": {
-            "forward": {"of": "action", "index": 0, "limits": [0.0, 1.0], "multiply": 0.6},
+            "forward": {
+                "of": "action",
+                "index": 0,
+                "limits": [0.0, 1.0],
+                "multiply": 0.6,
+            },
             "turn": {"of": "action", "index": 1, "multiply": 1.5, "clip": [-1.2, 1.2]},
         },
     }
@@ -87,10 +102,14 @@ def chooser(least=0.0, most=2.0):
         helper.make_node("Cast", ["within"], ["choice"], to=TensorProto.INT32),
     ]
     weights = {
-        "shape": np.int64([-1]), "near": np.float32([2.0]),
-        "least": np.float32([least]), "most": np.float32([most]),
-    }  # fmt: skip
-    return model_of(nodes, {"goal": ["n", 1]}, {"choice": (["n"], TensorProto.INT32)}, weights)
+        "shape": np.int64([-1]),
+        "near": np.float32([2.0]),
+        "least": np.float32([least]),
+        "most": np.float32([most]),
+    }
+    return model_of(
+        nodes, {"goal": ["n", 1]}, {"choice": (["n"], TensorProto.INT32)}, weights
+    )
 
 
 def chooser_mapping():
@@ -107,14 +126,19 @@ def chooser_mapping():
 def flat():
     """One vector of 64-bit numbers, fixed to one row, and a choice of five commands."""
     rng = np.random.default_rng(3)
-    weights = {"first": rng.normal(0.0, 0.3, (FLAT, 8)), "second": rng.normal(0.0, 1.0, (8, 5))}
+    weights = {
+        "first": rng.normal(0.0, 0.3, (FLAT, 8)),
+        "second": rng.normal(0.0, 1.0, (8, 5)),
+    }
     nodes = [
         helper.make_node("MatMul", ["obs", "first"], ["hidden"]),
         helper.make_node("Tanh", ["hidden"], ["bent"]),
         helper.make_node("MatMul", ["bent", "second"], ["logits"]),
     ]
     kind = TensorProto.DOUBLE
-    return model_of(nodes, {"obs": ([1, FLAT], kind)}, {"logits": ([1, 5], kind)}, weights)
+    return model_of(
+        nodes, {"obs": ([1, FLAT], kind)}, {"logits": ([1, 5], kind)}, weights
+    )
 
 
 def flat_numbers():
@@ -171,13 +195,17 @@ def with_gru():
     }
     gru = ["obs", "W", "R", "", "", "hidden"]
     nodes = [
-        helper.make_node("GRU", gru, ["", "following"], hidden_size=UNITS, linear_before_reset=1),
+        helper.make_node(
+            "GRU", gru, ["", "following"], hidden_size=UNITS, linear_before_reset=1
+        ),
         helper.make_node("Reshape", ["following", "row"], ["last"]),
         helper.make_node("MatMul", ["last", "head"], ["mean"]),
         helper.make_node("Tanh", ["mean"], ["action"]),
     ]
     inputs = {"obs": [1, "n", SEEN], "hidden": [1, "n", UNITS]}
-    return model_of(nodes, inputs, {"action": [1, 2], "following": [1, "n", UNITS]}, weights)
+    return model_of(
+        nodes, inputs, {"action": [1, 2], "following": [1, "n", UNITS]}, weights
+    )
 
 
 def with_gru_mapping():

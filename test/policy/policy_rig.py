@@ -36,7 +36,9 @@ def export(path: Path, model=None, normaliser=None, **options):
     size = task.observation_space.shape[0]
     outputs = 9 if task.actions == "discrete" else 3
     made = {"command": "a test", "seed": 3}
-    return export_policy(network(size, outputs), task, model, path, normaliser, made), task
+    return export_policy(
+        network(size, outputs), task, model, path, normaliser, made
+    ), task
 
 
 def bytes_of(proto) -> bytes:

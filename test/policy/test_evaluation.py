@@ -81,10 +81,14 @@ def test_a_task_that_tells_neither_success_nor_collision_is_driven_to_the_end():
 
 
 def test_an_action_that_is_no_number_is_told_with_its_step(env):
-    with pytest.raises(ConfigError, match="the policy's action in step 1 holds NaN or inf"):
+    with pytest.raises(
+        ConfigError, match="the policy's action in step 1 holds NaN or inf"
+    ):
         drive(env, Constant(np.nan, 0.0, 0.0), seed=1)
     many = BridgeVectorEnv(2, direct_model(), field())
-    with pytest.raises(ConfigError, match="the policy's action in step 1 holds NaN or inf"):
+    with pytest.raises(
+        ConfigError, match="the policy's action in step 1 holds NaN or inf"
+    ):
         drive_worlds(many, lambda seen: np.full((len(seen), 3), np.nan), [1, 2])
 
 
@@ -125,7 +129,12 @@ class Believing(gymnasium.Env):
         self.task, self.truth = task, truth
 
     def reset(self, *, seed=None, options=None):
-        return None, {"goal": GOAL, "bodies": np.zeros((0, 7)), "start": HOME, "pose": HOME}
+        return None, {
+            "goal": GOAL,
+            "bodies": np.zeros((0, 7)),
+            "start": HOME,
+            "pose": HOME,
+        }
 
     def step(self, action):
         told = {"is_success": True, "collision": False, "pose": np.array([*GOAL, 0.0])}
@@ -144,8 +153,12 @@ def at(x):
     return {"true_pose": np.array([x, 0.0, 0.0])}
 
 
-@pytest.mark.parametrize(("x", "result"), [(2.75, "success"), (2.65, "success"), (2.55, ELSEWHERE)])
-def test_a_robot_is_at_its_goal_where_it_truly_is_not_where_it_believes_to_be(x, result):
+@pytest.mark.parametrize(
+    ("x", "result"), [(2.75, "success"), (2.65, "success"), (2.55, ELSEWHERE)]
+)
+def test_a_robot_is_at_its_goal_where_it_truly_is_not_where_it_believes_to_be(
+    x, result
+):
     found = judged(**at(x))
     assert (found.result, found.believed) == (result, "success")
     assert found.believed_success
@@ -239,7 +252,8 @@ def test_arrived_is_who_truly_is_there():
     honest, lied = (
         drive_worlds(env, make_policy("straight", env.task).act, range(8))
         for env in (
-            kind(8, MODEL, WORLD, max_episode_steps=LIMIT) for kind in (BridgeVectorEnv, Aside)
+            kind(8, MODEL, WORLD, max_episode_steps=LIMIT)
+            for kind in (BridgeVectorEnv, Aside)
         )
     )
     assert honest.success.any()
@@ -259,14 +273,21 @@ def test_a_robot_that_stands_still_runs_out_of_time():
 def test_time_and_length_are_those_of_the_successful():
     flags = np.array([True, False, True, False])
     outcomes = Outcomes(
-        np.arange(4), flags, np.array([False, True, False, False]), np.array([10, 99, 30, 300]),
-        np.array([1.0, 50.0, 2.0, 60.0]), np.zeros(4), np.array([True, False, True, True]),
-    )  # fmt: skip
+        np.arange(4),
+        flags,
+        np.array([False, True, False, False]),
+        np.array([10, 99, 30, 300]),
+        np.array([1.0, 50.0, 2.0, 60.0]),
+        np.zeros(4),
+        np.array([True, False, True, True]),
+    )
     summary = summarise(outcomes, 0.1)
     assert summary.episodes == 4
     assert (summary.success.value, summary.collision.value, summary.time_out.value) == (
-        0.5, 0.25, 0.25,
-    )  # fmt: skip
+        0.5,
+        0.25,
+        0.25,
+    )
     assert summary.believed.value == 0.75
     assert summary.length.value == pytest.approx(1.5)
     assert summary.time.value == pytest.approx(2.0)
@@ -287,7 +308,12 @@ def test_worlds_are_compared_with_the_first():
     assert told["fast"].success.value == 1.0
     assert told["fast"].same == 1.0
     assert told["fast"].greatest_deviation == 0.0
-    assert told["dds"].success.value == told["dds"].collision.value == told["dds"].same == 0.5
+    assert (
+        told["dds"].success.value
+        == told["dds"].collision.value
+        == told["dds"].same
+        == 0.5
+    )
     assert told["dds"].greatest_deviation == pytest.approx(0.3)
     assert told["dds"].deviation.value == pytest.approx(0.15)
     assert told["fast"].time.value == pytest.approx(1.0)
@@ -304,7 +330,11 @@ def test_without_any_success_its_length_is_unknown_and_the_json_is_still_json():
 def test_what_the_robot_took_for_a_success_is_told_beside_what_was_one():
     lied = replace(episode(line(2.0), "elsewhere"), believed="success")
     told = tallies({"fast": [lied, episode(line(1.0), seed=1)]}, 0.1)["fast"]
-    assert (told.success.value, told.believed.value, told.time_out.value) == (0.5, 1.0, 0.5)
+    assert (told.success.value, told.believed.value, told.time_out.value) == (
+        0.5,
+        1.0,
+        0.5,
+    )
     assert lied.plain()["believed"] == "success"
     assert lied.plain()["goal_distance_m"] == pytest.approx(2.0)
 
@@ -316,12 +346,16 @@ def test_an_episode_as_plain_data_keeps_its_path():
     assert np.allclose(told["path"], RUNS["dds"][0].path)
 
 
-@pytest.mark.parametrize(("hits", "trials"), [(0, 10), (1, 3), (7, 10), (480, 500), (500, 500)])
+@pytest.mark.parametrize(
+    ("hits", "trials"), [(0, 10), (1, 3), (7, 10), (480, 500), (500, 500)]
+)
 def test_the_interval_of_a_rate_is_wilsons(hits, trials):
     wanted = stats.binomtest(hits, trials).proportion_ci(method="wilson")
     found = rate(hits, trials)
     assert found.value == hits / trials
-    assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), abs=1e-12)
+    assert (found.low, found.high) == pytest.approx(
+        (wanted.low, wanted.high), abs=1e-12
+    )
     assert found.low <= found.value <= found.high
 
 
@@ -329,7 +363,9 @@ def test_the_interval_of_a_mean_is_students():
     seen = np.random.default_rng(0).normal(3.0, 2.0, 17)
     found = mean(seen)
     low, high = stats.t.interval(0.95, 16, loc=seen.mean(), scale=stats.sem(seen))
-    assert (found.value, found.low, found.high) == pytest.approx((seen.mean(), low, high))
+    assert (found.value, found.low, found.high) == pytest.approx(
+        (seen.mean(), low, high)
+    )
 
 
 def test_nothing_observed_leaves_everything_open():
@@ -344,8 +380,13 @@ def test_a_summary_shows_neither_nan_nor_inf_and_is_json_that_others_read(arrive
     train = pytest.importorskip("nics_drl_bridge.policy.train")
     success, steps = np.arange(3) < arrived, np.full(3, 7)
     figures = steps, steps * 0.1, steps * 1.0
-    told = summarise(Outcomes(np.arange(3), success, np.zeros(3, bool), *figures, success), 0.1)
+    told = summarise(
+        Outcomes(np.arange(3), success, np.zeros(3, bool), *figures, success), 0.1
+    )
     line = f"{train.line_of(told)} {told.length.text('m')}"
     assert not re.search(r"\b(nan|inf)\b", line)
     assert ("path" in line) == (arrived > 0)
-    assert json.loads(json_of(asdict(told)), parse_constant=pytest.fail)["length"] is not None
+    assert (
+        json.loads(json_of(asdict(told)), parse_constant=pytest.fail)["length"]
+        is not None
+    )

@@ -34,7 +34,9 @@ class FullAhead:
     task: Navigation
 
     def act(self, observation):
-        actions = np.zeros((*observation.shape[:-1], len(self.task.robot.command)), np.float32)
+        actions = np.zeros(
+            (*observation.shape[:-1], len(self.task.robot.command)), np.float32
+        )
         actions[..., 0] = 1.0
         return actions
 
@@ -55,9 +57,13 @@ def before_a_wall(task, *distances, speed=0.0):
     for row, distance in zip(ranges, distances, strict=True):
         row[cosine > 0.1] = distance / cosine[cosine > 0.1]
     view = RobotView(
-        np.zeros((len(distances), 3)), np.tile([speed, 0.0, 0.0], (len(distances), 1)), ranges,
-        0.0, 0.0, 0.0,
-    )  # fmt: skip
+        np.zeros((len(distances), 3)),
+        np.tile([speed, 0.0, 0.0], (len(distances), 1)),
+        ranges,
+        0.0,
+        0.0,
+        0.0,
+    )
     return task.observation(view, {"goal": np.tile([2.5, 0.0], (len(distances), 1))})
 
 
@@ -70,7 +76,9 @@ def backed(robot, planner="mppi", policy=None, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize("planner", PLANNERS)
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_who_drives_on_into_what_is_ahead_touches_nothing_with_a_fallback(robot, planner):
+def test_who_drives_on_into_what_is_ahead_touches_nothing_with_a_fallback(
+    robot, planner
+):
     env = BridgeVectorEnv(
         20, robot, "circles", task_options={"scan": "around"}, max_episode_steps=60
     )
@@ -108,10 +116,16 @@ def test_a_net_in_a_file_that_drives_into_a_wall_does_not_with_a_fallback(tmp_pa
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_rows_that_are_admissible_keep_the_policys_bits_and_the_others_get_the_planners(planner):
+def test_rows_that_are_admissible_keep_the_policys_bits_and_the_others_get_the_planners(
+    planner,
+):
     policy, behind, task = backed("differential", planner)
     seen = before_a_wall(task, *np.linspace(0.2, 0.6, 40), speed=0.5)
-    own = np.random.default_rng(0).uniform([0.8, -0.1], [1.0, 0.1], (40, 2)).astype(np.float32)
+    own = (
+        np.random.default_rng(0)
+        .uniform([0.8, -0.1], [1.0, 0.1], (40, 2))
+        .astype(np.float32)
+    )
     policy._policy = type("Told", (), {"act": lambda _, rows: own[: len(rows)]})()
     actions, planned = policy.act(seen), behind.act(seen)
     kept = (actions == own).all(axis=1)
@@ -142,7 +156,9 @@ def test_an_action_is_admissible_as_long_as_its_stop_ends_before_the_margin(robo
     way = waited + np.linalg.norm((pose - start)[:2])
     front = front_of(task.robot)
     nearest = front + KEPT.margin + way
-    walls = np.arange(max(nearest - 0.3, front), nearest + 0.3, 0.01)  # none inside the robot
+    walls = np.arange(
+        max(nearest - 0.3, front), nearest + 0.3, 0.01
+    )  # none inside the robot
     commands = np.tile(command, (len(walls), 1))
     told = judge.can_stop(before_a_wall(task, *walls, speed=speed), commands)
     assert walls[told].min() == pytest.approx(nearest, abs=0.06)  # a cell of the map
@@ -198,9 +214,14 @@ def test_the_share_of_its_actions_is_told_by_an_evaluation():
         env = TimeLimit(BridgeEnv(model=model, world="circles", task=task), 60)
         episodes = drive_all(env, policy, range(6))
         runs[fallback] = Evaluated(
-            "straight", {"fast": episodes}, tallies({"fast": episodes}, model.control_period)
+            "straight",
+            {"fast": episodes},
+            tallies({"fast": episodes}, model.control_period),
         )
-    episodes, tally = runs["dynamic_window"].runs["fast"], runs["dynamic_window"].tallies["fast"]
+    episodes, tally = (
+        runs["dynamic_window"].runs["fast"],
+        runs["dynamic_window"].tallies["fast"],
+    )
     counts = [episode.planned for episode in episodes]
     assert sum(counts) > 0
     assert counts[0] == episodes[0].plain()["fallback_actions"]
@@ -225,11 +246,35 @@ class OwnReward(Navigation):
 @pytest.mark.parametrize(
     ("policy", "fallback", "kind", "options", "said"),
     [
-        ("straight", "mpi", Navigation, {}, "fallback 'mpi': no such planner; did you mean 'mppi'"),
+        (
+            "straight",
+            "mpi",
+            Navigation,
+            {},
+            "fallback 'mpi': no such planner; did you mean 'mppi'",
+        ),
         ("straight", "random", Navigation, {}, "valid are: 'dynamic_window', 'mppi'"),
-        ("mppi", "mppi", Navigation, {}, "is the policy itself; take 'dynamic_window', or none"),
-        ("straight", "mppi", OwnObservation, {}, "and OwnObservation observes otherwise"),
-        ("straight", "mppi", Navigation, {"actions": "discrete"}, "of the policy are discrete"),
+        (
+            "mppi",
+            "mppi",
+            Navigation,
+            {},
+            "is the policy itself; take 'dynamic_window', or none",
+        ),
+        (
+            "straight",
+            "mppi",
+            OwnObservation,
+            {},
+            "and OwnObservation observes otherwise",
+        ),
+        (
+            "straight",
+            "mppi",
+            Navigation,
+            {"actions": "discrete"},
+            "of the policy are discrete",
+        ),
     ],
 )
 def test_a_fallback_that_cannot_serve_is_refused(policy, fallback, kind, options, said):
@@ -240,12 +285,16 @@ def test_a_fallback_that_cannot_serve_is_refused(policy, fallback, kind, options
 
 def test_a_task_of_ones_own_reward_can_have_a_fallback():
     task = OwnReward(load_robot("differential"), lidar())
-    policy = make_policy("straight", task, builtin_model("differential"), "dynamic_window")
+    policy = make_policy(
+        "straight", task, builtin_model("differential"), "dynamic_window"
+    )
     assert acted(policy) == 0
 
 
 def test_a_car_of_unknown_wheelbase_has_no_fallback():
-    robot = load_robot("ackermann").model_copy(update={"textbook": None, "parameters": {}})
+    robot = load_robot("ackermann").model_copy(
+        update={"textbook": None, "parameters": {}}
+    )
     task = Navigation(robot, lidar())
     sentence = "^fallback 'dynamic_window': .*'ackermann' steers, and its wheelbase is not known"
     with pytest.raises(ConfigError, match=sentence):

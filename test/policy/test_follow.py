@@ -36,22 +36,32 @@ def test_errors_have_the_signs_of_the_standard():
     left = PlannedPath(CORNER).locate(np.array([0.5, 0.2, 0.3]), 1.0)
     assert left.left == pytest.approx(0.2)  # to the left of the path
     assert left.turned == pytest.approx(-0.3)  # turned to the left of its direction
-    assert PlannedPath(CORNER).locate(np.array([0.5, -0.2, -0.3]), 1.0).left == pytest.approx(-0.2)
+    assert PlannedPath(CORNER).locate(
+        np.array([0.5, -0.2, -0.3]), 1.0
+    ).left == pytest.approx(-0.2)
 
 
 def test_a_path_that_comes_back_is_followed_to_its_turn_first():
     there_and_back = np.array([(0.0, 0.0), (5.0, 0.0), (0.0, 0.0)])
     path = PlannedPath(there_and_back)
     assert path.locate(np.zeros(3), 1.0).remaining == pytest.approx(10.0)
-    assert path.locate(np.array([0.5, 0.0, 0.0]), 1.0).remaining == pytest.approx(9.5, abs=0.05)
+    assert path.locate(np.array([0.5, 0.0, 0.0]), 1.0).remaining == pytest.approx(
+        9.5, abs=0.05
+    )
 
 
 @pytest.mark.parametrize(
     ("poses", "why"),
-    [(np.zeros((0, 3)), "empty"), (np.full((2, 3), math.nan), "no number"),
-     (np.full((2, 3), 1e9), "no number, or out of all reach"),
-     (np.array([(0.0, 0.0), (2e5, 0.0)]), r"has 2e\+05 m, and 100000 m are the most")],
-)  # fmt: skip
+    [
+        (np.zeros((0, 3)), "empty"),
+        (np.full((2, 3), math.nan), "no number"),
+        (np.full((2, 3), 1e9), "no number, or out of all reach"),
+        (
+            np.array([(0.0, 0.0), (2e5, 0.0)]),
+            r"has 2e\+05 m, and 100000 m are the most",
+        ),
+    ],
+)
 def test_what_is_no_path_is_refused(poses, why):
     with pytest.raises(ConfigError, match=why):
         PlannedPath(poses)
@@ -66,7 +76,9 @@ def test_a_path_of_one_pose_is_its_own_end():
 def arrive(checker, *poses):
     path, turn = PlannedPath(CORNER), None
     for pose in ((1.0, 0.0, 0.0), (2.0, 0.5, 0.0), *poses):
-        turn = checker.turn_left(path.locate(np.array(pose), 1.0), np.array(pose), path.end)
+        turn = checker.turn_left(
+            path.locate(np.array(pose), 1.0), np.array(pose), path.end
+        )
     return turn
 
 
@@ -74,7 +86,9 @@ def test_at_the_goal_a_robot_turns_and_then_is_there():
     check = GoalCheck()
     assert arrive(GoalChecker(check, turns=True), (2.0, 1.5, 1.0)) is None
     left = arrive(GoalChecker(check, turns=True), (2.0, 1.9, 1.0))
-    assert left == pytest.approx(math.pi - 1.0 - 2.0 * math.pi * (math.pi - 1.0 >= math.pi))
+    assert left == pytest.approx(
+        math.pi - 1.0 - 2.0 * math.pi * (math.pi - 1.0 >= math.pi)
+    )
     assert arrive(GoalChecker(check, turns=True), (2.0, 1.9, math.pi - 0.2)) == 0.0
     assert arrive(GoalChecker(check, turns=False), (2.0, 1.9, 1.0)) == 0.0
 
@@ -86,9 +100,13 @@ def test_a_place_that_was_reached_stays_so_if_the_check_is_stateful():
 
 
 def test_a_loop_does_not_end_where_it_begins():
-    loop = np.array([(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (2.0, 2.0, 0.0), (0.0, 0.1, 0.0)])
+    loop = np.array(
+        [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (2.0, 2.0, 0.0), (0.0, 0.1, 0.0)]
+    )
     path, checker = PlannedPath(loop), GoalChecker(GoalCheck(), turns=False)
-    assert checker.turn_left(path.locate(np.zeros(3), 1.0), np.zeros(3), path.end) is None
+    assert (
+        checker.turn_left(path.locate(np.zeros(3), 1.0), np.zeros(3), path.end) is None
+    )
 
 
 def test_a_turn_is_progress_where_it_is_to_count():

@@ -35,7 +35,10 @@ def session(folder):
 def seen(steps: int = 8):
     """Observations (T, O) of a robot somewhere: shares of a scan, goal, velocity."""
     rng = np.random.default_rng(1)
-    shares, bearing = rng.uniform(0.0, 1.0, (steps, SECTORS)), rng.uniform(-3.1, 3.1, steps)
+    shares, bearing = (
+        rng.uniform(0.0, 1.0, (steps, SECTORS)),
+        rng.uniform(-3.1, 3.1, steps),
+    )
     distance = rng.uniform(0.1, 8.0, steps)
     velocity = rng.uniform(-0.5, 0.5, (steps, 3))
     goal = np.stack([distance, np.cos(bearing), np.sin(bearing)], axis=-1)
@@ -61,27 +64,42 @@ def test_a_whole_number_chooses_a_command(tmp_path, robot):
     found = commands_of(write(tmp_path, "chooser"), robot, rows)
     choices = np.clip(rows[:, SECTORS] - 2.0, 0.0, 2.0).astype(int)
     assert set(choices) == {0, 1, 2}
-    assert found == pytest.approx(np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 1.0]])[choices])
+    assert found == pytest.approx(
+        np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 1.0]])[choices]
+    )
 
 
 @pytest.mark.parametrize("limits", [(-1.0, -1.0), (3.0, 3.0)])
 def test_a_whole_number_that_chooses_nothing_is_no_command(tmp_path, robot, limits):
     path = write(tmp_path, "chooser")
-    write_bytes(tmp_path / "net.onnx", foreign_nets.chooser(*limits).SerializeToString())
+    write_bytes(
+        tmp_path / "net.onnx", foreign_nets.chooser(*limits).SerializeToString()
+    )
     with pytest.raises(PolicyError, match="gives NaN or inf"):
         open_policy(str(path), robot)
 
 
-def test_an_evaluation_names_a_command_that_is_none_and_keeps_what_was_driven_before(tmp_path):
+def test_an_evaluation_names_a_command_that_is_none_and_keeps_what_was_driven_before(
+    tmp_path,
+):
     path = write(tmp_path, "chooser")
     # Beyond the last command from 5 m on, farther than where policies are tried as they are opened.
-    write_bytes(tmp_path / "net.onnx", foreign_nets.chooser(0.0, 3.0).SerializeToString())
+    write_bytes(
+        tmp_path / "net.onnx", foreign_nets.chooser(0.0, 3.0).SerializeToString()
+    )
     world = tmp_path / "far.yaml"
     world.write_text("name: far\nsize: [16.0, 16.0]\ngoal_distance: [6.0, 7.0]\n")
     order = EvaluationOrder(
-        ["straight", str(path)], tmp_path / "out", "differential", str(world), 1, places=(FAST,)
+        ["straight", str(path)],
+        tmp_path / "out",
+        "differential",
+        str(world),
+        1,
+        places=(FAST,),
     )
-    with pytest.raises(ConfigError, match="the policy's action in step 1 holds NaN or inf"):
+    with pytest.raises(
+        ConfigError, match="the policy's action in step 1 holds NaN or inf"
+    ):
         evaluate(order, lambda _: None, lambda *_: None)
     kept = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert list(kept["policies"]) == ["straight"]
@@ -102,7 +120,10 @@ def test_a_network_of_three_inputs_commands_what_it_gives(tmp_path, robot):
             "velocity": row[None, [SECTORS + 3, SECTORS + 5]],
         }
         (action,) = net.run(None, feeds)[0]
-        wanted = [0.6 * np.clip(action[0], 0.0, 1.0), np.clip(1.5 * action[1], -1.2, 1.2)]
+        wanted = [
+            0.6 * np.clip(action[0], 0.0, 1.0),
+            np.clip(1.5 * action[1], -1.2, 1.2),
+        ]
         assert command == pytest.approx(wanted, abs=1e-6)
 
 
@@ -116,7 +137,9 @@ def test_a_flat_vector_has_its_own_order_numbers_and_history(tmp_path, robot):
         x, y = row[SECTORS] * np.cos(angle), row[SECTORS] * np.sin(angle)
         before = scan if before is None else before
         flat = np.concatenate([[turn, y, x], scan, before, [row[SECTORS + 5], 0.25]])
-        logits = net.run(None, {"obs": np.clip((flat - mean) / std, -4.0, 4.0)[None]})[0]
+        logits = net.run(None, {"obs": np.clip((flat - mean) / std, -4.0, 4.0)[None]})[
+            0
+        ]
         wanted = TWISTS[logits.argmax()]
         assert command == pytest.approx(wanted, abs=1e-6)
         before, turn = scan, wanted[1]
@@ -134,7 +157,9 @@ def test_a_recurrent_network_keeps_its_state_and_its_last_output(tmp_path, robot
         action, hidden = net.run(None, {"obs": obs[None, None], "hidden": hidden})
         last = action[0]
         assert command == pytest.approx([0.5 * last[0] + 0.5, last[1]], abs=1e-6)
-    fresh = np.array([commands_of(tmp_path / "foreign.yaml", robot, [row])[0] for row in rows])
+    fresh = np.array(
+        [commands_of(tmp_path / "foreign.yaml", robot, [row])[0] for row in rows]
+    )
     assert np.abs(found[1:] - fresh[1:]).max() > 0.01  # its state matters
 
 
@@ -194,9 +219,15 @@ def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
     weights = {name: np.int64(values) for name, values in numbers.items()}
     weights["weights"] = np.float32([[0.1, -0.1, 9.0, 9.0], [0.3, 0.1, 9.0, 9.0]])
     turn = {"of": "action", "index": 1, "clip": [-0.5, 0.5]}
-    path, (rows, bearing) = of_goal(tmp_path, nodes, {"action": "half"}, weights, turn), seen()
+    path, (rows, bearing) = (
+        of_goal(tmp_path, nodes, {"action": "half"}, weights, turn),
+        seen(),
+    )
     x, y = rows[:, SECTORS] * np.cos(bearing), rows[:, SECTORS] * np.sin(bearing)
-    wanted = [np.clip(0.1 * x + 0.3 * y, 0.0, 0.4), np.clip(0.1 * y - 0.1 * x, -0.5, 0.5)]
+    wanted = [
+        np.clip(0.1 * x + 0.3 * y, 0.0, 0.4),
+        np.clip(0.1 * y - 0.1 * x, -0.5, 0.5),
+    ]
     found = commands_of(path, robot, rows)
     assert found == pytest.approx(np.stack(wanted, axis=-1), abs=1e-5)
 
@@ -204,7 +235,10 @@ def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
 def test_an_output_may_be_an_input_as_it_is(tmp_path, robot):
     nodes = [onnx.helper.make_node("Neg", ["goal"], ["action"])]
     turn = {"of": "goal", "index": 1, "clip": [-0.5, 0.5]}
-    path, (rows, bearing) = of_goal(tmp_path, nodes, {"action": 2, "goal": 2}, {}, turn), seen()
+    path, (rows, bearing) = (
+        of_goal(tmp_path, nodes, {"action": 2, "goal": 2}, {}, turn),
+        seen(),
+    )
     x, y = rows[:, SECTORS] * np.cos(bearing), rows[:, SECTORS] * np.sin(bearing)
     wanted = [np.clip(-x, 0.0, 0.4), np.clip(y, -0.5, 0.5)]
     found = commands_of(path, robot, rows)
@@ -239,7 +273,10 @@ def test_it_becomes_a_policy_file(tmp_path, robot):
     rows, _ = seen()
     path, file = write(tmp_path, "gru"), tmp_path / "ours.onnx"
     write_bytes(file, import_policy(path, robot))
-    assert commands_of(file, None, rows).tolist() == commands_of(path, robot, rows).tolist()
+    assert (
+        commands_of(file, None, rows).tolist()
+        == commands_of(path, robot, rows).tolist()
+    )
     assert load_any(file).contract.robot == robot.robot
 
 
@@ -275,13 +312,22 @@ SPOILT = {
     "kind": (changed("kind", "policy"), "no mapping of a foreign policy"),
     "no network": (changed("network", "nets.onnx"), "'nets.onnx' can't be read"),
     "pickle": (changed("network", "net.pt"), "must be an .onnx file or a LEAPP bundle"),
-    "unknown key": (changed("output", {}), "unknown key 'output'; did you mean 'outputs'"),
+    "unknown key": (
+        changed("output", {}),
+        "unknown key 'output'; did you mean 'outputs'",
+    ),
     "unknown input": (
         changed("inputs/scann", {"parts": [{"of": "scan"}]}),
         "'inputs.scann': the network has no such input; did you mean 'scan'?",
     ),
-    "missing input": (changed("inputs/velocity", None), "'inputs.velocity': the network takes"),
-    "unknown quantity": (changed("inputs/goal/parts/0/of", "goal.range"), "goal.distance"),
+    "missing input": (
+        changed("inputs/velocity", None),
+        "'inputs.velocity': the network takes",
+    ),
+    "unknown quantity": (
+        changed("inputs/goal/parts/0/of", "goal.range"),
+        "goal.distance",
+    ),
     "wrong shape": (
         changed("scan", {"sectors": 20, "range_max": FAR}),
         "the network takes (1, 1, 24), and the parts give 20 (scan 20)",
@@ -289,16 +335,25 @@ SPOILT = {
     "unknown output": (changed("outputs/turn/of", "acton"), "did you mean 'action'?"),
     "missing output": (changed("outputs/turn", None), "'outputs.turn': is missing"),
     "left": (changed("outputs/left", {"of": "action"}), "'outputs.left': the robot"),
-    "index": (changed("outputs/turn/index", 2), "is 2, but the output 'action' has 2 elements"),
+    "index": (
+        changed("outputs/turn/index", 2),
+        "is 2, but the output 'action' has 2 elements",
+    ),
     "no such command": (changed("outputs/speed", {"of": "action"}), "no such command"),
     "divide": (changed("inputs/scan/divide", 0.0), "must not be 0"),
-    "numbers": (changed("inputs/scan/divide", [1.0, 2.0]), "has 2 numbers, where 24 are scaled"),
+    "numbers": (
+        changed("inputs/scan/divide", [1.0, 2.0]),
+        "has 2 numbers, where 24 are scaled",
+    ),
     "limits": (changed("inputs/scan/limits", [1.0, 0.0]), "must be [least, greatest]"),
     "constant": (changed("inputs/goal/parts/0/value", 1.0), "has no `value:`"),
     "period": (changed("control_period", 0.2), "is 0.2 s, but the robot's is 0.1 s"),
     "state": (changed("states", {"goal": {"next": "action"}}), "is an input as well"),
     "range": (changed("scan", {"sectors": SECTORS, "range_max": 50.0}), "sees farther"),
-    "both": (changed("choices", {"of": "action", "commands": [{}]}), "give either `outputs:`"),
+    "both": (
+        changed("choices", {"of": "action", "commands": [{}]}),
+        "give either `outputs:`",
+    ),
 }
 
 
@@ -314,7 +369,9 @@ def test_what_does_not_fit_is_refused_in_one_sentence(tmp_path, robot, name):
     assert str(tmp_path) in str(refused.value)
 
 
-def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(tmp_path, robot):
+def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(
+    tmp_path, robot
+):
     path, whole = write(tmp_path, "three"), foreign_nets.three()
     for node, words in (
         (onnx.helper.make_node("Log", ["bent"], ["left"]), "gives NaN or inf"),
@@ -335,16 +392,24 @@ def test_a_domain_that_no_operator_is_of_is_no_hindrance(tmp_path, robot):
     policy = load_any(path, robot)
     network.graph.node[3].domain = "ai.onnx.ml"
     write_bytes(tmp_path / "net.onnx", network.SerializeToString())
-    with pytest.raises(PolicyError, match=r"the operator ai\.onnx\.ml\.Tanh is not one"):
+    with pytest.raises(
+        PolicyError, match=r"the operator ai\.onnx\.ml\.Tanh is not one"
+    ):
         load_any(path, robot)
     assert policy.contract.robot == robot.robot
 
 
 def test_weights_in_another_file_are_refused_with_the_fix(tmp_path, robot):
     path, file = write(tmp_path, "three"), tmp_path / "net.onnx"
-    given = {"location": "net.onnx.data", "size_threshold": 0, "save_as_external_data": True}
+    given = {
+        "location": "net.onnx.data",
+        "size_threshold": 0,
+        "save_as_external_data": True,
+    }
     onnx.save(onnx.load(file), file, **given)
-    with pytest.raises(PolicyError, match=r"'net.onnx.data'.* export with `external_data=False`"):
+    with pytest.raises(
+        PolicyError, match=r"'net.onnx.data'.* export with `external_data=False`"
+    ):
         load_any(path, robot)
     onnx.save(onnx.load(file), file)
     assert load_any(path, robot).contract.robot == robot.robot

@@ -37,7 +37,9 @@ def test_sizes_are_folded_as_each_opset_says_them(opset):
         node("Reshape", ["x", "sizes"], ["y"]),
     ]
     numbers = {"one": [1], "two": [2], "minus": [-1], "five": 5}
-    model, shape = folded(nodes, {name: np.int64(n) for name, n in numbers.items()}, opset)
+    model, shape = folded(
+        nodes, {name: np.int64(n) for name, n in numbers.items()}, opset
+    )
     assert shape == (4, 5)
     assert [one.op_type for one in model.graph.node] == ["Reshape"]
     (sizes,) = model.graph.initializer  # without those that nothing takes any more
@@ -55,8 +57,14 @@ def test_a_part_of_a_shape_is_what_the_runtime_gives():
 WHOLE = np.arange(1024)
 LEFT = {
     "large": ([node("Add", ["a", "b"], ["y"])], {"a": WHOLE, "b": WHOLE[:, None]}),
-    "by zero": ([node("Div", ["a", "b"], ["y"])], {"a": np.int64([3]), "b": np.int64([0])}),
-    "overflow": ([node("Div", ["a", "b"], ["y"])], {"a": np.int64([-(2**63)]), "b": -WHOLE[1:2]}),
+    "by zero": (
+        [node("Div", ["a", "b"], ["y"])],
+        {"a": np.int64([3]), "b": np.int64([0])},
+    ),
+    "overflow": (
+        [node("Div", ["a", "b"], ["y"])],
+        {"a": np.int64([-(2**63)]), "b": -WHOLE[1:2]},
+    ),
     "no weights": ([node("Neg", ["x"], ["y"])], {}),
     "no whole numbers": ([node("Add", ["a", "a"], ["y"])], {"a": np.float32([1.0])}),
 }

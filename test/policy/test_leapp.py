@@ -30,7 +30,9 @@ def made(folder, kind):
     path = folder / "policy.onnx"
     if kind in ("gru", "stack"):
         return export_remembering(path, kind)[:2]
-    options = {"discrete": {"actions": "discrete"}, "beams": {"scan": None}}.get(kind, {})
+    options = {"discrete": {"actions": "discrete"}, "beams": {"scan": None}}.get(
+        kind, {}
+    )
     return export(path, **options)
 
 
@@ -64,7 +66,9 @@ def test_the_runner_of_leapp_takes_it_and_gives_the_same(tmp_path, kind):
     leapp = pytest.importorskip("leapp", reason="needs the extra 'leapp'")
     policy, task = made(tmp_path, kind)
     manager = leapp.InferenceManager(str(export_bundle(policy, tmp_path / "bundle")))
-    assert manager.inputs == [f"policy/{name}" for name in by_name(np.zeros(30), SECTORS)]
+    assert manager.inputs == [
+        f"policy/{name}" for name in by_name(np.zeros(30), SECTORS)
+    ]
     kept, state = policy.contract.state, None
     for _ in range(2):  # the second time after a reset
         if kept is not None:
@@ -106,7 +110,9 @@ def test_nics_policy_exports_and_imports_what_is_shipped(tmp_path):
     words = ("policy", "import", "bundle", "-o", "back.onnx", "--json")
     told = json.loads(nics(*words, cwd=tmp_path).stdout)
     assert told == {"file": "back.onnx", "robot": "differential"}
-    assert (tmp_path / "back.onnx").read_bytes() == (shipped() / "differential.onnx").read_bytes()
+    assert (tmp_path / "back.onnx").read_bytes() == (
+        shipped() / "differential.onnx"
+    ).read_bytes()
     done = nics("policy", "import", "bundle", "-o", "back.pt", cwd=tmp_path)
     assert done.returncode == 2
     (sentence,) = done.stderr.splitlines()
@@ -136,20 +142,26 @@ def parts():
     """Two networks, a scaling and a policy with a state that counts, and what they mean."""
     first = foreign_nets.model_of(
         [
-            helper.make_node("Concat", ["scan", "way", "linear", "angular"], ["seen"], axis=1),
+            helper.make_node(
+                "Concat", ["scan", "way", "linear", "angular"], ["seen"], axis=1
+            ),
             helper.make_node("Div", ["seen", "three"], ["features"]),
         ],
         {"scan": [1, SECTORS], "way": [1, 2], "linear": [1, 3], "angular": [1, 3]},
         {"features": [1, SECTORS + 8]},
         {"three": np.float32(3.0)},
     )
-    weights = np.random.default_rng(0).normal(0.0, 0.2, (SECTORS + 8, 4)).astype(np.float32)
+    weights = (
+        np.random.default_rng(0).normal(0.0, 0.2, (SECTORS + 8, 4)).astype(np.float32)
+    )
     second = foreign_nets.model_of(
         [
             helper.make_node("MatMul", ["features", "weights"], ["raw"]),
             helper.make_node("Add", ["raw", "hidden_in"], ["sum"]),
             helper.make_node("Tanh", ["sum"], ["hidden_out"]),
-            helper.make_node("Split", ["hidden_out"], ["speed", "spare", "turning"], axis=1),
+            helper.make_node(
+                "Split", ["hidden_out"], ["speed", "spare", "turning"], axis=1
+            ),
             helper.make_node("Identity", ["turning"], ["turn"]),
         ],
         {"features": [1, SECTORS + 8], "hidden_in": [1, 4]},
@@ -221,10 +233,11 @@ def write_foreign(folder, spoil=lambda data, models: None, made=parts):
         content = model.SerializeToString()
         write_bytes(folder / f"{name}.onnx", content)
         data["models"][name]["parameters"] = {
-            "model_path": f"{name}.onnx", "backend": "onnx",
+            "model_path": f"{name}.onnx",
+            "backend": "onnx",
             "md5sum": hashlib.md5(content).hexdigest(),
             "sha256sum": hashlib.sha256(content).hexdigest(),
-        }  # fmt: skip
+        }
     spoil(data, models)
     write_text(folder / "theirs.yaml", dump_yaml(data))
     return folder / "theirs.yaml"
@@ -242,13 +255,17 @@ def inputs_of(row):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "names"), [("command/goal", ["goal.x", "goal.y"]), ("command/body/pose", ["x", "y"])]
+    ("kind", "names"),
+    [("command/goal", ["goal.x", "goal.y"]), ("command/body/pose", ["x", "y"])],
 )
 def test_a_bundle_of_others_becomes_a_policy_file_by_its_kinds(kind, names, tmp_path):
     leapp = pytest.importorskip("leapp", reason="needs the extra 'leapp'")
 
     def goal(data, _):
-        data["models"]["scaling"]["inputs"][1] |= {"kind": kind, "element_names": [names]}
+        data["models"]["scaling"]["inputs"][1] |= {
+            "kind": kind,
+            "element_names": [names],
+        }
 
     bundle, model = write_foreign(tmp_path, goal), direct_model()
     policy = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
@@ -256,7 +273,9 @@ def test_a_bundle_of_others_becomes_a_policy_file_by_its_kinds(kind, names, tmp_
     manager = leapp.InferenceManager(str(bundle))
     state = np.full(policy.contract.state.size, policy.contract.state.start, np.float32)
     for row in sequence(task, 8):
-        given = {key: torch.as_tensor(value[None]) for key, value in inputs_of(row).items()}
+        given = {
+            key: torch.as_tensor(value[None]) for key, value in inputs_of(row).items()
+        }
         out = manager(given)
         wanted = np.concatenate([out["policy/speed"][0], out["policy/turn"][0]])
         _, command, state = policy.run(row, state)
@@ -282,8 +301,12 @@ def test_what_leapp_itself_traces_becomes_a_policy_file(tmp_path):
     leapp = pytest.importorskip("leapp", reason="needs the extra 'leapp'")
     annotate, means = leapp.annotate, leapp.TensorSemantics
     layout = {"sectors": SECTORS, "range_max": 3.0}
-    scan = means("scan", torch.rand(SECTORS), kind="state/lidar/sectors", extra={"scan": layout})
-    goal = means("goal", torch.rand(2), kind="command/goal", element_names=["goal.x", "goal.y"])
+    scan = means(
+        "scan", torch.rand(SECTORS), kind="state/lidar/sectors", extra={"scan": layout}
+    )
+    goal = means(
+        "goal", torch.rand(2), kind="command/goal", element_names=["goal.x", "goal.y"]
+    )
     leapp.start("walker", save_path=str(tmp_path))
     seen = annotate.input_tensors("walk", [scan, goal])
     hidden = annotate.state_tensors("walk", {"hidden": torch.full((1, 5), 0.25)})
@@ -295,7 +318,9 @@ def test_what_leapp_itself_traces_becomes_a_policy_file(tmp_path):
     leapp.stop()
     leapp.compile_graph(visualize=False)
     model = direct_model()
-    policy = policy_of(import_policy(tmp_path / "walker", model), tmp_path / "ours.onnx")
+    policy = policy_of(
+        import_policy(tmp_path / "walker", model), tmp_path / "ours.onnx"
+    )
     manager = leapp.InferenceManager(str(tmp_path / "walker" / "walker.yaml"))
     state = np.full(policy.contract.state.size, policy.contract.state.start, np.float32)
     for row in sequence(policy.make_task(model), 5):
@@ -334,7 +359,10 @@ def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path):
                 ]
             },
             "angular": {
-                "parts": [{"of": "constant", "value": [0.0, 0.0]}, {"of": "velocity.turn"}]
+                "parts": [
+                    {"of": "constant", "value": [0.0, 0.0]},
+                    {"of": "velocity.turn"},
+                ]
             },
         },
         "outputs": {
@@ -348,7 +376,9 @@ def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path):
     mine = load_any(path, model)
     theirs = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
     rows, state = sequence(mine.make_task(model), 1)[0], np.zeros(5, np.float32)
-    assert mine.run(rows, state)[1] == pytest.approx(theirs.run(rows, state)[1], abs=1e-7)
+    assert mine.run(rows, state)[1] == pytest.approx(
+        theirs.run(rows, state)[1], abs=1e-7
+    )
 
 
 def node(data, name, end, k, **changes):
@@ -365,7 +395,9 @@ REFUSED = {
         "'pipeline.inputs.scan': kind None is not known",
     ),
     "outputs": (
-        lambda data, _: node(data, "policy", "outputs", 1, kind="target/joint/position"),
+        lambda data, _: node(
+            data, "policy", "outputs", 1, kind="target/joint/position"
+        ),
         "none is told to be the robot's velocity",
     ),
     "backend": (
@@ -373,15 +405,21 @@ REFUSED = {
         "is 'jit', which is never opened here; export it with 'onnx'",
     ),
     "damaged": (
-        lambda data, _: data["models"]["policy"]["parameters"].update(sha256sum="0" * 64),
+        lambda data, _: data["models"]["policy"]["parameters"].update(
+            sha256sum="0" * 64
+        ),
         "does not fit 'policy.onnx', which was changed or damaged",
     ),
     "outside": (
-        lambda data, _: data["models"]["policy"]["parameters"].update(model_path="../p.onnx"),
+        lambda data, _: data["models"]["policy"]["parameters"].update(
+            model_path="../p.onnx"
+        ),
         "'../p.onnx' lies outside the bundle",
     ),
     "missing file": (
-        lambda data, _: data["models"]["policy"]["parameters"].update(model_path="p.onnx"),
+        lambda data, _: data["models"]["policy"]["parameters"].update(
+            model_path="p.onnx"
+        ),
         "'p.onnx' can't be read",
     ),
     "not connected": (
@@ -428,7 +466,9 @@ def test_a_changed_export_is_refused(tmp_path):
     file = export_bundle(policy, tmp_path / "bundle")
     network = tmp_path / "bundle" / "policy.onnx"
     model = onnx.load(network)
-    model.graph.initializer[-1].raw_data = bytes(len(model.graph.initializer[-1].raw_data))
+    model.graph.initializer[-1].raw_data = bytes(
+        len(model.graph.initializer[-1].raw_data)
+    )
     write_bytes(network, model.SerializeToString(deterministic=True))
     data = described(file)
     digest = hashlib.sha256(network.read_bytes()).hexdigest()

@@ -34,7 +34,14 @@ def seen(points, robot="jackal", goal=GOAL):
     away = np.linalg.norm(at, axis=1)
     outline = outline_of(load_robot(robot))
     rays = ScanRays(at / away[:, None], np.zeros(2), 10.0)
-    return look(away / 10.0, goal, rays, outline, CLOSE, scratch_of(len(at), outline, CLOSE, 3.0))
+    return look(
+        away / 10.0,
+        goal,
+        rays,
+        outline,
+        CLOSE,
+        scratch_of(len(at), outline, CLOSE, 3.0),
+    )
 
 
 def footprint(robot):
@@ -49,7 +56,9 @@ def wall(x, low, high):
 
 
 def test_depths_are_distances_to_the_border_and_negative_outside():
-    shape = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 0.4], [0.0, 1.0]])  # not convex
+    shape = np.array(
+        [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 0.4], [0.0, 1.0]]
+    )  # not convex
     points = np.random.default_rng(0).uniform(-1.0, 3.0, (300, 2))
     exact, inside = Polygon(shape).exterior, prep(Polygon(shape))
     for point, depth in zip(points, depths(points, shape), strict=True):
@@ -85,8 +94,12 @@ def box(length, width):
     return robot_from({"name": "box", "kind": "differential", "footprint": corners})
 
 
-@pytest.mark.parametrize(("length", "width"), [(0.6, 0.4), (1.2, 0.8), (2.4, 1.6), (6.0, 3.0)])
-def test_the_discs_of_a_large_footprint_take_little_memory_and_leave_little_out(length, width):
+@pytest.mark.parametrize(
+    ("length", "width"), [(0.6, 0.4), (1.2, 0.8), (2.4, 1.6), (6.0, 3.0)]
+)
+def test_the_discs_of_a_large_footprint_take_little_memory_and_leave_little_out(
+    length, width
+):
     tracemalloc.start()
     outline = outline_of(box(length, width))
     _, most = tracemalloc.get_traced_memory()
@@ -95,14 +108,19 @@ def test_the_discs_of_a_large_footprint_take_little_memory_and_leave_little_out(
     rng = np.random.default_rng(0)
     half = np.array([length, width]) / 2.0
     points = rng.uniform(-half, half, (2000, 2))
-    apart = np.linalg.norm(points[:, None] - outline.discs[:, :2], axis=-1) - outline.discs[:, 2]
+    apart = (
+        np.linalg.norm(points[:, None] - outline.discs[:, :2], axis=-1)
+        - outline.discs[:, 2]
+    )
     assert apart.min(axis=1).max() < CELL_M
     assert (np.abs(outline.discs[:, :2]) + outline.discs[:, 2:] <= half + 1e-9).all()
 
 
 def test_a_robot_that_is_too_near_already_may_only_move_away():
     around = seen([[0.254 + 0.02, 0.0]])
-    assert touching(around) == pytest.approx(room_at(0.0, 0.0, 1.0, 0.0, around), abs=2e-3)
+    assert touching(around) == pytest.approx(
+        room_at(0.0, 0.0, 1.0, 0.0, around), abs=2e-3
+    )
     assert room_at(0.1, 0.0, 1.0, 0.0, around) < touching(around)
     assert room_at(-0.1, 0.0, 1.0, 0.0, around) > touching(around)
     assert touching(seen([[2.0, 0.0]])) == CLOSE.margin
@@ -118,7 +136,8 @@ def test_the_way_in_the_open_is_straight_and_leads_around_a_wall():
 
 def test_a_gap_too_narrow_for_the_robot_costs_more_than_the_way_around():
     narrow, wide = (
-        seen(np.concatenate([wall(1.5, -1.0, -half), wall(1.5, half, 1.0)])) for half in (0.2, 0.5)
+        seen(np.concatenate([wall(1.5, -1.0, -half), wall(1.5, half, 1.0)]))
+        for half in (0.2, 0.5)
     )
     assert way_at(0.0, 0.0, wide) < way_at(0.0, 0.0, narrow) - 0.5
 
@@ -127,7 +146,8 @@ def test_a_heading_along_the_way_is_not_astray_and_the_other_way_is():
     around = seen([[0.0, 9.0]])
     way = way_at(0.0, 0.0, around)
     along, aside, against = (
-        astray(0.0, 0.0, math.cos(a), math.sin(a), way, around) for a in (0.0, math.pi / 2, math.pi)
+        astray(0.0, 0.0, math.cos(a), math.sin(a), way, around)
+        for a in (0.0, math.pi / 2, math.pi)
     )
     assert along < 0.1 < aside < 0.9 < against
 

@@ -65,7 +65,9 @@ def test_the_command_behind_a_twist_is_that_which_led_to_it(robot):
     moved = np.linalg.norm((pose - before)[:2]) / model.dt
     turned = (pose - before)[2] / model.dt
     direction = np.array([0.0]) if robot != "mecanum" else np.arctan2(*command[1::-1])
-    twist = np.array([moved * np.cos(direction).item(), moved * np.sin(direction).item(), turned])
+    twist = np.array(
+        [moved * np.cos(direction).item(), moved * np.sin(direction).item(), turned]
+    )
     _, lanes = policy._memory()
     follow(twist, policy._plant, lanes)
     assert lanes.held == pytest.approx(command, abs=0.08)
@@ -84,12 +86,16 @@ def test_it_plans_with_the_speeds_that_its_task_allows():
     slow = replace(slow, task=replace(slow.task, top_speed=0.2))
     fastest, _ = slow.task.command(np.ones(2))
     assert slow._plant.high[0] == fastest == 0.2
-    ahead = RobotView(np.zeros(3), np.zeros(3), np.full(90, np.inf, np.float32), 0.0, 0.0, 0.0)
+    ahead = RobotView(
+        np.zeros(3), np.zeros(3), np.full(90, np.inf, np.float32), 0.0, 0.0, 0.0
+    )
     action = slow.act(slow.task.observation(ahead, {"goal": np.array([2.0, 0.0])}))
     assert slow.task.command(action)[0] > 0.15
 
 
 def test_a_robot_of_which_neither_model_nor_textbook_is_known_is_refused():
-    robot = load_robot("ackermann").model_copy(update={"textbook": None, "parameters": {}})
+    robot = load_robot("ackermann").model_copy(
+        update={"textbook": None, "parameters": {}}
+    )
     with pytest.raises(BridgeError, match="ackermann"):
         Mppi(Navigation(robot, lidar(beams=90)))

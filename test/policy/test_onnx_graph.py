@@ -11,9 +11,21 @@ import pytest
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.policy import onnx_graph, policy_file
 from nics_drl_bridge.policy.contract import shipped
-from nics_drl_bridge.policy.onnx_graph import MOST_NESTED, MOST_PACKED, MOST_PARTS, check_wire
+from nics_drl_bridge.policy.onnx_graph import (
+    MOST_NESTED,
+    MOST_PACKED,
+    MOST_PARTS,
+    check_wire,
+)
 from nics_drl_bridge.policy.policy_file import load_policy
-from policy.policy_rig import SECTORS, bytes_of, contract_in, export, signed, with_contract
+from policy.policy_rig import (
+    SECTORS,
+    bytes_of,
+    contract_in,
+    export,
+    signed,
+    with_contract,
+)
 
 make_node, from_array = onnx.helper.make_node, onnx.numpy_helper.from_array
 
@@ -38,31 +50,42 @@ def add(proto, *nodes, **arrays):
 def concats(proto):
     """Each node gives twice what the one before it gave."""
     names = ["observation", *(f"c{k}" for k in range(22))]
-    return add(proto, *(
-        make_node("Concat", [a, a], [b], axis=1)
-        for a, b in itertools.pairwise(names)
-    ))  # fmt: skip
+    return add(
+        proto,
+        *(
+            make_node("Concat", [a, a], [b], axis=1)
+            for a, b in itertools.pairwise(names)
+        ),
+    )
 
 
 def outer(proto):
     """As many numbers as the square of the observations."""
     turned = make_node("Transpose", ["observation"], ["turned"], perm=[1, 0])
-    return add(proto, turned, make_node("MatMul", ["observation", "turned"], ["square"]))
+    return add(
+        proto, turned, make_node("MatMul", ["observation", "turned"], ["square"])
+    )
 
 
 def heavy(proto):
     """Little memory, but one large array multiplied by again and again."""
     whole, names = np.zeros((2048, 2048), np.float32), [f"h{k}" for k in range(9)]
     first = make_node("MatMul", ["observation", "begin"], ["h0"])
-    return add(proto, first, *(
-        make_node("MatMul", [a, "whole"], [b]) for a, b in itertools.pairwise(names)
-    ), begin=np.zeros((SECTORS + 6, 2048), np.float32), whole=whole)  # fmt: skip
+    return add(
+        proto,
+        first,
+        *(make_node("MatMul", [a, "whole"], [b]) for a, b in itertools.pairwise(names)),
+        begin=np.zeros((SECTORS + 6, 2048), np.float32),
+        whole=whole,
+    )
 
 
 def broadcast(proto):
     """Two thin arrays that make a wide one, before any observation is seen."""
     thin = np.zeros((60_000, 1), np.float32)
-    return add(proto, make_node("Add", ["thin", "turned"], ["wide"]), thin=thin, turned=thin.T)
+    return add(
+        proto, make_node("Add", ["thin", "turned"], ["wide"]), thin=thin, turned=thin.T
+    )
 
 
 def by_value(proto):
@@ -74,12 +97,16 @@ def by_value(proto):
         make_node("Slice", ["observation", "zero", "one", "one"], ["row"]),
         make_node("Reshape", ["first", "flat"], ["sizes"]),
         make_node("Slice", ["row", "sizes", "sizes"], ["cut"]),
-        zero=np.array([0]), one=np.array([1]), flat=np.array([-1]),
-    )  # fmt: skip
+        zero=np.array([0]),
+        one=np.array([1]),
+        flat=np.array([-1]),
+    )
 
 
 def padded(proto):
-    pool = make_node("MaxPool", ["row"], ["wide"], kernel_shape=[2**40], pads=[2**39, 2**39])
+    pool = make_node(
+        "MaxPool", ["row"], ["wide"], kernel_shape=[2**40], pads=[2**39, 2**39]
+    )
     row = make_node("Unsqueeze", ["observation", "one"], ["row"])
     return add(proto, row, pool, one=np.array([1]))
 
@@ -101,23 +128,35 @@ def sparse(proto):
 def divided(proto):
     """A quotient that no 64 bits hold; the processor's answer to it ends the process."""
     least, minus = np.array([-(2**63)], np.int64), np.array([-1], np.int64)
-    return add(proto, make_node("Div", ["least", "minus"], ["none"]), least=least, minus=minus)
+    return add(
+        proto, make_node("Div", ["least", "minus"], ["none"]), least=least, minus=minus
+    )
 
 
 def dimensions(proto):
     """Each node adds axes, so that to infer the shapes takes longer and longer."""
     names = ["observation", *(f"d{k}" for k in range(60))]
-    return add(proto, *(
-        make_node("Unsqueeze", [a, "axes"], [b]) for a, b in itertools.pairwise(names)
-    ), axes=np.arange(2, 102))  # fmt: skip
+    return add(
+        proto,
+        *(
+            make_node("Unsqueeze", [a, "axes"], [b])
+            for a, b in itertools.pairwise(names)
+        ),
+        axes=np.arange(2, 102),
+    )
 
 
 def whole_numbers(proto):
     """Shapes that double are computed while they are only looked at."""
     names = ["w0", *(f"w{k}" for k in range(1, 18))]
-    return add(proto, *(
-        make_node("Concat", [a, a], [b], axis=0) for a, b in itertools.pairwise(names)
-    ), w0=np.arange(9))  # fmt: skip
+    return add(
+        proto,
+        *(
+            make_node("Concat", [a, a], [b], axis=0)
+            for a, b in itertools.pairwise(names)
+        ),
+        w0=np.arange(9),
+    )
 
 
 REFUSED = {
@@ -142,7 +181,9 @@ def test_a_graph_that_grows_is_refused_before_the_runtime_sees_it(
     spoil, field, words = REFUSED[name]
     path = tmp_path / "grows.onnx"
     path.write_bytes(spoil(onnx.load(file)))
-    monkeypatch.setattr(policy_file, "open_session", lambda *_: pytest.fail("it was opened"))
+    monkeypatch.setattr(
+        policy_file, "open_session", lambda *_: pytest.fail("it was opened")
+    )
     with pytest.raises(PolicyError, match=words) as refused:
         load_policy(path)
     assert refused.value.field == field
@@ -171,9 +212,11 @@ def test_what_fails_only_when_it_runs_is_a_policy_error(file, tmp_path):
         make_node("Cast", ["goal"], ["index"], to=onnx.TensorProto.INT64),
         make_node("Gather", ["table", "index"], ["offset"]),
         make_node("Add", ["observation", "offset"], ["chosen"]),
-        from_=np.array([SECTORS]), to_=np.array([SECTORS + 1]), axis=np.array([1]),
+        from_=np.array([SECTORS]),
+        to_=np.array([SECTORS + 1]),
+        axis=np.array([1]),
         table=np.zeros(8, np.float32),
-    )  # fmt: skip
+    )
     path = tmp_path / "index.onnx"
     path.write_bytes(data)
     policy = load_policy(path)
@@ -187,7 +230,9 @@ def test_more_observations_than_fit_at_once_are_run_in_parts(file, monkeypatch):
     whole = load_policy(file)
     monkeypatch.setattr(onnx_graph, "MOST_AT_ONCE", 3 * 30)
     policy = load_policy(file)
-    rows = np.random.default_rng(0).uniform(0.0, 1.0, (10, SECTORS + 6)).astype(np.float32)
+    rows = (
+        np.random.default_rng(0).uniform(0.0, 1.0, (10, SECTORS + 6)).astype(np.float32)
+    )
     assert policy._rows_at_once < len(rows)
     assert policy.act(rows) == pytest.approx(whole.act(rows), abs=1e-6)
     assert policy.act(rows[:0]).shape == (0, 3)
@@ -206,9 +251,16 @@ def test_megabytes_in_a_field_are_not_told(file, tmp_path, entry):
 
 
 @pytest.mark.parametrize(
-    "text", ["[" * 3_000_000, '{"a":[' + "[]," * 500_000 + "0]}", '"' + "x" * (5 * 2**20) + '"']
+    "text",
+    [
+        "[" * 3_000_000,
+        '{"a":[' + "[]," * 500_000 + "0]}",
+        '"' + "x" * (5 * 2**20) + '"',
+    ],
 )
-def test_a_contract_of_very_many_entries_or_characters_is_not_read(file, tmp_path, text):
+def test_a_contract_of_very_many_entries_or_characters_is_not_read(
+    file, tmp_path, text
+):
     path = tmp_path / "large.onnx"
     path.write_bytes(bytes_of(with_contract(onnx.load(file), text)))
     with pytest.raises(PolicyError, match="at most") as refused:
@@ -267,7 +319,9 @@ def test_what_grows_when_it_is_parsed_is_not_parsed(tmp_path, monkeypatch, name)
     make, words = BAD[name]
     path = tmp_path / "bad.onnx"
     path.write_bytes(make())
-    monkeypatch.setattr(onnx, "load_model_from_string", lambda _: pytest.fail("it was parsed"))
+    monkeypatch.setattr(
+        onnx, "load_model_from_string", lambda _: pytest.fail("it was parsed")
+    )
     with pytest.raises(PolicyError, match=words) as refused:
         load_policy(path)
     assert refused.value.field == "file"

@@ -17,7 +17,11 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings, load_trai
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.world_set import load_worlds
 
-LEARNT = ("ackermann", "differential", "mecanum")  # robots whose policies come with the package
+LEARNT = (
+    "ackermann",
+    "differential",
+    "mecanum",
+)  # robots whose policies come with the package
 BURGER = {"robot": "turtlebot3_burger"}
 
 
@@ -34,7 +38,9 @@ def slow(model, speed=0.22):
 
 
 @pytest.mark.parametrize("name", LEARNT)
-def test_the_shipped_robots_keep_the_time_limit_that_their_policies_were_learnt_with(name):
+def test_the_shipped_robots_keep_the_time_limit_that_their_policies_were_learnt_with(
+    name,
+):
     worlds = [load_worlds(world) for world in shipped_names("worlds")]
     known = SimpleNamespace(robot=load_robot(name), control_period=0.1)
     assert pace_of(known, worlds).steps == MAX_EPISODE_STEPS
@@ -56,7 +62,9 @@ def test_a_goal_that_cant_be_reached_in_time_is_told_and_none_at_all_is_refused(
     told = pace.shortfall(300)
     assert "'doorway': a goal may lie 7 m away, which takes 32 s at 0.22 m/s" in told
     assert "set max_episode_steps to 573" in told
-    with pytest.raises(ConfigError, match=r"no goal can be reached in time: .* ends after 5 s"):
+    with pytest.raises(
+        ConfigError, match=r"no goal can be reached in time: .* ends after 5 s"
+    ):
         pace.shortfall(50)
 
 
@@ -72,19 +80,26 @@ def test_top_speed_is_that_of_the_kind_or_of_the_commands():
 @pytest.mark.parametrize(
     ("name", "like"),
     [
-        ("turtlebot3_waffle", "differential"), ("jackal", "differential"),
-        ("f1tenth", "ackermann"), ("tricycle", "ackermann"), ("mecanum", "mecanum"),
+        ("turtlebot3_waffle", "differential"),
+        ("jackal", "differential"),
+        ("f1tenth", "ackermann"),
+        ("tricycle", "ackermann"),
+        ("mecanum", "mecanum"),
     ],
-)  # fmt: skip
+)
 def test_a_robot_is_kin_to_the_shipped_one_that_moves_like_it(name, like):
     assert kin(load_robot(name)) == like
 
 
 def test_settings_that_are_inherited_keep_their_meaning_over_a_longer_episode(model):
-    base = load_training("own_differential").model_copy(update={"worlds": {"doorway": 4}})
+    base = load_training("own_differential").model_copy(
+        update={"worlds": {"doorway": 4}}
+    )
     settings, told = fitted(base, slow(model), inherited=True)
     factor = settings.max_episode_steps / MAX_EPISODE_STEPS
-    assert settings.task_options["time_reward"] * factor == pytest.approx(-0.02, rel=1e-3)
+    assert settings.task_options["time_reward"] * factor == pytest.approx(
+        -0.02, rel=1e-3
+    )
     assert (1.0 - settings.ppo.discount) * factor == pytest.approx(0.01, rel=1e-3)
     assert len(told) == 3
 
@@ -101,7 +116,9 @@ def test_a_lidar_that_sees_no_full_circle_gets_the_layout_of_the_front(model):
     hokuyo = replace(model, lidar=load_lidar("hokuyo_ust_10lx"))
     settings, told = fitted(load_training("own_differential"), hokuyo, inherited=True)
     assert settings.task_options["scan"] == "front"
-    assert told == ("the lidar 'hokuyo_ust_10lx' does not see 3 m all around: scan: front",)
+    assert told == (
+        "the lidar 'hokuyo_ust_10lx' does not see 3 m all around: scan: front",
+    )
 
 
 @pytest.mark.parametrize(
@@ -112,13 +129,17 @@ def test_a_lidar_that_sees_no_full_circle_gets_the_layout_of_the_front(model):
         ({"range_max": 2.0}, 72),  # which sees all around, but not far enough
     ],
 )
-def test_a_lidar_that_fills_no_layout_gets_sectors_over_its_own_view(model, changes, scan):
+def test_a_lidar_that_fills_no_layout_gets_sectors_over_its_own_view(
+    model, changes, scan
+):
     changed = LidarSpec.model_validate(model.lidar.model_dump() | changes)
     settings, told = fitted(
         load_training("own_differential"), replace(model, lidar=changed), inherited=True
     )
     assert settings.task_options["scan"] == scan
-    assert told == (f"the lidar {changed.name!r} does not see 3 m all around: scan: {scan}",)
+    assert told == (
+        f"the lidar {changed.name!r} does not see 3 m all around: scan: {scan}",
+    )
     task = make_task("navigation", replace(model, lidar=changed), settings.task_options)
     assert task.scan.sectors == scan
     with pytest.raises(ConfigError, match=f"or train with `scan: {scan}`"):
@@ -130,7 +151,9 @@ def test_an_own_robot_trains_with_the_settings_of_its_kin_and_says_so():
     settings, told = settings_for("navigation", None, BURGER | {"world": ["doorway"]})
     own = load_training("own_differential")
     assert (settings.hidden, settings.teaching) == (own.hidden, own.teaching)
-    assert settings.max_episode_steps == 287  # of 0.2 s, as its lidar turns five times a second
+    assert (
+        settings.max_episode_steps == 287
+    )  # of 0.2 s, as its lidar turns five times a second
     assert "settings 'own_differential'" in told[0]
 
 

@@ -33,7 +33,11 @@ def test_jitter_of_the_data_does_not_slow_it_down():
 
 
 def test_late_data_are_acted_on_at_once_and_not_made_up_for():
-    assert actions(ActionPace(0.1), [0.0, 0.35, 0.36, 0.4, 0.45, 0.5]) == [0.0, 0.35, 0.45]
+    assert actions(ActionPace(0.1), [0.0, 0.35, 0.36, 0.4, 0.45, 0.5]) == [
+        0.0,
+        0.35,
+        0.45,
+    ]
 
 
 def test_without_a_period_everything_is_acted_on():
@@ -44,6 +48,12 @@ def test_a_late_answer_is_dropped_and_several_in_a_row_stop_the_robot():
     deadline = Deadline(0.05, 3)
     times = [0.01, 0.06, 0.06, 0.06, 0.07, 0.02, 0.06]
     assert [deadline.judge(taken) for taken in times] == [
-        Answer.SEND, Answer.DROP, Answer.DROP, Answer.STOP, Answer.STOP, Answer.SEND, Answer.DROP,
-    ]  # fmt: skip
+        Answer.SEND,
+        Answer.DROP,
+        Answer.DROP,
+        Answer.STOP,
+        Answer.STOP,
+        Answer.SEND,
+        Answer.DROP,
+    ]
     assert (deadline.answered, deadline.late, deadline.longest_s) == (2, 5, 0.07)

@@ -21,7 +21,12 @@ from nics_drl_bridge.generator import builtin_model, open_model
 from nics_drl_bridge.interface import RobotView, Start
 from nics_drl_bridge.policy import policies
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
-from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, RandomActions, make_policy
+from nics_drl_bridge.policy.policies import (
+    POLICIES,
+    DynamicWindow,
+    RandomActions,
+    make_policy,
+)
 from nics_drl_bridge.policy.stateful import Stateful, begin, resume
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kinds import steady_twist
@@ -82,7 +87,9 @@ def test_it_turns_or_moves_to_the_side_of_the_goal_and_drives_to_one_ahead(robot
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("name", PLANNERS)
-def test_a_planner_does_not_drive_on_towards_a_wall_that_the_straight_one_drives_into(robot, name):
+def test_a_planner_does_not_drive_on_towards_a_wall_that_the_straight_one_drives_into(
+    robot, name
+):
     task = task_of(robot)
     ahead = np.abs(task.lidar.angles) < 1.2
     ranges = np.full(90, np.inf, np.float32)
@@ -93,17 +100,23 @@ def test_a_planner_does_not_drive_on_towards_a_wall_that_the_straight_one_drives
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_a_planner_drives_through_a_gap_narrower_than_the_circle_around_its_outline(name):
+def test_a_planner_drives_through_a_gap_narrower_than_the_circle_around_its_outline(
+    name,
+):
     robot = load_robot("jackal")
     assert 2.0 * robot.footprint_radius > 0.62
     task = Navigation(robot, lidar(beams=360, range_max=10.0))
-    walls = LineString([(1.0, 0.31), (1.0, 4.0)]), LineString([(1.0, -0.31), (1.0, -4.0)])
+    walls = (
+        LineString([(1.0, 0.31), (1.0, 4.0)]),
+        LineString([(1.0, -0.31), (1.0, -4.0)]),
+    )
     ranges = np.full(360, np.inf, np.float32)
     for b, angle in enumerate(task.lidar.angles):
         beam = LineString([(0.0, 0.0), (10.0 * np.cos(angle), 10.0 * np.sin(angle))])
         ends = (beam.intersection(wall) for wall in walls)
         ranges[b] = min(
-            (end.distance(Point(0, 0)) for end in ends if not end.is_empty), default=np.inf
+            (end.distance(Point(0, 0)) for end in ends if not end.is_empty),
+            default=np.inf,
         )
     policy = make_policy(name, task)
     forward, _, turn = twist_of(task, policy.act(observe(task, 0.0, 3.0, ranges)))
@@ -122,13 +135,19 @@ def test_random_actions_are_those_of_the_seed():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "robot", [pytest.param("ackermann", marks=campaign), "differential",
-              pytest.param("mecanum", marks=campaign)],
-)  # fmt: skip
+    "robot",
+    [
+        pytest.param("ackermann", marks=campaign),
+        "differential",
+        pytest.param("mecanum", marks=campaign),
+    ],
+)
 def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
     env = BridgeVectorEnv(30, robot, "arena", max_episode_steps=200)
     share = {
-        name: drive_worlds(env, make_policy(name, env.task).act, range(30)).success.mean()
+        name: drive_worlds(
+            env, make_policy(name, env.task).act, range(30)
+        ).success.mean()
         for name in ("dynamic_window", "straight", "random")
     }
     assert share["dynamic_window"] >= 0.8
@@ -150,7 +169,9 @@ def test_the_planner_leaves_its_start_with_wheels_that_answer_slowly(tmp_path):
     robot = (share_folder() / "config" / "robots" / "differential.yaml").read_text()
     slow = tmp_path / "slow.yaml"
     slow.write_text(robot.replace("wheel_lag: 0.1", "wheel_lag: 0.8"))
-    env = BridgeEnv(model=str(slow), world="empty", estimator=True)  # at rest it shows no noise
+    env = BridgeEnv(
+        model=str(slow), world="empty", estimator=True
+    )  # at rest it shows no noise
     policy = make_policy("dynamic_window", env.task)
     assert successes(drive_all(TimeLimit(env, 300), policy, range(3))) == 3
 
@@ -161,7 +182,9 @@ def car(**changes):
 
 @pytest.mark.parametrize("changes", [{}, {"textbook": None}])
 def test_a_car_turns_by_its_own_wheelbase(changes):
-    long = car(parameters={"wheelbase": 2.5, "speed_lag": 0.1, "steering_lag": 0.1}, **changes)
+    long = car(
+        parameters={"wheelbase": 2.5, "speed_lag": 0.1, "steering_lag": 0.1}, **changes
+    )
     speed, angle = long.command_high
     assert not long.takes_turn_rate  # a copy of it that does is made of it
     twist = [speed, 0.0, speed * np.tan(angle) / 2.5]
@@ -174,7 +197,9 @@ def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
     model = builtin_model("ackermann")
     curve = InputCurve(command="speed_command", dead=0.3)
     slow = np.array([[-0.5, 0.5], [-np.inf, np.inf]])
-    bent = replace(model, kinematics=replace(model.kinematics, inputs=(curve,), limits=slow))
+    bent = replace(
+        model, kinematics=replace(model.kinematics, inputs=(curve,), limits=slow)
+    )
     task = task_of("ackermann")
     plain, asking = (make_policy("dynamic_window", task, m) for m in (model, bent))
     assert np.abs(asking._search[0][:, 0]).max() == pytest.approx(0.7, abs=0.02)
@@ -184,12 +209,16 @@ def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
     still = asking._search[0][asking._commands[:, 0] == crawling]
     assert np.abs(still).max() < 1e-3
     slowness = asking._search[1].slowness - plain._search[1].slowness
-    assert 0.7 * slowness == pytest.approx(1.4, abs=0.35)  # from 0.7 m/s by 0.5 m/s^2, not by 2
+    assert 0.7 * slowness == pytest.approx(
+        1.4, abs=0.35
+    )  # from 0.7 m/s by 0.5 m/s^2, not by 2
 
 
 def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():
     unknown = car(parameters={}, textbook=None)
-    with pytest.raises(ConfigError, match="'ackermann' steers, and its wheelbase is not known"):
+    with pytest.raises(
+        ConfigError, match="'ackermann' steers, and its wheelbase is not known"
+    ):
         make_policy("dynamic_window", Navigation(unknown, lidar()))
 
 
@@ -201,7 +230,9 @@ def test_an_unknown_policy_gives_the_nearest():
 
 def counting(longest_gap=0.5):
     """A policy whose action is the number of its steps, for its states begin at 3."""
-    return Stateful(lambda seen, state: (state[..., 0] - 2.0, state + 1.0), 2, 3.0, longest_gap)
+    return Stateful(
+        lambda seen, state: (state[..., 0] - 2.0, state + 1.0), 2, 3.0, longest_gap
+    )
 
 
 def test_a_state_goes_on_from_step_to_step_and_begins_anew_where_it_is_reset():
@@ -217,7 +248,9 @@ def test_a_state_goes_on_from_step_to_step_and_begins_anew_where_it_is_reset():
 def test_other_worlds_than_before_are_refused_unless_an_episode_begins():
     policy = counting()
     policy.act(np.zeros((2, 5), np.float32))
-    with pytest.raises(ConfigError, match=r"of \(2,\) worlds .* of \(3,\); reset the policy"):
+    with pytest.raises(
+        ConfigError, match=r"of \(2,\) worlds .* of \(3,\); reset the policy"
+    ):
         policy.act(np.zeros((3, 5), np.float32))
 
 
@@ -256,7 +289,9 @@ def weak_jackal(rate=0.2):
 
 @pytest.mark.parametrize("name", ["dynamic_window", "mppi"])
 @pytest.mark.parametrize("rate", [0.2, 20.0])
-def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(name, rate):
+def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(
+    name, rate
+):
     """The goal is behind the wall, so that it drives up to it, at a speed that it can brake."""
     model = weak_jackal(rate)
     task = Navigation(model.robot, model.lidar)
@@ -274,7 +309,9 @@ def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(n
     assert farthest > 0.5
 
 
-@pytest.mark.parametrize("robot", ["ackermann", "differential", "jackal", "mecanum", "f1tenth"])
+@pytest.mark.parametrize(
+    "robot", ["ackermann", "differential", "jackal", "mecanum", "f1tenth"]
+)
 def test_planners_look_ahead_as_far_as_ever_for_robots_that_stop_soon(robot):
     model = builtin_model(robot)
     task = Navigation(model.robot, model.lidar)

@@ -45,7 +45,9 @@ def file(tmp_path_factory):
 @pytest.mark.slow
 def test_a_policy_acts_as_its_network_alone_and_in_batches(file):
     policy = load_policy(file)
-    rows = np.random.default_rng(0).uniform(0.0, 1.0, (5, SECTORS + 6)).astype(np.float32)
+    rows = (
+        np.random.default_rng(0).uniform(0.0, 1.0, (5, SECTORS + 6)).astype(np.float32)
+    )
     actions = policy.act(rows)
     assert actions.shape == (5, 3)
     assert np.abs(actions).max() <= 1.0
@@ -60,7 +62,9 @@ def test_its_command_is_what_the_task_makes_of_its_action(file):
     ranges = np.full(72, 1.0, np.float32)
     view = RobotView(np.zeros(3), np.zeros(3), ranges, 0.0, 0.0, 0.0)
     seen = task.observation(view, {"goal": np.array([1.0, 0.5])})
-    assert policy.command(seen) == pytest.approx(task.command(policy.act(seen)), abs=1e-5)
+    assert policy.command(seen) == pytest.approx(
+        task.command(policy.act(seen)), abs=1e-5
+    )
 
 
 def test_make_policy_opens_a_file_and_checks_it_against_the_task(file):
@@ -91,7 +95,9 @@ def changed(path, value, resigned):
         for key in path[:-1]:
             at = at[key]
         at[path[-1]] = value
-        return bytes_of(signed(proto, data) if resigned else with_contract(proto, json.dumps(data)))
+        return bytes_of(
+            signed(proto, data) if resigned else with_contract(proto, json.dumps(data))
+        )
 
     return spoil
 
@@ -130,7 +136,9 @@ def elsewhere(location):
 def node(op_type, domain="", **attributes):
     def spoil(proto):
         ends = ["observation"], ["unused"]
-        proto.graph.node.append(onnx.helper.make_node(op_type, *ends, domain=domain, **attributes))
+        proto.graph.node.append(
+            onnx.helper.make_node(op_type, *ends, domain=domain, **attributes)
+        )
         if domain:
             proto.opset_import.append(onnx.helper.make_opsetid(domain, 1))
         return bytes_of(signed(proto))
@@ -177,10 +185,14 @@ def loud(proto):
 def function(proto):
     proto.functions.append(
         onnx.helper.make_function(
-            "own", "F", ["x"], ["y"], [onnx.helper.make_node("Tanh", ["x"], ["y"])],
+            "own",
+            "F",
+            ["x"],
+            ["y"],
+            [onnx.helper.make_node("Tanh", ["x"], ["y"])],
             [onnx.helper.make_opsetid("", 17)],
         )
-    )  # fmt: skip
+    )
     return bytes_of(signed(proto))
 
 
@@ -223,11 +235,20 @@ REFUSED = {
     "no rate": (changed(["control_period"], 0.0, True), "control_period"),
     "task": (changed(["task", "name"], "pursuit_evasion", False), "task.name"),
     "task signed": (changed(["task", "name"], "pursuit_evasion", True), "task.sha256"),
-    "task option": (changed(["task", "options", "goal_radius"], 3.0, True), "task.sha256"),
+    "task option": (
+        changed(["task", "options", "goal_radius"], 3.0, True),
+        "task.sha256",
+    ),
     "task hash": (changed(["task", "sha256"], "0" * 64, True), "task.sha256"),
-    "model hash": (changed(["model_fingerprint"], "0" * 16, False), "model_fingerprint"),
+    "model hash": (
+        changed(["model_fingerprint"], "0" * 16, False),
+        "model_fingerprint",
+    ),
     "graph hash": (changed(["graph_sha256"], "0" * 64, False), "graph_sha256"),
-    "command limit": (changed(["robot", "command", 0, "max"], 9.0, False), "robot.command.0.max"),
+    "command limit": (
+        changed(["robot", "command", 0, "max"], 9.0, False),
+        "robot.command.0.max",
+    ),
     "seed": (changed(["provenance", "seed"], 4, False), "provenance.seed"),
     "other format": (changed(["format"], "nics_drl_bridge/policy/9", True), "format"),
     "unknown entry": (changed(["extra"], 1, True), "extra"),
@@ -235,8 +256,14 @@ REFUSED = {
     "missing": (without("robot"), "robot"),
     "no checksums": (without("checksums"), "checksums"),
     "no JSON": (lambda proto: bytes_of(with_contract(proto, "{")), "metadata"),
-    "NaN in JSON": (lambda p: bytes_of(with_contract(p, '{"format": NaN}')), "metadata"),
-    "a key twice": (lambda p: bytes_of(with_contract(p, '{"a": 1, "a": 2}')), "metadata"),
+    "NaN in JSON": (
+        lambda p: bytes_of(with_contract(p, '{"format": NaN}')),
+        "metadata",
+    ),
+    "a key twice": (
+        lambda p: bytes_of(with_contract(p, '{"a": 1, "a": 2}')),
+        "metadata",
+    ),
     "no contract": (bare, "metadata"),
     "two contracts": (two_contracts, "metadata"),
     "NaN weights": (weights(np.nan), "weights."),
@@ -295,8 +322,13 @@ def test_a_file_cut_anywhere_is_refused(file, tmp_path, share):
 def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
     whole, rng = file.read_bytes(), np.random.default_rng(4)
     path = tmp_path / "flipped.onnx"
-    last = len(onnx_graph.sealed(b""))  # every byte of the checksum, and any of the rest
-    places = [*range(len(whole) - last, len(whole)), *rng.integers(len(whole) - last, size=150)]
+    last = len(
+        onnx_graph.sealed(b"")
+    )  # every byte of the checksum, and any of the rest
+    places = [
+        *range(len(whole) - last, len(whole)),
+        *rng.integers(len(whole) - last, size=150),
+    ]
     for place in places:
         data = bytearray(whole)
         data[place] ^= 1 << rng.integers(8)
@@ -311,7 +343,10 @@ def test_a_file_without_its_checksum_or_with_an_addition_is_refused(file, tmp_pa
     load_policy(path)
     proto = onnx.load(file)
     proto.producer_name = "another"
-    for data in (proto.SerializeToString(), file.read_bytes()[: -len(onnx_graph.sealed(b""))]):
+    for data in (
+        proto.SerializeToString(),
+        file.read_bytes()[: -len(onnx_graph.sealed(b""))],
+    ):
         path.write_bytes(data)
         with pytest.raises(PolicyError, match=r"graph_sha256|field 'sha256'"):
             load_policy(path)
@@ -330,7 +365,9 @@ def test_a_pickle_in_disguise_is_never_opened(tmp_path):
 
 
 def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path):
-    with pytest.raises(PolicyError, match=r"none\.onnx: field 'file': there is no such file"):
+    with pytest.raises(
+        PolicyError, match=r"none\.onnx: field 'file': there is no such file"
+    ):
         load_policy(tmp_path / "none.onnx")
     with pytest.raises(PolicyError, match="field 'file'"):
         load_policy(tmp_path)
@@ -378,11 +415,27 @@ def forgetful(proto):
 REFUSED_STATES = {
     "none": (stateless, "state", "is missing, although the graph takes one"),
     "no shape": (shapeless, "state.size", "is missing; export the policy anew"),
-    "a list": (changed(["state"], [6, 0.0], True), "state", "must hold `key: value` pairs, not [6"),
-    "another shape": (changed(["state", "size"], 5, True), "graph.state_in", "5] is needed"),
-    "another start": (changed(["state", "start"], 0.5, True), "golden.actions", "differ by"),
+    "a list": (
+        changed(["state"], [6, 0.0], True),
+        "state",
+        "must hold `key: value` pairs, not [6",
+    ),
+    "another shape": (
+        changed(["state", "size"], 5, True),
+        "graph.state_in",
+        "5] is needed",
+    ),
+    "another start": (
+        changed(["state", "start"], 0.5, True),
+        "golden.actions",
+        "differ by",
+    ),
     "unsigned": (changed(["state", "start"], 0.5, False), "state.start", "was changed"),
-    "no gap": (changed(["state", "longest_gap"], 0.0, True), "state.longest_gap", "greater than 0"),
+    "no gap": (
+        changed(["state", "longest_gap"], 0.0, True),
+        "state.longest_gap",
+        "greater than 0",
+    ),
     "not passed on": (forgetful, "golden.actions", "differ by"),
 }
 
@@ -413,12 +466,16 @@ def test_a_policy_without_a_state_says_nothing_of_one(file):
     assert load_policy(file).contract.state is None
 
 
-def test_an_observation_without_the_state_that_a_policy_needs_is_refused(remembering, file):
+def test_an_observation_without_the_state_that_a_policy_needs_is_refused(
+    remembering, file
+):
     policy, seen = load_policy(remembering), np.zeros((3, SECTORS + 6), np.float32)
     size = policy.contract.state.size
     with pytest.raises(PolicyError, match=rf"field 'state'.*\(3, {size}\), not None"):
         policy.act(seen)
-    with pytest.raises(PolicyError, match=rf"field 'state'.*\(3, {size}\), not \(2, {size}\)"):
+    with pytest.raises(
+        PolicyError, match=rf"field 'state'.*\(3, {size}\), not \(2, {size}\)"
+    ):
         policy.run(seen, np.zeros((2, size), np.float32))
     with pytest.raises(PolicyError, match=r"field 'state'.*None, not \(3, 4\)"):
         load_policy(file).run(seen, np.zeros((3, 4), np.float32))
@@ -427,7 +484,9 @@ def test_an_observation_without_the_state_that_a_policy_needs_is_refused(remembe
 # What it runs on.
 
 
-@pytest.mark.parametrize("changes", [{"beams": 720}, {"range_max": 12.0}, {"rate": 5.0}])
+@pytest.mark.parametrize(
+    "changes", [{"beams": 720}, {"range_max": 12.0}, {"rate": 5.0}]
+)
 def test_any_lidar_that_fills_its_sectors_fits(file, changes):
     model = model_of(**changes)
     assert load_policy(file).make_task(model) is not None
@@ -473,7 +532,9 @@ def test_a_robot_that_does_not_fit_is_refused_and_the_field_named(file, model, f
         ("cooperative_reaching", {"scan": SECTORS}, "task.name"),
     ],
 )
-def test_a_task_that_does_not_fit_is_refused_and_the_field_named(file, name, options, field):
+def test_a_task_that_does_not_fit_is_refused_and_the_field_named(
+    file, name, options, field
+):
     model = model_of()
     with pytest.raises(PolicyError) as refused:
         load_policy(file).check_fits(model, make_task(name, model, options))
@@ -503,13 +564,18 @@ def test_it_loads_where_nothing_of_training_is_installed(file):
         "from nics_drl_bridge.policy.policy_file import load_policy\n"
         f"print(load_policy({str(file)!r}).contract.robot.name)"
     )
-    done = subprocess.run([sys.executable, "-c", BLOCKED + code], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCKED + code], capture_output=True, text=True
+    )
     assert done.stdout.strip() == "direct", done.stderr
 
 
 def test_a_scan_of_another_lidar_gives_the_same_command(file):
     policy, commands = load_policy(file), []
-    for spec in (lidar(beams=1440), lidar(beams=720, angle_min=0.0, angle_max=2.0 * np.pi)):
+    for spec in (
+        lidar(beams=1440),
+        lidar(beams=720, angle_min=0.0, angle_max=2.0 * np.pi),
+    ):
         task = policy.make_task(
             model_of(**spec.model_dump(include={"beams", "angle_min", "angle_max"}))
         )

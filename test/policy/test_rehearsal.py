@@ -62,9 +62,14 @@ def forgetful(monkeypatch):
 def test_concatenations_of_a_constant_take_no_gigabytes(file):
     file.write_bytes(bytes_of(signed(doubled(onnx.load(file), 31))))
     command = [sys.executable, "-c", MEASURE, str(file)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=True
+    )
     sentence, own, childs, seconds = done.stdout.splitlines()
-    assert "takes more than 512 MB of memory or 10 s to open, which no policy does" in sentence
+    assert (
+        "takes more than 512 MB of memory or 10 s to open, which no policy does"
+        in sentence
+    )
     assert int(own) < MOST_RSS
     assert int(childs) < MOST_RSS
     assert float(seconds) < MOST_S
@@ -73,8 +78,12 @@ def test_concatenations_of_a_constant_take_no_gigabytes(file):
 def test_a_network_of_somebody_else_takes_no_gigabytes(tmp_path, forgetful):
     wide = helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 1])
     out = helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1, 1])
-    graph = helper.make_graph([helper.make_node("Tanh", ["x"], ["y"])], "net", [wide], [out])
-    proto = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    graph = helper.make_graph(
+        [helper.make_node("Tanh", ["x"], ["y"])], "net", [wide], [out]
+    )
+    proto = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    )
     onnx.save(doubled(proto, 31), tmp_path / "net.onnx")
     mapping = tmp_path / "net.yaml"
     mapping.write_text(
@@ -88,10 +97,14 @@ def test_a_network_of_somebody_else_takes_no_gigabytes(tmp_path, forgetful):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + MOST_RSS
 
 
-def test_a_file_is_rehearsed_once_and_one_of_this_process_never(file, forgetful, monkeypatch):
+def test_a_file_is_rehearsed_once_and_one_of_this_process_never(
+    file, forgetful, monkeypatch
+):
     asked = []
     answer = rehearsal._answer_of
-    monkeypatch.setattr(rehearsal, "_answer_of", lambda one: asked.append(one) or answer(one))
+    monkeypatch.setattr(
+        rehearsal, "_answer_of", lambda one: asked.append(one) or answer(one)
+    )
     for _ in range(3):
         load_policy(file)
     assert len(asked) == 1
@@ -102,7 +115,9 @@ def test_a_file_is_rehearsed_once_and_one_of_this_process_never(file, forgetful,
     assert len(asked) == 1
 
 
-def test_what_takes_too_long_or_ends_the_process_is_one_sentence(file, forgetful, monkeypatch):
+def test_what_takes_too_long_or_ends_the_process_is_one_sentence(
+    file, forgetful, monkeypatch
+):
     for code, words in (
         ("import time; time.sleep(60)", "takes more than 0 s to open; not opened."),
         ("import os; os.abort()", "takes more than 512 MB of memory or 10 s to open"),
@@ -116,7 +131,9 @@ def test_what_takes_too_long_or_ends_the_process_is_one_sentence(file, forgetful
         assert "\n" not in str(refused.value)
 
 
-def test_the_working_folder_holds_no_modules_for_a_rehearsal(file, forgetful, monkeypatch):
+def test_the_working_folder_holds_no_modules_for_a_rehearsal(
+    file, forgetful, monkeypatch
+):
     canary = file.parent / "canary"
     for name in ("json", "numpy", "onnx", "onnxruntime"):
         (file.parent / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')\n")
@@ -125,7 +142,9 @@ def test_the_working_folder_holds_no_modules_for_a_rehearsal(file, forgetful, mo
     assert not canary.exists()
 
 
-def test_a_damaged_file_is_refused_before_anything_of_it_is_parsed(file, forgetful, monkeypatch):
+def test_a_damaged_file_is_refused_before_anything_of_it_is_parsed(
+    file, forgetful, monkeypatch
+):
     data = bytearray(file.read_bytes())
     data[200] ^= 1
     file.write_bytes(bytes(data))

@@ -29,16 +29,21 @@ def scan(t, ranges, lidar=LIDAR):
     fields = [float(value) for value in lidar.header]
     ranges = np.array(ranges, np.float32)
     return bags.new(
-        "sensor_msgs/msg/LaserScan", bags.header(t, "laser"), *fields, ranges,
+        "sensor_msgs/msg/LaserScan",
+        bags.header(t, "laser"),
+        *fields,
+        ranges,
         np.zeros(0, np.float32),
-    )  # fmt: skip
+    )
 
 
 def odometry(t, pose, twist):
     zeros = np.zeros(36)
     where = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(*pose), zeros)
     speed = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(*twist), zeros)
-    return bags.new("nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", where, speed)
+    return bags.new(
+        "nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", where, speed
+    )
 
 
 def driven_by(name):
@@ -68,13 +73,18 @@ def driven_by(name):
 def recorded(tmp_path_factory):
     """The goal of a drive of dynamic_window, and its bag."""
     goal, topics = driven_by("dynamic_window")
-    return goal, bags.write(tmp_path_factory.mktemp("drive") / "bag", topics), len(topics["/scan"])
+    return (
+        goal,
+        bags.write(tmp_path_factory.mktemp("drive") / "bag", topics),
+        len(topics["/scan"]),
+    )
 
 
 def test_a_policy_in_the_shadow_of_its_own_drive_commands_what_was_driven(recorded):
     goal, bag, count = recorded
     made, again = (
-        shadow(bag, builtin_model("ackermann"), "dynamic_window", {}, goal) for _ in range(2)
+        shadow(bag, builtin_model("ackermann"), "dynamic_window", {}, goal)
+        for _ in range(2)
     )
     assert made.policy.tobytes() == again.policy.tobytes()
     assert len(made.time) == count
@@ -104,12 +114,16 @@ def test_a_policy_with_a_state_commands_what_it_drove_even_where_no_command_is_l
     topics["/cmd_vel"] = topics["/cmd_vel"][12:]
     bag = bags.write(tmp_path / "fewer", topics)
     made = shadow(bag, builtin_model("ackermann"), policy, {}, goal)
-    assert np.abs(made.policy - made.driven).max() < 5e-3  # the estimator hears commands, too
+    assert (
+        np.abs(made.policy - made.driven).max() < 5e-3
+    )  # the estimator hears commands, too
     assert made.skipped["no command was driven"] >= 10
     assert made.resets == 0
 
 
-def test_after_a_gap_in_a_drive_the_state_begins_anew_and_it_is_counted(remembering, tmp_path):
+def test_after_a_gap_in_a_drive_the_state_begins_anew_and_it_is_counted(
+    remembering, tmp_path
+):
     policy, goal, topics = remembering
     bag = bags.write(
         tmp_path / "gap", {name: rows[:4] + rows[12:] for name, rows in topics.items()}
@@ -137,13 +151,23 @@ def test_figures_are_those_of_the_definition():
     driven = np.array([[0.5], [1.0], [-1.0], [0.5]])
     where = np.zeros((4, 3))
     one = Shadow(
-        ("speed",), ("m/s",), np.arange(4.0), where, where[:, :2], wanted, driven, np.ones(1), {}
+        ("speed",),
+        ("m/s",),
+        np.arange(4.0),
+        where,
+        where[:, :2],
+        wanted,
+        driven,
+        np.ones(1),
+        {},
     )
     told = one.differences()["speed"]
     assert told["mean"] == pytest.approx((0.5 - 2.0 + 1.02 + 0.0) / 4.0)
     assert told["mean_size"] == pytest.approx((0.5 + 2.0 + 1.02 + 0.0) / 4.0)
     assert told["greatest"] == pytest.approx(2.0)
-    assert told["opposite"] == pytest.approx(1.0 / 3.0)  # 0.02 is too small to have a sign
+    assert told["opposite"] == pytest.approx(
+        1.0 / 3.0
+    )  # 0.02 is too small to have a sign
 
 
 @pytest.mark.parametrize(
@@ -188,7 +212,13 @@ def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):
     done = nics(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert f"compared at {count} times" in done.stdout
-    told = json.loads((tmp_path / "out" / "shadow_dynamic_window.json").read_text(encoding="utf-8"))
+    told = json.loads(
+        (tmp_path / "out" / "shadow_dynamic_window.json").read_text(encoding="utf-8")
+    )
     assert told["resets"] == 0
     assert told["commands"]["speed_command"]["greatest"] < 1e-4
-    assert (tmp_path / "out" / "shadow_dynamic_window.png").read_bytes().startswith(b"\x89PNG")
+    assert (
+        (tmp_path / "out" / "shadow_dynamic_window.png")
+        .read_bytes()
+        .startswith(b"\x89PNG")
+    )

@@ -28,13 +28,15 @@ def _small_world(monkeypatch):
     monkeypatch.setattr(training, "open_model", lambda *_: MODEL)
     made = training.BridgeVectorEnv
     monkeypatch.setattr(
-        training, "BridgeVectorEnv", lambda n, model, _, *rest, **more: made(
-            n, model, WORLD, *rest, **more
-        ),
-    )  # fmt: skip
+        training,
+        "BridgeVectorEnv",
+        lambda n, model, _, *rest, **more: made(n, model, WORLD, *rest, **more),
+    )
 
 
-def test_a_policy_of_a_shipped_robot_does_not_name_a_folder_of_that_name(tmp_path, monkeypatch):
+def test_a_policy_of_a_shipped_robot_does_not_name_a_folder_of_that_name(
+    tmp_path, monkeypatch
+):
     told = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(training, "export_policy", lambda *given: told.append(given[5]))
@@ -50,7 +52,10 @@ ENGINES = {
     "gru": {"algorithm": "ppo", "memory": {"kind": "gru", "units": 5}},
     "stack": {"algorithm": "ppo", "memory": {"kind": "stack", "scans": 3, "every": 2}},
     "mirror": {"algorithm": "ppo", "ppo": {"rollout": 16, "batch": 64, "mirror": True}},
-    "sb3": {"algorithm": "ppo", "ppo": {"rollout": 16, "batch": 64, "epochs": 2, "engine": "sb3"}},
+    "sb3": {
+        "algorithm": "ppo",
+        "ppo": {"rollout": 16, "batch": 64, "epochs": 2, "engine": "sb3"},
+    },
     "sac": {"algorithm": "sac"},
 }
 
@@ -102,10 +107,14 @@ def steps_in(path):
         ("sac", "continuous"),
     ],
 )
-def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_path, monkeypatch):
+def test_an_interrupted_training_comes_to_the_same_weights(
+    engine, actions, tmp_path, monkeypatch
+):
     curriculum = {"success": 0.01}  # so that levels rise
     teaching = {"path": 1.0, "contact": -10.0, "retries": 1, "curriculum": curriculum}
-    chosen = settings(task_options={"actions": actions}, teaching=teaching, **ENGINES[engine])
+    chosen = settings(
+        task_options={"actions": actions}, teaching=teaching, **ENGINES[engine]
+    )
     whole = train(chosen, 1, tmp_path / "whole")
 
     def interrupt(progress):
@@ -131,7 +140,11 @@ def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_
 def test_a_training_that_stops_early_comes_to_the_same_end_if_interrupted(
     engine, tmp_path, monkeypatch
 ):
-    stop = {"success": 0.01, "every": 320, "episodes": 40}  # a random robot arrives now and then
+    stop = {
+        "success": 0.01,
+        "every": 320,
+        "episodes": 40,
+    }  # a random robot arrives now and then
     chosen = settings(steps=16000, stop=stop, **ENGINES[engine])
     whole = train(chosen, 1, tmp_path / "whole")
     assert 640 <= whole.steps < 16000
@@ -164,9 +177,15 @@ def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_anoth
     engine, parameter, tmp_path
 ):
     chosen = settings(steps=640, **ENGINES[engine])
-    one, same, other = (train(chosen, seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1)))
-    assert torch.equal(weights(one.algorithm)[parameter], weights(same.algorithm)[parameter])
-    assert not torch.equal(weights(one.algorithm)[parameter], weights(other.algorithm)[parameter])
+    one, same, other = (
+        train(chosen, seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1))
+    )
+    assert torch.equal(
+        weights(one.algorithm)[parameter], weights(same.algorithm)[parameter]
+    )
+    assert not torch.equal(
+        weights(one.algorithm)[parameter], weights(other.algorithm)[parameter]
+    )
 
 
 @pytest.mark.slow
@@ -174,13 +193,18 @@ def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_anoth
 def test_a_little_training_reaches_more_goals_than_none(engine, tmp_path):
     def successes(steps):
         chosen = settings(
-            worlds={"one": 32}, steps=steps, hidden=[32, 32], randomisation=None,
+            worlds={"one": 32},
+            steps=steps,
+            hidden=[32, 32],
+            randomisation=None,
             memory=ENGINES[engine].get("memory"),
             ppo={
-                "engine": "sb3" if engine == "sb3" else "lean", "rollout": 32, "batch": 256,
+                "engine": "sb3" if engine == "sb3" else "lean",
+                "rollout": 32,
+                "batch": 256,
                 "learning_rate": 2e-3,
             },
-        )  # fmt: skip
+        )
         algorithm = train(chosen, 0, tmp_path / str(steps)).algorithm
         return evaluate(algorithm, chosen, "one", 100).success.mean()
 
@@ -200,7 +224,9 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
     flipped[len(whole) // 2] ^= 1
     for damaged in (whole[:-500], bytes(flipped), whole[:-71]):
         path.write_bytes(damaged)
-        with pytest.raises(ConfigError, match="is no checkpoint of a training, or a damaged one"):
+        with pytest.raises(
+            ConfigError, match="is no checkpoint of a training, or a damaged one"
+        ):
             read_checkpoint(path)
 
 
@@ -218,10 +244,14 @@ def test_a_checkpoint_that_would_run_code_is_refused(tmp_path):
     assert not (tmp_path / "harm").exists()
 
 
-def test_sac_is_refused_for_discrete_actions_and_a_batch_that_no_rollout_fills(tmp_path):
+def test_sac_is_refused_for_discrete_actions_and_a_batch_that_no_rollout_fills(
+    tmp_path,
+):
     with pytest.raises(ConfigError, match="'sac' needs continuous actions; use 'ppo'"):
         train(settings("sac", task_options={"actions": "discrete"}), 0, tmp_path)
-    with pytest.raises(ConfigError, match=r"ppo\.batch 999: is more than the 128 transitions"):
+    with pytest.raises(
+        ConfigError, match=r"ppo\.batch 999: is more than the 128 transitions"
+    ):
         train(settings(ppo={"rollout": 16, "batch": 999}), 0, tmp_path)
 
 
@@ -260,7 +290,11 @@ def test_a_packed_checkpoint_is_refused_unread(tmp_path):
 
 @pytest.mark.parametrize("seed", [2**32, 2**63, 10**30, -1])
 def test_a_seed_that_the_generators_do_not_take_is_refused(tmp_path, seed):
-    order = TrainOrder(settings(steps=128), [0, seed], tmp_path / "run", 1, False, "test")
-    with pytest.raises(ConfigError, match="must be a whole number from 0 to 4294967295"):
+    order = TrainOrder(
+        settings(steps=128), [0, seed], tmp_path / "run", 1, False, "test"
+    )
+    with pytest.raises(
+        ConfigError, match="must be a whole number from 0 to 4294967295"
+    ):
         run(order)
     assert not (tmp_path / "run").exists()

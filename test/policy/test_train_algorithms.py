@@ -22,7 +22,9 @@ def test_a_policy_file_made_of_an_actor_does_what_the_actor_does(actions, tmp_pa
     torch.manual_seed(0)
     normaliser = rng.uniform(-1.0, 1.0, size), rng.uniform(0.1, 2.0, size)
     actor = Actor(task.observation_space, task.action_space, [16, 8], normaliser)
-    torch.nn.init.normal_(actor.layers[-1].weight)  # at the start all actions are near zero
+    torch.nn.init.normal_(
+        actor.layers[-1].weight
+    )  # at the start all actions are near zero
     export_policy(actor, task, MODEL, tmp_path / "policy.onnx")
     seen = rng.uniform(-1.0, 1.0, (50, size)).astype(np.float32)
     wanted = act_of(actor)(seen)
@@ -35,16 +37,22 @@ def test_a_policy_file_made_of_an_actor_does_what_the_actor_does(actions, tmp_pa
 
 
 def test_a_normaliser_bends_what_lies_between_0_and_1_and_cuts_what_is_far_off():
-    space = gymnasium.spaces.Box(np.zeros(2, np.float32), np.array([1.0, 9.0], np.float32))
+    space = gymnasium.spaces.Box(
+        np.zeros(2, np.float32), np.array([1.0, 9.0], np.float32)
+    )
     see = Normaliser(space, np.array([0.5, 3.0]), np.array([0.25, 0.5]))
     seen = see(torch.tensor([[0.1, 4.0], [0.0, 9.0], [1.0, -9.0]]))
-    torch.testing.assert_close(seen, torch.tensor([[0.2, 2.0], [-2.0, 5.0], [2.0, -5.0]]))
+    torch.testing.assert_close(
+        seen, torch.tensor([[0.2, 2.0], [-2.0, 5.0], [2.0, -5.0]])
+    )
 
 
 def test_an_actor_sees_through_its_normaliser():
     task = make_task("navigation", MODEL)
     size = task.observation_space.shape[0]
-    actor = Actor(task.observation_space, task.action_space, [4], (np.zeros(size), np.ones(size)))
+    actor = Actor(
+        task.observation_space, task.action_space, [4], (np.zeros(size), np.ones(size))
+    )
     seen = torch.full((1, size), 0.3)
     with torch.no_grad():
         assert torch.equal(actor(seen), actor.layers(actor.normaliser(seen)))

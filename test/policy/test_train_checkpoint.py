@@ -12,17 +12,25 @@ MODEL = direct_model(odometry=(0.02, 0.02), latency=0.05)
 
 
 def vector(count=5, **arguments):
-    return BridgeVectorEnv(count, MODEL, field(count=4), max_episode_steps=12, **arguments)
+    return BridgeVectorEnv(
+        count, MODEL, field(count=4), max_episode_steps=12, **arguments
+    )
 
 
 def actions(count, steps):
-    return np.random.default_rng(1).uniform(-1.0, 1.0, (steps, count, 3)).astype(np.float32)
+    return (
+        np.random.default_rng(1)
+        .uniform(-1.0, 1.0, (steps, count, 3))
+        .astype(np.float32)
+    )
 
 
 @pytest.mark.parametrize(
     "arguments", [{}, {"autoreset_mode": "SameStep"}, {"randomisation": "strong"}]
 )
-def test_an_env_that_is_given_the_state_of_another_goes_on_with_the_same_bits(arguments):
+def test_an_env_that_is_given_the_state_of_another_goes_on_with_the_same_bits(
+    arguments,
+):
     one, other = vector(**arguments), vector(**arguments)
     one.reset(seed=3)
     for chosen in actions(5, 30):
@@ -48,5 +56,7 @@ def test_a_snapshot_does_not_change_with_the_env():
 def test_the_state_of_another_env_is_refused():
     one, other = vector(5), vector(6)
     one.reset(seed=0)
-    with pytest.raises(ConfigError, match=r"of shape .5, .*, this env's is .* of shape .6, "):
+    with pytest.raises(
+        ConfigError, match=r"of shape .5, .*, this env's is .* of shape .6, "
+    ):
         restore(other, snapshot(one))

@@ -32,7 +32,9 @@ def env(request):
 def observations(env, count=50):
     space = env.task.observation_space
     rng = np.random.default_rng(5)
-    return rng.uniform(np.maximum(space.low, -4), np.minimum(space.high, 4), (count, *space.shape))
+    return rng.uniform(
+        np.maximum(space.low, -4), np.minimum(space.high, 4), (count, *space.shape)
+    )
 
 
 @pytest.mark.slow
@@ -53,7 +55,9 @@ def test_the_file_of_a_sac_acts_as_it_predicts(tmp_path):
     model = SAC("MlpPolicy", env, seed=0, buffer_size=10, device="cpu")
     policy = export_policy(model, env.task, env.model, tmp_path / "sac.onnx")
     rows = observations(env).astype(np.float32)
-    assert policy.act(rows) == pytest.approx(model.predict(rows, deterministic=True)[0], abs=1e-5)
+    assert policy.act(rows) == pytest.approx(
+        model.predict(rows, deterministic=True)[0], abs=1e-5
+    )
 
 
 def test_the_normaliser_is_inside_the_graph(tmp_path):
@@ -112,7 +116,9 @@ DIRECT_LOW, DIRECT_HIGH = model_of().robot.command_low, model_of().robot.command
 @pytest.mark.parametrize("kind", MEMORIES)
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_a_file_with_a_state_acts_as_the_module_step_by_step(tmp_path, kind, actions):
-    policy, task, actor = export_remembering(tmp_path / "one.onnx", kind, actions=actions)
+    policy, task, actor = export_remembering(
+        tmp_path / "one.onnx", kind, actions=actions
+    )
     kept = policy.contract.state
     assert (kept.size, kept.start) == (actor.memory.size, actor.memory.start)
     ours = theirs = actor.memory.begin(4).numpy()

@@ -22,7 +22,12 @@ IMITATION = {"expert": "straight", "steps": 120, "epochs": 300}
 
 def settings(**changes):
     ppo = {"rollout": 12, "batch": 72, "epochs": 1}
-    given = {"hidden": [32], "ppo": ppo, "worlds": {"empty": WORLDS}, "imitation": IMITATION}
+    given = {
+        "hidden": [32],
+        "ppo": ppo,
+        "worlds": {"empty": WORLDS},
+        "imitation": IMITATION,
+    }
     return validate(given | changes, TrainingSettings, "settings")
 
 
@@ -63,7 +68,10 @@ def test_what_drives_next_has_the_weights_that_were_fitted_and_the_same_seed_giv
     made, again, other = begun(), begun(), begun(1)
     ours, driving = made.networks.state_dict(), made.collector.networks.state_dict()
     assert all(torch.equal(driving[name], each) for name, each in ours.items())
-    assert all(torch.equal(again.networks.state_dict()[name], each) for name, each in ours.items())
+    assert all(
+        torch.equal(again.networks.state_dict()[name], each)
+        for name, each in ours.items()
+    )
     first = "actor.layers.0.weight"
     assert not torch.equal(other.networks.state_dict()[first], ours[first])
 
@@ -83,9 +91,9 @@ def test_returns_are_discounted_to_the_end_of_an_episode_and_unknown_without_one
     going = np.ones(WORLDS)
     for t in range(LIMIT):
         action = expert_of(settings(), again).act(seen)
-        moved = action + noise.normal(0.0, train_imitation.DISTURBANCE, action.shape).astype(
-            np.float32
-        )
+        moved = action + noise.normal(
+            0.0, train_imitation.DISTURBANCE, action.shape
+        ).astype(np.float32)
         seen, reward, done, _ = again.step(np.clip(moved, -1.0, 1.0))
         total += going * 0.5**t * reward
         going *= ~done
@@ -104,7 +112,9 @@ def test_the_spread_of_actions_is_that_of_the_fit_but_not_too_little():
 
 
 def test_an_expert_is_refused_for_discrete_actions_and_by_an_unknown_name():
-    with pytest.raises(ConfigError, match="experts drive continuous 'navigation' alone"):
+    with pytest.raises(
+        ConfigError, match="experts drive continuous 'navigation' alone"
+    ):
         expert_of(settings(), worlds("discrete"))
     with pytest.raises(ConfigError, match="did you mean 'mppi'"):
         expert_of(settings(imitation=IMITATION | {"expert": "mpi"}), worlds())

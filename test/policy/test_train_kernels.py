@@ -18,12 +18,16 @@ def test_outputs_and_gradients_of_layers_are_those_of_autograd(widths):
     layers, rows = torch.nn.Sequential(*parts[:-1]), 9
     weights = torch.nn.utils.parameters_to_vector(layers.parameters()).detach().numpy()
     size = rows * max(widths)
-    memory = (np.full((count, size), np.nan, np.float32) for count in (len(widths) - 1, 2))
+    memory = (
+        np.full((count, size), np.nan, np.float32) for count in (len(widths) - 1, 2)
+    )
     net = Net(weights, np.full_like(weights, np.nan), np.array(widths), *memory)
     seen, pull = torch.randn(rows, widths[0]), torch.randn(rows, widths[-1])
     wanted = layers(seen)
     wanted.backward(pull)
-    assert forward(net, seen.numpy()) == pytest.approx(wanted.detach().numpy(), abs=1e-5)
+    assert forward(net, seen.numpy()) == pytest.approx(
+        wanted.detach().numpy(), abs=1e-5
+    )
     gradient = net.spare[0, : pull.numel()].reshape(pull.shape)
     gradient[...] = pull.numpy()
     backward(net, seen.numpy(), gradient)

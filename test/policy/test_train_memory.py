@@ -58,13 +58,17 @@ def test_a_gru_is_that_of_torch():
 
 
 @pytest.mark.parametrize("settings", [STACK, GruMemory(kind="gru", units=4)])
-def test_steps_at_once_are_those_one_after_the_other_with_a_fresh_state_in_each_episode(settings):
+def test_steps_at_once_are_those_one_after_the_other_with_a_fresh_state_in_each_episode(
+    settings,
+):
     one = memory(settings)
     given, done = torch.rand(5, 3, INPUTS), torch.zeros(5, 3)
     done[1, 2] = done[3, 0] = 1.0
     first = one.begin(3)
     found = one.unroll(given, first, done)
-    alone, _ = one(given[2, 2:], one.begin(1))  # the third world begins anew before step 2
+    alone, _ = one(
+        given[2, 2:], one.begin(1)
+    )  # the third world begins anew before step 2
     assert torch.allclose(found[2, 2:], alone, atol=1e-6)
     _, state = one(given[0], first)
     wanted, _ = one(given[1], state)

@@ -25,11 +25,15 @@ STACK = {"kind": "stack", "scans": 3, "every": 2}
 def engine(mirror=True, actions="continuous", memory=None):
     """The lean engine, begun; with layers that are far from nothing."""
     options = {"actions": actions}
-    vector = BridgeVectorEnv(WORLDS, MODEL, field(count=2), "navigation", options, 5, "SameStep")
+    vector = BridgeVectorEnv(
+        WORLDS, MODEL, field(count=2), "navigation", options, 5, "SameStep"
+    )
     env = TrainVecEnv(vector)
     env.seed(3)
     ppo = {"rollout": STEPS, "batch": 24, "mirror": mirror}
-    settings = TrainingSettings.model_validate({"hidden": [16, 8], "ppo": ppo, "memory": memory})
+    settings = TrainingSettings.model_validate(
+        {"hidden": [16, 8], "ppo": ppo, "memory": memory}
+    )
     size, rng = env.observation_space.shape[0], np.random.default_rng(0)
     normaliser = rng.uniform(0.0, 0.5, size), rng.uniform(0.2, 1.0, size)
     lean = LeanPpo(settings, env, 0, normaliser)
@@ -47,8 +51,13 @@ def test_each_transition_is_followed_by_its_mirror_image(actions, memory):
     lean, mirror = engine(True, actions, memory)
     plain, _ = engine(False, actions, memory)
     plain.collector.networks.load_state_dict(lean.networks.state_dict())
-    both, driven = (one.learner.judge(one.collector.collect()[0]) for one in (lean, plain))
-    reflection, count = Reflection(mirror, lean.networks.actor.memory.extra, 72), STEPS * WORLDS
+    both, driven = (
+        one.learner.judge(one.collector.collect()[0]) for one in (lean, plain)
+    )
+    reflection, count = (
+        Reflection(mirror, lean.networks.actor.memory.extra, 72),
+        STEPS * WORLDS,
+    )
     for one, other in zip(both[:5], driven[:5], strict=True):
         assert len(one) == 2 * count
         assert torch.equal(one[:count], other)
@@ -76,14 +85,19 @@ def test_normalised_observations_mirror_as_the_observations_do():
     lean, mirror = engine()
     see = lean.networks.actor.normaliser
     seen = torch.rand(50, len(mirror.places)) * 2.0
-    mirrored = seen[:, torch.from_numpy(mirror.places)] * torch.from_numpy(np.float32(mirror.signs))
+    mirrored = seen[:, torch.from_numpy(mirror.places)] * torch.from_numpy(
+        np.float32(mirror.signs)
+    )
     reflection = Reflection(mirror, 0, 72)
     assert torch.allclose(see(mirrored), reflection.seen(see(seen)), atol=1e-6)
 
 
 def test_a_balanced_normaliser_has_mean_and_deviation_of_both_kinds_of_observations():
     _, mirror = engine()
-    rows = np.random.default_rng(0).normal(size=(2000, len(mirror.places))) + mirror.places % 5
+    rows = (
+        np.random.default_rng(0).normal(size=(2000, len(mirror.places)))
+        + mirror.places % 5
+    )
     both = np.concatenate([rows, rows[:, mirror.places] * mirror.signs])
     mean, std = Reflection(mirror, 0, 72).balanced(rows.mean(axis=0), rows.std(axis=0))
     np.testing.assert_allclose(mean, both.mean(axis=0), atol=1e-12)
@@ -103,7 +117,9 @@ def test_what_the_mirror_image_can_not_do_is_not_learnt():
     assert possible.tolist() == [True, True, False, False]
     rows = [torch.rand(4, 78), actions, *torch.rand(3, 4)]
     both = Reflection(mirror, 0, 72).doubled(Transitions(*rows))
-    assert both.actions[4:, 2].tolist() == pytest.approx([-0.1, -0.6])  # 0.8 and -0.2 rad/s
+    assert both.actions[4:, 2].tolist() == pytest.approx(
+        [-0.1, -0.6]
+    )  # 0.8 and -0.2 rad/s
     assert len(both.seen) == len(both.returns) == 6
 
 

@@ -34,7 +34,13 @@ def pair(actions="continuous", log_std=-0.5, clip=0.2, entropy=0.01):
         envs.append(TrainVecEnv(vector))
         envs[-1].seed(3)
     batch = STEPS * WORLDS
-    ppo = {"rollout": STEPS, "batch": batch, "epochs": 1, "clip": clip, "entropy": entropy}
+    ppo = {
+        "rollout": STEPS,
+        "batch": batch,
+        "epochs": 1,
+        "clip": clip,
+        "entropy": entropy,
+    }
     ppo["log_std"] = log_std
     settings = TrainingSettings.model_validate({"hidden": [16, 8], "ppo": ppo})
     size = envs[0].observation_space.shape[0]
@@ -42,14 +48,25 @@ def pair(actions="continuous", log_std=-0.5, clip=0.2, entropy=0.01):
     normaliser = rng.uniform(0.0, 0.5, size), rng.uniform(0.2, 1.0, size)
     lean = LeanPpo(settings, envs[0], 0, normaliser)
     network = {
-        "net_arch": [16, 8], "activation_fn": torch.nn.ReLU, "log_std_init": log_std,
+        "net_arch": [16, 8],
+        "activation_fn": torch.nn.ReLU,
+        "log_std_init": log_std,
         "features_extractor_class": Normaliser,
         "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
-    }  # fmt: skip
+    }
     theirs = PPO(
-        "MlpPolicy", envs[1], n_steps=STEPS, batch_size=batch, n_epochs=1, gamma=0.98,
-        gae_lambda=0.95, clip_range=clip, ent_coef=entropy, policy_kwargs=network, device="cpu",
-    )  # fmt: skip
+        "MlpPolicy",
+        envs[1],
+        n_steps=STEPS,
+        batch_size=batch,
+        n_epochs=1,
+        gamma=0.98,
+        gae_lambda=0.95,
+        clip_range=clip,
+        ent_coef=entropy,
+        policy_kwargs=network,
+        device="cpu",
+    )
     theirs.set_logger(Logger(None, []))
     envs[1].seed(3)
     for ours, other in zip(weights_of(lean), their_weights(theirs), strict=True):
@@ -60,7 +77,9 @@ def pair(actions="continuous", log_std=-0.5, clip=0.2, entropy=0.01):
 
 def remembering(memory):
     """The lean engine with a memory, and its first rollouts."""
-    vector = BridgeVectorEnv(WORLDS, MODEL, WORLD, "navigation", None, LIMIT, "SameStep")
+    vector = BridgeVectorEnv(
+        WORLDS, MODEL, WORLD, "navigation", None, LIMIT, "SameStep"
+    )
     env = TrainVecEnv(vector)
     env.seed(3)
     ppo = {"rollout": STEPS, "batch": STEPS * 2, "epochs": 1}
@@ -79,15 +98,24 @@ def weights_of(lean):
 
 def their_weights(ppo):
     policy = ppo.policy
-    actor = [*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()]
-    critic = [*policy.mlp_extractor.value_net.parameters(), *policy.value_net.parameters()]
+    actor = [
+        *policy.mlp_extractor.policy_net.parameters(),
+        *policy.action_net.parameters(),
+    ]
+    critic = [
+        *policy.mlp_extractor.value_net.parameters(),
+        *policy.value_net.parameters(),
+    ]
     return actor + critic
 
 
 def test_advantages_are_those_of_stable_baselines3():
     _, theirs = pair()
     rng = np.random.default_rng(1)
-    rewards, values = rng.normal(size=(STEPS, WORLDS)), rng.normal(size=(STEPS + 1, WORLDS))
+    rewards, values = (
+        rng.normal(size=(STEPS, WORLDS)),
+        rng.normal(size=(STEPS + 1, WORLDS)),
+    )
     done = rng.random((STEPS, WORLDS)) < 0.3
     buffer = RolloutBuffer(
         STEPS, theirs.observation_space, theirs.action_space, "cpu", 0.9, 0.97, WORLDS
@@ -96,7 +124,9 @@ def test_advantages_are_those_of_stable_baselines3():
     buffer.episode_starts[1:] = done[:-1]
     last = torch.as_tensor(values[-1], dtype=torch.float32)
     buffer.compute_returns_and_advantage(last, done[-1])
-    ours = advantages_of(*map(torch.as_tensor, (rewards, values, done * 1.0)), 0.97, 0.9)
+    ours = advantages_of(
+        *map(torch.as_tensor, (rewards, values, done * 1.0)), 0.97, 0.9
+    )
     assert buffer.advantages == pytest.approx(ours.numpy(), abs=1e-5)
 
 
@@ -104,7 +134,9 @@ def filled(lean, theirs, seed=2):
     """One batch of both, in the same order; the actions were drawn with somewhat other weights."""
     rng = np.random.default_rng(seed)
     rows = STEPS * WORLDS
-    seen = rng.uniform(-1.0, 1.0, (rows, *theirs.observation_space.shape)).astype(np.float32)
+    seen = rng.uniform(-1.0, 1.0, (rows, *theirs.observation_space.shape)).astype(
+        np.float32
+    )
     see = lean.networks.actor.normaliser
     with torch.no_grad():
         normalised = see(torch.from_numpy(seen))
@@ -115,9 +147,13 @@ def filled(lean, theirs, seed=2):
     buffer = theirs.rollout_buffer
     buffer.reset()
     shapes = {
-        "observations": seen, "actions": actions, "log_probs": log_probs, "advantages": gains,
-        "returns": returns, "values": np.zeros(rows),
-    }  # fmt: skip
+        "observations": seen,
+        "actions": actions,
+        "log_probs": log_probs,
+        "advantages": gains,
+        "returns": returns,
+        "values": np.zeros(rows),
+    }
     for name, values in shapes.items():
         target = getattr(buffer, name)
         target[...] = np.asarray(values, np.float32).reshape(target.shape)
@@ -138,7 +174,9 @@ def test_loss_and_gradients_are_those_of_stable_baselines3(actions):
     for ours, other in zip(weights_of(lean), their_weights(theirs), strict=True):
         assert torch.allclose(ours.grad, other.grad, atol=1e-6, rtol=1e-4)
     if actions == "continuous":
-        assert torch.allclose(lean.networks.log_std.grad, theirs.policy.log_std.grad, atol=1e-6)
+        assert torch.allclose(
+            lean.networks.log_std.grad, theirs.policy.log_std.grad, atol=1e-6
+        )
 
 
 def test_an_update_moves_the_weights_as_stable_baselines3_does():
@@ -151,7 +189,9 @@ def test_an_update_moves_the_weights_as_stable_baselines3_does():
         assert torch.allclose(ours, other, atol=2e-5)
 
 
-def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(monkeypatch):
+def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(
+    monkeypatch,
+):
     lean, theirs = pair()
     batch = filled(lean, theirs)
     loss = lean.learner.differentiate(batch)
@@ -161,7 +201,9 @@ def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(mo
     jobs = []
     together = train_ppo.run_parts
     monkeypatch.setattr(
-        train_ppo, "run_parts", lambda job, parts: jobs.append(len(parts)) or together(job, parts)
+        train_ppo,
+        "run_parts",
+        lambda job, parts: jobs.append(len(parts)) or together(job, parts),
     )
     lean.learner.core_is_free.set()
     assert torch.equal(lean.learner.differentiate(batch), loss)
@@ -174,7 +216,9 @@ def test_a_core_is_free_to_learn_from_the_end_of_a_rollout_to_the_next_begin():
     lean, _ = pair()
     seen = []
     collect = lean.collector.collect
-    lean.collector.collect = lambda: seen.append(lean.learner.core_is_free.is_set()) or collect()
+    lean.collector.collect = lambda: (
+        seen.append(lean.learner.core_is_free.is_set()) or collect()
+    )
     lean.collector.last = lean.collector.env.reset()
     rollout, _ = collect()
     for _ in range(2):
@@ -197,7 +241,9 @@ def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():
 
 
 def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_limits():
-    lean, theirs = pair(log_std=-30.0)  # no noise to speak of, as both draw it differently
+    lean, theirs = pair(
+        log_std=-30.0
+    )  # no noise to speak of, as both draw it differently
     _, callback = theirs._setup_learn(1, ConvertCallback(lambda *_: True))
     theirs.collect_rollouts(theirs.env, callback, theirs.rollout_buffer, STEPS)
     lean.collector.networks.load_state_dict(lean.networks.state_dict())
@@ -219,9 +265,13 @@ def test_what_is_learnt_through_time_is_what_was_driven():
     actor, networks = lean.networks.actor, lean.networks
     for rollout in rollouts:
         assert rollout.done.sum() >= WORLDS
-        seen = rollout.seen[:, : actor.normaliser.features_dim].unflatten(0, (STEPS, WORLDS))
+        seen = rollout.seen[:, : actor.normaliser.features_dim].unflatten(
+            0, (STEPS, WORLDS)
+        )
         with torch.no_grad():
-            features = actor.memory.unroll(seen, rollout.state, rollout.done).flatten(0, 1)
+            features = actor.memory.unroll(seen, rollout.state, rollout.done).flatten(
+                0, 1
+            )
             found = networks.log_probs(actor.layers(features), rollout.actions)
         assert torch.allclose(features, rollout.seen, atol=1e-6)
         assert torch.allclose(found, rollout.log_probs, atol=1e-4)

@@ -84,7 +84,10 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
     assert [line for line in one.output.splitlines() if line.startswith("seed 3")] == []
     assert "seed 4: 256 steps" in one.output
     refused = nics("--resume", "--seeds", 5, "--out", out)
-    assert "no checkpoint of these seeds; name one of [3, 4] with --seeds" in refused.output
+    assert (
+        "no checkpoint of these seeds; name one of [3, 4] with --seeds"
+        in refused.output
+    )
     refused = nics("--settings", settings, "--seeds", 3, "--out", out)
     assert refused.exit_code == 2
     assert "holds checkpoints of these seeds; add --resume" in refused.output
@@ -97,13 +100,25 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         (["--world", "arenna"], "unknown world 'arenna'; did you mean 'arena'"),
         (["--algorithm", "dqn"], "key 'algorithm'"),
         (["--resume"], "--resume needs --out"),
-        (["--resume", "--steps", "5", "--out", "x"], "--steps: a resumed run has its own settings"),
+        (
+            ["--resume", "--steps", "5", "--out", "x"],
+            "--steps: a resumed run has its own settings",
+        ),
         (["--resume", "--out", "nowhere"], "nowhere: holds no settings.yaml"),
         (["--seeds", "1", "1", "--out", "run"], "give one or more, none twice"),
         (["--engine", "rai"], "unknown engine 'rai'; did you mean 'ray'"),
-        (["--engine", "lean", "--algorithm", "sac"], "--engine lean learns with ppo, not 'sac'"),
-        (["--resume", "--engine", "lean", "--out", "x"], "--engine: a resumed run has its own"),
-        (["--address", "auto"], "--address: belongs to --engine ray; add that, or leave it out."),
+        (
+            ["--engine", "lean", "--algorithm", "sac"],
+            "--engine lean learns with ppo, not 'sac'",
+        ),
+        (
+            ["--resume", "--engine", "lean", "--out", "x"],
+            "--engine: a resumed run has its own",
+        ),
+        (
+            ["--address", "auto"],
+            "--address: belongs to --engine ray; add that, or leave it out.",
+        ),
         (["--env-runners", "2"], "--env-runners: belongs to --engine ray"),
     ],
 )
@@ -117,23 +132,51 @@ def test_what_can_not_be_trained_gives_one_sentence(
     assert "Traceback" not in done.output
 
 
-def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(tmp_path, monkeypatch):
+def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text("")
     done = nics("--task", "mine.py:Patrol", "--out", "run")
-    assert "'mine.py:Patrol': mine.py defines no subclass" in " ".join(done.output.split())
+    assert "'mine.py:Patrol': mine.py defines no subclass" in " ".join(
+        done.output.split()
+    )
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
     ("right", "wrong", "sentence"),
     [
-        ('{"near": -', '{"near": np.nan * ', "task Reach: its reward term 'near' must be finite"),
-        ('["goal"])}', '["goal"])[0]}', "'near' must be finite, of shape (8, 1), and is array("),
-        ('{"near": -distance(after.pose, memory["goal"])}', "-1.0", "must be a dictionary of"),
-        ("[self.free_share(view.ranges), seen]", "[seen]", "task Reach: its observation must be"),
-        ("self.touches(view.ranges)", "False", "task Reach: its end must be finite, of shape"),
-        ('memory["goal"])}', 'memory["gaol"])}', "mine.py:17, in reward: KeyError('gaol'); mend"),
+        (
+            '{"near": -',
+            '{"near": np.nan * ',
+            "task Reach: its reward term 'near' must be finite",
+        ),
+        (
+            '["goal"])}',
+            '["goal"])[0]}',
+            "'near' must be finite, of shape (8, 1), and is array(",
+        ),
+        (
+            '{"near": -distance(after.pose, memory["goal"])}',
+            "-1.0",
+            "must be a dictionary of",
+        ),
+        (
+            "[self.free_share(view.ranges), seen]",
+            "[seen]",
+            "task Reach: its observation must be",
+        ),
+        (
+            "self.touches(view.ranges)",
+            "False",
+            "task Reach: its end must be finite, of shape",
+        ),
+        (
+            'memory["goal"])}',
+            'memory["gaol"])}',
+            "mine.py:17, in reward: KeyError('gaol'); mend",
+        ),
     ],
 )
 def test_a_task_that_gives_no_numbers_is_refused_before_a_folder_is_begun(
@@ -141,7 +184,9 @@ def test_a_task_that_gives_no_numbers_is_refused_before_a_folder_is_begun(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(REACH.replace(right, wrong))
-    done = nics("--task", "mine.py:Reach", "--world", "empty", "--steps", 64, "--out", "run")
+    done = nics(
+        "--task", "mine.py:Reach", "--world", "empty", "--steps", 64, "--out", "run"
+    )
     assert done.exit_code == 2
     assert sentence in " ".join(done.output.split())
     assert "Traceback" not in done.output
@@ -152,7 +197,9 @@ def test_a_task_that_gives_no_numbers_is_refused_before_a_folder_is_begun(
 def test_a_task_that_tells_no_success_is_said_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(REACH)
-    (tmp_path / "settings.yaml").write_text("task: mine.py:Reach\n" + SETTINGS_OF_ANY_TASK)
+    (tmp_path / "settings.yaml").write_text(
+        "task: mine.py:Reach\n" + SETTINGS_OF_ANY_TASK
+    )
     own = "--task", "mine.py:Reach"
     done = nics("--settings", "settings.yaml", *own, "--episodes", 2, "--out", "run")
     assert done.exit_code == 0, done.output
@@ -164,19 +211,28 @@ def test_a_task_of_a_team_is_refused_before_a_folder_is_begun(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     done = nics("--task", "cooperative_reaching", "--steps", 64, "--out", "run")
     assert done.exit_code == 2
-    assert "task 'cooperative_reaching': is of 3 robots; train a task of one," in done.output
+    assert (
+        "task 'cooperative_reaching': is of 3 robots; train a task of one,"
+        in done.output
+    )
     assert not (tmp_path / "run").exists()
 
 
-def test_a_batch_of_more_than_a_rollout_is_refused_before_a_folder_is_begun(tmp_path, settings):
+def test_a_batch_of_more_than_a_rollout_is_refused_before_a_folder_is_begun(
+    tmp_path, settings
+):
     settings.write_text(SETTINGS.replace("batch: 64", "batch: 4096"))
     done = nics("--settings", settings, "--out", tmp_path / "run")
     assert done.exit_code == 2
-    assert "ppo.batch 4096: is more than the 128 transitions of a rollout" in done.output
+    assert (
+        "ppo.batch 4096: is more than the 128 transitions of a rollout" in done.output
+    )
     assert not (tmp_path / "run").exists()
 
 
-def test_settings_that_are_refused_late_do_not_bar_the_corrected_ones(tmp_path, settings):
+def test_settings_that_are_refused_late_do_not_bar_the_corrected_ones(
+    tmp_path, settings
+):
     out = tmp_path / "run"
     settings.write_text(f"{SETTINGS}imitation: {{expert: nobody, steps: 64}}\n")
     done = nics("--settings", settings, "--out", out)
@@ -186,12 +242,16 @@ def test_settings_that_are_refused_late_do_not_bar_the_corrected_ones(tmp_path, 
 
 
 @pytest.mark.parametrize("engine", ["lean", "sb3"])
-def test_a_training_that_diverges_says_so_and_leaves_no_broken_checkpoint(tmp_path, engine):
+def test_a_training_that_diverges_says_so_and_leaves_no_broken_checkpoint(
+    tmp_path, engine
+):
     (tmp_path / "settings.yaml").write_text(
         SETTINGS.replace("epochs: 1", "epochs: 20, learning_rate: 1.0e+30")
     )
     out = tmp_path / "run"
-    done = nics("--settings", tmp_path / "settings.yaml", "--engine", engine, "--out", out)
+    done = nics(
+        "--settings", tmp_path / "settings.yaml", "--engine", engine, "--out", out
+    )
     assert done.exit_code == 2
     assert "nics: the training diverged: after" in done.output
     assert "its weights are beyond all bounds; lower its learning_rate." in done.output
@@ -205,7 +265,9 @@ def test_a_training_beside_another_in_one_folder_is_refused(tmp_path, settings):
     with filelock.FileLock(out / ".lock"):
         done = nics("--settings", settings, "--out", out)
     assert done.exit_code == 2
-    assert "another training is at work there; wait for its end" in " ".join(done.output.split())
+    assert "another training is at work there; wait for its end" in " ".join(
+        done.output.split()
+    )
     assert nics("--settings", settings, "--episodes", 2, "--out", out).exit_code == 0
 
 
@@ -224,27 +286,41 @@ def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
     (tmp_path / "own.py").write_text(own)
     settings = "worlds: {empty: 64}\nsteps: 20000000\ncheckpoint_every: 2000\n"
     (tmp_path / "short.yaml").write_text(settings)
-    program = [sys.executable, "-c", "from nics_drl_bridge.commands.start import main; main()"]
+    program = [
+        sys.executable,
+        "-c",
+        "from nics_drl_bridge.commands.start import main; main()",
+    ]
     train = [*program, "train", "--settings", "short.yaml", "--task", "own.py:Mine"]
     train += ["--out", "my run", "--seeds", "3", "4", "--episodes", "7"]
     with subprocess.Popen(
-        train, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        train,
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    ) as process:  # fmt: skip
+    ) as process:
         checkpoint = tmp_path / "my run" / "seed_3" / "checkpoint.pt"
         wait_for(lambda: checkpoint.is_file() or process.poll() is not None, 300.0)
         process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=60.0)[1]
     assert process.returncode == 130, said
-    line = next(each for each in said.splitlines() if each.startswith("to go on from the last"))
+    line = next(
+        each for each in said.splitlines() if each.startswith("to go on from the last")
+    )
     command = line.partition("checkpoint: ")[2]
-    expected = "nics train --resume --out 'my run' --seeds 3 4 --episodes 7 --task own.py:Mine"
+    expected = (
+        "nics train --resume --out 'my run' --seeds 3 4 --episodes 7 --task own.py:Mine"
+    )
     assert command == expected
     resume = [*program, *shlex.split(command)[1:]]
     with subprocess.Popen(
-        resume, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        resume,
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    ) as process:  # fmt: skip
+    ) as process:
         before = checkpoint.stat().st_mtime_ns
         changed = lambda: checkpoint.stat().st_mtime_ns != before  # noqa: E731
         wait_for(lambda: changed() or process.poll() is not None, 300.0)

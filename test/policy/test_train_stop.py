@@ -53,11 +53,18 @@ def test_it_ends_after_two_evaluations_in_a_row_with_the_target_in_every_world(t
 def test_it_evaluates_once_in_each_interval(told):
     stop, rates, seeds = told
     rates.extend([0.0] * 4)
-    assert [stop.judge(steps, None) for steps in (99, 130, 199, 250)] == [False, True, False, True]
+    assert [stop.judge(steps, None) for steps in (99, 130, 199, 250)] == [
+        False,
+        True,
+        False,
+        True,
+    ]
     assert len(seeds) == 4
 
 
-def test_each_evaluation_has_episodes_of_its_own_beyond_those_of_training_and_protocol(told):
+def test_each_evaluation_has_episodes_of_its_own_beyond_those_of_training_and_protocol(
+    told,
+):
     stop, rates, seeds = told
     rates.extend([0.0] * 4)
     stop.judge(100, None)

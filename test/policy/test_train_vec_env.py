@@ -64,7 +64,9 @@ def test_it_feeds_what_a_vec_env_of_single_envs_feeds():
         for n in np.flatnonzero(one[2]):
             ended += 1
             mine, other = one[3][n], another[3][n]
-            assert np.array_equal(mine["terminal_observation"], other["terminal_observation"])
+            assert np.array_equal(
+                mine["terminal_observation"], other["terminal_observation"]
+            )
             for key in ("TimeLimit.truncated", "is_success", "collision"):
                 assert mine[key] == other[key]
         assert all(one[3][n] == {} for n in np.flatnonzero(~one[2]))
@@ -83,11 +85,17 @@ def test_the_observations_are_those_of_the_vector_env_without_a_copy():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", [PPO, pytest.param(DQN, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "algorithm", [PPO, pytest.param(DQN, marks=pytest.mark.campaign)]
+)
 def test_an_algorithm_learns_on_it_and_counts_episodes(algorithm):
     options = {"actions": "discrete"} if algorithm is DQN else None
     env = VecMonitor(TrainVecEnv(vector(task_options=options)))
-    sizes = {"learning_starts": 100} if algorithm is DQN else {"n_steps": 64, "batch_size": 64}
+    sizes = (
+        {"learning_starts": 100}
+        if algorithm is DQN
+        else {"n_steps": 64, "batch_size": 64}
+    )
     model = algorithm("MlpPolicy", env, seed=0, device="cpu", **sizes)
     model.learn(512)
     assert len(model.ep_info_buffer) > 3
@@ -108,7 +116,9 @@ def test_pictures_of_all_worlds_are_tiled():
 
 def test_who_watches_is_called_after_each_step_of_all_worlds():
     env, seen = TrainVecEnv(vector(2), vector(3)), []
-    env.on_step = lambda: seen.append([one.simulator.data.steps.max() for one in env.envs])
+    env.on_step = lambda: seen.append(
+        [one.simulator.data.steps.max() for one in env.envs]
+    )
     env.seed(0)
     env.reset()
     for _ in range(2):

@@ -11,8 +11,13 @@ from nics_drl_bridge.policy.training_settings import (
     load_training,
 )
 
-PARTS = {"jackal": 96, "f1tenth": 60}  # of an observation, where it sees less than a circle
-SHIPPED = sorted(path.stem for path in (share_folder() / "config" / "training").glob("*.yaml"))
+PARTS = {
+    "jackal": 96,
+    "f1tenth": 60,
+}  # of an observation, where it sees less than a circle
+SHIPPED = sorted(
+    path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")
+)
 
 
 @pytest.mark.slow
@@ -20,7 +25,9 @@ SHIPPED = sorted(path.stem for path in (share_folder() / "config" / "training").
 def test_shipped_settings_name_worlds_and_a_task_that_there_are(name):
     settings = load_training(name)
     for world in settings.worlds:
-        env = BridgeVectorEnv(1, settings.robot, world, settings.task, settings.task_options)
+        env = BridgeVectorEnv(
+            1, settings.robot, world, settings.task, settings.task_options
+        )
         assert env.single_observation_space.shape == (PARTS.get(settings.robot, 78),)
     assert settings.ppo.rollout * settings.num_envs >= settings.ppo.batch
 
@@ -55,25 +62,52 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
     ("text", "sentence"),
     [
         ("ppo: {rolout: 3}", r"unknown key 'ppo.rolout'; did you mean 'rollout'"),
-        ("algorithm: dqn", r"key 'algorithm': input should be 'ppo' or 'sac', not 'dqn'"),
+        (
+            "algorithm: dqn",
+            r"key 'algorithm': input should be 'ppo' or 'sac', not 'dqn'",
+        ),
         ("worlds: {}", r"key 'worlds'"),
-        ("worlds: {arena: 0}", r"key 'worlds.arena': .* greater than or equal to 1, not 0"),
+        (
+            "worlds: {arena: 0}",
+            r"key 'worlds.arena': .* greater than or equal to 1, not 0",
+        ),
         ("steps: 0.5", r"key 'steps'"),
         (
             "teaching: {curriculum: {begin: 0}}",
             r"key 'teaching.curriculum.begin': .* greater than 0",
         ),
         ("stop: {every: 10}", r"the key 'stop.success' is missing"),
-        ("stop: {success: 1.1}", r"key 'stop.success': .* less than or equal to 1, not 1.1"),
+        (
+            "stop: {success: 1.1}",
+            r"key 'stop.success': .* less than or equal to 1, not 1.1",
+        ),
         ("memory: {units: 8}", r"the key 'memory.kind' is missing"),
         ("memory: {kind: lstm}", r"key 'memory': unknown kind 'lstm'; .*'stack'"),
         ("memory: {kind: gru, scans: 4}", r"unknown key 'memory.*scans'; .*'units'"),
-        ("memory: {kind: stack, scans: 1}", r"key 'memory.*scans': .* greater than or equal to 2"),
-        ("memory: {kind: gru}\nppo: {mirror: true}", r"a gru has no mirror image; leave out ppo"),
-        ("ppo: {engine: sb3, mirror: true}", r"engine 'lean' alone learns by ppo.mirror; leave"),
-        ("memory: {kind: gru}\nppo: {engine: sb3}", r"ppo's engine 'lean' alone learns a memory"),
-        ("memory: {kind: stack}\nalgorithm: sac", r"ppo's engine 'lean' alone learns a memory"),
-        ("task_options: {robot: x}", r"task_options can't hold 'robot', which the model gives"),
+        (
+            "memory: {kind: stack, scans: 1}",
+            r"key 'memory.*scans': .* greater than or equal to 2",
+        ),
+        (
+            "memory: {kind: gru}\nppo: {mirror: true}",
+            r"a gru has no mirror image; leave out ppo",
+        ),
+        (
+            "ppo: {engine: sb3, mirror: true}",
+            r"engine 'lean' alone learns by ppo.mirror; leave",
+        ),
+        (
+            "memory: {kind: gru}\nppo: {engine: sb3}",
+            r"ppo's engine 'lean' alone learns a memory",
+        ),
+        (
+            "memory: {kind: stack}\nalgorithm: sac",
+            r"ppo's engine 'lean' alone learns a memory",
+        ),
+        (
+            "task_options: {robot: x}",
+            r"task_options can't hold 'robot', which the model gives",
+        ),
     ],
 )
 def test_wrong_settings_are_refused_with_the_key(tmp_path, text, sentence):
@@ -81,7 +115,9 @@ def test_wrong_settings_are_refused_with_the_key(tmp_path, text, sentence):
     file.write_text(text)
     with pytest.raises(ConfigError, match=sentence):
         load_training(str(file))
-    with pytest.raises(ConfigError, match="unknown settings 'navigation_mecanun'; did you mean"):
+    with pytest.raises(
+        ConfigError, match="unknown settings 'navigation_mecanun'; did you mean"
+    ):
         load_training("navigation_mecanun")
 
 

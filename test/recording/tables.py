@@ -23,12 +23,18 @@ def drive(count: int = 200) -> dict[str, np.ndarray]:
     t = np.arange(count) * 0.02
     yaw = 0.25 * t
     return {
-        "t": t, "x": 2.0 * np.sin(yaw), "y": 2.0 - 2.0 * np.cos(yaw), "yaw": yaw,
-        "v": np.full(count, 0.5), "w": np.where(t < 2.0, 0.25, 0.3),
-    }  # fmt: skip
+        "t": t,
+        "x": 2.0 * np.sin(yaw),
+        "y": 2.0 - 2.0 * np.cos(yaw),
+        "yaw": yaw,
+        "v": np.full(count, 0.5),
+        "w": np.where(t < 2.0, 0.25, 0.3),
+    }
 
 
-def write(path: Path, columns: dict[str, Any], separator: str = ",", header: bool = True) -> Path:
+def write(
+    path: Path, columns: dict[str, Any], separator: str = ",", header: bool = True
+) -> Path:
     """Writes columns as text, a row per line."""
     rows = [separator.join(columns)] if header else []
     rows += [

@@ -78,9 +78,14 @@ def test_the_folder_its_file_and_the_file_alone_give_the_same_drive(bag, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("storage", "compression"),
-    [("mcap", "file"), ("mcap", "message"), ("mcap", "storage"),
-     ("sqlite3", "file"), ("sqlite3", "message")],
-)  # fmt: skip
+    [
+        ("mcap", "file"),
+        ("mcap", "message"),
+        ("mcap", "storage"),
+        ("sqlite3", "file"),
+        ("sqlite3", "message"),
+    ],
+)
 def test_a_compressed_bag_gives_the_same_drive(tmp_path, storage, compression):
     plain = bags.write(tmp_path / "plain", bags.drive(), storage)
     small = bags.write(tmp_path / "small", bags.drive(), storage, compression)
@@ -245,12 +250,16 @@ def test_a_summary_that_lost_the_name_of_a_topic_is_refused(bag, k, name):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_a_topic_that_only_the_summary_or_only_the_file_has_is_refused(tmp_path, storage):
+def test_a_topic_that_only_the_summary_or_only_the_file_has_is_refused(
+    tmp_path, storage
+):
     """Also one that the drive is not read from."""
     topics = bags.drive() | {"/extra": [(0.0, bags.twist(0.0, 0.0, 0.0))]}
     bag = bags.write(tmp_path / "bag", topics, storage)
     with metadata(bag) as told:
-        names = [one["topic_metadata"]["name"] for one in told["topics_with_message_count"]]
+        names = [
+            one["topic_metadata"]["name"] for one in told["topics_with_message_count"]
+        ]
         renamed(told, names.index("/extra"), "/other")
     assert "topic '/extra' of type" in refused(bag)
 
@@ -268,7 +277,9 @@ BOMB = "k0: &k0 {x: 1}\n" + "".join(
 )
 
 
-@pytest.mark.parametrize("text", [BOMB, "a: !!python/name:os.system x\n", "a: !!timestamp x\n"])
+@pytest.mark.parametrize(
+    "text", [BOMB, "a: !!python/name:os.system x\n", "a: !!timestamp x\n"]
+)
 def test_a_summary_that_grows_or_wants_objects_made_is_refused(bag, text):
     file = bag / "metadata.yaml"
     file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")

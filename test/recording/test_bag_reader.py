@@ -54,12 +54,16 @@ POSES = {
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_every_kind_of_command_is_read(tmp_path, kind, storage):
     command = [(t, COMMANDS[kind](t)) for t in bags.times(0.1)]
-    recording = read(tmp_path, {"/cmd_vel": command, "/pose": bags.poses()}, storage=storage)
+    recording = read(
+        tmp_path, {"/cmd_vel": command, "/pose": bags.poses()}, storage=storage
+    )
     assert np.allclose(recording.command.values, [0.5, 0.1])
     assert np.allclose(recording.command.t - recording.command.t[0], bags.times(0.1))
 
 
-@pytest.mark.parametrize(("kind", "angle"), [("Twist", np.arctan(0.04)), ("AckermannDrive", 0.1)])
+@pytest.mark.parametrize(
+    ("kind", "angle"), [("Twist", np.arctan(0.04)), ("AckermannDrive", 0.1)]
+)
 def test_a_twist_tells_a_turn_rate_where_the_robot_takes_one(tmp_path, kind, angle):
     command = [(t, COMMANDS[kind](t)) for t in bags.times(0.1)]
     turning = CAR.model_copy(update={"angular_is": "turn_rate"})
@@ -75,7 +79,9 @@ def test_every_kind_of_pose_is_read(tmp_path, kind, storage):
     topics = {"/cmd_vel": bags.commands(), "/where": pose}
     recording = read(tmp_path, topics, storage=storage, pose="/where")
     assert np.allclose(recording.pose.values[:, :2], PLACES[:, :2])
-    assert np.allclose(np.exp(1j * recording.pose.values[:, 2]), np.exp(1j * PLACES[:, 2]))
+    assert np.allclose(
+        np.exp(1j * recording.pose.values[:, 2]), np.exp(1j * PLACES[:, 2])
+    )
     assert np.allclose(recording.pose.t, bags.times())
 
 
@@ -103,7 +109,9 @@ def several_bodies():
 
 def test_the_robot_is_found_among_the_transforms_of_many(tmp_path):
     topics = {"/cmd_vel": bags.commands(), "/tf": several_bodies()}
-    recording = read(tmp_path, topics, pose="/tf", frame="mocap", child_frame="/base_link")
+    recording = read(
+        tmp_path, topics, pose="/tf", frame="mocap", child_frame="/base_link"
+    )
     assert np.allclose(recording.pose.values[:, :2], PLACES[:, :2])
 
 
@@ -111,12 +119,17 @@ def test_the_robot_is_found_among_the_transforms_of_many(tmp_path):
     ("named", "sentence"),
     [
         ({}, "holds several transforms;"),
-        ({"child_frame": "base_link"}, "holds several transforms with the given names;"),
+        (
+            {"child_frame": "base_link"},
+            "holds several transforms with the given names;",
+        ),
         ({"child_frame": "robot"}, "holds no transform with the given names;"),
         ({"frame": "map"}, "holds no transform with the given names;"),
     ],
 )
-def test_transforms_that_could_be_of_several_bodies_are_listed(tmp_path, named, sentence):
+def test_transforms_that_could_be_of_several_bodies_are_listed(
+    tmp_path, named, sentence
+):
     topics = {"/cmd_vel": bags.commands(), "/tf": several_bodies()}
     told = refused(tmp_path, topics, pose="/tf", **named)
     assert sentence in told
@@ -135,7 +148,9 @@ def moving_joints(t: float):
 
 
 def test_the_state_is_read_from_the_joints_that_the_mapping_names(tmp_path):
-    topics = bags.drive() | {"/joint_states": [(t, moving_joints(t)) for t in bags.times()]}
+    topics = bags.drive() | {
+        "/joint_states": [(t, moving_joints(t)) for t in bags.times()]
+    }
     speed = {"joint": NAMES[0], "field": "velocity", "scale": 0.05}
     state = read(tmp_path, topics, state={"speed": speed, "steering": NAMES[1]}).state
     assert state is not None
@@ -143,8 +158,12 @@ def test_the_state_is_read_from_the_joints_that_the_mapping_names(tmp_path):
 
 
 def test_wheel_speeds_are_read_from_the_joints_that_the_mapping_names(tmp_path):
-    joints = [(t, bags.joints(t, ["a", "b"], (0.0, 0.0), (9.0, 11.0))) for t in bags.times()]
-    wheels = read(tmp_path, bags.drive() | {"/joint_states": joints}, wheels=["b", "a"]).wheels
+    joints = [
+        (t, bags.joints(t, ["a", "b"], (0.0, 0.0), (9.0, 11.0))) for t in bags.times()
+    ]
+    wheels = read(
+        tmp_path, bags.drive() | {"/joint_states": joints}, wheels=["b", "a"]
+    ).wheels
     assert wheels is not None
     assert np.allclose(wheels.values, [11.0, 9.0])
 
@@ -158,7 +177,9 @@ def test_the_imu_is_read(tmp_path):
 
 @pytest.mark.parametrize("topic", ["/cmd_vel", "/pose", "/imu"])
 def test_a_message_with_nan_is_named(tmp_path, topic):
-    topics = bags.drive() | {"/imu": [(t, bags.imu(t, 0.1, 0.2, 0.3)) for t in bags.times()]}
+    topics = bags.drive() | {
+        "/imu": [(t, bags.imu(t, 0.1, 0.2, 0.3)) for t in bags.times()]
+    }
     bad = {
         "/cmd_vel": bags.twist(np.nan, 0.0, 0.0),
         "/pose": bags.pose_stamped(7 * bags.STEP_S, np.inf, 0.0, 0.0),
@@ -190,13 +211,17 @@ def test_a_topic_of_a_type_that_nobody_knows_is_left_alone(tmp_path):
             kind = rows[0][1].__msgtype__
             connection = writer.add_connection(topic, kind, typestore=bags.STORE)
             for t, message in rows:
-                writer.write(connection, bags.ns(t), bags.STORE.serialize_cdr(message, kind))
+                writer.write(
+                    connection, bags.ns(t), bags.STORE.serialize_cdr(message, kind)
+                )
         strange = writer.add_connection(
             "/strange", "my_msgs/msg/Own", msgdef="int32 x", rihs01="RIHS01_00"
         )
         writer.write(strange, bags.ns(1.0), b"\x00\x01\x00\x00\x01\x00\x00\x00")
     assert len(read_recording(bag, CAR).command.t) == len(bags.commands())
-    with pytest.raises(RecordingError, match="is of type my_msgs/msg/Own; cmd_vel must be one of"):
+    with pytest.raises(
+        RecordingError, match="is of type my_msgs/msg/Own; cmd_vel must be one of"
+    ):
         read_recording(bag, CAR, TopicRoles(cmd_vel="/strange"))
 
 
@@ -255,13 +280,20 @@ def test_wheels_are_known_by_the_words_of_their_names(names):
     joints = table((names, (0.0, 0.0), (1.0, 2.0)), (names, (0.1, 0.2), (3.0, 4.0)))
     state = state_of(joints, CART, roles(), "drive")
     assert state.values.tolist() == [[1.0, 2.0], [3.0, 4.0]]
-    assert wheels_of(joints, roles(), "drive").values.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert wheels_of(joints, roles(), "drive").values.tolist() == [
+        [1.0, 2.0],
+        [3.0, 4.0],
+    ]
 
 
 def test_wheels_in_another_order_are_put_in_the_robots():
-    names = [f"{end}_{side}_wheel" for end in ("rear", "front") for side in ("right", "left")]
+    names = [
+        f"{end}_{side}_wheel" for end in ("rear", "front") for side in ("right", "left")
+    ]
     joints = table((names, np.zeros(4), (4.0, 3.0, 2.0, 1.0)))
-    assert state_of(joints, MECANUM, roles(), "drive").values.tolist() == [[1.0, 2.0, 3.0, 4.0]]
+    assert state_of(joints, MECANUM, roles(), "drive").values.tolist() == [
+        [1.0, 2.0, 3.0, 4.0]
+    ]
 
 
 def test_angles_are_positions_and_speeds_are_velocities_unless_the_mapping_says_otherwise():
@@ -287,13 +319,18 @@ def test_a_state_that_follows_its_command_need_not_be_measured():
 
 def test_a_component_of_the_twist_is_told_by_the_pose():
     husky = robot_from({"kind": "skid_steer", "footprint_radius": 0.6})
-    assert state_of(table((("elbow",), (0.0,), (1.0,))), husky, roles(), "drive") is None
+    assert (
+        state_of(table((("elbow",), (0.0,), (1.0,))), husky, roles(), "drive") is None
+    )
 
 
 def test_a_state_that_must_be_measured_and_is_not_is_named():
     sentence = refuse(table((("elbow",), (0.0,), (1.0,))), CART)
     assert "no joint is known for the state 'left_wheel'" in sentence
-    assert "are elbow: name it in the topics file, as in state: {left_wheel: JOINT}." in sentence
+    assert (
+        "are elbow: name it in the topics file, as in state: {left_wheel: JOINT}."
+        in sentence
+    )
 
 
 def test_joints_that_could_each_be_it_are_not_guessed():
@@ -305,7 +342,10 @@ def test_joints_without_velocity_are_refused():
     names = ("left_wheel", "right_wheel")
     for velocity in ((), (np.nan, np.nan)):
         sentence = refuse(table((names, (0.0, 0.0), velocity)), CART)
-        assert "no message tells the position or velocity that is needed of left_wheel" in sentence
+        assert (
+            "no message tells the position or velocity that is needed of left_wheel"
+            in sentence
+        )
         assert wheels_of(table((names, (0.0, 0.0), velocity)), roles(), "drive") is None
 
 
@@ -315,7 +355,9 @@ def test_names_that_are_not_there_come_with_the_nearest():
     assert sentence == (
         "drive: topic '/joint_states' has no joint 'weel_l'; did you mean 'wheel_l'?"
     )
-    assert "has no state 'left_weel'" in refuse(joints, CART, state={"left_weel": "wheel_l"})
+    assert "has no state 'left_weel'" in refuse(
+        joints, CART, state={"left_weel": "wheel_l"}
+    )
     with pytest.raises(RecordingError, match="has no joint 'left'"):
         wheels_of(joints, roles(wheels=["left", "wheel_r"]), "drive")
 
@@ -331,7 +373,9 @@ def drive(path, ahead=0.0, sweep=0.0, scans=300):
     """A drive whose scans come LEAST_S to JITTER_S more after they were measured."""
     times = bags.times(0.1, 30.0)[:scans]
     topics = bags.drive() | {
-        "/odom": [(t + 0.003, bags.odometry(t, *bags.place_at(t))) for t in bags.times(0.05)],
+        "/odom": [
+            (t + 0.003, bags.odometry(t, *bags.place_at(t))) for t in bags.times(0.05)
+        ],
         "/scan": [
             (t + late, bags.scan(t - sweep + ahead, time_increment=sweep / 3))
             for t, late in zip(times, delays(len(times)), strict=True)

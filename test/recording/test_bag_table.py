@@ -25,7 +25,9 @@ DEFINITION = "std_msgs/Header header\nfloat32[3] motor\nbool armed\nstring mode\
 
 
 def read(path, **given):
-    return read_recording(path, mapping=Mapping.model_validate({"pose": "/pose"} | given))
+    return read_recording(
+        path, mapping=Mapping.model_validate({"pose": "/pose"} | given)
+    )
 
 
 def ros_1_bag(path: Path) -> Path:
@@ -35,11 +37,16 @@ def ros_1_bag(path: Path) -> Path:
     time = store.types["builtin_interfaces/msg/Time"]
     with Ros1Writer(path) as writer:
         kinds = {"/throttle": "std_msgs/msg/Float32", "/pose": bags.kinds.POSE}
-        topics = {t: writer.add_connection(t, kind, typestore=store) for t, kind in kinds.items()}
+        topics = {
+            t: writer.add_connection(t, kind, typestore=store)
+            for t, kind in kinds.items()
+        }
         for k, t in enumerate(bags.times()):
             x, y, yaw = bags.place_at(t)
             stamp = time(*divmod(bags.ns(t - 0.003), 10**9))
-            pose = store.types[bags.kinds.POSE](header(k, stamp, "map"), bags.pose(x, y, yaw))
+            pose = store.types[bags.kinds.POSE](
+                header(k, stamp, "map"), bags.pose(x, y, yaw)
+            )
             raw = store.serialize_ros1(pose, bags.kinds.POSE)
             writer.write(topics["/pose"], bags.ns(t), raw)
             if k % 5 == 0:
@@ -68,7 +75,9 @@ def foreign_bag(path: Path) -> Path:
 
 
 def test_a_bag_of_ros_1_is_read_by_any_number_in_it(tmp_path):
-    found = read(ros_1_bag(tmp_path / "drive.bag"), command={"throttle": "/throttle:data"})
+    found = read(
+        ros_1_bag(tmp_path / "drive.bag"), command={"throttle": "/throttle:data"}
+    )
     assert np.allclose(found.command.values[:, 0], 0.5 + np.array(bags.times())[::5])
     assert np.allclose(found.pose.values[-1], bags.place_at(bags.times()[-1]))
     # Poses by header, the rest by arrival: of one clock, as the headers are 3 ms older only.
@@ -86,8 +95,13 @@ def test_a_bag_of_ros_1_is_read_by_roles_of_topics_too(tmp_path):
 
 
 def test_types_that_only_the_bag_knows_are_read_by_field_index_and_flag(tmp_path):
-    value = {"from": "/drive:motor[2]", "when": {"/drive:armed": True, "/drive:mode": "AUTO"}}
-    found = read(foreign_bag(tmp_path / "bag"), command={"a": value, "b": "drive:motor.1"})
+    value = {
+        "from": "/drive:motor[2]",
+        "when": {"/drive:armed": True, "/drive:mode": "AUTO"},
+    }
+    found = read(
+        foreign_bag(tmp_path / "bag"), command={"a": value, "b": "drive:motor.1"}
+    )
     t = np.array(bags.times())
     assert np.allclose(found.command.values[:, 0], np.where(t > 1.0, 2.0 * t, 0.0))
     assert np.allclose(found.command.values[:, 1], t)
@@ -107,7 +121,9 @@ def test_a_wrong_field_or_topic_is_named(tmp_path, command, sentence):
     assert sentence in str(refused.value)
 
 
-def test_joints_are_found_by_name_whatever_their_order_and_where_one_is_missing(tmp_path):
+def test_joints_are_found_by_name_whatever_their_order_and_where_one_is_missing(
+    tmp_path,
+):
     def joints(k, t):
         names = [["left", "right"], ["right", "left"], ["left"]][k % 3]
         velocity = [t if name == "left" else -t for name in names]
@@ -120,7 +136,10 @@ def test_joints_are_found_by_name_whatever_their_order_and_where_one_is_missing(
     t = np.array(bags.times())
     held = np.where(np.arange(len(t)) % 3 == 2, t - bags.STEP_S, t)
     assert np.allclose(found.command.values, np.stack([t, -held], axis=1))
-    assert "command.right: 100 of 300 rows have no value, and were left out." in found.repairs
+    assert (
+        "command.right: 100 of 300 rows have no value, and were left out."
+        in found.repairs
+    )
 
 
 def test_transforms_are_poses_between_two_frames(tmp_path):
@@ -138,17 +157,23 @@ def test_transforms_are_poses_between_two_frames(tmp_path):
 
 
 def test_all_times_may_be_those_of_arrival(tmp_path):
-    bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(offset=5.0), "/v": bags.commands()})
+    bag = bags.write(
+        tmp_path / "bag", {"/pose": bags.poses(offset=5.0), "/v": bags.commands()}
+    )
     command = {"v": "/v:linear.x"}
     clocks = read(bag, command=command)
-    assert clocks.pose.clock != clocks.command.clock  # the headers are of a foreign clock
+    assert (
+        clocks.pose.clock != clocks.command.clock
+    )  # the headers are of a foreign clock
     arrived = read(bag, command=command, time="arrival")
     assert arrived.pose.clock == arrived.command.clock
 
 
 @pytest.mark.parametrize("offset", [0.0, 5.0])
 def test_a_clock_that_the_mapping_names_decides(tmp_path, offset):
-    bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()})
+    bag = bags.write(
+        tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()}
+    )
     command = {"v": "/v:linear.x"}
     own = read(bag, command=command, pose={"in": "/pose", "clock": "mocap"})
     assert (own.pose.clock, own.command.clock) == ("mocap", "robot")
@@ -158,7 +183,9 @@ def test_a_clock_that_the_mapping_names_decides(tmp_path, offset):
 
 @pytest.mark.parametrize("offset", [0.0, 5.0])
 def test_a_pose_by_header_goes_with_commands_that_have_none(tmp_path, offset):
-    bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()})
+    bag = bags.write(
+        tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()}
+    )
     given = {"command": {"v": "/v:linear.x"}, "pose": {"in": "/pose", "time": "header"}}
     found = read(bag, **given)
     assert (found.pose.clock == found.command.clock) == (offset == 0.0)
@@ -167,7 +194,9 @@ def test_a_pose_by_header_goes_with_commands_that_have_none(tmp_path, offset):
     assert np.allclose(np.diff(found.pose.t), bags.STEP_S)
     if offset == 0.0:
         assert found.command.t[0] - found.pose.t[0] == pytest.approx(0.002)
-    with pytest.raises(RecordingError, match="topic '/v': its messages have no header stamps"):
+    with pytest.raises(
+        RecordingError, match="topic '/v': its messages have no header stamps"
+    ):
         read(bag, **given, time="header")
 
 
@@ -175,7 +204,9 @@ def test_the_covariance_of_a_message_gives_deviations(tmp_path):
     rows = [(t, bags.pose_with_covariance(t, *bags.place_at(t))) for t in bags.times()]
     topics = {"/pose": rows, "/v": bags.commands()}
     command = {"v": "/v:linear.x"}
-    assert read(bags.write(tmp_path / "none", topics), command=command).pose.sigma is None
+    assert (
+        read(bags.write(tmp_path / "none", topics), command=command).pose.sigma is None
+    )
     for _, message in rows:
         message.pose.covariance[[0, 7, 35]] = 0.01, 0.04, 0.09
     found = read(bags.write(tmp_path / "some", topics), command=command)
@@ -186,14 +217,19 @@ def test_a_bag_is_surveyed_to_a_first_mapping(tmp_path):
     with open_source(foreign_bag(tmp_path / "bag")) as source:
         tables = {table.name: table for table in survey(source)}
         guess = parse_yaml(first_mapping(list(tables.values())), "guess")
-    assert [column.name for column in tables["/drive"].columns][-2:] == ["armed", "mode"]
+    assert [column.name for column in tables["/drive"].columns][-2:] == [
+        "armed",
+        "mode",
+    ]
     assert any("50 Hz" in line for line in tables["/pose"].regularity)
     assert guess["pose"] == "/pose"
 
 
 def test_a_bag_whose_headers_were_set_back_is_stamped_by_arrival_and_says_so(tmp_path):
     store = bags.STORE
-    with Writer(tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with Writer(
+        tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP
+    ) as writer:
         poses = writer.add_connection("/pose", bags.kinds.POSE, typestore=store)
         speed = writer.add_connection("/speed", "std_msgs/msg/Float32", typestore=store)
         for t in bags.times():
@@ -215,9 +251,13 @@ def test_a_bag_of_simulated_time_at_another_rate_is_stamped_by_its_headers_and_s
     tmp_path, rate
 ):
     store = bags.STORE
-    with Writer(tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with Writer(
+        tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP
+    ) as writer:
         topics = ("/pose", "/target")
-        poses = [writer.add_connection(t, bags.kinds.POSE, typestore=store) for t in topics]
+        poses = [
+            writer.add_connection(t, bags.kinds.POSE, typestore=store) for t in topics
+        ]
         for t in bags.times():
             message = bags.pose_stamped(100.0 + t, *bags.place_at(t))
             raw = store.serialize_cdr(message, bags.kinds.POSE)
@@ -225,4 +265,7 @@ def test_a_bag_of_simulated_time_at_another_rate_is_stamped_by_its_headers_and_s
                 writer.write(topic, bags.ns(t / rate), raw)
     found = read(tmp_path / "set", command={"v": "/target:pose.position.x"})
     assert np.allclose(np.diff(found.pose.t), np.diff(bags.times()))
-    assert any("stamped by their headers, which go on together" in note for note in found.repairs)
+    assert any(
+        "stamped by their headers, which go on together" in note
+        for note in found.repairs
+    )

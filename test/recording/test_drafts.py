@@ -36,183 +36,476 @@ def motion() -> dict[str, np.ndarray]:
     wrapped = np.arctan2(np.sin(yaw), np.cos(yaw))
     zero = np.zeros(COUNT)
     return {
-        "t": t, "x": x, "y": y, "yaw": wrapped, "v": v, "w": w, "speed": speed, "rate": rate,
-        "qz": np.sin(yaw / 2.0), "qw": np.cos(yaw / 2.0), "zero": zero,
+        "t": t,
+        "x": x,
+        "y": y,
+        "yaw": wrapped,
+        "v": v,
+        "w": w,
+        "speed": speed,
+        "rate": rate,
+        "qz": np.sin(yaw / 2.0),
+        "qw": np.cos(yaw / 2.0),
+        "zero": zero,
         "noise": rng.normal(size=COUNT),
         "left": np.floor(np.cumsum(speed - 0.2 * rate) * 400.0),
         "right": np.floor(np.cumsum(speed + 0.2 * rate) * 400.0),
-    }  # fmt: skip
+    }
 
 
 M = motion()
-XYZ = {"tx": "x", "ty": "y", "tz": "zero", "qx": "zero", "qy": "zero", "qz": "qz", "qw": "qw"}
+XYZ = {
+    "tx": "x",
+    "ty": "y",
+    "tz": "zero",
+    "qx": "zero",
+    "qy": "zero",
+    "qz": "qz",
+    "qw": "qw",
+}
 LAT, LON = 47.5 + M["y"] * 9e-6, 8.7 + M["x"] * 13e-6
 # Columns: by the name of a signal of `motion`, or as they are. Then the columns that are to be
 # guessed for x, for the heading or quaternion, and as commands; None and {} for a blank.
 TABLES: dict[str, tuple[dict[str, Any], str | None, Any, dict[str, str]]] = {
     "issue": (
-        {"time": "t", "x(m)": "x", "y(m)": "y", "phi(rad)": "yaw",
-         "cmd_vel_x": "v", "cmd_vel_omega": "w"},
-        "x(m)", "phi(rad)", {"forward_command": "cmd_vel_x", "turn_command": "cmd_vel_omega"},
+        {
+            "time": "t",
+            "x(m)": "x",
+            "y(m)": "y",
+            "phi(rad)": "yaw",
+            "cmd_vel_x": "v",
+            "cmd_vel_omega": "w",
+        },
+        "x(m)",
+        "phi(rad)",
+        {"forward_command": "cmd_vel_x", "turn_command": "cmd_vel_omega"},
     ),
     "kitti oxts": (
-        {"lat": LAT, "lon": LON, "alt": "zero", "roll": "noise", "pitch": "noise", "yaw": "yaw",
-         "vn": "speed", "ve": "speed", "vf": "speed", "vl": "zero", "vu": "zero", "ax": "noise",
-         "ay": "noise", "az": "noise", "wx": "noise", "wy": "noise", "wz": "rate"},
-        "lon", "yaw", {},
+        {
+            "lat": LAT,
+            "lon": LON,
+            "alt": "zero",
+            "roll": "noise",
+            "pitch": "noise",
+            "yaw": "yaw",
+            "vn": "speed",
+            "ve": "speed",
+            "vf": "speed",
+            "vl": "zero",
+            "vu": "zero",
+            "ax": "noise",
+            "ay": "noise",
+            "az": "noise",
+            "wx": "noise",
+            "wy": "noise",
+            "wz": "rate",
+        },
+        "lon",
+        "yaw",
+        {},
     ),
     "tum": ({"timestamp": "t", **XYZ}, "tx", ["qx", "qy", "qz", "qw"], {}),
     "euroc": (
-        {"#timestamp": M["t"] * 1e9 + 1.4e18, "p_RS_R_x [m]": "x", "p_RS_R_y [m]": "y",
-         "p_RS_R_z [m]": "zero", "q_RS_w []": "qw", "q_RS_x []": "zero", "q_RS_y []": "zero",
-         "q_RS_z []": "qz", "v_RS_R_x [m s^-1]": "speed", "v_RS_R_y [m s^-1]": "zero",
-         "w_RS_S_z [rad s^-1]": "rate"},
-        "p_RS_R_x [m]", ["q_RS_x []", "q_RS_y []", "q_RS_z []", "q_RS_w []"], {},
+        {
+            "#timestamp": M["t"] * 1e9 + 1.4e18,
+            "p_RS_R_x [m]": "x",
+            "p_RS_R_y [m]": "y",
+            "p_RS_R_z [m]": "zero",
+            "q_RS_w []": "qw",
+            "q_RS_x []": "zero",
+            "q_RS_y []": "zero",
+            "q_RS_z []": "qz",
+            "v_RS_R_x [m s^-1]": "speed",
+            "v_RS_R_y [m s^-1]": "zero",
+            "w_RS_S_z [rad s^-1]": "rate",
+        },
+        "p_RS_R_x [m]",
+        ["q_RS_x []", "q_RS_y []", "q_RS_z []", "q_RS_w []"],
+        {},
     ),
     "euroc imu": (
-        {"timestamp [ns]": M["t"] * 1e9, "w_RS_S_x [rad s^-1]": "noise",
-         "w_RS_S_y [rad s^-1]": "noise", "w_RS_S_z [rad s^-1]": "rate",
-         "a_RS_S_x [m s^-2]": "noise", "a_RS_S_y [m s^-2]": "noise"},
-        None, None, {},
+        {
+            "timestamp [ns]": M["t"] * 1e9,
+            "w_RS_S_x [rad s^-1]": "noise",
+            "w_RS_S_y [rad s^-1]": "noise",
+            "w_RS_S_z [rad s^-1]": "rate",
+            "a_RS_S_x [m s^-2]": "noise",
+            "a_RS_S_y [m s^-2]": "noise",
+        },
+        None,
+        None,
+        {},
     ),
     "odometry only": (
-        {"t": "t", "odom_x": "x", "odom_y": "y", "odom_theta": "yaw", "odom_v": "speed",
-         "odom_w": "rate"},
-        "odom_x", "odom_theta", {},
+        {
+            "t": "t",
+            "odom_x": "x",
+            "odom_y": "y",
+            "odom_theta": "yaw",
+            "odom_v": "speed",
+            "odom_w": "rate",
+        },
+        "odom_x",
+        "odom_theta",
+        {},
     ),
     "bare v and w": (
-        {"t": "t", "x": "x", "y": "y", "theta": "yaw", "v": "speed", "w": "rate"}, "x", "theta", {},
+        {"t": "t", "x": "x", "y": "y", "theta": "yaw", "v": "speed", "w": "rate"},
+        "x",
+        "theta",
+        {},
     ),
     "truth beside odometry and slam": (
-        {"t": "t", "gt_x": "x", "gt_y": "y", "gt_yaw": "yaw", "odom_x": "noise", "odom_y": "noise",
-         "odom_yaw": "noise", "slam_x": "x", "slam_y": "y", "slam_yaw": "yaw", "cmd_v": "v",
-         "cmd_w": "w"},
-        "gt_x", "gt_yaw", {"forward_command": "cmd_v", "turn_command": "cmd_w"},
+        {
+            "t": "t",
+            "gt_x": "x",
+            "gt_y": "y",
+            "gt_yaw": "yaw",
+            "odom_x": "noise",
+            "odom_y": "noise",
+            "odom_yaw": "noise",
+            "slam_x": "x",
+            "slam_y": "y",
+            "slam_yaw": "yaw",
+            "cmd_v": "v",
+            "cmd_w": "w",
+        },
+        "gt_x",
+        "gt_yaw",
+        {"forward_command": "cmd_v", "turn_command": "cmd_w"},
     ),
     "slam positions": (
-        {"t": "t", "orb_x": "x", "orb_y": "y", "orb_z": "zero", "lio_x": "x", "lio_y": "y"},
-        None, None, {},
+        {
+            "t": "t",
+            "orb_x": "x",
+            "orb_y": "y",
+            "orb_z": "zero",
+            "lio_x": "x",
+            "lio_y": "y",
+        },
+        None,
+        None,
+        {},
     ),
     "rostopic echo of odometry": (
-        {"%time": M["t"] * 1e9 + 1.6e18, "field.header.seq": np.arange(COUNT),
-         "field.pose.pose.position.x": "x", "field.pose.pose.position.y": "y",
-         "field.pose.pose.position.z": "zero", "field.pose.pose.orientation.x": "zero",
-         "field.pose.pose.orientation.y": "zero", "field.pose.pose.orientation.z": "qz",
-         "field.pose.pose.orientation.w": "qw", "field.pose.covariance0": "noise",
-         "field.twist.twist.linear.x": "speed", "field.twist.twist.angular.z": "rate",
-         "field.twist.covariance0": "noise"},
+        {
+            "%time": M["t"] * 1e9 + 1.6e18,
+            "field.header.seq": np.arange(COUNT),
+            "field.pose.pose.position.x": "x",
+            "field.pose.pose.position.y": "y",
+            "field.pose.pose.position.z": "zero",
+            "field.pose.pose.orientation.x": "zero",
+            "field.pose.pose.orientation.y": "zero",
+            "field.pose.pose.orientation.z": "qz",
+            "field.pose.pose.orientation.w": "qw",
+            "field.pose.covariance0": "noise",
+            "field.twist.twist.linear.x": "speed",
+            "field.twist.twist.angular.z": "rate",
+            "field.twist.covariance0": "noise",
+        },
         "field.pose.pose.position.x",
-        [f"field.pose.pose.orientation.{axis}" for axis in "xyzw"], {},
+        [f"field.pose.pose.orientation.{axis}" for axis in "xyzw"],
+        {},
     ),
     "lidar beams": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "cmd_vel": "v",
-         **{f"range_{k}": "noise" for k in range(12)}, **{f"scan[{k}]": "noise" for k in range(4)}},
-        "x", "yaw", {},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "cmd_vel": "v",
+            **{f"range_{k}": "noise" for k in range(12)},
+            **{f"scan[{k}]": "noise" for k in range(4)},
+        },
+        "x",
+        "yaw",
+        {},
     ),
     "covariances": (
-        {"t": "t", "pose_x": "x", "pose_y": "y", "pose_yaw": "yaw", "cov_xx": "noise",
-         "cov_yy": "noise", "cov_yawyaw": "noise", "sigma_v": "noise", "cmd_covariance": "noise"},
-        "pose_x", "pose_yaw", {},
+        {
+            "t": "t",
+            "pose_x": "x",
+            "pose_y": "y",
+            "pose_yaw": "yaw",
+            "cov_xx": "noise",
+            "cov_yy": "noise",
+            "cov_yawyaw": "noise",
+            "sigma_v": "noise",
+            "cmd_covariance": "noise",
+        },
+        "pose_x",
+        "pose_yaw",
+        {},
     ),
     "f1tenth": (
-        {"t": "t", "pose_x": "x", "pose_y": "y", "pose_theta": "yaw", "speed": "speed",
-         "steering_angle": "w", "cmd_speed": "v", "cmd_steering_angle": "w"},
-        "pose_x", "pose_theta",
+        {
+            "t": "t",
+            "pose_x": "x",
+            "pose_y": "y",
+            "pose_theta": "yaw",
+            "speed": "speed",
+            "steering_angle": "w",
+            "cmd_speed": "v",
+            "cmd_steering_angle": "w",
+        },
+        "pose_x",
+        "pose_theta",
         {"speed_command": "cmd_speed", "steering_command": "cmd_steering_angle"},
     ),
     "f1tenth, measured only": (
-        {"t": "t", "pose_x": "x", "pose_y": "y", "pose_theta": "yaw", "speed": "speed",
-         "steering_angle": "w"},
-        "pose_x", "pose_theta", {},
+        {
+            "t": "t",
+            "pose_x": "x",
+            "pose_y": "y",
+            "pose_theta": "yaw",
+            "speed": "speed",
+            "steering_angle": "w",
+        },
+        "pose_x",
+        "pose_theta",
+        {},
     ),
     "jetracer": (
-        {"t": "t", "vicon x": "x", "vicon y": "y", "vicon yaw": "yaw", "W (IMU)": "rate",
-         "vel encoder": "speed", "throttle": "v", "steering": "w"},
-        "vicon x", "vicon yaw", {"throttle": "throttle", "steering": "steering"},
+        {
+            "t": "t",
+            "vicon x": "x",
+            "vicon y": "y",
+            "vicon yaw": "yaw",
+            "W (IMU)": "rate",
+            "vel encoder": "speed",
+            "throttle": "v",
+            "steering": "w",
+        },
+        "vicon x",
+        "vicon yaw",
+        {"throttle": "throttle", "steering": "steering"},
     ),
     "agv": (
-        {"time_ms": M["t"] * 1e3, "agv_x_mm": M["x"] * 1e3, "agv_y_mm": M["y"] * 1e3,
-         "agv_heading_deg": np.degrees(M["yaw"]), "act_speed": "speed", "set_speed": "v",
-         "set_steer_deg": np.degrees(M["w"]), "act_steer_deg": np.degrees(M["w"]),
-         "battery_voltage": "noise", "motor_current": "noise"},
-        "agv_x_mm", "agv_heading_deg",
+        {
+            "time_ms": M["t"] * 1e3,
+            "agv_x_mm": M["x"] * 1e3,
+            "agv_y_mm": M["y"] * 1e3,
+            "agv_heading_deg": np.degrees(M["yaw"]),
+            "act_speed": "speed",
+            "set_speed": "v",
+            "set_steer_deg": np.degrees(M["w"]),
+            "act_steer_deg": np.degrees(M["w"]),
+            "battery_voltage": "noise",
+            "motor_current": "noise",
+        },
+        "agv_x_mm",
+        "agv_heading_deg",
         {"speed_command": "set_speed", "steering_command": "set_steer_deg"},
     ),
     "encoder ticks": (
-        {"t": "t", "cam_x": "x", "cam_y": "y", "cam_theta": "yaw", "left_ticks": "left",
-         "right_ticks": "right"},
-        "cam_x", "cam_theta", {"left_wheel": "left_ticks", "right_wheel": "right_ticks"},
+        {
+            "t": "t",
+            "cam_x": "x",
+            "cam_y": "y",
+            "cam_theta": "yaw",
+            "left_ticks": "left",
+            "right_ticks": "right",
+        },
+        "cam_x",
+        "cam_theta",
+        {"left_wheel": "left_ticks", "right_wheel": "right_ticks"},
     ),
     "ticks beside commands": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "left_ticks": "left", "right_ticks": "right",
-         "v_cmd": "v", "w_cmd": "w"},
-        "x", "yaw", {"forward_command": "v_cmd", "turn_command": "w_cmd"},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "left_ticks": "left",
+            "right_ticks": "right",
+            "v_cmd": "v",
+            "w_cmd": "w",
+        },
+        "x",
+        "yaw",
+        {"forward_command": "v_cmd", "turn_command": "w_cmd"},
     ),
     "gps track": (
-        {"time": "t", "latitude": LAT, "longitude": LON, "altitude": "noise", "speed": "speed",
-         "hdop": "noise", "satellites": "noise"},
-        None, None, {},
+        {
+            "time": "t",
+            "latitude": LAT,
+            "longitude": LON,
+            "altitude": "noise",
+            "speed": "speed",
+            "hdop": "noise",
+            "satellites": "noise",
+        },
+        None,
+        None,
+        {},
     ),
     "gps and imu": (
         {"time": "t", "lat": LAT, "lon": LON, "imu_yaw": "yaw", "imu_gyro_z": "rate"},
-        None, None, {},
+        None,
+        None,
+        {},
     ),
     "phone imu": (
-        {"Time (s)": "t", "Acceleration x (m/s^2)": "noise", "Acceleration y (m/s^2)": "noise",
-         "Acceleration z (m/s^2)": "noise", "Gyroscope z (rad/s)": "rate"},
-        None, None, {},
+        {
+            "Time (s)": "t",
+            "Acceleration x (m/s^2)": "noise",
+            "Acceleration y (m/s^2)": "noise",
+            "Acceleration z (m/s^2)": "noise",
+            "Gyroscope z (rad/s)": "rate",
+        },
+        None,
+        None,
+        {},
     ),
     "goals": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "goal_x": "noise", "goal_y": "noise",
-         "goal_yaw": "noise", "target_x": "noise", "target_y": "noise"},
-        "x", "yaw", {},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "goal_x": "noise",
+            "goal_y": "noise",
+            "goal_yaw": "noise",
+            "target_x": "noise",
+            "target_y": "noise",
+        },
+        "x",
+        "yaw",
+        {},
     ),
     "sonars": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "left": "noise", "right": "noise",
-         "front_left": "noise", "front_right": "noise"},
-        "x", "yaw", {},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "left": "noise",
+            "right": "noise",
+            "front_left": "noise",
+            "front_right": "noise",
+        },
+        "x",
+        "yaw",
+        {},
     ),
     "wheel speeds, measured": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "wheel_speed_left [rad/s]": "v",
-         "wheel_speed_right [rad/s]": "w"},
-        "x", "yaw",
-        {"left_wheel": "wheel_speed_left [rad/s]", "right_wheel": "wheel_speed_right [rad/s]"},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "wheel_speed_left [rad/s]": "v",
+            "wheel_speed_right [rad/s]": "w",
+        },
+        "x",
+        "yaw",
+        {
+            "left_wheel": "wheel_speed_left [rad/s]",
+            "right_wheel": "wheel_speed_right [rad/s]",
+        },
     ),
     "references of a controller": (
-        {"t": "t", "x_m": "x", "y_m": "y", "psi_rad": "yaw", "v_ref_m_s": "v",
-         "omega_ref_rad_s": "w", "v_m_s": "speed", "omega_rad_s": "rate"},
-        "x_m", "psi_rad", {"forward_command": "v_ref_m_s", "turn_command": "omega_ref_rad_s"},
+        {
+            "t": "t",
+            "x_m": "x",
+            "y_m": "y",
+            "psi_rad": "yaw",
+            "v_ref_m_s": "v",
+            "omega_ref_rad_s": "w",
+            "v_m_s": "speed",
+            "omega_rad_s": "rate",
+        },
+        "x_m",
+        "psi_rad",
+        {"forward_command": "v_ref_m_s", "turn_command": "omega_ref_rad_s"},
     ),
     "mecanum": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "cmd_vx": "v", "cmd_vy": "noise",
-         "cmd_wz": "w", "vx": "speed", "vy": "zero", "wz": "rate"},
-        "x", "yaw", {"vx": "cmd_vx", "vy": "cmd_vy", "wz": "cmd_wz"},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "cmd_vx": "v",
+            "cmd_vy": "noise",
+            "cmd_wz": "w",
+            "vx": "speed",
+            "vy": "zero",
+            "wz": "rate",
+        },
+        "x",
+        "yaw",
+        {"vx": "cmd_vx", "vy": "cmd_vy", "wz": "cmd_wz"},
     ),
     "motors of a skid-steer": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "motor_left_cmd": "v", "motor_right_cmd": "w",
-         "motor_left_current": "noise", "motor_right_current": "noise"},
-        "x", "yaw", {"left_wheel": "motor_left_cmd", "right_wheel": "motor_right_cmd"},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "motor_left_cmd": "v",
+            "motor_right_cmd": "w",
+            "motor_left_current": "noise",
+            "motor_right_current": "noise",
+        },
+        "x",
+        "yaw",
+        {"left_wheel": "motor_left_cmd", "right_wheel": "motor_right_cmd"},
     ),
     "two commands of one meaning": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "cmd_v_raw": "v", "cmd_v_limited": "speed",
-         "cmd_w": "w"},
-        "x", "yaw", {},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "cmd_v_raw": "v",
+            "cmd_v_limited": "speed",
+            "cmd_w": "w",
+        },
+        "x",
+        "yaw",
+        {},
     ),
     "actions of a policy": (
-        {"t": "t", "x": "x", "y": "y", "yaw": "yaw", "action_0": "v", "action_1": "w",
-         "reward": "noise"},
-        "x", "yaw", {},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "action_0": "v",
+            "action_1": "w",
+            "reward": "noise",
+        },
+        "x",
+        "yaw",
+        {},
     ),
     "drone": (
-        {"t": "t", "x": "x", "y": "y", "z": M["noise"] + 1.5, "roll_cmd": "noise",
-         "thrust_cmd": "noise"},
-        None, None, {},
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "z": M["noise"] + 1.5,
+            "roll_cmd": "noise",
+            "thrust_cmd": "noise",
+        },
+        None,
+        None,
+        {},
     ),
     "nothing moves": (
-        {"t": "t", "x": "zero", "y": "zero", "yaw": "zero", "cmd_v": "zero", "cmd_w": "zero"},
-        None, None, {},
+        {
+            "t": "t",
+            "x": "zero",
+            "y": "zero",
+            "yaw": "zero",
+            "cmd_v": "zero",
+            "cmd_w": "zero",
+        },
+        None,
+        None,
+        {},
     ),
-}  # fmt: skip
+}
 
 
 def drafted(path) -> tuple[str, dict[str, Any]]:
@@ -233,8 +526,12 @@ def test_a_draft_of_a_table_is_right_or_blank(tmp_path, style):
     text, draft = drafted(path)
     assert draft["pose"]["x"] == x, text
     found = draft["pose"].get("quaternion") or draft["pose"].get("heading")
-    assert (found if isinstance(found, list) or found is None else column_of(found)) == turned
-    guessed = {name: column_of(value) for name, value in (draft["command"] or {}).items()}
+    assert (
+        found if isinstance(found, list) or found is None else column_of(found)
+    ) == turned
+    guessed = {
+        name: column_of(value) for name, value in (draft["command"] or {}).items()
+    }
     assert guessed == commands, text
     if x and commands:
         drive = read_recording(path, mapping=Mapping.model_validate(draft))
@@ -248,33 +545,46 @@ def test_a_blank_lists_the_candidates_as_comments_that_can_be_uncommented(tmp_pa
     assert draft["command"] is None
     assert "#  forward_command: v\n#  turn_command: w\n" in text
     chosen = text.replace("#  ", "  ")
-    drive = read_recording(path, mapping=Mapping.model_validate(parse_yaml(chosen, "draft")))
+    drive = read_recording(
+        path, mapping=Mapping.model_validate(parse_yaml(chosen, "draft"))
+    )
     assert drive.variables == ("forward_command", "turn_command")
 
 
 def test_a_blank_draft_is_refused_with_what_is_missing(tmp_path):
     (tmp_path / "my.yaml").write_text("robot: differential\npose: /odom\ncommand:\n")
-    with pytest.raises(ConfigError, match=r"command: names none.*record it together with the pose"):
+    with pytest.raises(
+        ConfigError, match=r"command: names none.*record it together with the pose"
+    ):
         load_mapping(tmp_path / "my.yaml")
 
 
 @pytest.mark.parametrize(
-    "column", ["latitude", "/fix:longitude", "gps altitude (m)", "pose.covariance[0]", "cov_xx"]
+    "column",
+    ["latitude", "/fix:longitude", "gps altitude (m)", "pose.covariance[0]", "cov_xx"],
 )
 def test_places_on_earth_and_covariances_are_refused_as_commands(tmp_path, column):
-    text = f'robot: differential\npose: /odom\ncommand: {{forward_command: "{column}"}}\n'
+    text = (
+        f'robot: differential\npose: /odom\ncommand: {{forward_command: "{column}"}}\n'
+    )
     (tmp_path / "my.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"command\.forward_command: .* was not sent to the rob"):
+    with pytest.raises(
+        ConfigError, match=r"command\.forward_command: .* was not sent to the rob"
+    ):
         load_mapping(tmp_path / "my.yaml")
 
 
-@pytest.mark.parametrize(("which", "name"), [(4, "latitude"), ("lat", "lat"), (4, "cov_xx")])
+@pytest.mark.parametrize(
+    ("which", "name"), [(4, "latitude"), ("lat", "lat"), (4, "cov_xx")]
+)
 def test_they_are_refused_by_number_and_by_short_names_too(tmp_path, which, name):
     columns = {"t": M["t"], "x": M["x"], "y": M["y"], "yaw": M["yaw"], name: LAT}
     path = write(tmp_path / "log.csv", columns)
     given = {
-        "time": "t", "pose": {"x": "x", "y": "y", "heading": "yaw"}, "command": {"v": which}
-    }  # fmt: skip
+        "time": "t",
+        "pose": {"x": "x", "y": "y", "heading": "yaw"},
+        "command": {"v": which},
+    }
     with pytest.raises(ConfigError, match=r"command\.v: .* was not sent to the robot"):
         read_recording(path, mapping=Mapping.model_validate(given))
 
@@ -282,12 +592,22 @@ def test_they_are_refused_by_number_and_by_short_names_too(tmp_path, which, name
 @pytest.mark.parametrize(
     ("column", "unit"),
     [
-        ("x(m)", "m"), ("x [mm]", "mm"), ("yaw_deg", "deg"), ("phi(rad)", "rad"),
-        ("v [m s^-1]", "m/s"), ("w (deg/s)", "deg/s"), ("speed_kmh", "km/h"), ("v_m_s", "m/s"),
-        ("acc (m/s^2)", "m/s^2"), ("heading (°)", "deg"), ("q_w []", None), ("cov[0]", None),
-        ("acc x (IMU)", None), ("omega_rad_per_s", "rad/s"),
+        ("x(m)", "m"),
+        ("x [mm]", "mm"),
+        ("yaw_deg", "deg"),
+        ("phi(rad)", "rad"),
+        ("v [m s^-1]", "m/s"),
+        ("w (deg/s)", "deg/s"),
+        ("speed_kmh", "km/h"),
+        ("v_m_s", "m/s"),
+        ("acc (m/s^2)", "m/s^2"),
+        ("heading (°)", "deg"),
+        ("q_w []", None),
+        ("cov[0]", None),
+        ("acc x (IMU)", None),
+        ("omega_rad_per_s", "rad/s"),
     ],
-)  # fmt: skip
+)
 def test_units_are_read_from_names(column, unit):
     assert unit_in(column)[1] == unit
 
@@ -298,12 +618,17 @@ def switched(name: str, on: float, off: float) -> dict[str, np.ndarray]:
     shift = np.cumsum(np.where(cut, 0.0, 1.0)).astype(int) - 1
     pose = {key: M[key][shift] for key in ("x", "y", "yaw")}
     return {
-        "t": M["t"], **pose, "throttle": M["v"], "steering": M["w"], name: np.where(cut, off, on)
-    }  # fmt: skip
+        "t": M["t"],
+        **pose,
+        "throttle": M["v"],
+        "steering": M["w"],
+        name: np.where(cut, off, on),
+    }
 
 
 @pytest.mark.parametrize(
-    ("name", "on", "off"), [("safety_value", 1.0, 0.0), ("estop", 0.0, 1.0), ("enabled", 1, 0)]
+    ("name", "on", "off"),
+    [("safety_value", 1.0, 0.0), ("estop", 0.0, 1.0), ("enabled", 1, 0)],
 )
 def test_a_switch_of_two_values_is_recognised(tmp_path, name, on, off):
     _, draft = drafted(write(tmp_path / "log.csv", switched(name, on, off)))
@@ -312,7 +637,8 @@ def test_a_switch_of_two_values_is_recognised(tmp_path, name, on, off):
 
 
 @pytest.mark.parametrize(
-    ("name", "on", "off"), [("safety_value", 0.0, 1.0), ("light", 1.0, 0.0), ("enable", 1.0, 0.5)]
+    ("name", "on", "off"),
+    [("safety_value", 0.0, 1.0), ("light", 1.0, 0.0), ("enable", 1.0, 0.5)],
 )
 def test_what_the_motion_denies_or_no_name_tells_is_no_switch(tmp_path, name, on, off):
     _, draft = drafted(write(tmp_path / "log.csv", switched(name, on, off)))
@@ -338,13 +664,18 @@ def test_a_command_that_no_latency_explains_is_said_on_top(tmp_path, shift, word
 
 def test_a_right_command_raises_no_doubt(tmp_path):
     columns, *_ = TABLES["issue"]
-    text, _ = drafted(write(tmp_path / "log.csv", {name: M[c] for name, c in columns.items()}))
+    text, _ = drafted(
+        write(tmp_path / "log.csv", {name: M[c] for name, c in columns.items()})
+    )
     assert "# doubt" not in text
 
 
 def test_the_car_of_the_validation_drive_is_drafted_whole(shared_recordings):
     _, draft = drafted(shared_recordings / "jetracer_dart" / "long_prediction_69s.csv")
-    assert draft["command"]["throttle"] == {"from": "throttle", "when": {"safety_value": 1}}
+    assert draft["command"]["throttle"] == {
+        "from": "throttle",
+        "when": {"safety_value": 1},
+    }
     assert draft["command"]["steering"] == "steering"
     assert draft["time"] == "vicon time"
 
@@ -357,7 +688,9 @@ def test_a_bag_without_commands_is_told_what_it_lacks(shared_recordings):
     assert draft["robot"] is None
     assert draft["pose"] == "/husky_velocity_controller/odom"
     robot = load_robot("differential")
-    with pytest.raises(RecordingError, match="a model learns from what was sent to the robot"):
+    with pytest.raises(
+        RecordingError, match="a model learns from what was sent to the robot"
+    ):
         read_recording(bag, robot)
 
 

@@ -18,7 +18,9 @@ FLOAT = "std_msgs/msg/Float64"
 
 def topic(name: str, kind: str, columns: dict[str, Any]) -> TableSurvey:
     data = {field: M[c] if isinstance(c, str) else c for field, c in columns.items()}
-    survey = [Survey(field, float(c.min()), float(c.max())) for field, c in data.items()]
+    survey = [
+        Survey(field, float(c.min()), float(c.max())) for field, c in data.items()
+    ]
     return TableSurvey(name, COUNT, survey, t=M["t"], data=data, kind=kind)
 
 
@@ -45,63 +47,112 @@ def odometry(name: str = "/odom") -> TableSurvey:
     return topic(name, kinds.ODOMETRY, turned("pose.pose.") | rates)
 
 
-IMU = topic("/imu", kinds.IMU, {"angular_velocity.z": "rate", "linear_acceleration.x": "noise"})
+IMU = topic(
+    "/imu", kinds.IMU, {"angular_velocity.z": "rate", "linear_acceleration.x": "noise"}
+)
 STEERED = {"drive.steering_angle": "w", "drive.steering_angle_velocity": "zero"}
 STEERED |= {"drive.speed": "v", "drive.acceleration": "zero"}
 # Topics of a bag; then the pose, and the topics of the commands, that are to be drafted.
 BAGS: dict[str, tuple[list[TableSurvey], str, list[str]]] = {
     "turtlebot 2": (
-        [odometry(), twist("/mobile_base/commands/velocity"), IMU,
-         twist("/cmd_vel_mux/input/teleop", "noise", "noise"), pose("/move_base_simple/goal")],
-        "/odom", ["/mobile_base/commands/velocity:linear.x",
-                  "/mobile_base/commands/velocity:angular.z"],
+        [
+            odometry(),
+            twist("/mobile_base/commands/velocity"),
+            IMU,
+            twist("/cmd_vel_mux/input/teleop", "noise", "noise"),
+            pose("/move_base_simple/goal"),
+        ],
+        "/odom",
+        [
+            "/mobile_base/commands/velocity:linear.x",
+            "/mobile_base/commands/velocity:angular.z",
+        ],
     ),
     "a topic called groundtruth": (
         [odometry(), twist("/cmd_vel"), pose("/groundtruth"), IMU],
-        "/groundtruth", ["/cmd_vel:linear.x", "/cmd_vel:angular.z"],
+        "/groundtruth",
+        ["/cmd_vel:linear.x", "/cmd_vel:angular.z"],
     ),
     "true odometry of a simulator": (
         [odometry(), twist("/cmd_vel"), odometry("/ground_truth/state")],
-        "/ground_truth/state", ["/cmd_vel:linear.x", "/cmd_vel:angular.z"],
+        "/ground_truth/state",
+        ["/cmd_vel:linear.x", "/cmd_vel:angular.z"],
     ),
     "a controller with its own odometry": (
-        [odometry("/husky_velocity_controller/odom"), twist("/husky_velocity_controller/cmd_vel")],
+        [
+            odometry("/husky_velocity_controller/odom"),
+            twist("/husky_velocity_controller/cmd_vel"),
+        ],
         "/husky_velocity_controller/odom",
-        ["/husky_velocity_controller/cmd_vel:linear.x",
-         "/husky_velocity_controller/cmd_vel:angular.z"],
+        [
+            "/husky_velocity_controller/cmd_vel:linear.x",
+            "/husky_velocity_controller/cmd_vel:angular.z",
+        ],
     ),
-    "measured twists": ([odometry(), twist("/vehicle/twist"), twist("/vel")], "/odom", []),
+    "measured twists": (
+        [odometry(), twist("/vehicle/twist"), twist("/vel")],
+        "/odom",
+        [],
+    ),
     "commands of two robots": (
-        [odometry(), twist("/r1/cmd_vel"), twist("/r2/cmd_vel", "noise", "noise")], "/odom", [],
+        [odometry(), twist("/r1/cmd_vel"), twist("/r2/cmd_vel", "noise", "noise")],
+        "/odom",
+        [],
     ),
     "a car": (
-        [odometry(), topic("/drive", kinds.ACKERMANN_STAMPED, STEERED),
-         topic("/commands/motor/speed", FLOAT, {"data": "v"}), pose("/pf/viz/inferred_pose")],
-        "/pf/viz/inferred_pose", ["/drive:drive.speed", "/drive:drive.steering_angle"],
+        [
+            odometry(),
+            topic("/drive", kinds.ACKERMANN_STAMPED, STEERED),
+            topic("/commands/motor/speed", FLOAT, {"data": "v"}),
+            pose("/pf/viz/inferred_pose"),
+        ],
+        "/pf/viz/inferred_pose",
+        ["/drive:drive.speed", "/drive:drive.steering_angle"],
     ),
     "a car's measured steering": (
-        [odometry(), topic("/ackermann_odom", kinds.ACKERMANN_STAMPED, STEERED)], "/odom", [],
+        [odometry(), topic("/ackermann_odom", kinds.ACKERMANN_STAMPED, STEERED)],
+        "/odom",
+        [],
     ),
     "joints": (
-        [odometry(), topic("/joint_states", kinds.JOINTS,
-                           {"velocity[left]": "v", "velocity[right]": "w"})],
-        "/odom", [],
+        [
+            odometry(),
+            topic(
+                "/joint_states",
+                kinds.JOINTS,
+                {"velocity[left]": "v", "velocity[right]": "w"},
+            ),
+        ],
+        "/odom",
+        [],
     ),
     "wheels": (
-        [pose("/vrpn_client_node/robot/pose"), topic("/wheel_cmd_left", FLOAT, {"data": "v"}),
-         topic("/wheel_cmd_right", FLOAT, {"data": "w"})],
-        "/vrpn_client_node/robot/pose", ["/wheel_cmd_left:data", "/wheel_cmd_right:data"],
+        [
+            pose("/vrpn_client_node/robot/pose"),
+            topic("/wheel_cmd_left", FLOAT, {"data": "v"}),
+            topic("/wheel_cmd_right", FLOAT, {"data": "w"}),
+        ],
+        "/vrpn_client_node/robot/pose",
+        ["/wheel_cmd_left:data", "/wheel_cmd_right:data"],
     ),
     "satellites": (
-        [odometry(), topic("/gps/fix", "sensor_msgs/msg/NavSatFix",
-                           {"latitude": "x", "longitude": "y", "altitude": "noise"})],
-        "/odom", [],
+        [
+            odometry(),
+            topic(
+                "/gps/fix",
+                "sensor_msgs/msg/NavSatFix",
+                {"latitude": "x", "longitude": "y", "altitude": "noise"},
+            ),
+        ],
+        "/odom",
+        [],
     ),
     "a start that was set": (
         [pose("/slam_out_pose"), pose("/initialpose"), twist("/cmd_vel")],
-        "/slam_out_pose", ["/cmd_vel:linear.x", "/cmd_vel:angular.z"],
+        "/slam_out_pose",
+        ["/cmd_vel:linear.x", "/cmd_vel:angular.z"],
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("bag", BAGS)

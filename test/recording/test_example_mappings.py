@@ -20,7 +20,9 @@ SOURCES = {
     "jetracer_csv": ("jetracer_dart/free_driving_104s.csv",),
     "jetracer_bag": ("jetracer_dart/random_driving_slow_63s.bag",),
     "f110_folder": tuple(f"f110_frictionmaps/DS{k}" for k in (1, 3, 4)),
-    "differential_ticks": tuple(f"differential_ticks/Camera_Odo_Data_0{k}.txt" for k in (1, 2)),
+    "differential_ticks": tuple(
+        f"differential_ticks/Camera_Odo_Data_0{k}.txt" for k in (1, 2)
+    ),
     "xtark_folder": ("xtark_ackermann/random_drive_45s",),
 }
 
@@ -75,7 +77,9 @@ def test_the_wheel_speeds_of_a_real_car_are_no_counters(shared_recordings, drive
     counted = Value.model_validate({"from": "L_wheel.csv:0", "unit": "ticks"})
     wheels = mapping.wheels.model_copy(update={"left": counted})
     counting = mapping.model_copy(update={"wheels": wheels})
-    with pytest.raises(RecordingError, match=r"'L_wheel.csv:0' goes up and down like a speed"):
+    with pytest.raises(
+        RecordingError, match=r"'L_wheel.csv:0' goes up and down like a speed"
+    ):
         read_recording(shared_recordings / "xtark_ackermann" / drive, mapping=counting)
 
 
@@ -90,7 +94,9 @@ def test_the_throttle_is_zero_while_the_switch_is_off(shared_recordings):
 
 
 @pytest.mark.parametrize("k", [0, 1])
-def test_ticks_are_wheels_that_turn_the_robot_as_its_calibration_says(shared_recordings, k):
+def test_ticks_are_wheels_that_turn_the_robot_as_its_calibration_says(
+    shared_recordings, k
+):
     """Radius / base is 0.284 by the mean of the published radii and bases."""
     _, drive = imported(shared_recordings, "differential_ticks", k)
     t, pose = drive.command.t, drive.pose
@@ -101,8 +107,12 @@ def test_ticks_are_wheels_that_turn_the_robot_as_its_calibration_says(shared_rec
     left, right = np.linalg.lstsq(wheels.T, heading, rcond=None)[0]
     assert (-left, right) == pytest.approx((0.284, 0.284), rel=0.03)
     columns = [np.interp(grid, pose.t, each) for each in pose.values[:, :2].T]
-    at = np.stack([*columns, np.interp(grid, pose.t, np.unwrap(pose.values[:, 2]))], axis=1)
+    at = np.stack(
+        [*columns, np.interp(grid, pose.t, np.unwrap(pose.values[:, 2]))], axis=1
+    )
     ahead = geometry.log(geometry.between(at[:-1], at[1:]))[:, 0]
     rolled = np.linalg.lstsq(wheels.T, ahead, rcond=None)[0]
-    assert rolled.sum() == pytest.approx(0.1676, rel=0.08)  # [m]: the mean published radius
+    assert rolled.sum() == pytest.approx(
+        0.1676, rel=0.08
+    )  # [m]: the mean published radius
     assert 0.005 < np.median(pose.sigma[:, 0]) < 0.05

@@ -7,7 +7,11 @@ from steps import integrate
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.identify.excitation import commands_together, levels, unmoved_variables
+from nics_drl_bridge.identify.excitation import (
+    commands_together,
+    levels,
+    unmoved_variables,
+)
 from nics_drl_bridge.recording.excite import (
     PERIOD_S,
     STILL_S,
@@ -20,7 +24,9 @@ from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
 
-ROBOTS = [load_robot(name) for name in ("ackermann", "differential", "mecanum")] + [DIRECT]
+ROBOTS = [load_robot(name) for name in ("ackermann", "differential", "mecanum")] + [
+    DIRECT
+]
 STILL = round(STILL_S / PERIOD_S)
 
 CAMPAIGN = pytest.mark.campaign
@@ -59,7 +65,9 @@ def test_it_begins_and_ends_at_rest(robot):
 
 @robots
 @pytest.mark.parametrize("speed", [1.0, pytest.param(0.5, marks=CAMPAIGN)])
-def test_commands_stay_within_a_share_of_the_limits_that_leaves_angles_alone(robot, speed):
+def test_commands_stay_within_a_share_of_the_limits_that_leaves_angles_alone(
+    robot, speed
+):
     command = preview(robot, speed=speed).command
     share = np.array([1.0 if c.unit == "rad" else speed for c in robot.command])
     assert (command >= share * robot.command_low - 1e-12).all()
@@ -71,7 +79,9 @@ def test_commands_stay_within_a_share_of_the_limits_that_leaves_angles_alone(rob
 @pytest.mark.slow
 @robots
 @pytest.mark.parametrize("duration", [20.0, 60.0])
-def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(robot, duration):
+def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(
+    robot, duration
+):
     pattern = preview(robot, duration)
     t = pattern.period * np.arange(len(pattern.command))
     none = np.zeros((len(t), 0))
@@ -125,7 +135,9 @@ def drive_another(robot, really, gain, seed):
         ("mecanum", {"wheel_lag": 0.2}, (1.2, 0.8, 1.2)),
     ],
 )
-def test_a_robot_that_moves_otherwise_than_expected_is_kept_within_too(name, changes, gain, seed):
+def test_a_robot_that_moves_otherwise_than_expected_is_kept_within_too(
+    name, changes, gain, seed
+):
     robot = load_robot(name)
     really = robot.model_copy(update={"parameters": {**robot.parameters, **changes}})
     assert drive_another(robot, really, np.array(gain), seed) <= 2.0
@@ -134,9 +146,14 @@ def test_a_robot_that_moves_otherwise_than_expected_is_kept_within_too(name, cha
 @pytest.mark.slow
 def test_without_being_watched_such_a_robot_would_leave(monkeypatch):
     robot = load_robot("ackermann")
-    really = robot.model_copy(update={"parameters": {**robot.parameters, "wheelbase": 0.24}})
+    really = robot.model_copy(
+        update={"parameters": {**robot.parameters, "wheelbase": 0.24}}
+    )
     monkeypatch.setattr(Exploration, "see", lambda *_: None)
-    assert any(drive_another(robot, really, np.array([1.1, 1.0]), seed) > 2.0 for seed in range(3))
+    assert any(
+        drive_another(robot, really, np.array([1.1, 1.0]), seed) > 2.0
+        for seed in range(3)
+    )
 
 
 @pytest.mark.slow
@@ -190,7 +207,9 @@ def quarter_circle():
     poses = [np.zeros(3)]
     for twist in turn:
         poses.append(geometry.compose(poses[-1], geometry.exp(twist * np.pi / 100)))
-    return Pattern(np.pi / 100, turn[:, [0, 2]], np.array(poses), bound=3.5, footprint=0.5)
+    return Pattern(
+        np.pi / 100, turn[:, [0, 2]], np.array(poses), bound=3.5, footprint=0.5
+    )
 
 
 def test_it_tells_duration_path_speeds_and_space(quarter_circle):
@@ -229,7 +248,10 @@ def test_it_is_the_textbook_but_for_a_centimetre(name):
 
 def test_without_a_textbook_cmd_vel_is_the_twist():
     poses, states = expected_motion(DIRECT).roll(
-        np.zeros((1, 3)), np.zeros((1, 0)), np.tile([1.0, -0.5, 0.0], (1, 20, 1)), PERIOD_S
+        np.zeros((1, 3)),
+        np.zeros((1, 0)),
+        np.tile([1.0, -0.5, 0.0], (1, 20, 1)),
+        PERIOD_S,
     )
     assert poses[0, -1] == pytest.approx([1.0, -0.5, 0.0])
     assert states.shape == (1, 21, 0)
@@ -237,5 +259,7 @@ def test_without_a_textbook_cmd_vel_is_the_twist():
 
 def test_a_steering_angle_without_a_textbook_can_not_be_predicted():
     car = load_robot("ackermann").model_copy(update={"textbook": None})
-    with pytest.raises(ConfigError, match=r"'steering_command' in rad.*add `textbook:`"):
+    with pytest.raises(
+        ConfigError, match=r"'steering_command' in rad.*add `textbook:`"
+    ):
         expected_motion(car)

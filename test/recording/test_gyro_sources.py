@@ -55,7 +55,9 @@ def table(tmp_path, rows=400):
     pose = [np.sin(heading), 1.0 - np.cos(heading), heading]
     columns = [t, np.full(rows, 0.3), np.full(rows, 0.3), *pose, second]
     path = tmp_path / "drive.csv"
-    text = "\n".join(",".join(f"{v:.6f}" for v in row) for row in np.stack(columns, axis=1))
+    text = "\n".join(
+        ",".join(f"{v:.6f}" for v in row) for row in np.stack(columns, axis=1)
+    )
     path.write_text(HEADER + text + "\n", encoding="utf-8")
     return path
 
@@ -92,7 +94,9 @@ def test_a_mapping_says_itself_what_measured_the_pose(tmp_path):
 
 
 def test_a_draft_of_a_bag_with_an_imu_names_its_yaw_rate(tmp_path):
-    rows = [(t, bags.imu(t, 0.0, 0.0, 0.25 + 0.1 * np.sin(t))) for t in bags.times(0.02)]
+    rows = [
+        (t, bags.imu(t, 0.0, 0.0, 0.25 + 0.1 * np.sin(t))) for t in bags.times(0.02)
+    ]
     bag = bags.write(tmp_path / "bag", bags.drive() | {"/imu/data": rows})
     with open_source(bag) as source:
         draft = first_mapping(survey(source))

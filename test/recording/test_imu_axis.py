@@ -19,9 +19,15 @@ def mounted(t, rate, axis, sign):
     turn, acceleration = np.zeros(3), np.array([0.3, -0.2, 0.1])
     turn[axis], acceleration[axis] = sign * rate, sign * 9.81
     return bags.new(
-        IMU, bags.header(t), bags.turned(0.0), np.zeros(9), bags.vector(*turn), np.arange(9.0),
-        bags.vector(*acceleration), np.zeros(9),
-    )  # fmt: skip
+        IMU,
+        bags.header(t),
+        bags.turned(0.0),
+        np.zeros(9),
+        bags.vector(*turn),
+        np.arange(9.0),
+        bags.vector(*acceleration),
+        np.zeros(9),
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -32,7 +38,9 @@ def test_a_live_imu_gives_its_yaw_rate_however_it_is_mounted(axis, sign):
     assert variance == 4.0 * axis
 
 
-@pytest.mark.parametrize("acceleration", [[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [6.0, 6.0, 6.0]])
+@pytest.mark.parametrize(
+    "acceleration", [[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [6.0, 6.0, 6.0]]
+)
 def test_without_gravity_along_an_axis_z_points_up(acceleration):
     assert up_axis_of(np.array(acceleration)) == UpAxis()
 
@@ -45,7 +53,9 @@ def test_a_bump_does_not_turn_the_axis():
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(1, 1.0), (2, -1.0)])
-def test_the_imu_of_a_bag_and_of_its_draft_is_read_as_it_is_mounted(tmp_path, axis, sign):
+def test_the_imu_of_a_bag_and_of_its_draft_is_read_as_it_is_mounted(
+    tmp_path, axis, sign
+):
     topics = bags.drive()
     topics["/imu/data"] = [
         (t, mounted(t, 0.25 + 0.1 * np.sin(t), axis, sign)) for t in bags.times(0.02)

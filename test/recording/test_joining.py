@@ -10,7 +10,11 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.joining import APART_S, LEARNT_SHARE, join
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.recording import Recording, load_recording, save_recording
+from nics_drl_bridge.recording.recording import (
+    Recording,
+    load_recording,
+    save_recording,
+)
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -29,12 +33,19 @@ def drives(*durations: float) -> list[Recording]:
 
 def test_what_is_learnt_comes_first_and_the_rest_of_each_drive_is_held_out():
     joined = join(drives(12.0, 24.0))
-    assert [each.source for each in joined.episodes] == ["a.csv", "b.csv", "a.csv", "b.csv"]
+    assert [each.source for each in joined.episodes] == [
+        "a.csv",
+        "b.csv",
+        "a.csv",
+        "b.csv",
+    ]
     lasting = [each.duration_s for each in joined.episodes]
     assert np.allclose(lasting, [8.0, 16.0, 4.0, 8.0], atol=0.03)
     assert joined.learn_until_s == pytest.approx(joined.episodes[1].end_s)
     assert joined.driven_s() == pytest.approx(36.0, abs=0.1)
-    assert joined.driven_s(joined.learn_until_s) == pytest.approx(LEARNT_SHARE * 36.0, abs=0.1)
+    assert joined.driven_s(joined.learn_until_s) == pytest.approx(
+        LEARNT_SHARE * 36.0, abs=0.1
+    )
     assert "the last third of each was held out" in joined.repairs[0]
     assert "a.csv, b.csv" in joined.repairs[0]
 
@@ -47,7 +58,9 @@ def test_every_pose_keeps_its_motion_and_its_commands():
     pose = joined.pose.values[rows]
     moved = geometry.between(pose[:-1], pose[1:])
     count = len(pose)
-    expected = geometry.between(other.pose.values[: count - 1], other.pose.values[1:count])
+    expected = geometry.between(
+        other.pose.values[: count - 1], other.pose.values[1:count]
+    )
     assert np.allclose(moved, expected, atol=1e-9)
     at = np.searchsorted(joined.command.t, joined.pose.t[rows], side="right") - 1
     assert np.array_equal(joined.command.values[at], other.command.values[:count])
@@ -92,17 +105,23 @@ def test_a_stream_that_one_recording_lacks_is_left_out_and_said():
     (one, other) = drives(12.0, 24.0)
     joined = join([one, replace(other, odometry=other.pose)])
     assert joined.odometry is None
-    assert "odometry was left out, as not all of the recordings have it." in joined.repairs
+    assert (
+        "odometry was left out, as not all of the recordings have it." in joined.repairs
+    )
 
 
 @pytest.mark.parametrize("restarts", [True, False])
-def test_an_episode_column_makes_episodes_whether_its_times_begin_anew_or_go_on(tmp_path, restarts):
+def test_an_episode_column_makes_episodes_whether_its_times_begin_anew_or_go_on(
+    tmp_path, restarts
+):
     columns = drive(1000)
     episode = np.repeat([0, 1], [400, 600])
     if restarts:
         columns["t"] = np.concatenate([columns["t"][:400], columns["t"][:600]])
     path = write(tmp_path / "log.csv", columns | {"run": episode})
-    joined = read_recording(path, mapping=Mapping.model_validate(MAP | {"episode": "run"}))
+    joined = read_recording(
+        path, mapping=Mapping.model_validate(MAP | {"episode": "run"})
+    )
     sources = [each.source.rpartition("(")[2] for each in joined.episodes]
     assert sources == ["episode 0)", "episode 1)"] * 2
     assert joined.driven_s() == pytest.approx(20.0, abs=0.2)
@@ -112,7 +131,11 @@ def test_episodes_reach_over_the_tables_of_a_folder(tmp_path):
     columns = drive(1000)
     pose = {name: columns[name] for name in ("t", "x", "y", "yaw")}
     write(tmp_path / "pose.csv", pose)
-    commands = {"t": columns["t"][::10], "v": columns["v"][::10], "w": columns["w"][::10]}
+    commands = {
+        "t": columns["t"][::10],
+        "v": columns["v"][::10],
+        "w": columns["w"][::10],
+    }
     write(tmp_path / "cmd.csv", commands | {"run": np.repeat([3, 7], [40, 60])})
     given = {
         "time": "t",

@@ -5,7 +5,12 @@ import pytest
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
-from nics_drl_bridge.recording.readers import arranged, read_recording, robot_and_drive, robot_of
+from nics_drl_bridge.recording.readers import (
+    arranged,
+    read_recording,
+    robot_and_drive,
+    robot_of,
+)
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
@@ -33,8 +38,10 @@ def test_columns_are_streams_by_name_or_by_number(tmp_path, columns):
     assert named.repairs == ()
     numbered = read(
         write(tmp_path / "plain.csv", columns, header=False),
-        time=0, pose={"x": 1, "y": 2, "heading": 3}, command={"v": 4, "w": 5},
-    )  # fmt: skip
+        time=0,
+        pose={"x": 1, "y": 2, "heading": 3},
+        command={"v": 4, "w": 5},
+    )
     assert same(named, numbered)
 
 
@@ -51,13 +58,23 @@ def test_stamps_since_1970_begin_near_zero_split_or_as_dates(tmp_path, columns):
 def test_units_scale_and_offset_lead_to_si(tmp_path, columns):
     whole = read(write(tmp_path / "a.csv", columns))
     other = columns | {
-        "t": columns["t"] * 1e3, "x": columns["x"] * 100.0, "y": columns["y"] * 100.0,
-        "yaw": np.degrees(columns["yaw"]), "v": columns["v"] * 3.6, "w": columns["w"] / 0.4 * 100.0,
-    }  # fmt: skip
+        "t": columns["t"] * 1e3,
+        "x": columns["x"] * 100.0,
+        "y": columns["y"] * 100.0,
+        "yaw": np.degrees(columns["yaw"]),
+        "v": columns["v"] * 3.6,
+        "w": columns["w"] / 0.4 * 100.0,
+    }
     found = read(
         write(tmp_path / "b.csv", other),
         time={"from": "t", "unit": "ms"},
-        pose={"x": "x", "y": "y", "heading": "yaw", "unit": "cm", "heading_unit": "deg"},
+        pose={
+            "x": "x",
+            "y": "y",
+            "heading": "yaw",
+            "unit": "cm",
+            "heading_unit": "deg",
+        },
         command={
             "v": {"from": "v", "unit": "km/h"},
             "w": {"from": "w", "unit": "%", "maximum": 0.4},
@@ -71,8 +88,15 @@ def test_units_scale_and_offset_lead_to_si(tmp_path, columns):
 
 
 def test_a_command_counts_only_while_its_flags_are_set(tmp_path, columns):
-    more = columns | {"safe": columns["t"] > 1.0, "mode": np.where(columns["t"] < 3, "AUTO", "RC")}
-    value = {"from": "v", "when": {"safe": 1, "mode": ["auto", "idle"]}, "otherwise": -1.0}
+    more = columns | {
+        "safe": columns["t"] > 1.0,
+        "mode": np.where(columns["t"] < 3, "AUTO", "RC"),
+    }
+    value = {
+        "from": "v",
+        "when": {"safe": 1, "mode": ["auto", "idle"]},
+        "otherwise": -1.0,
+    }
     found = read(write(tmp_path / "log.csv", more), command={"v": value})
     on = (columns["t"] > 1.0) & (columns["t"] < 3.0)
     assert np.array_equal(found.command.values[:, 0], np.where(on, 0.5, -1.0))
@@ -81,11 +105,18 @@ def test_a_command_counts_only_while_its_flags_are_set(tmp_path, columns):
 def test_quaternions_are_headings_and_variances_deviations(tmp_path, columns):
     half = columns["yaw"] / 2.0
     zero = np.zeros_like(half)
-    other = columns | {"qz": np.sin(half), "qw": np.cos(half), "q": zero, "c": zero + 4.0}
+    other = columns | {
+        "qz": np.sin(half),
+        "qw": np.cos(half),
+        "q": zero,
+        "c": zero + 4.0,
+    }
     pose = {
-        "x": {"from": "x", "scale": 100.0}, "y": {"from": "y", "scale": 100.0}, "unit": "cm",
+        "x": {"from": "x", "scale": 100.0},
+        "y": {"from": "y", "scale": 100.0},
+        "unit": "cm",
         "quaternion": ["q", "q", "qz", "qw"],
-    }  # fmt: skip
+    }
     path = write(tmp_path / "log.csv", other)
     found = read(path, pose=pose | {"covariance": ["c", "c", "c"]})
     assert np.allclose(found.pose.values[:, 2], columns["yaw"])
@@ -109,14 +140,27 @@ def test_a_variance_that_is_no_positive_number_is_unknown(tmp_path, columns):
     assert any("3 of " in told and "variance" in told for told in found.repairs)
 
 
-def test_counts_that_come_at_once_are_of_the_time_since_the_burst_before(tmp_path, columns):
+def test_counts_that_come_at_once_are_of_the_time_since_the_burst_before(
+    tmp_path, columns
+):
     t = np.repeat(columns["t"][::2], 2)
     t[1::2] += 0.001
-    bursts = {"t": t, "x": t, "y": 0.0 * t, "yaw": 0.0 * t, "n": np.round(700.0 * t), "w": 0.0 * t}
+    bursts = {
+        "t": t,
+        "x": t,
+        "y": 0.0 * t,
+        "yaw": 0.0 * t,
+        "n": np.round(700.0 * t),
+        "w": 0.0 * t,
+    }
     path = write(tmp_path / "log.csv", bursts)
-    found = read(path, command={"left": {"from": "n", "unit": "ticks", "ticks_per_turn": 100}})
+    found = read(
+        path, command={"left": {"from": "n", "unit": "ticks", "ticks_per_turn": 100}}
+    )
     speed = 700.0 * 2.0 * np.pi / 100.0
-    assert found.command.values == pytest.approx(speed, rel=0.05)  # not that of a millisecond
+    assert found.command.values == pytest.approx(
+        speed, rel=0.05
+    )  # not that of a millisecond
 
 
 def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(tmp_path, columns):
@@ -126,25 +170,38 @@ def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(tmp_path, col
     value = {"from": "n", "ticks_per_turn": 100}
     backwards = {"from": "m", "unit": "ticks", "scale": -1}
     found = read(path, command={"left": value, "right": backwards})
-    assert np.allclose(found.command.values, speed[:-1, None] * [2.0 * np.pi / 100.0, 1.0])
+    assert np.allclose(
+        found.command.values, speed[:-1, None] * [2.0 * np.pi / 100.0, 1.0]
+    )
     assert np.allclose(found.command.t, columns["t"][:-1])
     assert found.repairs == (
         "command.left: the counter overflowed once, at 65536, as it seems, and was continued.",
     )
     wheels = read(path, wheels={"left": value, "right": backwards}).wheels
-    assert np.allclose(wheels.t, columns["t"][:-1] + 0.01)  # measured between two stamps
+    assert np.allclose(
+        wheels.t, columns["t"][:-1] + 0.01
+    )  # measured between two stamps
 
 
 def test_an_absolute_encoder_is_an_angle_about_zero(tmp_path, columns):
-    angle = 0.3 * np.sin(columns["t"] - 0.5)  # begins below zero, near the end of its range
+    angle = 0.3 * np.sin(
+        columns["t"] - 0.5
+    )  # begins below zero, near the end of its range
     counts = np.round(angle / (2.0 * np.pi) * 8192) % 8192
     value = {"from": "n", "ticks_per_turn": 8192, "wrap": 8192, "differentiate": False}
-    found = read(write(tmp_path / "log.csv", columns | {"n": counts}), command={"steering": value})
+    found = read(
+        write(tmp_path / "log.csv", columns | {"n": counts}),
+        command={"steering": value},
+    )
     assert np.allclose(found.command.values[:, 0], angle, atol=1e-3)
 
 
-@pytest.mark.parametrize(("reach", "period"), [(50.0, 0.5), (1000.0, 100.0), (0.0, 1.0)])
-def test_a_wheel_that_goes_to_and_fro_or_trembles_is_counted(tmp_path, columns, reach, period):
+@pytest.mark.parametrize(
+    ("reach", "period"), [(50.0, 0.5), (1000.0, 100.0), (0.0, 1.0)]
+)
+def test_a_wheel_that_goes_to_and_fro_or_trembles_is_counted(
+    tmp_path, columns, reach, period
+):
     turned = reach * np.sin(columns["t"] * 2.0 * np.pi / period)
     ticks = np.round(turned) + np.round(np.sin(columns["t"] * 100.0))
     path = write(tmp_path / "log.csv", columns | {"n": ticks})
@@ -167,7 +224,8 @@ def test_a_folder_has_its_values_in_several_files(tmp_path, columns):
 
 def test_streams_of_other_clocks_keep_their_offset_or_begin_at_zero(tmp_path, columns):
     path = write(
-        tmp_path / "log.csv", columns | {"near": columns["t"] + 1.0, "far": columns["t"] + 1e9}
+        tmp_path / "log.csv",
+        columns | {"near": columns["t"] + 1.0, "far": columns["t"] + 1e9},
     )
     pose = {"x": "x", "y": "y", "heading": "yaw", "clock": "mocap"}
     near = read(path, pose=pose | {"time": "near"})
@@ -196,16 +254,26 @@ def test_what_was_mended_is_told(tmp_path, columns):
         ({"command": {"v": "other.csv:v"}}, "has no 'other.csv'"),
         ({"pose": {"x": "x", "y": "y", "heading": "deg"}}, "write `heading_unit: deg`"),
         ({"pose": {"x": "mm", "y": "mm", "heading": "yaw"}}, "write `unit: mm`"),
-        ({"pose": {"x": "x", "y": "y", "quaternion": ["x", "y", "x", "y"]}}, "x, y, z, w"),
-        ({"command": {"v": {"from": "v", "time": "later"}}}, "give one of them a `clock:`"),
+        (
+            {"pose": {"x": "x", "y": "y", "quaternion": ["x", "y", "x", "y"]}},
+            "x, y, z, w",
+        ),
+        (
+            {"command": {"v": {"from": "v", "time": "later"}}},
+            "give one of them a `clock:`",
+        ),
     ],
 )
-def test_a_wrong_mapping_is_told_with_the_line_to_write(tmp_path, columns, changes, sentence):
+def test_a_wrong_mapping_is_told_with_the_line_to_write(
+    tmp_path, columns, changes, sentence
+):
     wavy = 400.0 * np.sin(columns["t"] * 3.0)
     more = {
-        "ms": columns["t"] * 1e3, "deg": np.degrees(columns["yaw"] * 60.0), "mm": wavy * 3.0,
+        "ms": columns["t"] * 1e3,
+        "deg": np.degrees(columns["yaw"] * 60.0),
+        "mm": wavy * 3.0,
         "later": columns["t"] + 1e4,
-    }  # fmt: skip
+    }
     path = write(tmp_path / "log.csv", columns | more)
     with pytest.raises((ConfigError, RecordingError)) as refused:
         read(path, **changes)
@@ -215,15 +283,30 @@ def test_a_wrong_mapping_is_told_with_the_line_to_write(tmp_path, columns, chang
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {form: 1}}", "did you mean 'from'?"),
-        ("pose: {x: 1, y: 2}\ncommand: {v: 1}", "pose needs either heading or quaternion"),
-        ("pose: {x: 1, y: 2, heading: 3, unit: ms}\ncommand: {v: 1}", "must be one of m, dm, cm"),
+        (
+            "pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {form: 1}}",
+            "did you mean 'from'?",
+        ),
+        (
+            "pose: {x: 1, y: 2}\ncommand: {v: 1}",
+            "pose needs either heading or quaternion",
+        ),
+        (
+            "pose: {x: 1, y: 2, heading: 3, unit: ms}\ncommand: {v: 1}",
+            "must be one of m, dm, cm",
+        ),
         (
             "pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {from: 1, unit: kmph}}",
             "did you mean 'mph'?",
         ),
-        ("pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]}\ncommand: {v: 1}", "3, 9 or 36"),
-        ("pose: {x: 1, y: 2, heading: 3}\ncommand: {}", "command: names none, but a model"),
+        (
+            "pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]}\ncommand: {v: 1}",
+            "3, 9 or 36",
+        ),
+        (
+            "pose: {x: 1, y: 2, heading: 3}\ncommand: {}",
+            "command: names none, but a model",
+        ),
     ],
 )
 def test_a_mapping_that_is_none_is_refused_with_file_and_key(tmp_path, text, sentence):
@@ -244,21 +327,28 @@ def test_commands_come_in_the_order_of_the_robot(tmp_path, columns):
     assert spec.name == "ackermann"
     assert found.variables == spec.variable_names
     assert np.allclose(found.command.values[0], [0.5, 0.25])
-    with pytest.raises(ConfigError, match="the command is v, w, that of the robot 'ackermann'"):
+    with pytest.raises(
+        ConfigError, match="the command is v, w, that of the robot 'ackermann'"
+    ):
         arranged(read(path), load_robot("ackermann"))
     with pytest.raises(ConfigError, match="names no robot; add `robot:` to it"):
         robot_of(Mapping.model_validate(given | {"robot": None}), read(path))
 
 
 LORRY = "kind: tricycle\nfootprint_radius: 0.9\nparameters: {wheelbase: 1.2}\n"
-STEERED = {"speed_command": {"from": "v", "scale": 3.0}, "steering_command": {"from": "w"}}
+STEERED = {
+    "speed_command": {"from": "v", "scale": 3.0},
+    "steering_command": {"from": "w"},
+}
 
 
 def test_a_robots_file_is_the_same_robot_however_it_is_named(tmp_path, columns):
     (tmp_path / "lorry.yaml").write_text(LORRY)
     path, robot = write(tmp_path / "log.csv", columns), str(tmp_path / "lorry.yaml")
     given = MAP | {"command": STEERED}
-    one, other = (Mapping.model_validate(given | {"robot": each}) for each in ("car", robot))
+    one, other = (
+        Mapping.model_validate(given | {"robot": each}) for each in ("car", robot)
+    )
     spec, _ = robot_and_drive(path, robot, TopicRoles(), one)
     assert spec == robot_and_drive(path, None, TopicRoles(), other)[0]
     assert spec.command_high.tolist() == [1.5, 0.3]  # as recorded
@@ -268,7 +358,9 @@ def test_an_imported_drive_keeps_its_robot_as_text(tmp_path, columns):
     (tmp_path / "lorry.yaml").write_text(LORRY)
     given = MAP | {"command": STEERED, "robot": str(tmp_path / "lorry.yaml")}
     mapping = Mapping.model_validate(given)
-    spec, drive = robot_and_drive(write(tmp_path / "log.csv", columns), None, TopicRoles(), mapping)
+    spec, drive = robot_and_drive(
+        write(tmp_path / "log.csv", columns), None, TopicRoles(), mapping
+    )
     save_recording(drive, tmp_path / "drive.npz")
     (tmp_path / "lorry.yaml").unlink()
     back, again = robot_and_drive(tmp_path / "drive.npz", None, TopicRoles(), None)
@@ -289,28 +381,51 @@ def test_an_imported_drive_keeps_deviations_and_repairs(tmp_path, columns):
     assert back.command.sigma is None
     assert back.repairs == drive.repairs != ()
     assert back.variables == ("v", "w")
-    again = read_recording(tmp_path / "drive.npz", mapping=Mapping.model_validate(MAPPED))
-    assert same(back, again)  # of a recording of this package a mapping tells the robot only
+    again = read_recording(
+        tmp_path / "drive.npz", mapping=Mapping.model_validate(MAPPED)
+    )
+    assert same(
+        back, again
+    )  # of a recording of this package a mapping tells the robot only
 
 
-MAPPED = {"robot": "ackermann", "pose": {"x": 0, "y": 1, "heading": 2}, "command": {"v": 3, "w": 4}}
+MAPPED = {
+    "robot": "ackermann",
+    "pose": {"x": 0, "y": 1, "heading": 2},
+    "command": {"v": 3, "w": 4},
+}
 
 
 @pytest.mark.parametrize(
     ("changes", "columns", "sentence"),
     [
-        ({}, {"yaw": lambda d: np.degrees(d["yaw"] + d["t"])}, "write `heading_unit: deg` into"),
-        ({}, {"t": lambda d: d["t"] * 0.0}, "all of its stamps are 0 s; choose another column"),
-        ({}, {"t": lambda d: d["t"] / 3600.0}, "lasts 0.00111 s; give the `unit:` of its `time:`"),
         (
-            {"command": {"v": {"from": "v", "when": {"w": 7}}}}, {},
+            {},
+            {"yaw": lambda d: np.degrees(d["yaw"] + d["t"])},
+            "write `heading_unit: deg` into",
+        ),
+        (
+            {},
+            {"t": lambda d: d["t"] * 0.0},
+            "all of its stamps are 0 s; choose another column",
+        ),
+        (
+            {},
+            {"t": lambda d: d["t"] / 3600.0},
+            "lasts 0.00111 s; give the `unit:` of its `time:`",
+        ),
+        (
+            {"command": {"v": {"from": "v", "when": {"w": 7}}}},
+            {},
             "'v' never counts: there is no row in which w is 7.0; check `when:`",
         ),
         (
             {"pose": {"x": "x", "y": "y", "quaternion": ["w", "x", "y", "z"]}},
             {
-                "w": lambda d: np.cos(d["t"]), "x": lambda d: 0.0 * d["t"],
-                "y": lambda d: 0.0 * d["t"], "z": lambda d: np.sin(d["t"]),
+                "w": lambda d: np.cos(d["t"]),
+                "x": lambda d: 0.0 * d["t"],
+                "y": lambda d: 0.0 * d["t"],
+                "z": lambda d: np.sin(d["t"]),
             },
             "look like w, x, y, z of a level body; list them in the order x, y, z, w",
         ),
@@ -321,10 +436,14 @@ MAPPED = {"robot": "ackermann", "pose": {"x": 0, "y": 1, "heading": 2}, "command
         ),
         *(
             (
-                {"command": {"v": {"from": "v", **unit}}}, {"v": lambda d: -40 * np.arange(200)},
+                {"command": {"v": {"from": "v", **unit}}},
+                {"v": lambda d: -40 * np.arange(200)},
                 "'v' is a counter that went on by 7960, no speed: write `{from: v, unit: ticks, ",
             )
-            for unit in ({}, *({"unit": unit} for unit in ("rad/s", "rpm", "m/s", "ticks/s")))
+            for unit in (
+                {},
+                *({"unit": unit} for unit in ("rad/s", "rpm", "m/s", "ticks/s")),
+            )
         ),
         (
             {"command": {"v": {"from": "v", "unit": "ticks"}}},
@@ -332,12 +451,13 @@ MAPPED = {"robot": "ackermann", "pose": {"x": 0, "y": 1, "heading": 2}, "command
             "'v' goes up and down like a speed, and is no counter: write `unit: ticks/s` for comm",
         ),
         (
-            {"time": "sec"}, {"sec": lambda d: d["t"] // 1, "nanosec": lambda d: d["t"] % 1 * 1e9},
+            {"time": "sec"},
+            {"sec": lambda d: d["t"] // 1, "nanosec": lambda d: d["t"] % 1 * 1e9},
             "whole seconds, of 50 rows each; write `time: [sec, nanosec]` into the mapping",
         ),
         ({}, {"t": lambda d: d["t"] // 1}, "of 50 rows each; write `time: {rate: 50}`"),
     ],
-)  # fmt: skip
+)
 def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
     tmp_path, changes, columns, sentence
 ):
@@ -350,12 +470,15 @@ def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
 
 
 @pytest.mark.parametrize(
-    "pwm", [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400), 5 * np.arange(400)]
+    "pwm",
+    [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400), 5 * np.arange(400)],
 )
 def test_commands_in_whole_numbers_are_no_counters(tmp_path, pwm):
     columns = drive(400) | {"v": pwm + np.arange(400) % 2}
     found = read(write(tmp_path / "log.csv", columns))
-    assert np.array_equal(np.unique(found.command.values[:, 0]), np.unique(columns["v"]))
+    assert np.array_equal(
+        np.unique(found.command.values[:, 0]), np.unique(columns["v"])
+    )
 
 
 @pytest.mark.parametrize("form", ["2024-05-01T12:00:{:09.6f}+02:00", "12:00:{:09.6f}"])
@@ -376,38 +499,63 @@ def test_poses_far_from_the_origin_of_a_fast_car_are_read(tmp_path):
 
 def test_longitude_and_latitude_are_places_on_the_ground(tmp_path):
     columns = drive()
-    far = columns | {  # 111.2 km to a degree of latitude at 48 degrees north, 74.6 km of longitude
-        "lon": 11.5 + columns["x"] / 74.626e3, "lat": 48.0 + columns["y"] / 111.197e3,
-    }  # fmt: skip
+    far = (
+        columns
+        | {  # 111.2 km to a degree of latitude at 48 degrees north, 74.6 km of longitude
+            "lon": 11.5 + columns["x"] / 74.626e3,
+            "lat": 48.0 + columns["y"] / 111.197e3,
+        }
+    )
     path = write(tmp_path / "log.csv", far)
     pose = {"x": "lon", "y": "lat", "heading": "yaw", "unit": "deg"}
     found = read(path, pose=pose).pose.values[:, :2]
     moved = np.stack([columns["x"], columns["y"]], axis=1)
     assert np.allclose(found - found[0], moved - moved[0], rtol=1e-3, atol=1e-4)
-    with pytest.raises(ConfigError, match=r"pose.y: is in m, not in rad; check its unit"):
+    with pytest.raises(
+        ConfigError, match=r"pose.y: is in m, not in rad; check its unit"
+    ):
         read(path, pose=pose | {"y": {"from": "y", "unit": "m"}})
 
 
 @pytest.mark.parametrize(
     ("value", "says"),
     [
-        ({"from": "w", "unit": "m/s"}, "command.steering_command: is in m/s, where rad is needed"),
+        (
+            {"from": "w", "unit": "m/s"},
+            "command.steering_command: is in m/s, where rad is needed",
+        ),
         (
             {"from": "w", "unit": "V"},
             "is in V, where rad is needed; check its unit, or give `scale",
         ),
         ({"from": "w", "unit": "%"}, "is in 1, where rad is needed"),
-        ({"from": "w", "unit": "ticks", "differentiate": False}, "add `ticks_per_turn:`"),
+        (
+            {"from": "w", "unit": "ticks", "differentiate": False},
+            "add `ticks_per_turn:`",
+        ),
     ],
 )
-def test_a_unit_of_another_kind_than_the_command_s_is_refused(tmp_path, columns, value, says):
+def test_a_unit_of_another_kind_than_the_command_s_is_refused(
+    tmp_path, columns, value, says
+):
     path = write(tmp_path / "log.csv", columns)
-    robot = {"kind": "ackermann", "footprint_radius": 0.2, "parameters": {"wheelbase": 0.3}}
+    robot = {
+        "kind": "ackermann",
+        "footprint_radius": 0.2,
+        "parameters": {"wheelbase": 0.3},
+    }
     given = {
-        "robot": robot, "time": "t", "pose": {"x": "x", "y": "y", "heading": "yaw"},
-        "command": {"speed_command": {"from": "v", "unit": "km/h"}, "steering_command": value},
-    }  # fmt: skip
+        "robot": robot,
+        "time": "t",
+        "pose": {"x": "x", "y": "y", "heading": "yaw"},
+        "command": {
+            "speed_command": {"from": "v", "unit": "km/h"},
+            "steering_command": value,
+        },
+    }
     with pytest.raises(ConfigError, match=says):
         robot_and_drive(path, None, TopicRoles(), Mapping.model_validate(given))
-    scaled = given | {"command": given["command"] | {"steering_command": value | {"scale": 0.5}}}
+    scaled = given | {
+        "command": given["command"] | {"steering_command": value | {"scale": 0.5}}
+    }
     robot_and_drive(path, None, TopicRoles(), Mapping.model_validate(scaled))

@@ -37,11 +37,15 @@ FORMS = {
     "no chunks": {"use_chunking": False},
     "sealed": {"enable_data_crcs": True},
     "bare": {
-        "compression": CompressionType.NONE, "index_types": IndexType.NONE, "enable_crcs": False,
-        "repeat_channels": False, "repeat_schemas": False, "use_statistics": False,
+        "compression": CompressionType.NONE,
+        "index_types": IndexType.NONE,
+        "enable_crcs": False,
+        "repeat_channels": False,
+        "repeat_schemas": False,
+        "use_statistics": False,
         "use_summary_offsets": False,
     },
-}  # fmt: skip
+}
 
 
 def written(path, size=2000, data=DATA, **options):
@@ -91,7 +95,10 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path, form):
     [
         (framed(1, struct.pack("<I4sI", 4, b"ros2", 0)), None),
         (framed(0x90, b"of another program"), None),
-        (framed(1, struct.pack("<I4sII", 4, b"ros2", 0, 0)), None),  # the format may grow
+        (
+            framed(1, struct.pack("<I4sII", 4, b"ros2", 0, 0)),
+            None,
+        ),  # the format may grow
         (framed(1, struct.pack("<I4sI", 4, b"ros2", 9)), "shorter than"),
         (framed(1, struct.pack("<I4sI", 2**32 - 1, b"ros2", 9)), "shorter than"),
         (framed(1, struct.pack("<I4sI", 4, b"\xff\xff\xff\xff", 0)), "not UTF-8"),
@@ -121,16 +128,26 @@ def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
             assert caught.value.end == len(good) + len(record)
 
 
-def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(
+    tmp_path, monkeypatch
+):
     """Also in a file without summary, whose chunks rosbags unpacks when it opens it."""
-    path = written(tmp_path / "drive.mcap", size=2**22, data=DATA + bytes(2**14), **FORMS["zstd"])
+    path = written(
+        tmp_path / "drive.mcap", size=2**22, data=DATA + bytes(2**14), **FORMS["zstd"]
+    )
     monkeypatch.setattr(mcap, "MOST_UNPACKED", 2**20)
     for data in (path.read_bytes(), without_summary(path.read_bytes())):
         path.write_bytes(data)
-        with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(path):
+        with (
+            pytest.raises(RecordingError, match="more than 1048576 bytes"),
+            opened(path),
+        ):
             pass
         bag = packed_as_a_whole(tmp_path / "bag", data)
-        with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(bag):
+        with (
+            pytest.raises(RecordingError, match="more than 1048576 bytes"),
+            opened(bag),
+        ):
             pass
 
 
@@ -146,7 +163,9 @@ def packed_as_a_whole(folder, data):
 def test_a_chunk_that_says_that_it_is_terabytes_is_refused(tmp_path):
     path = written(tmp_path / "drive.mcap", **FORMS["bare"])
     data = bytearray(path.read_bytes())
-    (chunk, *_) = (r for r in records(memoryview(bytes(data)), len(MAGIC)) if data[r.offset] == 6)
+    (chunk, *_) = (
+        r for r in records(memoryview(bytes(data)), len(MAGIC)) if data[r.offset] == 6
+    )
     struct.pack_into("<Q", data, chunk.offset + PREFIX + 16, 2**42)
     path.write_bytes(data)
     with pytest.raises(RecordingError, match="not as long as it says"), opened(path):
@@ -154,7 +173,9 @@ def test_a_chunk_that_says_that_it_is_terabytes_is_refused(tmp_path):
 
 
 def without_summary(data):
-    end = next(r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15).end
+    end = next(
+        r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15
+    ).end
     return data[: end - 4] + bytes(4) + framed(2, bytes(20)) + MAGIC
 
 
@@ -170,7 +191,9 @@ def test_a_file_without_summary_is_read(tmp_path):
 def test_a_flipped_bit_of_a_sealed_file_is_found(tmp_path):
     path = written(tmp_path / "drive.mcap", **FORMS["sealed"])
     data = path.read_bytes()
-    end = next(r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15).offset
+    end = next(
+        r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15
+    ).offset
     assert zlib.crc32(data[:end]) == struct.unpack_from("<I", data, end + PREFIX)[0]
     for place in range(len(MAGIC), len(data), 41):
         path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
@@ -180,7 +203,9 @@ def test_a_flipped_bit_of_a_sealed_file_is_found(tmp_path):
 
 def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
     path = written(tmp_path / "drive.mcap")
-    monkeypatch.setattr(messages, "find_spec", lambda name: None if name == "mcap" else name)
+    monkeypatch.setattr(
+        messages, "find_spec", lambda name: None if name == "mcap" else name
+    )
     said = r"library mcap; .*nics_drl_bridge\[bags\]"
     with pytest.raises(RecordingError, match=said), opened(path):
         pass

@@ -3,7 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.recording import along_path, clockwise_line, implausible_pose
+from nics_drl_bridge.recording.recording import (
+    along_path,
+    clockwise_line,
+    implausible_pose,
+)
 
 T = np.arange(3000) * 0.02
 
@@ -53,7 +57,9 @@ def test_a_robot_that_spins_on_a_line_has_no_heading_in_degrees():
     assert implausible_pose(T, values) is None
 
 
-@pytest.mark.parametrize(("factor", "line"), [(100.0, "unit: cm"), (1000.0, "unit: mm")])
+@pytest.mark.parametrize(
+    ("factor", "line"), [(100.0, "unit: cm"), (1000.0, "unit: mm")]
+)
 def test_positions_that_are_no_metres_are_told(factor, line):
     assert implausible_pose(T, pose() * [factor, factor, 1.0]).line == line
 
@@ -73,7 +79,10 @@ def test_the_heading_of_a_compass_is_told_with_what_turns_it_round(speed, turn):
     values = pose(speed, turn)
     assert line_of(values) == ""
     assert line_of(values * [1.0, 1.0, -1.0]) == "scale: -1"
-    assert line_of(values * [1.0, 1.0, -1.0] + [0.0, 0.0, np.pi / 2]) == "scale: -1, offset: 1.5708"
+    assert (
+        line_of(values * [1.0, 1.0, -1.0] + [0.0, 0.0, np.pi / 2])
+        == "scale: -1, offset: 1.5708"
+    )
 
 
 def test_a_straight_drive_or_a_robot_that_only_spins_does_not_show_a_compass():

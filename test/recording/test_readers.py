@@ -18,7 +18,16 @@ def folder(tmp_path):
     t = np.arange(100) * 0.1
     write(tmp_path / "cmd.csv", np.stack([t * 0.1, t * 0.0 - 0.5, t + 0.2], axis=1))
     yaw, zero = np.arange(100) * 0.1, np.zeros(100)
-    pose = [t, -t, zero, zero, zero, np.sin(yaw / 2), np.cos(yaw / 2), np.round(t * 1e9)]
+    pose = [
+        t,
+        -t,
+        zero,
+        zero,
+        zero,
+        np.sin(yaw / 2),
+        np.cos(yaw / 2),
+        np.round(t * 1e9),
+    ]
     write(tmp_path / "vrpn.csv", np.stack(pose, axis=1))
     for name, speed in (("L_wheel.csv", 3.0), ("R_wheel.csv", 5.0)):
         write(tmp_path / name, np.stack([zero + speed, t + 0.2], axis=1))
@@ -47,7 +56,9 @@ def test_it_reads_commands_poses_and_wheels_with_their_clocks(folder):
     assert clocks == {"command": "robot", "pose": "mocap", "wheels": "robot"}
 
 
-def test_a_folder_tells_its_robot_and_a_drive_that_tells_none_is_of_the_default(folder, tmp_path):
+def test_a_folder_tells_its_robot_and_a_drive_that_tells_none_is_of_the_default(
+    folder, tmp_path
+):
     def robot_of(path, named=None):
         return robot_and_drive(path, named, TopicRoles(), None)[0].name
 
@@ -66,23 +77,47 @@ def test_wheels_and_acceleration_may_be_missing(folder):
 @pytest.mark.parametrize(
     ("file", "row", "text", "sentence"),
     [
-        ("cmd.csv", 3, "0.1,inf,0.4", "cmd.csv: line 3: column '1' is infinite; mend or remove"),
-        ("cmd.csv", 7, "0.1,fast,0.4", "line 7: column '1' is 'fast', which is no number; mend"),
-        ("vrpn.csv", 2, "0,0,0,0,0,0,3,100000000", "0.100 s from the start the quaternion has"),
+        (
+            "cmd.csv",
+            3,
+            "0.1,inf,0.4",
+            "cmd.csv: line 3: column '1' is infinite; mend or remove",
+        ),
+        (
+            "cmd.csv",
+            7,
+            "0.1,fast,0.4",
+            "line 7: column '1' is 'fast', which is no number; mend",
+        ),
+        (
+            "vrpn.csv",
+            2,
+            "0,0,0,0,0,0,3,100000000",
+            "0.100 s from the start the quaternion has",
+        ),
     ],
 )
-def test_a_bad_row_is_named_with_place_and_fix_and_the_mapping(folder, file, row, text, sentence):
+def test_a_bad_row_is_named_with_place_and_fix_and_the_mapping(
+    folder, file, row, text, sentence
+):
     spoil(folder / file, row, text)
     with pytest.raises(RecordingError, match=sentence) as caught:
         read_recording(folder)
-    assert re.search(r"; the mapping is .*\.yaml, --map gives another\.$", str(caught.value))
+    assert re.search(
+        r"; the mapping is .*\.yaml, --map gives another\.$", str(caught.value)
+    )
 
 
 @pytest.mark.parametrize(
     ("file", "row", "text", "repair"),
     [
         ("cmd.csv", 3, "0.1,nan,0.4", "1 of 100 rows have no value, and were left out"),
-        ("cmd.csv", 7, "0.1,0.4", "cmd.csv: 1 lines of another length (line 7) were left out"),
+        (
+            "cmd.csv",
+            7,
+            "0.1,0.4",
+            "cmd.csv: 1 lines of another length (line 7) were left out",
+        ),
         ("L_wheel.csv", 5, "3,0.1", "L_wheel.csv: 1 of 100 rows came after later ones"),
         ("vrpn.csv", 2, "0,0,0,0,0,0,0,100000000", "1 of 100 rows without orientation"),
     ],
@@ -103,24 +138,32 @@ def test_titles_and_what_no_stream_needs_do_not_matter(folder):
 @pytest.mark.parametrize("file", ["cmd.csv", "vrpn.csv"])
 def test_a_folder_that_lacks_a_file_names_those_that_are_needed(folder, file):
     (folder / file).unlink()
-    with pytest.raises(RecordingError, match=r"a folder with cmd.csv and vrpn.csv .* --map"):
+    with pytest.raises(
+        RecordingError, match=r"a folder with cmd.csv and vrpn.csv .* --map"
+    ):
         read_recording(folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00\x81"])
 def test_a_file_without_numbers_is_named(folder, content):
     (folder / "cmd.csv").write_bytes(content)
-    with pytest.raises(RecordingError, match=r"cmd.csv: holds no row of numbers; give a table"):
+    with pytest.raises(
+        RecordingError, match=r"cmd.csv: holds no row of numbers; give a table"
+    ):
         read_recording(folder)
 
 
 @pytest.mark.parametrize("name", ["cmd.csv", "L_wheel.csv"])
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "us"), (1e9, "ns")])
-def test_of_stamps_in_another_unit_the_file_is_named_and_the_line(folder, name, factor, unit):
+def test_of_stamps_in_another_unit_the_file_is_named_and_the_line(
+    folder, name, factor, unit
+):
     table = np.loadtxt(folder / name, delimiter=",")
     table[:, -1] *= factor
     write(folder / name, table)
-    with pytest.raises(RecordingError, match=f"write `time: {{from: ., unit: {unit}}}`") as caught:
+    with pytest.raises(
+        RecordingError, match=f"write `time: {{from: ., unit: {unit}}}`"
+    ) as caught:
         read_recording(folder)
     assert str(caught.value).startswith(str(folder / name))
 
@@ -147,7 +190,10 @@ def test_the_reader_is_chosen_by_what_lies_there(folder, tmp_path):
     [
         ("nowhere", "no such file or folder"),
         ("nowhere.npz", "no such file"),
-        ("cmd.csv", "is neither a bag nor a folder with cmd.csv .* nor an .npz file; say what is"),
+        (
+            "cmd.csv",
+            "is neither a bag nor a folder with cmd.csv .* nor an .npz file; say what is",
+        ),
     ],
 )
 def test_a_path_that_holds_no_recording_is_refused(folder, name, sentence):
@@ -179,5 +225,7 @@ def test_more_rows_or_bytes_than_any_drive_has_are_refused(tmp_path):
         read_recording(tmp_path)
     with (tmp_path / "cmd.csv").open("wb") as file:
         file.truncate(2**33)
-    with pytest.raises(RecordingError, match=r"larger than 64 MB.* cut it, or give --map"):
+    with pytest.raises(
+        RecordingError, match=r"larger than 64 MB.* cut it, or give --map"
+    ):
         read_recording(tmp_path)

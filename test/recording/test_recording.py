@@ -82,7 +82,10 @@ def test_chosen_rows_stay_together():
 def test_a_good_recording_passes(recording, car):
     assert check(recording, car) is recording
     assert set(recording.streams) == {"command", "pose", "state", "wheels"}
-    assert set(replace(recording, state=None, wheels=None).streams) == {"command", "pose"}
+    assert set(replace(recording, state=None, wheels=None).streams) == {
+        "command",
+        "pose",
+    }
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -113,7 +116,9 @@ def test_equal_stamps_are_allowed(recording, car):
 
 
 def test_a_recording_of_another_robot_is_refused(recording):
-    with pytest.raises(RecordingError, match=r"command: has the shape \(50, 2\) where \(50, 3\)"):
+    with pytest.raises(
+        RecordingError, match=r"command: has the shape \(50, 2\) where \(50, 3\)"
+    ):
         check(recording, load_robot("mecanum"))
 
 
@@ -152,7 +157,9 @@ def packed(arrays):
     return buffer.getvalue()
 
 
-def test_numpy_reads_a_recording_whose_checksum_follows_the_archive(recording, tmp_path):
+def test_numpy_reads_a_recording_whose_checksum_follows_the_archive(
+    recording, tmp_path
+):
     path = tmp_path / "drive.npz"
     save_recording(recording, path)
     with np.load(path, allow_pickle=False) as arrays:
@@ -165,8 +172,14 @@ def test_files_of_previous_versions_are_read_and_their_damage_is_noticed(
     recording, tmp_path, version
 ):
     streams = recording.streams
-    meta = {"format": version, "clocks": {k: v.clock for k, v in streams.items()}, "variables": []}
-    arrays = {f"{k}_t": v.t for k, v in streams.items()} | {k: v.values for k, v in streams.items()}
+    meta = {
+        "format": version,
+        "clocks": {k: v.clock for k, v in streams.items()},
+        "variables": [],
+    }
+    arrays = {f"{k}_t": v.t for k, v in streams.items()} | {
+        k: v.values for k, v in streams.items()
+    }
     data = packed({"meta": np.array(json.dumps(meta)), **arrays})
     if version == COMMENT_FORMAT:
         buffer = io.BytesIO(data)
@@ -177,7 +190,9 @@ def test_files_of_previous_versions_are_read_and_their_damage_is_noticed(
     path = tmp_path / "old.npz"
     path.write_bytes(data)
     assert np.array_equal(load_recording(path).pose.values, recording.pose.values)
-    for place in range(10, len(data), 97) if version == COMMENT_FORMAT else [len(data) // 2]:
+    for place in (
+        range(10, len(data), 97) if version == COMMENT_FORMAT else [len(data) // 2]
+    ):
         damaged = bytearray(data)
         damaged[place] ^= 4
         path.write_bytes(damaged)
@@ -240,12 +255,16 @@ def test_every_flipped_bit_and_every_cut_is_refused(recording, tmp_path):
             load_recording(path)
 
 
-@pytest.mark.parametrize("field", [{"method": 99}, {"flags": 1}], ids=["packing", "password"])
+@pytest.mark.parametrize(
+    "field", [{"method": 99}, {"flags": 1}], ids=["packing", "password"]
+)
 def test_entries_that_zipfile_can_not_unpack_are_refused(tmp_path, field):
     data = bytearray(packed({"meta": np.arange(1000)}))
     for signature, flags, method in ((b"PK\x03\x04", 6, 8), (b"PK\x01\x02", 8, 10)):
         begin = data.index(signature)
-        data[begin + (flags if "flags" in field else method)] = next(iter(field.values()))
+        data[begin + (flags if "flags" in field else method)] = next(
+            iter(field.values())
+        )
     path = tmp_path / "drive.npz"
     path.write_bytes(sealed(data))
     with pytest.raises(RecordingError, match=r"compression|password|encrypted"):

@@ -27,7 +27,11 @@ def test_arrays_of_an_archive_are_columns_those_of_a_matrix_by_index(tmp_path, c
     assert np.allclose(found.pose.values[:, 0], columns["x"])
     assert found.command.values.shape == (40, 1)
     with pytest.raises(RecordingError, match="200 stamps can't be those of 40 values"):
-        read(tmp_path / "log.npz", command={"v": "c"}, pose={"x": 1, "y": 2, "heading": 3})
+        read(
+            tmp_path / "log.npz",
+            command={"v": "c"},
+            pose={"x": 1, "y": 2, "heading": 3},
+        )
 
 
 def test_a_matrix_has_numbers_and_records_have_names(tmp_path, columns):
@@ -40,7 +44,9 @@ def test_a_matrix_has_numbers_and_records_have_names(tmp_path, columns):
 
 
 def test_objects_and_damage_are_refused(tmp_path):
-    np.save(tmp_path / "objects.npy", np.array([{"x": 1}], dtype=object), allow_pickle=True)
+    np.save(
+        tmp_path / "objects.npy", np.array([{"x": 1}], dtype=object), allow_pickle=True
+    )
     (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 and nothing else")
     for name in ("objects.npy", "damaged.npz"):
         with pytest.raises(RecordingError, match="write numbers with numpy"):
@@ -57,8 +63,14 @@ def test_parquet_without_its_library_is_one_sentence(tmp_path, monkeypatch):
 def test_parquet_is_read_with_its_stamps(tmp_path, columns):
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
-    dates = (np.round(columns["t"] * 1e9) + 1.7e18).astype(np.int64).astype("datetime64[ns]")
-    parquet.write_table(pyarrow.table(columns | {"date": dates}), tmp_path / "log.parquet")
+    dates = (
+        (np.round(columns["t"] * 1e9) + 1.7e18)
+        .astype(np.int64)
+        .astype("datetime64[ns]")
+    )
+    parquet.write_table(
+        pyarrow.table(columns | {"date": dates}), tmp_path / "log.parquet"
+    )
     found = read(tmp_path / "log.parquet", time="date")
     assert np.allclose(found.pose.t, columns["t"], atol=1e-6)
 
@@ -68,12 +80,17 @@ def test_a_column_of_parquet_that_holds_no_numbers_is_let_be(tmp_path, columns, 
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
     other = pyarrow.array([each] * len(columns["t"]))
-    parquet.write_table(pyarrow.table(columns | {"other": other}), tmp_path / "log.parquet")
+    parquet.write_table(
+        pyarrow.table(columns | {"other": other}), tmp_path / "log.parquet"
+    )
     assert np.allclose(read(tmp_path / "log.parquet").pose.values[:, 0], columns["x"])
 
 
 def test_a_folder_without_tables_and_a_path_that_is_none_are_refused(tmp_path):
     (tmp_path / "notes.md").write_text("none")
-    for path, sentence in ((tmp_path, "holds no file of a known"), (tmp_path / "x", "no such")):
+    for path, sentence in (
+        (tmp_path, "holds no file of a known"),
+        (tmp_path / "x", "no such"),
+    ):
         with pytest.raises(RecordingError, match=sentence), open_source(path):
             pass

@@ -34,7 +34,9 @@ COMMAND = topic("/cmd_vel")
 
 def test_headers_of_the_recorders_clock_share_it_with_what_has_none():
     shaken = np.random.default_rng(0).uniform(0.001, 0.02, len(T))
-    made = streams({"command": COMMAND, "pose": topic("/pose", T, T + shaken)}, "auto", "drive")
+    made = streams(
+        {"command": COMMAND, "pose": topic("/pose", T, T + shaken)}, "auto", "drive"
+    )
     assert made["pose"].clock == made["command"].clock == RECEIVE
     assert np.allclose(made["pose"].t, T)
     assert np.allclose(made["command"].t, T)
@@ -43,7 +45,9 @@ def test_headers_of_the_recorders_clock_share_it_with_what_has_none():
 @pytest.mark.parametrize("delay", [0.02, 0.07, 0.3, 0.9])
 def test_the_time_that_a_localiser_needs_is_no_other_clock(delay):
     late = delay + np.random.default_rng(0).uniform(-0.01, 0.02, len(T))
-    made = streams({"command": COMMAND, "pose": topic("/pose", T, T + late)}, "auto", "drive")
+    made = streams(
+        {"command": COMMAND, "pose": topic("/pose", T, T + late)}, "auto", "drive"
+    )
     assert made["pose"].clock == made["command"].clock == RECEIVE
     assert np.allclose(made["pose"].t - made["command"].t, 0.0)
 
@@ -91,12 +95,16 @@ def test_two_foreign_clocks_are_told_apart():
         "pose": topic("/pose", T - 100.0),
         "state": topic("/joint_states", T + 100.001),
     }
-    clocks = {name: stream.clock for name, stream in streams(data, "auto", "drive").items()}
+    clocks = {
+        name: stream.clock for name, stream in streams(data, "auto", "drive").items()
+    }
     assert clocks["command"] == clocks["state"] != clocks["pose"]
 
 
 def test_headers_without_a_stamp_give_way_to_the_time_of_receipt():
-    made = streams({"command": COMMAND, "pose": topic("/pose", 0 * T, start=0)}, "auto", "drive")
+    made = streams(
+        {"command": COMMAND, "pose": topic("/pose", 0 * T, start=0)}, "auto", "drive"
+    )
     assert made["pose"].clock == RECEIVE
     assert np.allclose(made["pose"].t, T)
 
@@ -105,8 +113,14 @@ def test_headers_of_which_some_have_no_stamp_are_refused():
     pose = topic("/pose", T)
     pose.header_ns[300:305] = 0
     sentence = refused({"command": COMMAND, "pose": pose})
-    assert "topic '/pose': 5 of 1500 headers have no stamp; write `stamps: receive`" in sentence
-    assert streams({"command": COMMAND, "pose": pose}, "receive", "drive")["pose"].t[0] == 0.0
+    assert (
+        "topic '/pose': 5 of 1500 headers have no stamp; write `stamps: receive`"
+        in sentence
+    )
+    assert (
+        streams({"command": COMMAND, "pose": pose}, "receive", "drive")["pose"].t[0]
+        == 0.0
+    )
 
 
 def test_what_a_simulation_sent_before_it_had_a_time_is_left_out():
@@ -168,7 +182,9 @@ def test_repeated_messages_stay_in_order():
 def test_receipt_out_of_order_is_sorted():
     order = np.random.default_rng(0).permutation(len(T))
     data = topic("/cmd_vel", None, T[order])
-    made = streams({"command": data, "pose": topic("/pose", T)}, "auto", "drive")["command"]
+    made = streams({"command": data, "pose": topic("/pose", T)}, "auto", "drive")[
+        "command"
+    ]
     assert np.allclose(made.t, T)
     assert np.array_equal(made.values[:, 0], np.argsort(order))
 
@@ -179,4 +195,7 @@ def test_header_stamps_are_taken_on_request_and_must_be_there():
     assert {stream.clock for stream in made.values()} == {HEADER}
     assert np.allclose(made["pose"].t - made["command"].t, 2.0)
     sentence = refused({"command": COMMAND, "pose": topic("/pose", T)}, "header")
-    assert "topic '/cmd_vel': its messages have no header stamps; write `stamps: auto`" in sentence
+    assert (
+        "topic '/cmd_vel': its messages have no header stamps; write `stamps: auto`"
+        in sentence
+    )

@@ -70,7 +70,9 @@ def test_rows_that_repeat_stamp_and_values_are_left_out():
     assert "1 of 4 rows repeat" in note
 
 
-@pytest.mark.parametrize(("step", "unit"), [(0.02, None), (20.0, "ms"), (2e4, "us"), (2e7, "ns")])
+@pytest.mark.parametrize(
+    ("step", "unit"), [(0.02, None), (20.0, "ms"), (2e4, "us"), (2e7, "ns")]
+)
 def test_the_unit_of_stamps_that_are_no_seconds_is_named(step, unit):
     assert likely_unit(np.arange(50) * step) == unit
 

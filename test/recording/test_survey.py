@@ -7,7 +7,11 @@ from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.guess import first_mapping
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import open_source, read_recording, why_no_mapping
+from nics_drl_bridge.recording.readers import (
+    open_source,
+    read_recording,
+    why_no_mapping,
+)
 from nics_drl_bridge.recording.survey import survey, words_of
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.write import write_drive
@@ -15,7 +19,13 @@ from nics_drl_bridge.robot.spec import load_robot
 
 from .tables import drive, write
 
-NAMES = {"x": "vicon x", "y": "vicon y", "yaw": "vicon yaw", "v": "throttle", "w": "steering"}
+NAMES = {
+    "x": "vicon x",
+    "y": "vicon y",
+    "yaw": "vicon yaw",
+    "v": "throttle",
+    "w": "steering",
+}
 
 
 def surveyed(path):
@@ -45,9 +55,16 @@ def test_guesses_reach_over_files_split_stamps_and_quaternions(tmp_path):
     split = {"": np.arange(200), "s": ns // 10**9, "ns": ns % 10**9}
     half, zero = columns["yaw"] / 2.0, np.zeros(200)
     turned = {"q.x": zero, "q.y": zero, "q.z": np.sin(half), "q.w": np.cos(half)}
-    write(tmp_path / "pose.csv", split | {"x": columns["x"], "y": columns["y"]} | turned)
-    write(tmp_path / "odom.csv", split | {"x": columns["x"], "y": columns["y"]} | turned)
-    write(tmp_path / "cmd.csv", split | {"V": columns["v"] + 0.1 * half, "delta": columns["w"]})
+    write(
+        tmp_path / "pose.csv", split | {"x": columns["x"], "y": columns["y"]} | turned
+    )
+    write(
+        tmp_path / "odom.csv", split | {"x": columns["x"], "y": columns["y"]} | turned
+    )
+    write(
+        tmp_path / "cmd.csv",
+        split | {"V": columns["v"] + 0.1 * half, "delta": columns["w"]},
+    )
     _, guess = surveyed(tmp_path)
     assert guess["time"] == ["s", "ns"]
     assert guess["pose"]["in"] == "pose.csv"
@@ -78,21 +95,40 @@ def test_a_quaternion_without_names_stands_after_the_place_whatever_is_first(
 def test_streams_of_different_lengths_in_one_file_are_guessed_apart(tmp_path):
     columns = drive()
     quick = np.linspace(0.0, 20.0, 321)
-    streams = {"t": columns["t"], "x": columns["x"], "y": columns["y"], "yaw": columns["yaw"]}
+    streams = {
+        "t": columns["t"],
+        "x": columns["x"],
+        "y": columns["y"],
+        "yaw": columns["yaw"],
+    }
     np.savez(
-        tmp_path / "log.npz", **streams, wheel_t=quick, ticks_left=np.floor(50.0 * quick),
-        ticks_right=np.floor(50.0 * quick[:300]), v=columns["v"], w=columns["w"],
-    )  # fmt: skip
+        tmp_path / "log.npz",
+        **streams,
+        wheel_t=quick,
+        ticks_left=np.floor(50.0 * quick),
+        ticks_right=np.floor(50.0 * quick[:300]),
+        v=columns["v"],
+        w=columns["w"],
+    )
     _, guess = surveyed(tmp_path / "log.npz")
     assert guess["pose"]["heading"] == "yaw"
 
 
-def test_a_pose_of_streams_of_different_lengths_is_listed_and_guessed_by_its_names(tmp_path):
+def test_a_pose_of_streams_of_different_lengths_is_listed_and_guessed_by_its_names(
+    tmp_path,
+):
     columns = drive()
     half = columns["yaw"][:150] / 2.0
-    turned = {"qx": 0.0 * half, "qy": 0.0 * half, "qz": np.sin(half), "qw": np.cos(half)}
+    turned = {
+        "qx": 0.0 * half,
+        "qy": 0.0 * half,
+        "qz": np.sin(half),
+        "qw": np.cos(half),
+    }
     place = {name: columns[name] for name in ("t", "x", "y")}
-    np.savez(tmp_path / "log.npz", **place, **turned, imu_t=np.arange(321.0), v=columns["v"])
+    np.savez(
+        tmp_path / "log.npz", **place, **turned, imu_t=np.arange(321.0), v=columns["v"]
+    )
     _, guess = surveyed(tmp_path / "log.npz")
     assert guess["pose"]["quaternion"] == ["qx", "qy", "qz", "qw"]
 
@@ -113,7 +149,9 @@ def test_units_that_can_only_be_others_are_guessed(tmp_path):
     wavy["pose.theta"] = np.degrees(columns["yaw"] * 40.0)
     wheel = {"unit": "ticks", "ticks_per_turn": 128}
     ticks = {"Left_Tick": np.arange(200), "Right_Tick": np.arange(200) * 2}
-    _, guess = surveyed(write(tmp_path / "log.csv", {"time": columns["t"] * 1e3} | wavy | ticks))
+    _, guess = surveyed(
+        write(tmp_path / "log.csv", {"time": columns["t"] * 1e3} | wavy | ticks)
+    )
     assert guess["time"] == {"from": "time", "unit": "ms"}
     assert guess["pose"]["heading_unit"] == "deg"
     assert guess["command"]["left_wheel"] == wheel | {"from": "Left_Tick"}
@@ -125,7 +163,9 @@ def test_gaps_backward_stamps_and_repeated_rows_are_listed(tmp_path):
     order = np.concatenate([np.arange(50), [49, 49], np.arange(90, 200)])
     t = columns["t"].copy()
     t[150:] -= 0.5
-    path = write(tmp_path / "log.csv", {k: c[order] for k, c in (columns | {"t": t}).items()})
+    path = write(
+        tmp_path / "log.csv", {k: c[order] for k, c in (columns | {"t": t}).items()}
+    )
     (table,), _ = surveyed(path)
     text = "\n".join(table.regularity)
     assert "gaps: 1, the longest of 0.82 s after 1.0 s" in text
@@ -151,9 +191,15 @@ MEASURES = {"v": "cmd speed [km/h]", "w": "cmd_steer_angle", "t": "stamp"}
 
 def test_units_and_places_are_understood_from_names(tmp_path):
     columns = drive()
-    columns |= {"x": 4e5 + columns["x"], "yaw": np.degrees(columns["yaw"]), "v": columns["w"] * 3.6}
+    columns |= {
+        "x": 4e5 + columns["x"],
+        "yaw": np.degrees(columns["yaw"]),
+        "v": columns["w"] * 3.6,
+    }
     names = SAID | MEASURES
-    path = write(tmp_path / "log.csv", {names[name]: column for name, column in columns.items()})
+    path = write(
+        tmp_path / "log.csv", {names[name]: column for name, column in columns.items()}
+    )
     _, guess = surveyed(path)
     assert guess["pose"]["heading_unit"] == "deg"
     found = read_recording(path, mapping=Mapping.model_validate(guess))
@@ -213,8 +259,15 @@ def test_a_source_without_a_readable_table_is_refused(tmp_path):
 
 def test_columns_that_a_mapping_does_not_use_are_named_with_a_word_why(tmp_path):
     columns = {NAMES.get(name, name): column for name, column in drive().items()}
-    more = {"brake_pct": columns["t"], "spare": 0.0 * columns["t"], "seq": np.arange(200)}
-    more |= {"blorp": columns["t"] ** 2, "mode": np.where(columns["t"] < 1.0, "AUTO", "HAND")}
+    more = {
+        "brake_pct": columns["t"],
+        "spare": 0.0 * columns["t"],
+        "seq": np.arange(200),
+    }
+    more |= {
+        "blorp": columns["t"] ** 2,
+        "mode": np.where(columns["t"] < 1.0, "AUTO", "HAND"),
+    }
     _, text = written(write(tmp_path / "log.csv", columns | more))
     rest = "brake_pct, spare (constant), blorp, mode (no numbers)"
     assert text.splitlines()[-1] == f"# not used: {rest}"
@@ -225,7 +278,10 @@ def test_columns_that_a_mapping_does_not_use_are_named_by_table(tmp_path):
     write(tmp_path / "a.csv", {name: columns[name] for name in ("t", "x", "y", "yaw")})
     more = {f"pump{k}": np.full(200, k) for k in range(22)}
     write(tmp_path / "b.csv", {"t": columns["t"], "throttle": columns["v"]} | more)
-    write(tmp_path / "c.csv", {"t": columns["t"], "steering": columns["w"], "rest": columns["t"]})
+    write(
+        tmp_path / "c.csv",
+        {"t": columns["t"], "steering": columns["w"], "rest": columns["t"]},
+    )
     first, last = written(tmp_path)[1].splitlines()[-2:]
     assert first.startswith("# not used: b.csv: pump0 (constant), pump1 (constant), ")
     assert first.endswith("pump19 (constant) and 2 more")
@@ -250,8 +306,14 @@ def test_fields_of_a_twist_that_are_zero_make_no_robot_that_moves_sideways(tmp_p
 
 def test_a_pose_that_shares_no_time_with_the_commands_has_a_clock_of_its_own(tmp_path):
     columns = drive()
-    write(tmp_path / "pose.csv", {name: columns[name] for name in ("t", "x", "y", "yaw")})
-    late = {"t": columns["t"] + 1.7e9, "throttle": columns["v"], "steering": columns["w"]}
+    write(
+        tmp_path / "pose.csv", {name: columns[name] for name in ("t", "x", "y", "yaw")}
+    )
+    late = {
+        "t": columns["t"] + 1.7e9,
+        "throttle": columns["v"],
+        "steering": columns["w"],
+    }
     write(tmp_path / "cmd.csv", late)
     _, guess = surveyed(tmp_path)
     assert guess["pose"]["clock"] == "tracker"
@@ -261,11 +323,15 @@ def test_a_pose_that_shares_no_time_with_the_commands_has_a_clock_of_its_own(tmp
 
 def test_a_drive_over_midnight_has_one_clock(tmp_path):
     columns = drive()
-    times = np.datetime64("2026-01-01T23:59:58") + np.round(columns["t"] * 1e3).astype("m8[ms]")
+    times = np.datetime64("2026-01-01T23:59:58") + np.round(columns["t"] * 1e3).astype(
+        "m8[ms]"
+    )
     stamps = [str(time).partition("T")[2] for time in times]
     rest = {"x": columns["x"], "y": columns["y"], "theta": columns["yaw"]}
     commands = {"v_cmd": columns["v"], "w_cmd": columns["w"]}
-    _, guess = surveyed(write(tmp_path / "log.csv", {"timestamp": stamps} | rest | commands))
+    _, guess = surveyed(
+        write(tmp_path / "log.csv", {"timestamp": stamps} | rest | commands)
+    )
     assert "clock" not in guess["pose"]
 
 
@@ -278,7 +344,11 @@ def test_a_pose_that_counts_from_its_first_row_in_another_unit_has_a_clock(
     columns = drive()
     pose = {name: columns[name] for name in ("t", "x", "y", "yaw")}
     write(tmp_path / "pose.csv", pose | {"t": unit * (since + columns["t"])})
-    later = {"t": since + 0.13 + columns["t"], "throttle": columns["v"], "steering": columns["w"]}
+    later = {
+        "t": since + 0.13 + columns["t"],
+        "throttle": columns["v"],
+        "steering": columns["w"],
+    }
     write(tmp_path / "cmd.csv", later)
     assert ("clock" in surveyed(tmp_path)[1]["pose"]) == own
 
@@ -292,7 +362,10 @@ def test_the_motion_capture_of_a_real_car_is_guessed_to_have_a_clock(shared_reco
 @pytest.mark.parametrize("name", ["left_rpm", "rpm_left", "motor_rpm_left_cmd"])
 def test_revolutions_a_minute_are_understood_anywhere_in_a_name(tmp_path, name):
     columns = drive()
-    columns |= {name: np.sin(columns["t"]), name.replace("left", "right"): np.cos(columns["t"])}
+    columns |= {
+        name: np.sin(columns["t"]),
+        name.replace("left", "right"): np.cos(columns["t"]),
+    }
     del columns["v"], columns["w"]
     _, guess = surveyed(write(tmp_path / "log.csv", columns))
     assert guess["command"]["left_wheel"] == {"from": name, "unit": "rpm"}
@@ -301,12 +374,17 @@ def test_revolutions_a_minute_are_understood_anywhere_in_a_name(tmp_path, name):
 @pytest.mark.parametrize(
     ("names", "alike"),
     [
-        (("cmd_vel.linear.x", "cmd_vel.angular.z"), "{kind: differential, *, or skid_steer; "),
+        (
+            ("cmd_vel.linear.x", "cmd_vel.angular.z"),
+            "{kind: differential, *, or skid_steer; ",
+        ),
         (("speed_cmd", "steering_cmd"), "{kind: ackermann, *, or tricycle; "),
         (("throttle", "steering"), "{kind: ackermann_throttle, *guessed; "),
     ],
 )
-def test_kinds_of_robots_with_the_same_commands_are_named_beside_the_guess(tmp_path, names, alike):
+def test_kinds_of_robots_with_the_same_commands_are_named_beside_the_guess(
+    tmp_path, names, alike
+):
     columns = drive()
     columns |= {names[0]: columns.pop("v"), names[1]: columns.pop("w")}
     _, text = written(write(tmp_path / "log.csv", columns))

@@ -17,14 +17,26 @@ def table(tmp_path, text, name="log.csv", encoding="utf-8"):
 
 @pytest.mark.parametrize(
     ("separator", "point"),
-    [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), (" | ", "."), ("  ", ".")],
+    [
+        (",", "."),
+        (";", "."),
+        (";", ","),
+        ("\t", "."),
+        ("\t", ","),
+        (" | ", "."),
+        ("  ", "."),
+    ],
 )
 @pytest.mark.parametrize("header", [("t", "x", "y"), None])
-def test_any_separator_is_found_with_header_or_without(tmp_path, separator, point, header):
+def test_any_separator_is_found_with_header_or_without(
+    tmp_path, separator, point, header
+):
     rows = [header] if header else []
     rows += [[f"{v}".replace(".", point) for v in row] for row in NUMBERS]
     found = table(tmp_path, "\n".join(separator.join(row) for row in rows))
-    assert np.array_equal(np.stack([numbers_of(found, k) for k in range(3)], axis=1), NUMBERS)
+    assert np.array_equal(
+        np.stack([numbers_of(found, k) for k in range(3)], axis=1), NUMBERS
+    )
     assert found.names == (header or ("", "", ""))
 
 
@@ -46,19 +58,25 @@ def test_a_header_may_be_a_comment_shorter_than_the_rows_or_lack_a_name(tmp_path
 
 def test_labels_within_the_rows_name_the_columns(tmp_path):
     row = "time: {t} ticks: {t} 4294859756 tracker_pose: 0.2 1.5 -0.1\n"
-    found = table(tmp_path, "#kinematics: 0.1 0.01\n" + row.format(t=1) + row.format(t=2))
+    found = table(
+        tmp_path, "#kinematics: 0.1 0.01\n" + row.format(t=1) + row.format(t=2)
+    )
     poses = tuple(f"tracker_pose[{k}]" for k in range(3))
     assert found.names == ("time", "ticks[0]", "ticks[1]", *poses)
     assert numbers_of(found, "ticks[1]").tolist() == [4294859756.0] * 2
 
 
 def test_a_tum_trajectory_needs_no_header(tmp_path):
-    found = table(tmp_path, "10.0 1 2 0 0 0 0.6 0.8\n10.1 1 2 0 0 0 0.6 0.8\n", "drive.txt")
+    found = table(
+        tmp_path, "10.0 1 2 0 0 0 0.6 0.8\n10.1 1 2 0 0 0 0.6 0.8\n", "drive.txt"
+    )
     assert found.names[:3] == ("timestamp", "tx", "ty")
 
 
 def test_flags_may_be_words_and_cells_empty(tmp_path):
-    found = table(tmp_path, "t,on,mode,x\n0,True,AUTO,1\n1,False,MANUAL,\n2,True,AUTO,3\n")
+    found = table(
+        tmp_path, "t,on,mode,x\n0,True,AUTO,1\n1,False,MANUAL,\n2,True,AUTO,3\n"
+    )
     assert numbers_of(found, "on").tolist() == [1.0, 0.0, 1.0]
     assert found.column("mode").tolist() == ["AUTO", "MANUAL", "AUTO"]
     assert np.isnan(numbers_of(found, "x")[1])
@@ -78,7 +96,10 @@ def test_a_row_that_was_cut_short_is_left_out_and_told(tmp_path):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("t,x\n" + "0,1\n" * 9 + "0\n1,2,3\n", "line 11 has 1 fields where most lines have 2"),
+        (
+            "t,x\n" + "0,1\n" * 9 + "0\n1,2,3\n",
+            "line 11 has 1 fields where most lines have 2",
+        ),
         ("speed,angle\nfast,left\n", "holds no row of numbers"),
         ("0,1\n" + "2" * 30_000, "line 2 has 30000 characters"),
         ("0,1\0\n", "is not text"),

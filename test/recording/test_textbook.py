@@ -36,9 +36,13 @@ def test_a_car_on_a_constant_steer_drives_a_circle_of_the_textbook_radius():
 def test_a_car_that_starts_lags_behind_its_command_as_a_first_order_system():
     car = load_robot("ackermann")
     lag = car.parameters["speed_lag"]
-    pose, state = integrate(textbook(car), np.zeros(3), np.zeros(2), np.array([0.6, 0.0]), 0.37)
+    pose, state = integrate(
+        textbook(car), np.zeros(3), np.zeros(2), np.array([0.6, 0.0]), 0.37
+    )
     assert state[0] == pytest.approx(0.6 * (1.0 - np.exp(-0.37 / lag)), rel=1e-9)
-    assert pose[0] == pytest.approx(0.6 * (0.37 - lag * (1.0 - np.exp(-0.37 / lag))), abs=1e-6)
+    assert pose[0] == pytest.approx(
+        0.6 * (0.37 - lag * (1.0 - np.exp(-0.37 / lag))), abs=1e-6
+    )
     assert pose[1:] == pytest.approx([0.0, 0.0])
 
 
@@ -66,7 +70,13 @@ def test_a_differential_robot_turns_on_the_spot_with_wheels_against_each_other()
 def test_mecanum_wheels_move_the_body_sideways():
     spec = load_robot("mecanum")
     front_left, front_right, rear_left, rear_right = steady(spec, [0.0, 0.5, 0.0])
-    assert -front_left == front_right == rear_left == -rear_right == pytest.approx(0.5 / 0.05)
+    assert (
+        -front_left
+        == front_right
+        == rear_left
+        == -rear_right
+        == pytest.approx(0.5 / 0.05)
+    )
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -97,7 +107,11 @@ def test_a_recorded_drive_is_what_integration_gives_step_by_step(name, dt):
     book = textbook(spec)
     drive = record(spec, np.random.default_rng(1), duration=2.0, dt=dt)
     pose, state = integrate(
-        book, drive.pose.values[:-1], drive.state.values[:-1], drive.command.values[:-1], dt
+        book,
+        drive.pose.values[:-1],
+        drive.state.values[:-1],
+        drive.command.values[:-1],
+        dt,
     )
     assert np.allclose(state, drive.state.values[1:], atol=1e-9)
     assert np.abs(geometry.between(pose, drive.pose.values[1:])).max() < 1e-9
@@ -111,7 +125,9 @@ def test_a_recorded_drive_holds_commands_within_limits_and_starts_at_rest():
     assert (command >= spec.command_low).all()
     assert (command <= spec.command_high).all()
     assert len(np.unique(command, axis=0)) == 20
-    assert np.array_equal(np.flatnonzero(np.diff(command[:, 0])), np.arange(49, 999, 50))
+    assert np.array_equal(
+        np.flatnonzero(np.diff(command[:, 0])), np.arange(49, 999, 50)
+    )
     assert not drive.state.values[0].any()
     assert not drive.pose.values[0].any()
     heading = drive.pose.values[:, 2]
@@ -140,5 +156,7 @@ def test_only_terms_of_the_structure_move_the_body(name):
 def test_a_missing_parameter_is_named():
     car = load_robot("ackermann")
     spoilt = car.model_copy(update={"parameters": {"wheelbase": 0.2}})
-    with pytest.raises(ConfigError, match="ackermann kinematics need the parameter 'speed_lag'"):
+    with pytest.raises(
+        ConfigError, match="ackermann kinematics need the parameter 'speed_lag'"
+    ):
         textbook(spoilt)

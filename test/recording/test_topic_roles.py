@@ -71,20 +71,30 @@ def test_what_is_measured_is_no_command():
 
 def test_the_mapping_goes_before_the_names():
     types = USUAL | {"/other": kinds.TWIST}
-    assert assign(TopicRoles(cmd_vel="other"), types, (), "drive")["cmd_vel"] == "/other"
+    assert (
+        assign(TopicRoles(cmd_vel="other"), types, (), "drive")["cmd_vel"] == "/other"
+    )
 
 
 def test_several_topics_for_a_role_are_listed_with_what_to_write():
     sentence = refused(USUAL | {"/b/cmd_vel": kinds.TWIST_STAMPED})
-    assert "/b/cmd_vel (geometry_msgs/msg/TwistStamped), /cmd_vel (geometry_msgs" in sentence
+    assert (
+        "/b/cmd_vel (geometry_msgs/msg/TwistStamped), /cmd_vel (geometry_msgs"
+        in sentence
+    )
     assert sentence.endswith("say which with --topic cmd_vel=/b/cmd_vel.")
     sentence = refused(USUAL | {"/imu": kinds.IMU})
     assert sentence.endswith("say which with --topic imu=/imu, or imu=none for none.")
 
 
 def test_without_poses_the_topics_are_listed_with_their_types():
-    sentence = refused({"/cmd_vel": kinds.TWIST, "/tf": kinds.TRANSFORMS, "/a": "a/msg/A"})
-    assert "no topic is known to hold the poses; say which does, as in --topic pose=/tf" in sentence
+    sentence = refused(
+        {"/cmd_vel": kinds.TWIST, "/tf": kinds.TRANSFORMS, "/a": "a/msg/A"}
+    )
+    assert (
+        "no topic is known to hold the poses; say which does, as in --topic pose=/tf"
+        in sentence
+    )
     assert sentence.endswith(
         "its topics are /tf (tf2_msgs/msg/TFMessage), /a (a/msg/A), /cmd_vel "
         "(geometry_msgs/msg/Twist)."
@@ -92,7 +102,9 @@ def test_without_poses_the_topics_are_listed_with_their_types():
 
 
 def test_without_a_topic_of_a_fitting_type_the_types_are_listed():
-    assert "record one of type geometry_msgs/msg/Twist, " in refused({"/odom": kinds.ODOMETRY})
+    assert "record one of type geometry_msgs/msg/Twist, " in refused(
+        {"/odom": kinds.ODOMETRY}
+    )
 
 
 def test_an_empty_topic_plays_no_role():
@@ -108,7 +120,9 @@ def test_an_empty_topic_plays_no_role():
 def test_a_topic_that_is_not_there_or_of_a_wrong_type_is_refused():
     assert "has no topic '/cmd' (cmd_vel)" in refused(USUAL, cmd_vel="/cmd")
     sentence = refused(USUAL, cmd_vel="/odom")
-    assert "'/odom' is of type nav_msgs/msg/Odometry; cmd_vel must be one of" in sentence
+    assert (
+        "'/odom' is of type nav_msgs/msg/Odometry; cmd_vel must be one of" in sentence
+    )
 
 
 def test_the_list_of_many_topics_is_cut_short():

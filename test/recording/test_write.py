@@ -90,7 +90,9 @@ def test_a_place_that_is_taken_or_of_no_kind_is_refused(tmp_path):
     (tmp_path / "drive.npz").write_text("mine")
     with pytest.raises(ConfigError, match=r"drive.npz: is there already"):
         check_out(tmp_path / "drive.npz")
-    with pytest.raises(ConfigError, match=r"drive.csv: unknown kind of recording '.csv'"):
+    with pytest.raises(
+        ConfigError, match=r"drive.csv: unknown kind of recording '.csv'"
+    ):
         check_out(tmp_path / "drive.csv")
 
 

@@ -11,7 +11,11 @@ from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.report import estimates, fit_report
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report import fit_pictures
-from nics_drl_bridge.report.fit_pictures import CAPTIONS, calibration_pictures, timing_curves
+from nics_drl_bridge.report.fit_pictures import (
+    CAPTIONS,
+    calibration_pictures,
+    timing_curves,
+)
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.style import png
@@ -72,7 +76,9 @@ def test_the_estimates_are_right_within_their_uncertainty(disturbed):
     }
     for name, value in truth.items():
         estimate = found[name]
-        tolerance = 4.0 * estimate.sigma + (WHEEL_TICK_S if estimate.unit == "s" else 0.0)
+        tolerance = 4.0 * estimate.sigma + (
+            WHEEL_TICK_S if estimate.unit == "s" else 0.0
+        )
         assert estimate.value == pytest.approx(value, abs=tolerance, rel=0.02), name
     assert found["wheels_swapped"].remark == "left and right are interchanged"
 
@@ -83,7 +89,9 @@ def test_a_shift_explains_most_at_the_estimate(disturbed):
     assert [c.name for c in curves] == ["clock_offset_s", "command_latency_s"]
     for curve in curves:
         best = curve.value[np.argmin(curve.unexplained)]
-        assert best == pytest.approx(getattr(identified.calibration, curve.name), abs=0.03)
+        assert best == pytest.approx(
+            getattr(identified.calibration, curve.name), abs=0.03
+        )
 
 
 def test_what_was_not_possible_has_no_picture_and_the_report_says_why(exact):
@@ -102,9 +110,13 @@ def test_what_was_not_possible_has_no_picture_and_the_report_says_why(exact):
 def with_half_a_lever(identified: Identified) -> tuple[Identified, Mounting]:
     """The lever arm along y is not known."""
     mounting = Mounting(0.0, np.zeros(2), 0.001, np.array([0.001, np.nan]), 2)
-    known = replace(identified, findings=replace(identified.findings, mounting=mounting))
+    known = replace(
+        identified, findings=replace(identified.findings, mounting=mounting)
+    )
     sigma = {"rotation_rad": 0.001, "lever_arm_x_m": 0.001}
-    return replace(known, calibration=replace(known.calibration, uncertainty=sigma)), mounting
+    return replace(
+        known, calibration=replace(known.calibration, uncertainty=sigma)
+    ), mounting
 
 
 def test_the_table_gives_the_reason_that_the_sentence_gives(exact):
@@ -157,7 +169,8 @@ def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
     assert f"*{name}'" in report
     assert ", at least -3, at most 2, less dry friction of 0.2  [rad/s/s]" in report
     assert (
-        f"{name:<24} dead zone on both sides of 0: 0.12 +- 0.004 {spec.command[0].unit}" in report
+        f"{name:<24} dead zone on both sides of 0: 0.12 +- 0.004 {spec.command[0].unit}"
+        in report
     )
     assert f"{state:<24} dry friction: 0.2 rad/s/s" in report
     assert "saturates" in report

@@ -14,7 +14,13 @@ from nics_drl_bridge.lidar.sectors import ScanLayout
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor import examine
-from nics_drl_bridge.report.doctor_facts import Endpoints, Expected, Facts, facts_of_bag, names_in
+from nics_drl_bridge.report.doctor_facts import (
+    Endpoints,
+    Expected,
+    Facts,
+    facts_of_bag,
+    names_in,
+)
 from nics_drl_bridge.robot.spec import load_robot
 
 SECONDS = 8.0
@@ -30,24 +36,37 @@ def scan(t, **changed):
     values = header | {"ranges": ranges, "frame": LIDAR.frame} | changed
     frame, ranges = values.pop("frame"), np.asarray(values.pop("ranges"), np.float32)
     return bags.new(
-        "sensor_msgs/msg/LaserScan", bags.header(t, frame), *values.values(), ranges,
+        "sensor_msgs/msg/LaserScan",
+        bags.header(t, frame),
+        *values.values(),
+        ranges,
         np.zeros(0, np.float32),
-    )  # fmt: skip
+    )
 
 
 def odometry(
-    t, frames=("odom", "base_link"), pose=1.0, speed=1.0, turn=1.0, covariance=0.01, jump=0.0
+    t,
+    frames=("odom", "base_link"),
+    pose=1.0,
+    speed=1.0,
+    turn=1.0,
+    covariance=0.01,
+    jump=0.0,
 ):
     x, y, heading = bags.place_at(0.0 if t is None else t)
     inner = bags.new(
         "geometry_msgs/PoseWithCovariance",
-        bags.pose(pose * x + jump, pose * y, heading), np.full(36, covariance),
-    )  # fmt: skip
+        bags.pose(pose * x + jump, pose * y, heading),
+        np.full(36, covariance),
+    )
     twist = bags.new(
         "geometry_msgs/TwistWithCovariance",
-        bags.twist(0.5 * speed, 0.0, 0.25 * turn), np.full(36, covariance),
-    )  # fmt: skip
-    return bags.new("nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist)
+        bags.twist(0.5 * speed, 0.0, 0.25 * turn),
+        np.full(36, covariance),
+    )
+    return bags.new(
+        "nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist
+    )
 
 
 def each_scan(**changed):
@@ -67,7 +86,8 @@ def heard(scans=None, odometries=None, commands=None, late=0.002, ticks=None):
     every = {
         "scan": scans or each_scan(),
         "odom": odometries or own_odometry(),
-        "cmd_vel": commands or [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
+        "cmd_vel": commands
+        or [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
     }
     if ticks is not None:
         every["/clock"] = [
@@ -83,7 +103,9 @@ def heard(scans=None, odometries=None, commands=None, late=0.002, ticks=None):
     return facts
 
 
-SECTORED = Expected(EXPECTED.robot, LIDAR, EXPECTED.period_s, ScanLayout(sectors=36, range_max=3.0))
+SECTORED = Expected(
+    EXPECTED.robot, LIDAR, EXPECTED.period_s, ScanLayout(sectors=36, range_max=3.0)
+)
 """What a policy expects that sees sectors, all around."""
 
 
@@ -108,32 +130,69 @@ HALF = LIDAR.beams // 2
         ({"frame": "/laser"}, "frame", "/laser"),
         ({"frame": "camera"}, "frame", "frame: camera"),
         ({"ranges": FREE}, "range convention", "no_return: zero"),
-        ({"ranges": np.where(FREE == 0.0, np.nan, FREE)}, "range convention", "no_return: nan"),
+        (
+            {"ranges": np.where(FREE == 0.0, np.nan, FREE)},
+            "range convention",
+            "no_return: nan",
+        ),
         (
             {"ranges": np.where(FREE == 0.0, LIDAR.range_max, FREE)},
-            "range convention", "no_return: range_max",
+            "range convention",
+            "no_return: range_max",
         ),
         ({"ranges": np.where(FREE == 0.0, -1.0, FREE)}, "range convention", "negative"),
-        ({"ranges": np.where(FREE == 0.0, 2.0 * LIDAR.range_max, FREE)}, "range convention",
-         "exceed range_max"),
+        (
+            {"ranges": np.where(FREE == 0.0, 2.0 * LIDAR.range_max, FREE)},
+            "range convention",
+            "exceed range_max",
+        ),
         ({"ranges": 1000.0 * FREE}, "unit", "millimetres"),
         ({"range_max": 1000.0 * LIDAR.range_max}, "unit", "range_max"),
         ({"range_max": 2.0 * LIDAR.range_max}, "range limits", "range_max"),
-        ({"ranges": np.full(HALF, np.inf),
-          "angle_max": LIDAR.header.angle_min + (HALF - 1) * LIDAR.header.angle_increment},
-         "beam layout", f"{HALF} beams"),
-        ({"angle_min": LIDAR.header.angle_max, "angle_max": LIDAR.header.angle_min,
-          "angle_increment": -LIDAR.header.angle_increment}, "beam layout", "clockwise"),
-        ({"angle_min": LIDAR.header.angle_min + 0.5, "angle_max": LIDAR.header.angle_max + 0.5},
-         "beam layout", "beams go from"),
-        ({"angle_min": -180.0, "angle_max": -180.0 + 1.0 * (LIDAR.beams - 1),
-          "angle_increment": 1.0}, "unit", "degrees"),
+        (
+            {
+                "ranges": np.full(HALF, np.inf),
+                "angle_max": LIDAR.header.angle_min
+                + (HALF - 1) * LIDAR.header.angle_increment,
+            },
+            "beam layout",
+            f"{HALF} beams",
+        ),
+        (
+            {
+                "angle_min": LIDAR.header.angle_max,
+                "angle_max": LIDAR.header.angle_min,
+                "angle_increment": -LIDAR.header.angle_increment,
+            },
+            "beam layout",
+            "clockwise",
+        ),
+        (
+            {
+                "angle_min": LIDAR.header.angle_min + 0.5,
+                "angle_max": LIDAR.header.angle_max + 0.5,
+            },
+            "beam layout",
+            "beams go from",
+        ),
+        (
+            {
+                "angle_min": -180.0,
+                "angle_max": -180.0 + 1.0 * (LIDAR.beams - 1),
+                "angle_increment": 1.0,
+            },
+            "unit",
+            "degrees",
+        ),
         ({"angle_max": LIDAR.header.angle_max + 0.5}, "beam layout", "angle_max"),
     ],
-)  # fmt: skip
+)
 def test_a_scan_that_does_not_fit_is_named(changed, check, said):
     findings = examine(heard(scans=each_scan(**changed)), EXPECTED)
-    assert any(f.check == check and f.where == "/scan" and said in f.what + f.fix for f in findings)
+    assert any(
+        f.check == check and f.where == "/scan" and said in f.what + f.fix
+        for f in findings
+    )
     assert {f.where for f in findings} == {"/scan"}
 
 
@@ -151,7 +210,7 @@ def test_a_scan_that_does_not_fit_is_named(changed, check, said):
         ({"pose": 2.0}, "odometry", "times what the pose does"),
         ({"covariance": 0.0}, "odometry", "covariance of zeros"),
     ],
-)  # fmt: skip
+)
 def test_an_odometry_that_does_not_fit_is_named(changed, check, said):
     finding = only(heard(odometries=each_odometry(**changed)))
     assert (finding.check, finding.where) == (check, "/odom")
@@ -162,7 +221,11 @@ def other_lidar(beams, begin, end, range_max):
     step = (end - begin) / (beams - 1)
     ranges = np.where(np.arange(beams) % 3, 1.5, np.inf)
     return each_scan(
-        ranges=ranges, angle_min=begin, angle_max=end, angle_increment=step, range_max=range_max
+        ranges=ranges,
+        angle_min=begin,
+        angle_max=end,
+        angle_increment=step,
+        range_max=range_max,
     )
 
 
@@ -171,7 +234,9 @@ def test_any_lidar_fits_a_policy_whose_sectors_it_fills():
     for begin, end in ((-3.13, 3.13), (3.13, -3.13)):
         facts = heard(scans=other_lidar(360, begin, end, 8.0))
         assert examine(facts, SECTORED) == []
-        assert {finding.check for finding in examine(facts, EXPECTED)} >= {"beam layout"}
+        assert {finding.check for finding in examine(facts, EXPECTED)} >= {
+            "beam layout"
+        }
 
 
 @pytest.mark.parametrize(
@@ -196,7 +261,10 @@ def test_a_jump_of_odometry_is_named():
 def test_a_robot_that_turns_against_its_commands_is_named():
     rows = [(t, bags.twist(0.5, 0.0, -0.2)) for t in bags.times(0.1, SECONDS)]
     finding = only(heard(commands=rows))
-    assert (finding.check, finding.what) == ("command", "the robot turns against its commands")
+    assert (finding.check, finding.what) == (
+        "command",
+        "the robot turns against its commands",
+    )
 
 
 def test_a_lidar_at_another_rate_is_named():
@@ -207,11 +275,15 @@ def test_a_lidar_at_another_rate_is_named():
 
 
 @pytest.mark.parametrize(
-    ("late", "side"), [(-3.0, "after their arrival"), (1.0, "before"), (3600.0, "before")]
+    ("late", "side"),
+    [(-3.0, "after their arrival"), (1.0, "before"), (3600.0, "before")],
 )
 def test_stamps_that_are_not_of_the_time_of_arrival_are_named(late, side):
     findings = examine(heard(late=late), EXPECTED)
-    assert {(f.check, f.where) for f in findings} == {("stamp", "/scan"), ("stamp", "/odom")}
+    assert {(f.check, f.where) for f in findings} == {
+        ("stamp", "/scan"),
+        ("stamp", "/odom"),
+    }
     assert all(side in f.what for f in findings)
     assert all(("NTP" in f.fix) == (late != 1.0) for f in findings)
 
@@ -249,14 +321,28 @@ def test_a_simulation_in_its_own_time_fits():
     ("topic", "ends", "check", "said"),
     [
         ("/cmd_vel", {"offers": (RELIABLE, RELIABLE)}, "publishers", "2 publishers"),
-        ("/cmd_vel", {"offers": (BEST_EFFORT,)}, "quality of service", "asks for reliable"),
+        (
+            "/cmd_vel",
+            {"offers": (BEST_EFFORT,)},
+            "quality of service",
+            "asks for reliable",
+        ),
         ("/cmd_vel", {"asks": ()}, "missing topic", "nobody listens"),
-        ("/odom", {"asks": (Offer(transient_local=True),)}, "quality of service", "transient"),
+        (
+            "/odom",
+            {"asks": (Offer(transient_local=True),)},
+            "quality of service",
+            "transient",
+        ),
         ("/scan", {"types": ("sensor_msgs/msg/PointCloud2",)}, "type", "PointCloud2"),
-        ("/cmd_vel", {"types": ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")},
-         "type", "Twist and geometry_msgs/msg/TwistStamped"),
+        (
+            "/cmd_vel",
+            {"types": ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")},
+            "type",
+            "Twist and geometry_msgs/msg/TwistStamped",
+        ),
     ],
-)  # fmt: skip
+)
 def test_ends_of_a_topic_that_do_not_fit_are_named(topic, ends, check, said):
     facts = heard()
     facts.topics[topic] = replace(facts.topics[topic], **ends)
@@ -305,7 +391,8 @@ def test_a_model_that_was_made_with_the_gyro_knows_that_odometry_slips():
 
 
 @pytest.mark.parametrize(
-    ("rate", "said"), [(-0.25, "against odometry"), (0.25 * 180.0 / np.pi, "degrees per second")]
+    ("rate", "said"),
+    [(-0.25, "against odometry"), (0.25 * 180.0 / np.pi, "degrees per second")],
 )
 def test_a_gyro_of_another_sign_or_unit_is_an_error(rate, said):
     finding = only(with_gyro(rate))
@@ -318,7 +405,9 @@ def test_the_gyro_of_a_bag_is_found_by_its_type(tmp_path):
         "/scan": [(t + 0.002, scan(t)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],
         "/odom": [(t + 0.002, odometry(t)) for t in bags.times(0.02, SECONDS)],
         "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
-        "/gyroscope": [(t, bags.imu(t, 0.0, 0.0, 0.15)) for t in bags.times(0.01, SECONDS)],
+        "/gyroscope": [
+            (t, bags.imu(t, 0.0, 0.0, 0.15)) for t in bags.times(0.01, SECONDS)
+        ],
     }
     bag = bags.write(tmp_path / "bag", rows)
     assert only(facts_of_bag(bag)).where == "/gyroscope"
@@ -333,6 +422,8 @@ def test_a_bag_is_judged_like_the_robot(tmp_path):
     }
     good = bags.write(tmp_path / "good", rows)
     assert examine(facts_of_bag(good), EXPECTED) == []
-    rows["/odom"] = [(t + 0.002, odometry(t, turn=-1.0)) for t in bags.times(0.02, SECONDS)]
+    rows["/odom"] = [
+        (t + 0.002, odometry(t, turn=-1.0)) for t in bags.times(0.02, SECONDS)
+    ]
     bad = bags.write(tmp_path / "bad", rows)
     assert "sign opposite" in only(facts_of_bag(bad)).what

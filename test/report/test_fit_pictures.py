@@ -22,14 +22,24 @@ slow = pytest.mark.slow
 @pytest.fixture(scope="module")
 def found():
     spec = load_robot("differential")
-    return spec, identify(record(spec, np.random.default_rng(0), 30.0), spec, alpha="auto")
+    return spec, identify(
+        record(spec, np.random.default_rng(0), 30.0), spec, alpha="auto"
+    )
 
 
 @slow
 def test_every_picture_of_a_fit_is_drawn(found, tmp_path):
     files = write_pictures(*found, tmp_path / "pictures")
-    assert {file.stem for file in files} <= set(generator.PICTURES), "a new model removes them"
-    assert {f.stem for f in files} >= {"accuracy", "alignment", "paths", "residuals", "timing"}
+    assert {file.stem for file in files} <= set(generator.PICTURES), (
+        "a new model removes them"
+    )
+    assert {f.stem for f in files} >= {
+        "accuracy",
+        "alignment",
+        "paths",
+        "residuals",
+        "timing",
+    }
     assert all(f.read_bytes().startswith(PNG) for f in files)
 
 
@@ -41,7 +51,11 @@ def test_a_page_of_a_fit_begins_with_its_verdict_and_folds_all_figures(found, tm
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert re.findall("<h2>(.*?)</h2>", html) == ["Verdict", "Paths", "Model"]
     figure, meaning, good = fit_tile(identified)
-    assert html.index(figure.replace("<", "&lt;")) < html.index(meaning) < html.index("Paths")
+    assert (
+        html.index(figure.replace("<", "&lt;"))
+        < html.index(meaning)
+        < html.index("Paths")
+    )
     assert good
     shown = re.sub("(?s)<details>.*?</details>", "", html)
     assert "Cross-validated error" in html
@@ -72,7 +86,13 @@ def test_a_short_drive_has_fewer_pictures():
 def test_the_report_names_errors_pruning_and_validity(found):
     spec, identified = found
     text = fit_report("here", spec, identified)
-    for part in ("with standard errors", "Eq. 2", "knee", "condition number", "Valid range"):
+    for part in (
+        "with standard errors",
+        "Eq. 2",
+        "knee",
+        "condition number",
+        "Valid range",
+    ):
         assert part in text
 
 
@@ -80,7 +100,12 @@ def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
     spec, identified = found
     by_motion = replace(identified, findings=replace(identified.findings, width=0.1))
     text = fit_report("here", spec, by_motion)
-    for part in ("Eq. 2", "Cross-validated", "linear fit", f"{identified.model.terms_kept} of"):
+    for part in (
+        "Eq. 2",
+        "Cross-validated",
+        "linear fit",
+        f"{identified.model.terms_kept} of",
+    ):
         assert part not in text
     assert f"Kept {identified.model.terms_kept} terms, step" in text
     assert "accuracy" not in fit_pictures(spec, by_motion)

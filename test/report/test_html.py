@@ -55,7 +55,15 @@ def test_a_page_is_well_formed_and_holds_what_it_was_given():
         code("x = 1\ny = 2"),
     ]
     found = parsed(page("Title", "a lead", [("First", blocks), ("Second", [])]))
-    for text in ("Title", "a lead", "First", "a paragraph", "speed", "1.5", "x = 1\ny = 2"):
+    for text in (
+        "Title",
+        "a lead",
+        "First",
+        "a paragraph",
+        "speed",
+        "1.5",
+        "x = 1\ny = 2",
+    ):
         assert text in found.text
     assert found.tags.count("h2") == 2
     assert found.tags.count("tr") == 2
@@ -63,12 +71,19 @@ def test_a_page_is_well_formed_and_holds_what_it_was_given():
 
 def test_text_is_never_taken_for_markup():
     evil = "<script>alert('1 & 2')</script>"
-    blocks = [paragraph(evil), code(evil), table([evil], [[evil]]), picture(b"png", evil + '"')]
+    blocks = [
+        paragraph(evil),
+        code(evil),
+        table([evil], [[evil]]),
+        picture(b"png", evil + '"'),
+    ]
     blocks += [bullets([evil]), tiles([(evil, evil, True)]), details(evil, [])]
     html = page(evil, evil, [(evil, blocks)])
     found = parsed(html)
     assert "script" not in found.tags
-    assert found.text.count(evil) == 13  # title, heading, lead, section, caption, and the blocks
+    assert (
+        found.text.count(evil) == 13
+    )  # title, heading, lead, section, caption, and the blocks
     assert html.count('alt="') == 1
 
 

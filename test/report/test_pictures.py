@@ -69,7 +69,9 @@ def test_there_is_one_panel_per_episode(count):
 
 
 def test_another_path_gives_another_picture():
-    pictures = [trajectories({"run": [episode(seed)]}, WORLD, 0.2) for seed in (0, 0, 1)]
+    pictures = [
+        trajectories({"run": [episode(seed)]}, WORLD, 0.2) for seed in (0, 0, 1)
+    ]
     assert np.array_equal(decoded(pictures[0]), decoded(pictures[1]))
     assert not np.array_equal(decoded(pictures[0]), decoded(pictures[2]))
 
@@ -90,7 +92,9 @@ def pixels_of(image, colour, off=8):
 
 @pytest.mark.slow
 def test_the_picture_of_a_world_shows_the_episode_of_its_seed():
-    first, again, other = (decoded(world_picture(WORLD, 0.2, seed)) for seed in (0, 0, 1))
+    first, again, other = (
+        decoded(world_picture(WORLD, 0.2, seed)) for seed in (0, 0, 1)
+    )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
@@ -107,10 +111,16 @@ def test_a_robot_with_an_outline_is_drawn_with_it():
 
 def test_the_picture_of_an_open_field_is_as_wide_and_deep_as_its_bounds():
     places = {"starts": {"at": [[9.0, 1.0, 0.0]]}, "goals": {"at": [[9.8, 7.0]]}}
-    bounds = {"name": "open", "bounds": [8.0, 0.0, 10.0, 8.0], "goal_distance": [1.0, 9.0]}
+    bounds = {
+        "name": "open",
+        "bounds": [8.0, 0.0, 10.0, 8.0],
+        "goal_distance": [1.0, 9.0],
+    }
     image = decoded(world_picture(World.model_validate(bounds | places), 0.3, 0))
     robot, goal = (pixels_of(image, colour) for colour in (MEASURED, GOAL))
-    robot, goal = (one[one[:, 0] > 60].mean(axis=0) for one in (robot, goal))  # below the legend
+    robot, goal = (
+        one[one[:, 0] > 60].mean(axis=0) for one in (robot, goal)
+    )  # below the legend
     up, right = robot[0] - goal[0], goal[1] - robot[1]
     assert up / right == pytest.approx(6.0 / 0.8, rel=0.03)
 
@@ -146,7 +156,10 @@ def drawn(world, bodies):
 
 
 def test_every_shape_is_drawn_where_it_stands():
-    poses, radii = [[1.0, 1.0, 0.0], [-1.0, 0.0, np.pi / 2], [0.0, -2.0, 0.0]], [0.25, 0.0, 0.5]
+    poses, radii = (
+        [[1.0, 1.0, 0.0], [-1.0, 0.0, np.pi / 2], [0.0, -2.0, 0.0]],
+        [0.25, 0.0, 0.5],
+    )
     radii[1] = WORLD.shapes[1].radius
     dark = drawn(WORLD, place(poses, radii, [0, 1, 2]))
     for x, y in ((1.2, 1.0), (-1.0, 0.28), (-1.13, 0.0), (0.45, -2.0), (-0.45, -2.0)):
@@ -174,7 +187,11 @@ def test_a_drive_is_drawn(name):
 
 
 @pytest.mark.parametrize(
-    "points", [[Point(8192, math.nan, math.nan)], [Point(8192, 0.1, 0.9), Point(16384, 0.6, 0.4)]]
+    "points",
+    [
+        [Point(8192, math.nan, math.nan)],
+        [Point(8192, 0.1, 0.9), Point(16384, 0.6, 0.4)],
+    ],
 )
 def test_a_training_is_drawn_from_its_first_rollout_on(points):
     assert training_curve(points).startswith(b"\x89PNG")

@@ -28,29 +28,56 @@ from nics_drl_bridge.robot.spec import robot_from
 from nics_drl_bridge.robot.taylor import TaylorModel, exponents
 
 SHIPPED = (
-    "ackermann", "differential", "f1tenth", "jackal", "mecanum", "tricycle", "turtlebot3_burger",
+    "ackermann",
+    "differential",
+    "f1tenth",
+    "jackal",
+    "mecanum",
+    "tricycle",
+    "turtlebot3_burger",
     "turtlebot3_waffle",
-)  # fmt: skip
-WHEELS = {"differential": 0.05, "jackal": 0.098, "mecanum": 0.05, "turtlebot3_burger": 0.033}
+)
+WHEELS = {
+    "differential": 0.05,
+    "jackal": 0.098,
+    "mecanum": 0.05,
+    "turtlebot3_burger": 0.033,
+}
 SHARES = (1.0, 0.83, 0.707, 0.55, 0.31, 0.17)
 OWN = {
     "tricycle": {
-        "kind": "tricycle", "footprint": [[0.9, 0.3], [0.9, -0.3], [-0.3, -0.4], [-0.3, 0.4]],
+        "kind": "tricycle",
+        "footprint": [[0.9, 0.3], [0.9, -0.3], [-0.3, -0.4], [-0.3, 0.4]],
         "parameters": {"wheelbase": 0.8, "speed_lag": 0.4},
         "command": [
-            {"name": "speed_command", "unit": "m/s", "min": -0.6, "max": 1.5,
-             "cmd_vel": "linear.x"},
-            {"name": "steering_command", "unit": "rad", "min": -0.7, "max": 0.7,
-             "cmd_vel": "angular.z"},
+            {
+                "name": "speed_command",
+                "unit": "m/s",
+                "min": -0.6,
+                "max": 1.5,
+                "cmd_vel": "linear.x",
+            },
+            {
+                "name": "steering_command",
+                "unit": "rad",
+                "min": -0.7,
+                "max": 0.7,
+                "cmd_vel": "angular.z",
+            },
         ],
     },
-    "mecanum": {"kind": "mecanum", "footprint_radius": 0.4, "parameters": {"wheel_lag": 0.3}},
+    "mecanum": {
+        "kind": "mecanum",
+        "footprint_radius": 0.4,
+        "parameters": {"wheel_lag": 0.3},
+    },
     "skid_steer": {
-        "kind": "skid_steer", "footprint": [[0.5, 0.34], [-0.5, 0.34], [-0.5, -0.34], [0.5, -0.34]],
+        "kind": "skid_steer",
+        "footprint": [[0.5, 0.34], [-0.5, 0.34], [-0.5, -0.34], [0.5, -0.34]],
         "parameters": {"wheel_lag": 0.25},
     },
     "differential": {"kind": "differential", "footprint_radius": 0.2},
-}  # fmt: skip
+}
 
 
 @cache
@@ -83,7 +110,9 @@ def run_stops(model, commands, starting_s=6.0, stopping_s=40.0):
         before, (pose, state) = pose, model.step(pose, state, rest)
         step = np.hypot(*(pose - before)[:, :2].T)
         moves = step / model.dt > np.abs(idle[:, 0]) + 1e-4
-        angle = np.abs(np.remainder(pose[:, 2] - before[:, 2] + np.pi, 2.0 * np.pi) - np.pi)
+        angle = np.abs(
+            np.remainder(pose[:, 2] - before[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+        )
         turns_on = angle / model.dt > np.abs(idle[:, 1]) + 1e-4
         paths += np.maximum(step - np.abs(idle[:, 0]) * model.dt, 0.0)
         turns += np.maximum(angle - np.abs(idle[:, 1]) * model.dt, 0.0)
@@ -131,7 +160,9 @@ def assert_bounds(robot, model, factor=1.3, late_s=0.0):
             continue
         worst = paths[speeds < 1.1 * speed].max()
         twist = speed * np.append(direction_of(robot, command), 0.0)
-        assumed = speed * (braking.reaction_s + braking.pace(twist) / (2.0 * braking.deceleration))
+        assumed = speed * (
+            braking.reaction_s + braking.pace(twist) / (2.0 * braking.deceleration)
+        )
         assert assumed >= 0.998 * path - 2e-3, (speed, path, assumed)
         assert assumed <= factor * worst + 0.05, (speed, worst, assumed)
 
@@ -177,11 +208,21 @@ def throttle_car(pull=2.0, decay=0.5, bias=0.0, **changes):
     """A car that is driven by a throttle, without a brake: it rolls until drag has slowed it."""
     robot = robot_from(
         {
-            "name": "throttle", "kind": "free", "footprint_radius": 0.3,
+            "name": "throttle",
+            "kind": "free",
+            "footprint_radius": 0.3,
             "command": [{"name": "throttle", "unit": "1", "min": -1.0, "max": 1.0}],
-            "state": [{"name": "speed", "unit": "m/s", "min": -10.0, "max": 10.0, "twist": "vx"}],
+            "state": [
+                {
+                    "name": "speed",
+                    "unit": "m/s",
+                    "min": -10.0,
+                    "max": 10.0,
+                    "twist": "vx",
+                }
+            ],
         }
-    )  # fmt: skip
+    )
     powers = exponents(2, 1)
     coefficients = np.zeros((4, 3))
     speed = int(np.flatnonzero((powers == [1, 0]).all(axis=1))[0])
@@ -191,9 +232,16 @@ def throttle_car(pull=2.0, decay=0.5, bias=0.0, **changes):
     coefficients[3, speed] = -decay
     coefficients[3, throttle] = pull
     model = TaylorModel(
-        ("speed", "throttle"), robot.dof_names, robot.dof_units, powers, coefficients, 0.02,
-        np.array([-3.0, -1.0]), np.array([3.0, 1.0]), **changes,
-    )  # fmt: skip
+        ("speed", "throttle"),
+        robot.dof_names,
+        robot.dof_units,
+        powers,
+        coefficients,
+        0.02,
+        np.array([-3.0, -1.0]),
+        np.array([3.0, 1.0]),
+        **changes,
+    )
     return robot, model
 
 
@@ -212,7 +260,10 @@ def test_so_is_that_of_a_car_with_a_throttle(changes):
     late = float(model.delays.max(initial=0.0))
     # Friction and drag beside a lag make a bound of two numbers less tight.
     assert_bounds(
-        robot, model, factor=1.6 if model.drag.any() or model.friction.any() else 1.3, late_s=late
+        robot,
+        model,
+        factor=1.6 if model.drag.any() or model.friction.any() else 1.3,
+        late_s=late,
     )
 
 
@@ -222,12 +273,23 @@ def test_a_turn_that_ends_later_is_counted():
     weak = limited(model, 0.2 / 0.098)
     braking = braking_of(robot, weak)
     radius = robot.footprint_radius
-    commands = [[2.0, 2.5], [1.0, -1.5], [0.4, 2.0], [-0.5, 2.5], [0.0, 2.5], [1.5, 0.4]]
-    for speed, turn, path, turned in zip(*run_stops(weak, np.array(commands)), strict=True):
+    commands = [
+        [2.0, 2.5],
+        [1.0, -1.5],
+        [0.4, 2.0],
+        [-0.5, 2.5],
+        [0.0, 2.5],
+        [1.5, 0.4],
+    ]
+    for speed, turn, path, turned in zip(
+        *run_stops(weak, np.array(commands)), strict=True
+    ):
         pace = max(braking.pace(np.array([speed, 0.0, turn])), radius * turn)
         duration = braking.reaction_s + pace / (2.0 * braking.deceleration)
         assert (speed + radius * turn) * duration >= path + radius * turned - 5e-3
-        if radius * turn < speed:  # it leaves the arc of its twist by no more than the drift tells
+        if (
+            radius * turn < speed
+        ):  # it leaves the arc of its twist by no more than the drift tells
             assert turned / turn <= 1.02 * braking.drift.greatest * path / speed
 
 
@@ -294,9 +356,13 @@ def test_standard_errors_make_the_response_slower():
 
 
 @pytest.mark.parametrize("changes", [{"decay": 0.0}, {"decay": -0.2}, {"bias": 0.4}])
-def test_a_model_that_does_not_stop_is_refused_in_a_sentence_that_says_what_to_give(changes):
+def test_a_model_that_does_not_stop_is_refused_in_a_sentence_that_says_what_to_give(
+    changes,
+):
     robot, model = throttle_car(**changes)
-    with pytest.raises(ConfigError, match=r"'throttle'.* does not stop.* generate .* from a drive"):
+    with pytest.raises(
+        ConfigError, match=r"'throttle'.* does not stop.* generate .* from a drive"
+    ):
         braking_of(robot, model)
 
 
@@ -322,7 +388,9 @@ def test_time_and_distance_are_those_of_even_braking_after_the_reaction():
     assert braking.time_s(np.array([1.0, 0.0, 0.0])) == pytest.approx(2.2)
     assert braking.distance(1.0) == pytest.approx(1.2)
     assert braking.time_s(np.array([-1.0, 0.0, -5.0])) == pytest.approx(3.2)
-    assert replace(braking, order=1.0).pace(np.array([0.5, -0.25, 0.0])) == pytest.approx(0.75)
+    assert replace(braking, order=1.0).pace(
+        np.array([0.5, -0.25, 0.0])
+    ) == pytest.approx(0.75)
 
 
 def test_no_share_of_a_bound_of_zero_is_taken():

@@ -30,7 +30,9 @@ def test_the_kernel_bends_commands_as_the_curve_does(curve):
 
 
 def test_an_effect_leads_back_to_its_command():
-    inside = COMMANDS[(np.abs(COMMANDS) > 0.11) & (COMMANDS > -0.59) & (COMMANDS < 0.49)]
+    inside = COMMANDS[
+        (np.abs(COMMANDS) > 0.11) & (COMMANDS > -0.59) & (COMMANDS < 0.49)
+    ]
     assert CURVE.sent(CURVE.of(inside)) == pytest.approx(inside)
     assert CURVE.sent(CURVE.of([-0.7, 0.8])).tolist() == [-np.inf, np.inf]
 
@@ -47,7 +49,10 @@ def test_only_the_commands_that_are_named_are_bent():
 
 
 def test_a_command_of_zero_never_does_anything():
-    assert InputCurve(command="throttle", least=0.2, most=1.0).of([-0.5, 0.0]).tolist() == [0.0] * 2
+    assert (
+        InputCurve(command="throttle", least=0.2, most=1.0).of([-0.5, 0.0]).tolist()
+        == [0.0] * 2
+    )
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,15 @@ import pytest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.kernels import SERIES, advance, delayed, rates, run, scratch, term_arrays
+from nics_drl_bridge.robot.kernels import (
+    SERIES,
+    advance,
+    delayed,
+    rates,
+    run,
+    scratch,
+    term_arrays,
+)
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 
@@ -21,7 +29,9 @@ def random_model(state_size, command_size, order, seed):
     return TaylorModel(variables, dofs, dofs, powers, coefficients, 0.01, -box, box)
 
 
-@pytest.mark.parametrize(("state_size", "command_size"), [(0, 1), (0, 3), (2, 2), (4, 3)])
+@pytest.mark.parametrize(
+    ("state_size", "command_size"), [(0, 1), (0, 3), (2, 2), (4, 3)]
+)
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
 def test_compiled_rates_are_those_of_the_model(state_size, command_size, order):
     model = random_model(state_size, command_size, order, seed=order)
@@ -83,7 +93,12 @@ def test_a_delayed_command_takes_effect_after_exactly_its_delay(delay):
     substeps = 4
     periods = -(-delay // substeps) + 1
     for period in range(6):
-        sent = period - np.arange(periods)  # newest first, numbered by the period of sending
+        sent = period - np.arange(
+            periods
+        )  # newest first, numbered by the period of sending
         for substep in range(substeps):
             now = period * substeps + substep
-            assert sent[delayed(substep, delay, substeps, periods)] == (now - delay) // substeps
+            assert (
+                sent[delayed(substep, delay, substeps, periods)]
+                == (now - delay) // substeps
+            )

@@ -36,7 +36,13 @@ from nics_drl_bridge.robot.urdf import urdf_of
 PACKAGE = Path(__file__).resolve().parents[2] / "nics_drl_bridge"
 NEW = "tricycle"
 SHIPPED = ("ackermann", "differential", "mecanum", NEW)
-MADE = ("ackermann_throttle", "differential_wheels", "free", "omnidirectional", "skid_steer")
+MADE = (
+    "ackermann_throttle",
+    "differential_wheels",
+    "free",
+    "omnidirectional",
+    "skid_steer",
+)
 KINDS = sorted((*SHIPPED, *MADE))
 
 
@@ -46,7 +52,11 @@ def test_the_kinds_are_the_modules_that_define_one():
 
 
 def test_no_other_file_of_the_package_names_the_newest_kind():
-    naming = {path for path in PACKAGE.rglob("*.py") if NEW in path.read_text(encoding="utf-8")}
+    naming = {
+        path
+        for path in PACKAGE.rglob("*.py")
+        if NEW in path.read_text(encoding="utf-8")
+    }
     assert naming == {PACKAGE / "robot" / f"{NEW}.py"}
 
 
@@ -54,14 +64,18 @@ def comparisons(path):
     """Comparisons with a field of cmd_vel, by line."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Compare):
-            words = {each.value for each in ast.walk(node) if isinstance(each, ast.Constant)}
+            words = {
+                each.value for each in ast.walk(node) if isinstance(each, ast.Constant)
+            }
             if words & {"linear.x", "linear.y", "angular.z"}:
                 yield f"{path.relative_to(PACKAGE)}:{node.lineno}"
 
 
 @pytest.mark.slow
 def test_nobody_but_the_spec_asks_for_a_field_of_cmd_vel():
-    found = [place for path in sorted(PACKAGE.rglob("*.py")) for place in comparisons(path)]
+    found = [
+        place for path in sorted(PACKAGE.rglob("*.py")) for place in comparisons(path)
+    ]
     assert found
     assert all(place.startswith("robot/spec.py:") for place in found), found
 
@@ -104,7 +118,9 @@ def test_the_command_for_a_twist_leads_to_it(kind):
     robot = made(kind)
     for share in np.random.default_rng(0).uniform(-1.0, 1.0, (20, len(robot.command))):
         command = share * robot.command_high
-        assert command_for(robot, steady_twist(robot, command)) == pytest.approx(command)
+        assert command_for(robot, steady_twist(robot, command)) == pytest.approx(
+            command
+        )
     far = command_for(robot, np.full((2, 3), 1e3))
     assert (far <= robot.command_high).all()
 
@@ -114,7 +130,9 @@ def test_a_robot_known_by_its_twist_comes_to_that_of_its_actuators(kind):
     robot = made(kind)
     command, start = 0.6 * robot.command_high, np.zeros(len(textbook(robot).lag))
     _, state = integrate(textbook(robot), np.zeros(3), start, command, 5.0)
-    assert textbook(robot).twist(state) == pytest.approx(steady_twist(robot, command), abs=1e-3)
+    assert textbook(robot).twist(state) == pytest.approx(
+        steady_twist(robot, command), abs=1e-3
+    )
 
 
 def test_a_skid_steer_robot_turns_less_than_it_is_commanded():
@@ -149,26 +167,33 @@ def test_where_the_commands_of_a_free_robot_lead_is_not_known():
     assert not has_textbook(robot)
     assert robot.moves_sideways
     for ask in (textbook, reach, lambda robot: command_for(robot, np.zeros(3))):
-        with pytest.raises(ConfigError, match="no textbook tells where the commands of the kind"):
+        with pytest.raises(
+            ConfigError, match="no textbook tells where the commands of the kind"
+        ):
             ask(robot)
 
 
 def test_rate_limits_need_the_actuators_as_state():
     robot = made("differential", parameters={"wheel_rate": 3.0})
-    with pytest.raises(ConfigError, match="a rate limit of an actuator needs the actuators"):
+    with pytest.raises(
+        ConfigError, match="a rate limit of an actuator needs the actuators"
+    ):
         textbook(robot)
 
 
 def test_a_state_that_is_no_state_of_its_kind_is_named():
     robot = made("differential", state=[])
-    with pytest.raises(ConfigError, match="need a state of 2 actuators, not none; correct `state"):
+    with pytest.raises(
+        ConfigError, match="need a state of 2 actuators, not none; correct `state"
+    ):
         textbook(robot)
 
 
 def test_too_few_commands_for_the_wheels_are_refused():
     robot = made("differential_wheels", command=[{"name": "left_wheel"}])
     with pytest.raises(
-        ConfigError, match="differential_wheels kinematics need 2 commands, not 1; correct"
+        ConfigError,
+        match="differential_wheels kinematics need 2 commands, not 1; correct",
     ):
         textbook(robot)
 
@@ -243,7 +268,9 @@ def test_a_car_of_a_guessed_wheelbase_drives_in_an_env_by_its_own_commands():
 
 def test_their_discrete_actions_drive_ahead_and_turn():
     wheels = discrete_commands(made("differential_wheels"))
-    assert wheels[1:4] == pytest.approx(np.array([[10.0, 10.0], [0.0, 10.0], [10.0, 0.0]]))
+    assert wheels[1:4] == pytest.approx(
+        np.array([[10.0, 10.0], [0.0, 10.0], [10.0, 0.0]])
+    )
     car = discrete_commands(made("ackermann_throttle"))
     assert car[1:4] == pytest.approx(np.array([[1.0, 0.0], [1.0, 1.0], [1.0, -1.0]]))
     free = robot_from({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
@@ -252,7 +279,9 @@ def test_their_discrete_actions_drive_ahead_and_turn():
 
 def test_a_front_wheel_across_turns_a_tricycle_about_its_rear_axle():
     book = textbook(load_robot(NEW))
-    assert book.twist(np.array([0.6, np.pi / 2])) == pytest.approx([0.0, 0.0, 0.6 / 0.3])
+    assert book.twist(np.array([0.6, np.pi / 2])) == pytest.approx(
+        [0.0, 0.0, 0.6 / 0.3]
+    )
     assert book.twist(np.array([0.6, 0.0])) == pytest.approx([0.6, 0.0, 0.0])
 
 
@@ -267,9 +296,14 @@ def test_it_records_and_its_model_moves_as_it_does(model):
     robot = model.robot
     drive = record(robot, np.random.default_rng(1), duration=20.0)
     x = np.concatenate([drive.state.values, drive.command.values], axis=1)
-    twist, found = textbook(robot).twist(drive.state.values), model.kinematics.rates(x)[:, :3]
+    twist, found = (
+        textbook(robot).twist(drive.state.values),
+        model.kinematics.rates(x)[:, :3],
+    )
     off, size = (np.sqrt((each**2).mean(axis=0)) for each in (found - twist, twist))
-    assert (off <= 0.1 * size).all()  # cosine and sine of the steering, to the second order
+    assert (
+        off <= 0.1 * size
+    ).all()  # cosine and sine of the steering, to the second order
 
 
 @pytest.mark.parametrize("options", [{}, {"actions": "discrete"}])
@@ -291,8 +325,16 @@ def test_it_has_limits_and_is_drawn_on_three_wheels():
     robot = load_robot(NEW)
     assert load_limits(NEW, robot).linear.tolist() == [True, False]
     root = ElementTree.fromstring(urdf_of(robot))
-    wheels = [link.attrib["name"] for link in root.iter("link") if "wheel" in link.attrib["name"]]
-    assert wheels == ["rear_left_wheel_link", "rear_right_wheel_link", "front_wheel_link"]
+    wheels = [
+        link.attrib["name"]
+        for link in root.iter("link")
+        if "wheel" in link.attrib["name"]
+    ]
+    assert wheels == [
+        "rear_left_wheel_link",
+        "rear_right_wheel_link",
+        "front_wheel_link",
+    ]
     (steering,) = [j for j in root.iter("joint") if j.attrib["type"] == "revolute"]
     assert steering.attrib["name"] == "steering"
     assert steering.find("mimic") is None
@@ -301,14 +343,20 @@ def test_it_has_limits_and_is_drawn_on_three_wheels():
 def test_mujoco_says_that_it_has_no_machine_of_it():
     from nics_drl_bridge.extras.mujoco.machines import build_machine
 
-    with pytest.raises(ConfigError, match="'tricycle': MuJoCo has no machine of the kind 'tricycl"):
+    with pytest.raises(
+        ConfigError, match="'tricycle': MuJoCo has no machine of the kind 'tricycl"
+    ):
         build_machine(load_robot(NEW))
 
 
 @pytest.mark.parametrize("name", ["tank", "mecanum"])
-def test_another_package_adds_a_kind_by_an_entry_point_or_takes_the_place_of_one(monkeypatch, name):
+def test_another_package_adds_a_kind_by_an_entry_point_or_takes_the_place_of_one(
+    monkeypatch, name
+):
     points = {name: EntryPoint(name, f"nics_drl_bridge.robot.{NEW}:KIND", "")}
-    monkeypatch.setattr(extensions, "known", lambda group: points if group == "kinds" else {})
+    monkeypatch.setattr(
+        extensions, "known", lambda group: points if group == "kinds" else {}
+    )
     robot = RobotSpec.model_validate(load_robot(NEW).model_dump() | {"textbook": name})
     assert textbook(robot).twist(np.array([1.0, 0.0])) == pytest.approx([1.0, 0.0, 0.0])
     assert name in kind_names()
@@ -319,7 +367,10 @@ def test_an_unknown_kind_is_refused_with_all_that_there_are():
     with pytest.raises(ConfigError) as caught:
         validate(data, RobotSpec, "tank.yaml")
     known = ", ".join(KINDS)
-    assert str(caught.value) == f"tank.yaml: key 'textbook': must be one of {known}, not 'tank'."
+    assert (
+        str(caught.value)
+        == f"tank.yaml: key 'textbook': must be one of {known}, not 'tank'."
+    )
 
 
 def textbook_and_drawing(robot):
@@ -330,7 +381,11 @@ def textbook_and_drawing(robot):
 def test_a_parameter_that_is_missing_is_named(name):
     robot = load_robot(name)
     for parameter in robot.parameters:
-        left = {key: value for key, value in robot.parameters.items() if key != parameter}
+        left = {
+            key: value for key, value in robot.parameters.items() if key != parameter
+        }
         spoilt = robot.model_copy(update={"parameters": left})
-        with pytest.raises(ConfigError, match=f"need the parameter '{parameter}'; add it under"):
+        with pytest.raises(
+            ConfigError, match=f"need the parameter '{parameter}'; add it under"
+        ):
             textbook_and_drawing(spoilt)

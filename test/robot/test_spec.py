@@ -43,8 +43,12 @@ def test_names_and_units_stand_in_the_order_of_x_and_of_dq():
 
 
 def test_each_command_travels_in_the_field_of_cmd_vel_that_it_names():
-    assert np.array_equal(load_robot("ackermann").to_cmd_vel([0.5, -0.2]), [0.5, 0.0, -0.2])
-    assert np.array_equal(load_robot("mecanum").to_cmd_vel([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])
+    assert np.array_equal(
+        load_robot("ackermann").to_cmd_vel([0.5, -0.2]), [0.5, 0.0, -0.2]
+    )
+    assert np.array_equal(
+        load_robot("mecanum").to_cmd_vel([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0]
+    )
     backwards = RobotSpec.model_validate(data(command=data()["command"][::-1]))
     assert np.array_equal(backwards.to_cmd_vel([0.1, 0.7]), [0.7, 0.0, 0.1])
 
@@ -57,7 +61,9 @@ def test_commands_come_back_from_cmd_vel_in_any_batch(name):
 
 
 def test_fields_that_a_robot_has_no_use_for_are_dropped():
-    assert np.array_equal(load_robot("ackermann").from_cmd_vel([1.0, 9.0, 0.3]), [1.0, 0.3])
+    assert np.array_equal(
+        load_robot("ackermann").from_cmd_vel([1.0, 9.0, 0.3]), [1.0, 0.3]
+    )
 
 
 def car(kind="ackermann", **changes):
@@ -84,21 +90,30 @@ def test_a_tricycle_turns_by_its_front_wheel():
 
 def test_a_car_at_rest_holds_its_wheels_straight_and_one_that_can_turn_no_further_its_limit():
     robot = car()
-    given = [[0.0, 0.0, 1.0], [0.0, 0.0, -1e300], [0.1, 0.0, 3.0], [-1e-320, 0.0, 1e300]]
+    given = [
+        [0.0, 0.0, 1.0],
+        [0.0, 0.0, -1e300],
+        [0.1, 0.0, 3.0],
+        [-1e-320, 0.0, 1e300],
+    ]
     wanted = [[0.0, 0.0], [0.0, 0.0], [0.1, 0.5], [-1e-320, -0.5]]
     assert robot.from_cmd_vel(given) == pytest.approx(np.array(wanted))
 
 
 def test_what_goes_through_cmd_vel_is_what_the_robot_takes():
     given = np.array([[0.5, 0.3], [0.0, 0.3]])
-    assert car().through_cmd_vel(given) == pytest.approx(np.array([[0.5, 0.3], [0.0, 0.0]]))
+    assert car().through_cmd_vel(given) == pytest.approx(
+        np.array([[0.5, 0.3], [0.0, 0.0]])
+    )
     assert car(assumed=["wheelbase"]).through_cmd_vel(given).tolist() == given.tolist()
     assert load_robot("ackermann").through_cmd_vel(given).tolist() == given.tolist()
 
 
 @pytest.mark.parametrize("changes", [{"parameters": {}}, {"assumed": ["wheelbase"]}])
 def test_a_turn_rate_needs_a_wheelbase_that_is_known(changes):
-    with pytest.raises(ConfigError, match=r"its wheelbase is not known; add `wheelbase:` \[m\] to"):
+    with pytest.raises(
+        ConfigError, match=r"its wheelbase is not known; add `wheelbase:` \[m\] to"
+    ):
         car(**changes).require_cmd_vel()
     car(angular_is="steering", **changes).require_cmd_vel()
 
@@ -106,29 +121,52 @@ def test_a_turn_rate_needs_a_wheelbase_that_is_known(changes):
 def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
     given = data()
     del given["command"][1]["cmd_vel"]
-    with pytest.raises(ConfigError, match="'cart': the command 'turn' names no field of cmd_vel"):
+    with pytest.raises(
+        ConfigError, match="'cart': the command 'turn' names no field of cmd_vel"
+    ):
         RobotSpec.model_validate(given).require_cmd_vel()
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"state": [TWIST, TWIST | {"name": "b"}]}, "two states are the same component of the"),
-        ({"state": [TWIST | {"unit": "rad"}]}, "state 'a' is vx of the twist, so its unit is m/s"),
+        (
+            {"state": [TWIST, TWIST | {"name": "b"}]},
+            "two states are the same component of the",
+        ),
+        (
+            {"state": [TWIST | {"unit": "rad"}]},
+            "state 'a' is vx of the twist, so its unit is m/s",
+        ),
         ({"name": "../../evil"}, "name '../../evil': files are named so"),
         ({"name": "a\\b"}, "leave out .., / and \\"),
         ({"angular_is": "sideways"}, "'turn_rate' or 'steering'"),
         ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
-        ({"footprint_radius": 30.0}, "reaches 30 m from base_link, at most 10 m can be"),
+        (
+            {"footprint_radius": 30.0},
+            "reaches 30 m from base_link, at most 10 m can be",
+        ),
         ({"parameters": {"track": -0.3}}, "track -0.3: must be more than 0"),
         ({"parameters": {"wheel_radius": 0.0}}, "wheel_radius 0: must be more than 0"),
         ({"parameters": {"wheel_lag": 0.0}}, "wheel_lag 0: must be more than 0"),
-        ({"parameters": {"track": 330.0}}, "track 330 m is too long for a robot of 0.2 m"),
-        ({"lidar_mount": [0.0, 0.0, 180]}, "'lidar_mount.2': must be in radians, within 2 pi"),
-        ({"lidar_mount": [-40, 0.0, 3.14]}, "'lidar_mount.0': must be in metres, within 10"),
+        (
+            {"parameters": {"track": 330.0}},
+            "track 330 m is too long for a robot of 0.2 m",
+        ),
+        (
+            {"lidar_mount": [0.0, 0.0, 180]},
+            "'lidar_mount.2': must be in radians, within 2 pi",
+        ),
+        (
+            {"lidar_mount": [-40, 0.0, 3.14]},
+            "'lidar_mount.0': must be in metres, within 10",
+        ),
         ({"command": []}, "number of entries must be at least 1"),
         ({"state": data()["command"][:1]}, "unknown key 'state.0.cmd_vel'"),
-        ({"state": [{"name": "push", "unit": "m", "min": 0, "max": 1}]}, "a name of its own"),
+        (
+            {"state": [{"name": "push", "unit": "m", "min": 0, "max": 1}]},
+            "a name of its own",
+        ),
         (
             {"state": [{"name": "a", "unit": "m", "min": 1, "max": 1}]},
             "min must be less than max of variable 'a'",
@@ -143,12 +181,21 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
         ),
         ({"state": [{"name": "A b", "unit": "m", "min": 0, "max": 1}]}, "state.0.name"),
         ({"textbook": "tank"}, "key 'textbook'"),
-        ({"footprint": [[0.1, 0.0], [0.0, 0.1]]}, "number of entries must be at least 3"),
+        (
+            {"footprint": [[0.1, 0.0], [0.0, 0.1]]},
+            "number of entries must be at least 3",
+        ),
         ({"footprint": [[0.1, 0.0], [0.0, "a"], [0.0, 0.0]]}, "footprint.1.1"),
-        ({"footprint": [[0.1, 0.1], [-0.1, -0.1], [0.1, -0.1], [-0.1, 0.1]]}, "cross or touch"),
+        (
+            {"footprint": [[0.1, 0.1], [-0.1, -0.1], [0.1, -0.1], [-0.1, 0.1]]},
+            "cross or touch",
+        ),
         ({"footprint": [[0.1, 0.0], [0.2, 0.0], [0.1, 0.0]]}, "cross or touch"),
         ({"footprint": [[0.1, 0.0], [0.1, 0.0], [0.0, 0.1]]}, "cross or touch"),
-        ({"footprint": [[0.1, 0.1], [-0.1, 0.1], [0.0, -0.1]]}, "leave footprint_radius out"),
+        (
+            {"footprint": [[0.1, 0.1], [-0.1, 0.1], [0.0, -0.1]]},
+            "leave footprint_radius out",
+        ),
     ],
 )
 def test_a_robot_that_cant_be_is_refused_in_one_sentence(changes, sentence):
@@ -160,11 +207,18 @@ def test_a_robot_that_cant_be_is_refused_in_one_sentence(changes, sentence):
 
 def test_a_steering_in_degrees_is_refused_where_the_robot_is_read_but_not_one_that_was_recorded():
     kind = {"kind": "ackermann", "footprint_radius": 0.2}
-    speed, angle = {"name": "speed_command"}, {"name": "steering_command", "min": -24, "max": 22}
-    with pytest.raises(ConfigError, match=r"steering_command reaches -24 rad, .* are in radians"):
+    speed, angle = (
+        {"name": "speed_command"},
+        {"name": "steering_command", "min": -24, "max": 22},
+    )
+    with pytest.raises(
+        ConfigError, match=r"steering_command reaches -24 rad, .* are in radians"
+    ):
         robot_from(kind | {"command": [speed, angle]})
     ranges = {"speed_command": (-1.0, 1.0), "steering_command": (-24.0, 22.0)}
-    assert robot_from(kind, ranges).command[1].min == -24.0  # its mapping can turn it into radians
+    assert (
+        robot_from(kind, ranges).command[1].min == -24.0
+    )  # its mapping can turn it into radians
 
 
 def test_a_robot_without_textbook_is_told_so():
@@ -175,11 +229,19 @@ def test_a_robot_without_textbook_is_told_so():
 def test_a_grown_robot_keeps_the_margin_from_each_edge_of_its_outline_and_around_its_circle():
     corners = [[0.3, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.3, -0.1]]
     for order in (1, -1):
-        given = data(footprint=corners[::order], footprint_radius=float(np.hypot(0.3, 0.1)))
+        given = data(
+            footprint=corners[::order], footprint_radius=float(np.hypot(0.3, 0.1))
+        )
         grown = RobotSpec.model_validate(given).grown(0.05)
-        assert np.abs(np.array(grown.footprint)).max(axis=0) == pytest.approx([0.35, 0.15])
-        assert grown.footprint_radius == pytest.approx(np.hypot(0.3, 0.1))  # where it may stand
-    assert RobotSpec.model_validate(data()).grown(0.05).footprint_radius == pytest.approx(0.25)
+        assert np.abs(np.array(grown.footprint)).max(axis=0) == pytest.approx(
+            [0.35, 0.15]
+        )
+        assert grown.footprint_radius == pytest.approx(
+            np.hypot(0.3, 0.1)
+        )  # where it may stand
+    assert RobotSpec.model_validate(data()).grown(
+        0.05
+    ).footprint_radius == pytest.approx(0.25)
 
 
 def test_a_footprint_gives_the_radius_of_the_circle_that_holds_it():
@@ -191,7 +253,9 @@ def test_a_footprint_gives_the_radius_of_the_circle_that_holds_it():
 
 
 def test_a_footprint_may_be_concave():
-    given = data(footprint=[[0.3, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.3, -0.2], [0.0, 0.0]])
+    given = data(
+        footprint=[[0.3, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.3, -0.2], [0.0, 0.0]]
+    )
     del given["footprint_radius"]
     assert len(RobotSpec.model_validate(given).footprint) == 5
 

@@ -179,7 +179,17 @@ def test_names_read_as_formulas():
 
 
 @pytest.mark.parametrize(
-    "text", ["", "nonsense", "speed*", "speed^x", "speed^-1", "speed^0.5", "speed^0", "2*speed"]
+    "text",
+    [
+        "",
+        "nonsense",
+        "speed*",
+        "speed^x",
+        "speed^-1",
+        "speed^0.5",
+        "speed^0",
+        "2*speed",
+    ],
 )
 def test_what_is_no_term_is_refused(text):
     with pytest.raises(ValueError, match=r"term|literal"):

@@ -11,7 +11,14 @@ from nics_drl_bridge.robot.kinds import find_kind, kind_names, textbook
 from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
 
 WHEELED = "differential_wheels"
-SLIPPING = ("ackermann", "ackermann_throttle", "free", "mecanum", "omnidirectional", "skid_steer")
+SLIPPING = (
+    "ackermann",
+    "ackermann_throttle",
+    "free",
+    "mecanum",
+    "omnidirectional",
+    "skid_steer",
+)
 
 
 WIDE = {"kind": "mecanum", "footprint_radius": 0.3}
@@ -37,7 +44,9 @@ def test_two_words_are_a_whole_robot_of_every_kind(kind):
 
 
 @pytest.mark.parametrize("kind", kind_names())
-def test_its_state_is_its_twist_unless_it_follows_commands_or_wheels_are_the_motion(kind):
+def test_its_state_is_its_twist_unless_it_follows_commands_or_wheels_are_the_motion(
+    kind,
+):
     robot = made(kind)
     if kind == "tricycle":
         assert [v.follows for v in robot.state] == [c.name for c in robot.command]
@@ -47,11 +56,16 @@ def test_its_state_is_its_twist_unless_it_follows_commands_or_wheels_are_the_mot
 
 
 def test_a_state_that_is_called_as_a_command_gets_another_name():
-    assert [v.name for v in made("omnidirectional").state] == ["body_vx", "body_vy", "body_wz"]
+    assert [v.name for v in made("omnidirectional").state] == [
+        "body_vx",
+        "body_vy",
+        "body_wz",
+    ]
     car = made("tricycle", {"speed": (0.0, 3.0), "steering": (-0.4, 0.4)})
     assert [(v.name, v.follows) for v in car.state] == [
-        ("actual_speed", "speed"), ("actual_steering", "steering")
-    ]  # fmt: skip
+        ("actual_speed", "speed"),
+        ("actual_steering", "steering"),
+    ]
 
 
 def test_a_state_reaches_twice_as_far_as_its_commands_where_they_tell():
@@ -63,28 +77,41 @@ def test_a_state_reaches_twice_as_far_as_its_commands_where_they_tell():
 
 def test_recorded_ranges_hold_where_the_user_gave_none_and_always_include_rest():
     ranges = {"throttle": (0.1, 0.6), "steering": (-0.4, 0.4)}
-    robot = made("ackermann_throttle", ranges, command=[{"name": "throttle", "max": 0.9}])
+    robot = made(
+        "ackermann_throttle", ranges, command=[{"name": "throttle", "max": 0.9}]
+    )
     assert commands(robot) == [("throttle", "1", 0.0, 0.9)]
     robot = made("ackermann_throttle", ranges)
-    assert commands(robot) == [("throttle", "1", 0.0, 0.6), ("steering", "1", -0.4, 0.4)]
+    assert commands(robot) == [
+        ("throttle", "1", 0.0, 0.6),
+        ("steering", "1", -0.4, 0.4),
+    ]
     robot = made("ackermann_throttle", {"throttle": (0.0, 0.0), "steering": (0.2, 0.2)})
-    assert commands(robot) == [("throttle", "1", -1.0, 1.0), ("steering", "1", 0.0, 0.2)]
+    assert commands(robot) == [
+        ("throttle", "1", -1.0, 1.0),
+        ("steering", "1", 0.0, 0.2),
+    ]
 
 
 def test_commands_stand_in_the_order_of_the_recording():
     ranges = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
     robot = made("ackermann_throttle", ranges, parameters={"wheelbase": 0.2})
     assert [c.name for c in robot.command] == ["steering", "throttle"]
-    assert textbook(robot).steady(np.array([0.0, 1.0])) == pytest.approx([3.0, 0.0, 0.0])
+    assert textbook(robot).steady(np.array([0.0, 1.0])) == pytest.approx(
+        [3.0, 0.0, 0.0]
+    )
 
 
 def test_names_of_the_users_own_stand_in_the_usual_order():
-    robot = made("tricycle", {"v": (-1.0, 5.0)}, command=[{"name": "v"}, {"name": "delta"}])
+    robot = made(
+        "tricycle", {"v": (-1.0, 5.0)}, command=[{"name": "v"}, {"name": "delta"}]
+    )
     assert commands(robot) == [("v", "m/s", -1.0, 5.0), ("delta", "rad", -0.5, 0.5)]
     assert [c.cmd_vel for c in robot.command] == ["linear.x", "angular.z"]
     assert [(v.name, v.follows, v.max) for v in robot.state] == [
-        ("speed", "v", 10.0), ("steering", "delta", 1.0)
-    ]  # fmt: skip
+        ("speed", "v", 10.0),
+        ("steering", "delta", 1.0),
+    ]
 
 
 def test_a_skid_steer_robot_is_driven_by_twist_or_by_sides():
@@ -96,20 +123,32 @@ def test_a_skid_steer_robot_is_driven_by_twist_or_by_sides():
 
 
 def test_free_takes_whatever_was_recorded():
-    robot = made("free", {"pump": (0.0, 2.0), "valve": (-1.0, 1.0)}, command=[
-        {"name": "pump", "unit": "V"}, {"name": "valve"},
-    ])  # fmt: skip
+    robot = made(
+        "free",
+        {"pump": (0.0, 2.0), "valve": (-1.0, 1.0)},
+        command=[
+            {"name": "pump", "unit": "V"},
+            {"name": "valve"},
+        ],
+    )
     assert commands(robot) == [("pump", "V", 0.0, 2.0), ("valve", "1", -1.0, 1.0)]
 
 
 def test_parameters_and_a_state_that_are_given_stand():
-    state = [{"name": "vx", "max": 3.0}, {"name": "angle", "unit": "rad", "min": -1, "max": 1}]
+    state = [
+        {"name": "vx", "max": 3.0},
+        {"name": "angle", "unit": "rad", "min": -1, "max": 1},
+    ]
     robot = made("differential", parameters={"track": 0.5}, state=state)
     assert robot.parameters["track"] == 0.5
-    assert robot.assumed == ("wheel_lag", "wheel_radius")  # lengths by the footprint, usual lags
+    assert robot.assumed == (
+        "wheel_lag",
+        "wheel_radius",
+    )  # lengths by the footprint, usual lags
     assert [(v.name, v.twist, v.max) for v in robot.state] == [
-        ("vx", "vx", 3.0), ("angle", None, 1.0)
-    ]  # fmt: skip
+        ("vx", "vx", 3.0),
+        ("angle", None, 1.0),
+    ]
 
 
 def test_sizes_come_from_a_footprint_too():
@@ -130,7 +169,9 @@ def test_a_file_without_a_name_is_a_robot_of_the_files_name(tmp_path):
     file = tmp_path / "husky.yaml"
     file.write_text("kind: skid_steer\nfootprint_radius: 0.6\n")
     assert load_robot(file).name == definition(file)["name"] == "husky"
-    assert robot_from({"kind": "skid_steer", "footprint_radius": 0.6}).name == "skid_steer"
+    assert (
+        robot_from({"kind": "skid_steer", "footprint_radius": 0.6}).name == "skid_steer"
+    )
     shipped = [load_robot(name).name for name in shipped_names("robots")]
     assert shipped == shipped_names("robots")
 
@@ -142,33 +183,55 @@ def test_the_content_of_a_file_is_a_robot_too():
 @pytest.mark.parametrize(
     ("given", "ranges", "sentence"),
     [
-        ({"kind": "tank"}, None, "robot: key 'kind': there is no 'tank'; valid are: 'ackermann', "),
-        ({"kind": "free"}, None, "commands of a robot of the kind 'free' are not known; name them"),
-        ({"kind": "mecanum", "footprint_radius": "wide"}, None, "key 'footprint_radius'"),
+        (
+            {"kind": "tank"},
+            None,
+            "robot: key 'kind': there is no 'tank'; valid are: 'ackermann', ",
+        ),
+        (
+            {"kind": "free"},
+            None,
+            "commands of a robot of the kind 'free' are not known; name them",
+        ),
+        (
+            {"kind": "mecanum", "footprint_radius": "wide"},
+            None,
+            "key 'footprint_radius'",
+        ),
         ({"kind": "mecanum"}, None, "the key 'footprint_radius' is missing; add it."),
-        ({"kind": "mecanum", "textbook": "mecanum"}, None, "a `kind` and a `textbook`; remove one"),
+        (
+            {"kind": "mecanum", "textbook": "mecanum"},
+            None,
+            "a `kind` and a `textbook`; remove one",
+        ),
         ({**WIDE, "command": 3}, None, "key 'command'"),
         ({**WIDE, "state": "none"}, None, "key 'state'"),
         ({**WIDE, "parameters": [1]}, None, "key 'parameters'"),
         ({**WIDE, "wheels": 4}, None, "unknown key 'wheels'"),
         (
-            {"kind": "mecanum", "footprint": [[0, 0], [1, 1]]}, None,
+            {"kind": "mecanum", "footprint": [[0, 0], [1, 1]]},
+            None,
             "key 'footprint': number of entries must be at least 3, not 2.",
         ),
         ({**WIDE, "command": [{"name": ["v"]}]}, None, "key 'command.0.name'"),
-        ({**WIDE, "state": [{"name": "vx", "twist": ["vx"]}]}, None, "key 'state.0.twist"),
+        (
+            {**WIDE, "state": [{"name": "vx", "twist": ["vx"]}]},
+            None,
+            "key 'state.0.twist",
+        ),
         (
             {"kind": "ackermann", "name": "kart"},
             {"forward_command": (0, 1), "turn_command": (0, 1)},
             "'speed', 'steering', not 'forward_command', 'turn_command'; name them so",
         ),
         (
-            {"kind": "ackermann_throttle", "name": "kart"}, {"gas": (0, 1), "wheel": (0, 1)},
+            {"kind": "ackermann_throttle", "name": "kart"},
+            {"gas": (0, 1), "wheel": (0, 1)},
             "robot 'kart': commands of the kind 'ackermann_throttle' are 'throttle', 'steering', "
             "not 'gas', 'wheel'; name them so",
         ),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_robot_is_refused_in_one_sentence(given, ranges, sentence):
     with pytest.raises(ConfigError) as caught:
         robot_from(given, ranges)
@@ -177,7 +240,11 @@ def test_what_is_no_robot_is_refused_in_one_sentence(given, ranges, sentence):
 
 
 def test_a_misspelt_parameter_is_refused_and_one_of_the_users_own_is_not():
-    with pytest.raises(ConfigError, match=r"unknown parameter 'trak'; did you mean 'track'\?"):
+    with pytest.raises(
+        ConfigError, match=r"unknown parameter 'trak'; did you mean 'track'\?"
+    ):
         made("differential", parameters={"trak": 0.16})
-    robot = made("ackermann", parameters={"wheelbase": 0.3, "steering_rate": 2.0, "mass": 3.0})
+    robot = made(
+        "ackermann", parameters={"wheelbase": 0.3, "steering_rate": 2.0, "mass": 3.0}
+    )
     assert robot.parameters["mass"] == 3.0

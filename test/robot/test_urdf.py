@@ -18,7 +18,10 @@ ROBOTS = ("ackermann", "differential", "mecanum", "jackal")
 
 
 def joints(text: str) -> dict[str, ElementTree.Element]:
-    return {joint.attrib["name"]: joint for joint in ElementTree.fromstring(text).iter("joint")}
+    return {
+        joint.attrib["name"]: joint
+        for joint in ElementTree.fromstring(text).iter("joint")
+    }
 
 
 def place(text: str, link: str) -> np.ndarray:
@@ -26,7 +29,9 @@ def place(text: str, link: str) -> np.ndarray:
     at = np.zeros(3)
     parents = {j.find("child").attrib["link"]: j for j in joints(text).values()}
     while link in parents:
-        at += [float(word) for word in parents[link].find("origin").attrib["xyz"].split()]
+        at += [
+            float(word) for word in parents[link].find("origin").attrib["xyz"].split()
+        ]
         link = parents[link].find("parent").attrib["link"]
     assert link == "base_link"
     return at
@@ -36,7 +41,9 @@ def wheels(text: str) -> dict[str, float]:
     """Links of wheels and their radii."""
     links = ElementTree.fromstring(text).iter("link")
     return {
-        link.attrib["name"]: float(link.find("visual/geometry/cylinder").attrib["radius"])
+        link.attrib["name"]: float(
+            link.find("visual/geometry/cylinder").attrib["radius"]
+        )
         for link in links
         if link.attrib["name"].endswith("_wheel_link")
     }
@@ -46,7 +53,9 @@ def wheels(text: str) -> dict[str, float]:
 def test_the_shipped_files_are_those_of_the_shipped_robots(name: str) -> None:
     lidar = lidar_of(load_robot(name))
     file = ROOT / "urdf" / f"{name}.urdf"
-    assert file.read_text(encoding="utf-8") == urdf_of(load_robot(name), lidar.mount, lidar.frame)
+    assert file.read_text(encoding="utf-8") == urdf_of(
+        load_robot(name), lidar.mount, lidar.frame
+    )
 
 
 def test_the_command_tells_the_file_that_it_wrote(tmp_path: Path) -> None:
@@ -76,8 +85,12 @@ def test_wheels_stand_on_the_ground_and_move_as_joint_states_says(name: str) -> 
     assert wheels(text)
     for link, radius in wheels(text).items():
         assert place(text, link)[2] == pytest.approx(radius)
-    movable = {key for key, joint in joints(text).items() if joint.attrib["type"] != "fixed"}
-    mimics = {key for key, joint in joints(text).items() if joint.find("mimic") is not None}
+    movable = {
+        key for key, joint in joints(text).items() if joint.attrib["type"] != "fixed"
+    }
+    mimics = {
+        key for key, joint in joints(text).items() if joint.find("mimic") is not None
+    }
     assert movable - mimics <= {variable.name for variable in spec.state}
     turning = [j for j in joints(text).values() if j.attrib["type"] == "continuous"]
     assert all(joint.find("axis").attrib["xyz"] == "0 1 0" for joint in turning)
@@ -99,7 +112,9 @@ def test_a_mecanum_robot_has_four_wheels_in_the_order_of_its_state() -> None:
 def test_a_jackal_stands_on_its_wheels_not_on_the_track_of_its_drive() -> None:
     text = urdf_of(load_robot("jackal"))
     assert place(text, "front_left_wheel_link") == pytest.approx([0.131, 0.188, 0.098])
-    assert place(text, "rear_right_wheel_link") == pytest.approx([-0.131, -0.188, 0.098])
+    assert place(text, "rear_right_wheel_link") == pytest.approx(
+        [-0.131, -0.188, 0.098]
+    )
 
 
 def test_a_car_has_its_wheelbase_and_steers_within_its_limits() -> None:

@@ -30,7 +30,9 @@ SCENES = {
 
 
 def noisy_model():
-    return direct_model(latency=0.03, odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01))
+    return direct_model(
+        latency=0.03, odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01)
+    )
 
 
 def taken(step, steps=STEPS, bookkeeping=BOOKKEEPING):
@@ -80,9 +82,14 @@ def compiled(step, steps=100):
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize(
     "several",
-    [pytest.param(False, marks=pytest.mark.campaign, id="one"), pytest.param(True, id="many")],
+    [
+        pytest.param(False, marks=pytest.mark.campaign, id="one"),
+        pytest.param(True, id="many"),
+    ],
 )
-def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(scene, several):
+def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(
+    scene, several
+):
     world, robots, worlds = SCENES[scene]
     worlds = worlds if several else 1
     model = noisy_model()
@@ -100,11 +107,17 @@ def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(scene
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "task", ["navigation", pytest.param("cooperative_reaching", marks=pytest.mark.campaign)]
+    "task",
+    ["navigation", pytest.param("cooperative_reaching", marks=pytest.mark.campaign)],
 )
 def test_the_memory_of_a_vector_env_does_not_grow_with_its_steps(task):
     env = BridgeVectorEnv(
-        16, noisy_model(), field(8.0, 5), task, max_episode_steps=20, autoreset_mode="SameStep"
+        16,
+        noisy_model(),
+        field(8.0, 5),
+        task,
+        max_episode_steps=20,
+        autoreset_mode="SameStep",
     )
     env.reset(seed=0)
     env.action_space.seed(0)

@@ -20,7 +20,9 @@ def rows(name):
     if not BARN.is_dir():
         pytest.skip("the benchmark's tables are not on this machine")
     with (BARN / f"{name}.csv").open() as file:
-        return np.array([[float(value) for value in row] for row in list(csv.reader(file))[1:]])
+        return np.array(
+            [[float(value) for value in row] for row in list(csv.reader(file))[1:]]
+        )
 
 
 def ordered(points):
@@ -68,5 +70,7 @@ def test_a_robot_begins_and_ends_where_the_benchmark_says():
 
 @pytest.mark.parametrize("number", [6, 300, -1])
 def test_a_number_without_a_world_is_refused(number):
-    with pytest.raises(ConfigError, match=rf"no BARN world {number}; the numbers are 1 to 299"):
+    with pytest.raises(
+        ConfigError, match=rf"no BARN world {number}; the numbers are 1 to 299"
+    ):
         barn_world(number)

@@ -23,7 +23,14 @@ CIRCLE = {"kind": "circle", "radius": 0.2}
 PLATE = {"kind": "rectangle", "size": [0.8, 0.02]}
 HOOK = {
     "kind": "polygon",
-    "points": [[-0.5, -0.4], [0.5, -0.4], [0.5, -0.3], [-0.4, -0.3], [-0.4, 0.5], [-0.5, 0.5]],
+    "points": [
+        [-0.5, -0.4],
+        [0.5, -0.4],
+        [0.5, -0.3],
+        [-0.4, -0.3],
+        [-0.4, 0.5],
+        [-0.5, 0.5],
+    ],
 }
 
 
@@ -38,7 +45,9 @@ def fast_model(footprint):
         else {"footprint": footprint}
     )
     model = direct_model(sensor=lidar(rate=1.0 / DT))
-    return dataclasses.replace(model, robot=RobotSpec.model_validate(about), control_period=DT)
+    return dataclasses.replace(
+        model, robot=RobotSpec.model_validate(about), control_period=DT
+    )
 
 
 def silent(_message):
@@ -67,18 +76,24 @@ def points_from(p, q):
 def between(p, q):
     """(...) least distance of segments (..., P, 4) and (..., Q, 4); 0 where two cross."""
     least = np.minimum(
-        np.minimum(points_from(p[..., :2], q), points_from(p[..., 2:], q)).min(axis=(-1, -2)),
-        np.minimum(points_from(q[..., :2], p), points_from(q[..., 2:], p)).min(axis=(-1, -2)),
+        np.minimum(points_from(p[..., :2], q), points_from(p[..., 2:], q)).min(
+            axis=(-1, -2)
+        ),
+        np.minimum(points_from(q[..., :2], p), points_from(q[..., 2:], p)).min(
+            axis=(-1, -2)
+        ),
     )
 
     def side(a, b, c):
-        return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (
-            c[..., 0] - a[..., 0]
-        )
+        return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (
+            b[..., 1] - a[..., 1]
+        ) * (c[..., 0] - a[..., 0])
 
     p, q = p[..., :, None, :], q[..., None, :, :]
     a, b, c, d = p[..., :2], p[..., 2:], q[..., :2], q[..., 2:]
-    crossing = (side(a, b, c) * side(a, b, d) < 0.0) & (side(c, d, a) * side(c, d, b) < 0.0)
+    crossing = (side(a, b, c) * side(a, b, d) < 0.0) & (
+        side(c, d, a) * side(c, d, b) < 0.0
+    )
     return np.where(crossing.any(axis=(-1, -2)), 0.0, least)
 
 
@@ -159,7 +174,9 @@ def free_starts(rng, footprint, scenes, size, number):
         while True:
             pose = np.array([*rng.uniform(-size, size, 2), rng.uniform(-np.pi, np.pi)])
             here = footprint_mover(footprint, pose, np.zeros(3))
-            if all(clearance(here, other, np.zeros(1))[0] > 1e-3 for other in scenes[n]):
+            if all(
+                clearance(here, other, np.zeros(1))[0] > 1e-3 for other in scenes[n]
+            ):
                 starts[n, 0] = pose
                 break
     return starts
@@ -168,10 +185,12 @@ def free_starts(rng, footprint, scenes, size, number):
 SHAPES = [CIRCLE, PLATE, HOOK, SEGMENT]
 MORE = {"marks": pytest.mark.campaign}
 FOOTPRINTS = [
-    pytest.param(0.01, **MORE, id="1cm"), pytest.param(0.1, id="10cm"),
-    pytest.param(0.5, **MORE, id="50cm"), pytest.param(BAR, id="bar"),
+    pytest.param(0.01, **MORE, id="1cm"),
+    pytest.param(0.1, id="10cm"),
+    pytest.param(0.5, **MORE, id="50cm"),
+    pytest.param(BAR, id="bar"),
     pytest.param(DART, id="dart"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("footprint", FOOTPRINTS)
@@ -182,7 +201,9 @@ def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprin
     walls = random_walls(rng, 8, 3.4)
     groups = [{"shapes": [shape], "count": 1} for shape in SHAPES]
     world = field(7.0, obstacles=groups, walls=[tuple(wall) for wall in walls])
-    simulator = FastSimulator(fast_model(footprint), world, number, renderer="exact", tell=silent)
+    simulator = FastSimulator(
+        fast_model(footprint), world, number, renderer="exact", tell=silent
+    )
     drawn = simulator.reset(range(number))
     shapes = simulator.sampler.shapes
     scenes = [
@@ -206,7 +227,9 @@ def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprin
             assert flagged == (least < 0.0 or touch < np.inf), (n, least, touch)
         end = simulator.data.pose[n, 0]
         if not flagged:
-            assert end[:2] == pytest.approx(robot.poses(np.array([DT]))[0, :2], abs=1e-6)
+            assert end[:2] == pytest.approx(
+                robot.poses(np.array([DT]))[0, :2], abs=1e-6
+            )
             continue
         touched += 1
         here = footprint_mover(footprint, end, np.zeros(3))
@@ -230,7 +253,9 @@ def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [CIRCLE, PLATE, HOOK], ids=["circle", "plate", "hook"])
+@pytest.mark.parametrize(
+    "shape", [CIRCLE, PLATE, HOOK], ids=["circle", "plate", "hook"]
+)
 def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
     number, rng = 100, np.random.default_rng(7)
     world = field(10.0, obstacles=[{"shapes": [shape], "count": 1}])
@@ -241,8 +266,10 @@ def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
     bearing, heading = rng.uniform(-np.pi, np.pi, (2, number))
     bodies = simulator.data.bodies[:, 0]
     bodies[:, 0], bodies[:, 1], bodies[:, 2] = (
-        away * np.cos(bearing), away * np.sin(bearing), heading,
-    )  # fmt: skip
+        away * np.cos(bearing),
+        away * np.sin(bearing),
+        heading,
+    )
     bodies[:, 3], bodies[:, 4] = np.cos(heading), np.sin(heading)
     before = bodies[:, :3].copy()
     own = rng.uniform(0.0, 40.0, number)[:, None] * np.stack(
@@ -285,7 +312,9 @@ def test_robots_that_run_into_each_other_stop_there_and_are_marked():
     simulator.step(twists)
     touched = 0
     for n in range(number):
-        one, other = (footprint_mover(0.03, starts[n, m], twists[n, m]) for m in range(2))
+        one, other = (
+            footprint_mover(0.03, starts[n, m], twists[n, m]) for m in range(2)
+        )
         touch, least = first_touch(one, [other])
         flags = simulator.data.collided[n].tolist()
         if abs(least) > OVERLAP:
@@ -322,9 +351,15 @@ def test_nothing_overlaps_in_a_long_drive_of_fast_robots(deviation):
     model, robots = fast_model(0.04), 4
     groups = [
         {"shapes": [CIRCLE], "count": 3},
-        {"shapes": [CIRCLE], "count": 3, "motion": {"kind": "wander", "speed": [0.5, 2.0]}},
+        {
+            "shapes": [CIRCLE],
+            "count": 3,
+            "motion": {"kind": "wander", "speed": [0.5, 2.0]},
+        },
     ]
-    simulator = FastSimulator(model, field(4.0, obstacles=groups), 24, robots, tell=silent)
+    simulator = FastSimulator(
+        model, field(4.0, obstacles=groups), 24, robots, tell=silent
+    )
     simulator.data.noise[..., 2:5] = deviation
     simulator.reset(range(24))
     rng = np.random.default_rng(2)
@@ -366,7 +401,10 @@ def turned_by(simulator, twist, steps):
     for _ in range(steps):
         simulator.step([[twist]])
         after = simulator.data.pose[0, 0, 2]
-        turned, before = turned + (after - before + np.pi) % (2.0 * np.pi) - np.pi, after
+        turned, before = (
+            turned + (after - before + np.pi) % (2.0 * np.pi) - np.pi,
+            after,
+        )
     return turned
 
 
@@ -464,7 +502,10 @@ def test_nothing_overlaps_where_robots_with_corners_push_and_slide(footprint):
         for n in range(number):
             ends = simulator.data.pose[n]
             robots = [footprint_mover(footprint, end, np.zeros(3)) for end in ends]
-            for robot, rest in ((robots[0], [*scenes[n], robots[1]]), (robots[1], scenes[n])):
+            for robot, rest in (
+                (robots[0], [*scenes[n], robots[1]]),
+                (robots[1], scenes[n]),
+            ):
                 gaps = [clearance(robot, other, np.zeros(1))[0] for other in rest]
                 assert min(gaps) > 0.0, (n, k)
     assert simulator.data.collided.any(axis=1).sum() > number // 2

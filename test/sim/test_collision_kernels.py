@@ -8,7 +8,14 @@ from shapely import affinity, geometry
 
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.shapes import Circle, Outlines, Polygon, Rectangle, Segment, place
+from nics_drl_bridge.lidar.shapes import (
+    Circle,
+    Outlines,
+    Polygon,
+    Rectangle,
+    Segment,
+    place,
+)
 from nics_drl_bridge.sim import collision_kernels as kernels
 from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.state import NO_FIELD
@@ -16,10 +23,16 @@ from nics_drl_bridge.sim.state import NO_FIELD
 L = Polygon(points=((0, 0), (1, 0), (1, 0.3), (0.3, 0.3), (0.3, 1), (0, 1)))
 FORK = Polygon(
     points=(
-        (0.3, 0.2), (-0.2, 0.2), (-0.2, -0.2), (0.3, -0.2), (0.3, -0.1), (0, -0.1), (0, 0.1),
+        (0.3, 0.2),
+        (-0.2, 0.2),
+        (-0.2, -0.2),
+        (0.3, -0.2),
+        (0.3, -0.1),
+        (0, -0.1),
+        (0, 0.1),
         (0.3, 0.1),
     )
-)  # fmt: skip
+)
 WEDGE = Polygon(points=((0.3, 0.0), (-0.2, 0.2), (-0.2, -0.2)))
 SHAPES = (
     Circle(radius=0.3),
@@ -39,7 +52,9 @@ def solid(shape, pose):
     if isinstance(shape, Circle):
         return geometry.Point(pose[0], pose[1])
     outline = shape.outline
-    plain = geometry.LineString(outline) if len(outline) == 2 else geometry.Polygon(outline)
+    plain = (
+        geometry.LineString(outline) if len(outline) == 2 else geometry.Polygon(outline)
+    )
     turned = affinity.rotate(plain, pose[2], origin=(0, 0), use_radians=True)
     return affinity.translate(turned, pose[0], pose[1])
 
@@ -57,7 +72,9 @@ def gap(one, other, limit=np.inf):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("one", "other"), combinations_with_replacement(range(len(SHAPES)), 2))
+@pytest.mark.parametrize(
+    ("one", "other"), combinations_with_replacement(range(len(SHAPES)), 2)
+)
 def test_the_clearance_of_two_bodies_is_that_of_shapely(one, other):
     rng = np.random.default_rng(10 * one + other)
     lines = isinstance(SHAPES[one], Segment) and isinstance(SHAPES[other], Segment)
@@ -111,7 +128,10 @@ def test_bodies_that_share_the_lines_of_their_edges_overlap():
 def test_the_clearance_to_a_straight_wall_is_that_of_shapely(index):
     rng = np.random.default_rng(index)
     for _ in range(150):
-        pose, wall = rng.uniform(-0.8, 0.8, 3) * [1.0, 1.0, 4.0], rng.uniform(-1.0, 1.0, 4)
+        pose, wall = (
+            rng.uniform(-0.8, 0.8, 3) * [1.0, 1.0, 4.0],
+            rng.uniform(-1.0, 1.0, 4),
+        )
         line = geometry.LineString([wall[:2], wall[2:]])
         expected = solid(SHAPES[index], pose).distance(line) - radius(SHAPES[index])
         found = kernels.wall_gap(body(index, pose), wall, ARRAYS, np.inf, SPARE)
@@ -137,7 +157,9 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
     for _ in range(150):
         pose = rng.uniform(-3.0, 4.0, 3)
         shape = solid(SHAPES[index], pose)
-        expected = min(shape.distance(square) for square in squares) - radius(SHAPES[index])
+        expected = min(shape.distance(square) for square in squares) - radius(
+            SHAPES[index]
+        )
         there = body(index, pose)
         found = kernels.map_gap(there, known, ARRAYS, np.inf, SPARE)
         at_once = kernels.map_gap(there, known, ARRAYS, 0.0, SPARE)

@@ -20,10 +20,11 @@ from nics_drl_bridge.sim.world import load_world
 
 PARTS = 4
 LATE = Randomisation(
-    name="late", observation_latency=(0.0, 1.5),
+    name="late",
+    observation_latency=(0.0, 1.5),
     odometry={"odom_linear": (0.0, 0.1), "odom_angular": (0.0, 0.1)},
     lidar={"noise_std": (0.0, 0.05), "dropout": (0.0, 0.2)},
-)  # fmt: skip
+)
 
 
 def end_of(fast: FastSimulator) -> tuple[np.ndarray, ...]:
@@ -37,7 +38,9 @@ def end_of(fast: FastSimulator) -> tuple[np.ndarray, ...]:
 @pytest.mark.parametrize("name", ["crowd", "room"])
 @pytest.mark.parametrize("skew", ["none", "counter_clockwise"])
 @pytest.mark.parametrize("drawn", [None, LATE])
-def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(name, skew, drawn):
+def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(
+    name, skew, drawn
+):
     sensor = lidar(noise_std=0.01, faults={"skew": skew})
     model = direct_model(odometry=(0.05, 0.03), sensor=sensor)
     world, rng = load_world(name), np.random.default_rng(1)
@@ -54,7 +57,9 @@ def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(nam
                 driven.move_obstacles(model.control_period * (part + 1) / PARTS)
             driven.end_period(*end_of(fast))
             for known in ("ranges", "twist", "collided", "steps", "marks"):
-                assert np.array_equal(getattr(driven.data, known), getattr(fast.data, known))
+                assert np.array_equal(
+                    getattr(driven.data, known), getattr(fast.data, known)
+                )
             for rounded in ("bodies", "odom"):
                 ours, theirs = (getattr(s.data, rounded) for s in (driven, fast))
                 assert np.abs(ours - theirs).max() < 1e-12
@@ -67,7 +72,12 @@ def test_commands_are_in_force_as_late_as_is_drawn_and_without_the_latency_of_th
     driven.reset([0])
     for k in (1.0, 2.0, 3.0):
         driven.begin_period(np.full((1, 3), k))
-    assert [driven.in_force(time)[0, 0] for time in (0.0, 0.02, 0.03, 0.09)] == [1.0, 1.0, 2.0, 2.0]
+    assert [driven.in_force(time)[0, 0] for time in (0.0, 0.02, 0.03, 0.09)] == [
+        1.0,
+        1.0,
+        2.0,
+        2.0,
+    ]
     driven.reset([1])
     assert not driven.in_force(0.0).any()
     prompt = DrivenSimulator(model, world)
@@ -115,7 +125,9 @@ def test_the_covariance_of_odometry_is_that_of_the_errors_of_many_drives():
 
 def test_a_heading_error_widens_the_pose_across_the_way_and_not_along_it():
     heading_only = np.diag([0.0, 0.0, 0.01])[None]
-    after = propagate(heading_only, [[0.0, 0.0, 0.0]], [[2.0, 0.0, 0.0]], np.zeros((3, 3)))[0]
+    after = propagate(
+        heading_only, [[0.0, 0.0, 0.0]], [[2.0, 0.0, 0.0]], np.zeros((3, 3))
+    )[0]
     assert after[0, 0] == 0.0
     assert after[1, 1] == pytest.approx(2.0**2 * 0.01)
     assert after[1, 2] == pytest.approx(2.0 * 0.01)
@@ -131,7 +143,9 @@ def test_an_episode_that_would_begin_outside_the_world_is_refused_and_the_one_at
     model, world = direct_model(), load_world("empty")
     device = DeviceWorld(FastSimulator(model, world), model, 1)
     device.begin(3, np.array([1.0, -1.0, 0.5]))
-    with pytest.raises(ConfigError, match=r"^episode_start: \(99, 0\) m lies outside the world"):
+    with pytest.raises(
+        ConfigError, match=r"^episode_start: \(99, 0\) m lies outside the world"
+    ):
         device.begin(4, np.array([99.0, 0.0, 0.0]))
     device.advance()
     assert device.simulator.data.pose[0, 0] == pytest.approx([1.0, -1.0, 0.5])

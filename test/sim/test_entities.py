@@ -158,7 +158,9 @@ def test_room_for_what_was_spawned_is_given_back(staged):
     entities = staged("arena")
     room = entities.simulator.sampler.count
     for k in range(3):
-        entities.spawn("disc", ((Circle(radius=0.1 + 0.05 * k), (0.0, 0.0, 0.0)),), START)
+        entities.spawn(
+            "disc", ((Circle(radius=0.1 + 0.05 * k), (0.0, 0.0, 0.0)),), START
+        )
         entities.restore()
         entities.device.begin(0, None)
         assert entities.simulator.sampler.count == room
@@ -181,7 +183,9 @@ def test_a_robot_takes_no_twist_beyond_its_reach(staged, value):
     entities = staged("empty")
     car = entities.find("car")
     at, twist = entities.pose(car), entities.twist(car)
-    with pytest.raises(ConfigError, match="more than 10 times what 'ackermann' can be commanded"):
+    with pytest.raises(
+        ConfigError, match="more than 10 times what 'ackermann' can be commanded"
+    ):
         entities.move(car, START, np.array([value, value, value]))
     assert entities.pose(car) == pytest.approx(at)
     assert entities.twist(car) == pytest.approx(twist)

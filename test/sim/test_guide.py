@@ -29,11 +29,15 @@ def lengths_of(world, seeds=(0,), at=None):
 
 
 def walled(*walls, **changes):
-    return field(9.0, **APART, **PLACES, walls=[list(wall) for wall in walls], **changes)
+    return field(
+        9.0, **APART, **PLACES, walls=[list(wall) for wall in walls], **changes
+    )
 
 
 def test_where_nothing_stands_it_is_the_straight_distance():
-    found, scenes = lengths_of(field(12.0, goal_distance=[1.0, 6.0], clearance=1.0), range(20))
+    found, scenes = lengths_of(
+        field(12.0, goal_distance=[1.0, 6.0], clearance=1.0), range(20)
+    )
     straight = np.linalg.norm(scenes.starts[:, 0, :2] - scenes.goals[:, 0], axis=1)
     np.testing.assert_allclose(found, straight, rtol=0.08, atol=0.05)
 
@@ -64,7 +68,10 @@ def test_every_place_has_a_way_even_one_within_an_obstacle():
 
 
 def test_a_box_is_in_the_way_as_it_stands_and_what_moves_is_not():
-    box = {"shapes": [{"kind": "rectangle", "size": [0.2, 4.0]}], "at": [[0.0, 0.0, 0.0]]}
+    box = {
+        "shapes": [{"kind": "rectangle", "size": [0.2, 4.0]}],
+        "at": [[0.0, 0.0, 0.0]],
+    }
     along = box | {"at": [[0.0, 0.0, math.pi / 2.0]]}
     across, beside = (
         lengths_of(field(9.0, **(APART | {"obstacles": [group]}), **PLACES))[0][0]
@@ -72,7 +79,9 @@ def test_a_box_is_in_the_way_as_it_stands_and_what_moves_is_not():
     )
     assert across > 2.0 * math.hypot(3.0, 2.0)
     assert beside < across
-    moving = circles(8, radii=(0.4,)) | {"motion": {"kind": "pedestrian", "speed": [0.2, 0.4]}}
+    moving = circles(8, radii=(0.4,)) | {
+        "motion": {"kind": "pedestrian", "speed": [0.2, 0.4]}
+    }
     crowd = field(9.0, **(APART | {"obstacles": [moving]}), **PLACES)
     assert lengths_of(crowd)[0][0] == pytest.approx(6.0, abs=0.1)
 
@@ -80,7 +89,13 @@ def test_a_box_is_in_the_way_as_it_stands_and_what_moves_is_not():
 def test_worlds_of_a_set_have_their_own_ways():
     one = walled((0.0, -4.5, 0.0, 2.0))
     other = World.model_validate(
-        {"name": "long", "size": [30.0, 6.0], **APART, **PLACES, "goal_distance": [1.0, 30.0]}
+        {
+            "name": "long",
+            "size": [30.0, 6.0],
+            **APART,
+            **PLACES,
+            "goal_distance": [1.0, 30.0],
+        }
     )
     seeds = range(12)
     found, scenes = lengths_of(WorldSet("two", (one, other)), seeds)

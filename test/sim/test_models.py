@@ -42,7 +42,10 @@ def test_an_sdf_model_that_is_low_counts_at_its_own_height():
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        (CRATE.replace("</model>", "</model><model name='b'/>").format(BOX), "holds 2 models"),
+        (
+            CRATE.replace("</model>", "</model><model name='b'/>").format(BOX),
+            "holds 2 models",
+        ),
         ("<sdf version='1.9'>", "resource_string, line 1"),
         ("<!DOCTYPE a><sdf version='1.9'/>", "document type"),
     ],
@@ -63,7 +66,9 @@ def test_every_shipped_entity_is_read():
     files = sorted((share_folder() / "config" / "entities").glob("*.yaml"))
     assert files
     for file in files:
-        assert model_of_yaml(read_text(find_config(file.stem, "entities")), str(file)).description
+        assert model_of_yaml(
+            read_text(find_config(file.stem, "entities")), str(file)
+        ).description
 
 
 def test_an_sdf_model_may_hold_prefixes_that_nothing_binds():
@@ -76,8 +81,12 @@ def test_an_sdf_model_of_too_many_shapes_is_refused():
     head, tail = CRATE.format(BOX).split("</link>")
 
     def of(count):
-        return head + "".join(map(collision.format, range(count - 1))) + f"</link>{tail}"
+        return (
+            head + "".join(map(collision.format, range(count - 1))) + f"</link>{tail}"
+        )
 
     assert len(model_of_sdf(of(MOST_PARTS), 0.15).parts) == MOST_PARTS
-    with pytest.raises(BridgeError, match=f"holds more than {MOST_PARTS} shapes; split it"):
+    with pytest.raises(
+        BridgeError, match=f"holds more than {MOST_PARTS} shapes; split it"
+    ):
         model_of_sdf(of(MOST_PARTS + 1), 0.15)

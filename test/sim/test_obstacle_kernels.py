@@ -17,13 +17,21 @@ from nics_drl_bridge.sim import obstacle_kernels as kernels
 from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.obstacle_kernels import FAR, repulsion
-from nics_drl_bridge.sim.obstacles import Motion, Patrol, Pedestrian, Wander, plan_arrays
+from nics_drl_bridge.sim.obstacles import (
+    Motion,
+    Patrol,
+    Pedestrian,
+    Wander,
+    plan_arrays,
+)
 from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
 WANDER, WALKER = Wander(speed=(0.3, 0.8)), Pedestrian()
-SQUARE = Patrol(waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7)
+SQUARE = Patrol(
+    waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7
+)
 MIXED = [WANDER, SQUARE, WALKER, None, WALKER, WANDER]
 WALLS = np.array([(-3.0, 0.5, -0.5, 0.5), (0.8, -1.0, 0.8, 3.0)])
 TOUCH = 1e-9
@@ -40,7 +48,9 @@ class Mover(Schema):
 )
 @pytest.mark.parametrize("walls", [None, WALLS], ids=["open", "walled"])
 def test_nothing_ever_touches_or_leaves_the_field(motions, walls, seed):
-    radii = np.array([0.2, 0.3, 0.15, 0.25, 0.2, 0.3, 0.2, 0.2])  # the last two are robots
+    radii = np.array(
+        [0.2, 0.3, 0.15, 0.25, 0.2, 0.3, 0.2, 0.2]
+    )  # the last two are robots
     rng = np.random.default_rng(seed)
     places = scattered(radii, (3.0, 3.0), rng, walls)
     seen = watch(motions, places, radii, walls=walls, seed=seed)
@@ -57,7 +67,12 @@ def test_nothing_ever_touches_or_leaves_the_field(motions, walls, seed):
 @pytest.mark.parametrize("motions", [[WANDER] * 6, MIXED], ids=["wander", "mixed"])
 def test_two_that_move_do_not_touch_within_a_period_either(motions):
     radii = np.full(6, 0.25)
-    seen = watch(motions, scattered(radii, (2.0, 2.0), np.random.default_rng(0)), radii, (2.0, 2.0))
+    seen = watch(
+        motions,
+        scattered(radii, (2.0, 2.0), np.random.default_rng(0)),
+        radii,
+        (2.0, 2.0),
+    )
     for share in (0.25, 0.5, 0.75):
         between = seen.places[:-1] + share * np.diff(seen.places, axis=0)
         away = np.linalg.norm(between[:, :, None] - between[:, None], axis=-1)
@@ -65,7 +80,9 @@ def test_two_that_move_do_not_touch_within_a_period_either(motions):
 
 
 @pytest.mark.parametrize("motion", ["wander", "pedestrian"])
-def test_what_moves_stays_within_open_bounds_wherever_they_lie_and_uses_all_of_them(motion):
+def test_what_moves_stays_within_open_bounds_wherever_they_lie_and_uses_all_of_them(
+    motion,
+):
     low, high = np.array([10.0, -2.0]), np.array([13.0, 1.0])
     group = circles(4) | {"motion": {"kind": motion, "speed": [0.5, 0.9]}}
     world = {"name": "open", "bounds": [*low, *high], "goal_distance": [0.5, 2.0]}
@@ -82,19 +99,25 @@ def test_what_moves_stays_within_open_bounds_wherever_they_lie_and_uses_all_of_t
 
 
 def test_what_has_no_motion_stands_still():
-    seen = watch(MIXED, scattered([0.2] * 6, (3.0, 3.0), np.random.default_rng(0)), [0.2] * 6)
+    seen = watch(
+        MIXED, scattered([0.2] * 6, (3.0, 3.0), np.random.default_rng(0)), [0.2] * 6
+    )
     assert (seen.velocities[:, 3] == 0.0).all()
     assert (seen.speeds[:, [0, 1, 2, 4, 5]].max(axis=0) > 0.2).all()
 
 
 def test_speeds_stay_within_their_bounds():
-    seen = watch(MIXED, scattered([0.2] * 6, (3.0, 3.0), np.random.default_rng(0)), [0.2] * 6)
+    seen = watch(
+        MIXED, scattered([0.2] * 6, (3.0, 3.0), np.random.default_rng(0)), [0.2] * 6
+    )
     drawn, fastest = seen.marks[-1, :, at.SPEED], seen.speeds.max(axis=0)
     for k, motion in enumerate(MIXED):
         if motion is not None:
             low, high = np.broadcast_to(motion.speed, 2)
             assert low <= drawn[k] <= high
-            assert fastest[k] <= (high if motion is WALKER else drawn[k]) * (1.0 + 1e-12)
+            assert fastest[k] <= (high if motion is WALKER else drawn[k]) * (
+                1.0 + 1e-12
+            )
     assert np.abs(seen.velocities[..., 2]).max() <= kernels.TURN
 
 
@@ -116,8 +139,12 @@ def test_wandering_obstacles_turn_away_before_they_touch_and_never_get_stuck():
     seen = watch([WANDER], np.zeros((1, 2)), [0.2], steps=3000)
     room = 3.0 - 0.2 - np.abs(seen.places[:, 0]).max(axis=1)
     assert (room < 0.02).mean() < 0.01
-    crowd = watch([WANDER] * 8, scattered([0.2] * 8, (3.0, 3.0), np.random.default_rng(5)),
-                  [0.2] * 8, steps=3000)  # fmt: skip
+    crowd = watch(
+        [WANDER] * 8,
+        scattered([0.2] * 8, (3.0, 3.0), np.random.default_rng(5)),
+        [0.2] * 8,
+        steps=3000,
+    )
     for begin in range(0, 3000, 200):  # in any 20 s each of them gets somewhere
         part = crowd.places[begin : begin + 200]
         assert (np.ptp(part, axis=0).max(axis=1) > 0.3).all()
@@ -127,7 +154,10 @@ def on_path(corners, speed, pause, times):
     """Where a patrol is that was at the first corner at time 0, by interpolation in time."""
     when, where, now = [0.0], [corners[0]], 0.0
     for one, other in pairwise(corners):
-        for spent, stop in ((pause, one), (np.linalg.norm(np.subtract(other, one)) / speed, other)):
+        for spent, stop in (
+            (pause, one),
+            (np.linalg.norm(np.subtract(other, one)) / speed, other),
+        ):
             now += spent
             when.append(now)
             where.append(stop)
@@ -164,7 +194,9 @@ def test_a_patrol_waits_while_a_robot_stands_in_its_way():
 def test_patrols_that_meet_head_on_stop_and_do_not_touch():
     there = Patrol(waypoints=((-2.0, 0.0), (2.0, 0.0)), speed=0.5)
     back = Patrol(waypoints=((2.0, 0.0), (-2.0, 0.0)), speed=1.0)
-    seen = watch([there, back], np.array([(-2.0, 0.0), (2.0, 0.0)]), [0.3, 0.3], steps=200)
+    seen = watch(
+        [there, back], np.array([(-2.0, 0.0), (2.0, 0.0)]), [0.3, 0.3], steps=200
+    )
     assert 0.0 <= seen.gaps([0.3, 0.3]).min() < 0.01
     assert seen.speeds[-1].max() < 1e-3
 
@@ -209,7 +241,10 @@ def walk_on(marks, places, radii, half, seed, steps=120):
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, 2)))
     marks, velocity, track = marks[None].copy(), np.zeros((1, 1, 3)), []
     scene = surroundings_of([WALKER], half, sides(half))
-    state, goal = state_of(bodies, marks, velocity, [seed]), marks[0, 0, at.GOAL_X].copy()
+    state, goal = (
+        state_of(bodies, marks, velocity, [seed]),
+        marks[0, 0, at.GOAL_X].copy(),
+    )
     for t in range(steps):
         state.steps[0] = t + 1
         kernels.steer(0, state, scene, PERIOD, np.zeros((1, 2)))
@@ -232,9 +267,14 @@ def in_batch(seeds, motions=tuple(MIXED), steps=200):
     count, worlds = len(motions), len(seeds)
     radii, half = np.full((worlds, count + 1), 0.2), np.array([3.0, 3.0])
     places = scattered([0.2] * (count + 1), half, np.random.default_rng(0))
-    poses = np.tile(np.concatenate([places, np.zeros((count + 1, 1))], 1), (worlds, 1, 1))
+    poses = np.tile(
+        np.concatenate([places, np.zeros((count + 1, 1))], 1), (worlds, 1, 1)
+    )
     bodies = place(poses, radii, np.zeros_like(radii))
-    marks, velocity = np.full((worlds, count, MARK), 7.0), np.full((worlds, count, 3), 9.0)
+    marks, velocity = (
+        np.full((worlds, count, MARK), 7.0),
+        np.full((worlds, count, 3), 9.0),
+    )
     scene, still = surroundings_of(motions, half, sides(half)), np.zeros((1, 2))
     state = state_of(bodies, marks, velocity, seeds)
     for n in range(worlds):
@@ -261,7 +301,9 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
     cells[40:50, 20:70], cells[70:100, 80:84], cells[20:23, 90:93] = 100, 100, 100
     grid = GridMap(cells, 0.05, (-2.5, -3.0, heading))
     corners = np.stack(np.nonzero(grid.blocked), axis=1)
-    squares = [box(j * 0.05, i * 0.05, (j + 1) * 0.05, (i + 1) * 0.05) for i, j in corners]
+    squares = [
+        box(j * 0.05, i * 0.05, (j + 1) * 0.05, (i + 1) * 0.05) for i, j in corners
+    ]
     solid, (x, y, _) = unary_union(squares), grid.origin
     c, s = np.cos(heading), np.sin(heading)
     radius, count, rng, places = 0.2, 4, np.random.default_rng(0), []
@@ -273,10 +315,13 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
             np.linalg.norm(spot - other) > 0.5 for other in places
         ):
             places.append(spot)
-    seen = watch([motion] * count, np.array(places), [radius] * count,
-                 grid=map_field(grid))  # fmt: skip
+    seen = watch(
+        [motion] * count, np.array(places), [radius] * count, grid=map_field(grid)
+    )
     d = seen.places - (x, y)
-    local = np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]], axis=-1)
+    local = np.stack(
+        [c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]], axis=-1
+    )
     for k in range(count):
         assert LineString(local[:, k]).distance(solid) > radius - 0.005
         assert np.ptp(local[:, k], axis=0).max() > 2.0
@@ -289,11 +334,23 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
         ({"kind": "wander", "speed": [0.8, 0.3]}, "speed must be [least, greatest]"),
         ({"kind": "wander", "speed": [0.0, 0.3]}, "above 0"),
         ({"kind": "wander", "speed": [1.0, 30.0]}, "at most 10 m/s"),
-        ({"kind": "patrol", "waypoints": [[0, 0]], "speed": 1.0}, "motion.patrol.waypoints"),
-        ({"kind": "patrol", "waypoints": [[0, 0], [0, 0]], "speed": 1.0}, "must differ"),
-        ({"kind": "patrol", "waypoints": [[0, 0], [1, 0], [0, 0]], "speed": 1.0}, "must differ"),
+        (
+            {"kind": "patrol", "waypoints": [[0, 0]], "speed": 1.0},
+            "motion.patrol.waypoints",
+        ),
+        (
+            {"kind": "patrol", "waypoints": [[0, 0], [0, 0]], "speed": 1.0},
+            "must differ",
+        ),
+        (
+            {"kind": "patrol", "waypoints": [[0, 0], [1, 0], [0, 0]], "speed": 1.0},
+            "must differ",
+        ),
         ({"kind": "pedestrian", "relaxation": 0.0}, "relaxation"),
-        ({"kind": "pedestrain"}, "unknown kind 'pedestrain'; did you mean 'pedestrian'?"),
+        (
+            {"kind": "pedestrain"},
+            "unknown kind 'pedestrain'; did you mean 'pedestrian'?",
+        ),
     ],
 )
 def test_a_wrong_motion_is_one_sentence(motion, sentence):
@@ -305,7 +362,12 @@ def test_a_wrong_motion_is_one_sentence(motion, sentence):
 def test_motions_are_read_by_their_kind():
     read = TypeAdapter(Motion).validate_python
     assert read({"kind": "pedestrian"}) == Pedestrian()
-    back = {"kind": "patrol", "waypoints": [[0, 0], [1, 0], [0, 0]], "speed": 1, "loop": False}
+    back = {
+        "kind": "patrol",
+        "waypoints": [[0, 0], [1, 0], [0, 0]],
+        "speed": 1,
+        "loop": False,
+    }
     assert isinstance(read(back), Patrol)
 
 
@@ -335,7 +397,8 @@ def test_the_force_is_the_downhill_slope_of_the_potential(foresight):
     for _ in range(300):
         r, v = rng.uniform(-1.0, 1.0, 2), rng.uniform(-1.5, 1.5, 2)
         slope = [
-            (potential(r + d, v, foresight) - potential(r - d, v, foresight)) / (2.0 * delta)
+            (potential(r + d, v, foresight) - potential(r - d, v, foresight))
+            / (2.0 * delta)
             for d in delta * np.eye(2)
         ]
         force = np.array(repulsion(*r, *v, foresight, STRENGTH, REACH))

@@ -34,13 +34,17 @@ def agreement(name, seed, spare=()):
     exact = make_scanner(LIDAR, shapes, "exact", world.grid)
     mapped = make_scanner(LIDAR, [], "exact", grid)
     free = np.argwhere(grid.distance_field > 0.2)[::997]
-    poses = np.column_stack([grid.cell_to_world(free), np.linspace(-3.0, 3.0, len(free))])
+    poses = np.column_stack(
+        [grid.cell_to_world(free), np.linspace(-3.0, 3.0, len(free))]
+    )
     at = np.array([pose for _, pose in placed]).reshape(-1, 3)
     bodies = np.tile(exact.place(shapes, at), (len(poses), 1, 1))
     true = exact.scan(poses, bodies, world.all_walls())
     around = np.stack([np.roll(true, k, axis=1) for k in (-1, 0, 1)])
     seen, slack = mapped.scan(poses, []), 1.5 * grid.resolution
-    return np.mean((seen >= around.min(axis=0) - slack) & (seen <= around.max(axis=0) + slack))
+    return np.mean(
+        (seen >= around.min(axis=0) - slack) & (seen <= around.max(axis=0) + slack)
+    )
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -60,7 +64,9 @@ def test_a_map_of_a_world_is_kept_to_its_cells_however_coarse_they_are():
         inner = grid.cells[1:-1, 1:-1]
         assert np.array_equal(inner, world.grid.cells.repeat(parts, 0).repeat(parts, 1))
         assert grid.cell_to_world([1, 1]) == pytest.approx(
-            world.grid.cell_to_world([0, 0]) + grid.resolution / 2 - world.grid.resolution / 2
+            world.grid.cell_to_world([0, 0])
+            + grid.resolution / 2
+            - world.grid.resolution / 2
         )
 
 
@@ -70,13 +76,18 @@ def test_what_moves_is_left_out():
     scene = sampler.draw([0])[0]
     pillars = worlds.obstacles[-1]
     assert np.count_nonzero(scene.bodies[:, 5]) > len(pillars.at)
-    assert [tuple(pose) for _, pose in standing(sampler, 0, scene.bodies)] == list(pillars.at)
+    assert [tuple(pose) for _, pose in standing(sampler, 0, scene.bodies)] == list(
+        pillars.at
+    )
 
 
 def test_things_thinner_than_a_cell_do_not_vanish():
     world = world_of(bounds=(-1.0, -1.0, 1.0, 1.0), walls=[(-0.5, -0.5, 0.5, -0.4)])
     thin = Polygon(points=((0.0, 0.0), (0.6, 0.001), (0.6, 0.002), (0.0, 0.001)))
-    placed = [(thin, (-0.3, 0.3, 0.2)), (Segment(ends=((0.0, 0.0), (0.3, 0.0))), (0.0, 0.7, 1.0))]
+    placed = [
+        (thin, (-0.3, 0.3, 0.2)),
+        (Segment(ends=((0.0, 0.0), (0.3, 0.0))), (0.0, 0.7, 1.0)),
+    ]
     grid = occupancy(world, placed, 0.05)
     scanner = make_scanner(LIDAR, [], "exact", grid)
     seen = scanner.scan([(0.0, 0.0, 0.0)], [])[0]
@@ -96,7 +107,9 @@ def test_a_field_beside_a_turned_map_is_closed_all_around(tmp_path):
 
 
 def test_a_large_world_has_larger_cells():
-    grid = occupancy(world_of(size=(400.0, 100.0)), [(Circle(radius=3.0), (20.0, 0.0, 0.0))])
+    grid = occupancy(
+        world_of(size=(400.0, 100.0)), [(Circle(radius=3.0), (20.0, 0.0, 0.0))]
+    )
     assert grid.cells.size < 1.1 * MOST_CELLS
     assert grid.cells[tuple(grid.world_to_cell([20.0, 0.0]))] == OCCUPIED
 

@@ -69,7 +69,11 @@ def test_the_shipped_ranges_fit_every_shipped_robot(name, robot):
     assert factor.max() <= high * (1.0 + 1e-12)
     assert factor.std(axis=0).min() > 0.2 * (high - low)
     named = drawn.named()
-    assert {"action_latency_s", "observation_latency_s", "lidar.noise_std"} <= named.keys()
+    assert {
+        "action_latency_s",
+        "observation_latency_s",
+        "lidar.noise_std",
+    } <= named.keys()
     assert f"kinematics.{builtin_model(robot).kinematics.dofs[0]}" in ".".join(named)
     assert all(np.isfinite(value).all() for value in named.values())
 
@@ -82,7 +86,9 @@ def test_a_seed_gives_the_same_bits_in_any_batch_and_among_any_robots():
         alone = many.draw([seed])
         single = one.draw([seed])
         for name in ARRAYS:
-            assert np.array_equal(getattr(together, name)[row], getattr(alone, name)[0]), name
+            assert np.array_equal(
+                getattr(together, name)[row], getattr(alone, name)[0]
+            ), name
             whole = getattr(single, name)[0]
             part = getattr(alone, name)[0]
             assert np.array_equal(part[:1] if part.ndim else part, whole), name
@@ -92,7 +98,11 @@ def test_a_seed_gives_the_same_bits_in_any_batch_and_among_any_robots():
 def test_naming_one_range_does_not_shift_the_draws_of_another():
     one = Sampler(given(lidar={"dropout": [0.0, 0.5]}), model()).draw(SEEDS)
     ranges = given(
-        lidar={"dropout": [0.0, 0.5], "noise_std": [0.0, 0.1], "skew": ["none", "clockwise"]},
+        lidar={
+            "dropout": [0.0, 0.5],
+            "noise_std": [0.0, 0.1],
+            "skew": ["none", "clockwise"],
+        },
         kinematics={"scale": [0.5, 2.0]},
         action_latency=[0.0, 3.0],
     )
@@ -113,7 +123,9 @@ def test_each_range_alone_leaves_the_others_as_they_are():
 
 
 def test_each_coefficient_is_scaled_evenly_and_on_its_own():
-    drawn = Sampler(given(kinematics={"scale": [0.5, 2.0]}), builtin_model("ackermann")).draw(SEEDS)
+    drawn = Sampler(
+        given(kinematics={"scale": [0.5, 2.0]}), builtin_model("ackermann")
+    ).draw(SEEDS)
     nominal = term_arrays(builtin_model("ackermann").kinematics).coefficient
     factor = (drawn.coefficient / nominal)[:, 0]
     for column in factor.T:
@@ -124,14 +136,23 @@ def test_each_coefficient_is_scaled_evenly_and_on_its_own():
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_a_slower_response_scales_all_time_constants_alike_and_leads_to_the_same_state(robot):
-    nominal, command = builtin_model(robot).kinematics, builtin_model(robot).robot.command_high
-    sampler = Sampler(given(kinematics={"response": [1.0, 3.0]}), builtin_model(robot), 2)
+def test_a_slower_response_scales_all_time_constants_alike_and_leads_to_the_same_state(
+    robot,
+):
+    nominal, command = (
+        builtin_model(robot).kinematics,
+        builtin_model(robot).robot.command_high,
+    )
+    sampler = Sampler(
+        given(kinematics={"response": [1.0, 3.0]}), builtin_model(robot), 2
+    )
     drawn = sampler.draw(SEEDS[:50])
     kept, size = np.nonzero(nominal.coefficients), nominal.state_size
     factor = term_arrays(nominal).coefficient / drawn.coefficient
     assert np.allclose(factor[..., kept[0] < 3], 1.0)
-    assert np.allclose(factor[..., kept[0] >= 3], drawn.named()["kinematics.response"][..., None])
+    assert np.allclose(
+        factor[..., kept[0] >= 3], drawn.named()["kinematics.response"][..., None]
+    )
     assert drawn.response.min() < 1.2
     assert drawn.response.max() > 2.8
     settled = []
@@ -152,7 +173,9 @@ def test_a_rate_and_a_term_may_have_ranges_of_their_own():
         "dofs": {"wz": [2.0, 2.0]},
         "terms": {"wz": {"steering*speed": [3.0, 4.0]}},
     }
-    drawn = Sampler(given(kinematics=kinematics), builtin_model("ackermann")).draw(SEEDS)
+    drawn = Sampler(given(kinematics=kinematics), builtin_model("ackermann")).draw(
+        SEEDS
+    )
     nominal = builtin_model("ackermann").kinematics
     named = drawn.named()
     assert "kinematics.wz.speed*steering_command" not in named  # always twice as much
@@ -160,16 +183,30 @@ def test_a_rate_and_a_term_may_have_ranges_of_their_own():
     factor = named["kinematics.wz.speed*steering"][:, 0] / nominal.coefficients[d, k]
     assert_even(factor, 3.0, 4.0)
     factor = named["kinematics.vx.speed"][:, 0]
-    assert_even(factor / nominal.coefficients[0, nominal.term_names.index("speed")], 0.9, 1.1)
+    assert_even(
+        factor / nominal.coefficients[0, nominal.term_names.index("speed")], 0.9, 1.1
+    )
 
 
 @pytest.mark.parametrize(
     ("kinematics", "sentence"),
     [
-        ({"dofs": {"d_sped": [1, 2]}}, "unknown rate 'd_sped'; did you mean 'd_speed'?"),
-        ({"terms": {"vy": {"speed": [1, 2]}}}, "no term 'speed' there; it has none at all"),
-        ({"terms": {"wz": {"sped*steering": [1, 2]}}}, "did you mean 'speed*steering'?"),
-        ({"terms": {"wz": {"speed": [1, 2]}}}, "no term 'speed' there; valid are: 'speed*"),
+        (
+            {"dofs": {"d_sped": [1, 2]}},
+            "unknown rate 'd_sped'; did you mean 'd_speed'?",
+        ),
+        (
+            {"terms": {"vy": {"speed": [1, 2]}}},
+            "no term 'speed' there; it has none at all",
+        ),
+        (
+            {"terms": {"wz": {"sped*steering": [1, 2]}}},
+            "did you mean 'speed*steering'?",
+        ),
+        (
+            {"terms": {"wz": {"speed": [1, 2]}}},
+            "no term 'speed' there; valid are: 'speed*",
+        ),
         ({"scale": [1.0, 30.0]}, "the state of the robot grows by itself"),
     ],
 )
@@ -183,15 +220,24 @@ def test_a_range_that_the_model_cannot_take_is_one_sentence(kinematics, sentence
 @pytest.mark.parametrize(
     ("data", "sentence"),
     [
-        ({"kinematics": {"scale": [1.1, 0.9]}}, "key 'kinematics.scale': a range is [least"),
+        (
+            {"kinematics": {"scale": [1.1, 0.9]}},
+            "key 'kinematics.scale': a range is [least",
+        ),
         ({"kinematics": {"scale": [0.0, 0.9]}}, "key 'kinematics.scale.0': input"),
         ({"kinematics": {"dofs": {"wz": [-1.0, 0.9]}}}, "key 'kinematics.dofs.wz.0'"),
         ({"action_latency": [-0.1, 0.9]}, "key 'action_latency.0'"),
         ({"observation_latency": [0, 51]}, "less than or equal to 50"),
         ({"lidar": {"dropuot": [0, 1]}}, "did you mean 'dropout'?"),
-        ({"lidar": {"dropout": [0, 0.6], "dropout_far": [0, 0.6]}}, "add up to at most 1"),
+        (
+            {"lidar": {"dropout": [0, 0.6], "dropout_far": [0, 0.6]}},
+            "add up to at most 1",
+        ),
         ({"lidar": {"skew": ["anticlockwise"]}}, "key 'lidar.skew.0'"),
-        ({"odometry": {"noise": [1, 2], "odom_linear": [0, 1]}}, "either the factor noise or"),
+        (
+            {"odometry": {"noise": [1, 2], "odom_linear": [0, 1]}},
+            "either the factor noise or",
+        ),
         ({"obstacles": {"count": [4, 3]}}, "count must be [least, greatest]"),
         ({"obstacles": {"size": [-1.0, 3]}}, "key 'obstacles.size.0'"),
         ({"latency": [0, 1]}, "unknown key 'latency'"),
@@ -205,7 +251,9 @@ def test_a_wrong_range_is_one_sentence(data, sentence):
 
 
 def test_an_unknown_name_is_answered_with_the_nearest():
-    with pytest.raises(ConfigError, match="unknown randomisation 'stronk'; did you mean 'strong'"):
+    with pytest.raises(
+        ConfigError, match="unknown randomisation 'stronk'; did you mean 'strong'"
+    ):
         load_randomisation("stronk")
 
 
@@ -254,7 +302,9 @@ def test_odometry_is_scaled_or_given():
 
 
 def test_a_factor_on_a_drift_that_nobody_measured_is_refused():
-    with pytest.raises(ConfigError, match="no measured drift to scale; give 'position_drift'"):
+    with pytest.raises(
+        ConfigError, match="no measured drift to scale; give 'position_drift'"
+    ):
         Sampler(given(odometry={"drift": [0.5, 2.0]}), model())
 
 
@@ -263,12 +313,16 @@ def test_every_fault_of_a_lidar_may_be_drawn():
 
 
 def test_the_lidar_gets_faults_within_the_ranges_and_keeps_the_others():
-    ranges = given(lidar={"noise_std": [0.0, 0.05], "too_close": ["ghost", "no_return"]})
+    ranges = given(
+        lidar={"noise_std": [0.0, 0.05], "too_close": ["ghost", "no_return"]}
+    )
     sampler = Sampler(ranges, model(), 2)
     drawn = sampler.draw(SEEDS)
     assert_even(drawn.faults[:, 1, fault_kernels.NOISE_STD], 0.0, 0.05)
     assert (drawn.faults[..., fault_kernels.DROPOUT] == 0.1).all()
-    words, counts = np.unique(drawn.faults[..., fault_kernels.TOO_CLOSE], return_counts=True)
+    words, counts = np.unique(
+        drawn.faults[..., fault_kernels.TOO_CLOSE], return_counts=True
+    )
     assert words.tolist() == [fault_kernels.AS_NO_RETURN, fault_kernels.AS_GHOST]
     assert abs(counts[0] - len(SEEDS)) < 5.0 * np.sqrt(len(SEEDS) / 2.0)
     assert drawn.named().keys() == {"lidar.noise_std", "lidar.too_close"}
@@ -287,7 +341,9 @@ def test_a_skew_is_one_of_the_words_or_the_lidars_own(own, drawn):
 
 
 def test_a_fault_that_the_lidar_cannot_have_on_top_of_its_own_is_refused():
-    with pytest.raises(ConfigError, match="dropout and dropout_far must add up to at most 1"):
+    with pytest.raises(
+        ConfigError, match="dropout and dropout_far must add up to at most 1"
+    ):
         Sampler(given(lidar={"dropout_far": [0.0, 0.95]}), model())
 
 
@@ -299,7 +355,9 @@ def test_number_and_size_of_the_obstacles_are_each_as_likely():
         found, counts = np.unique(whole, return_counts=True)
         assert found.tolist() == values
         assert stats.chisquare(counts).pvalue > 1e-3
-    assert np.array_equal(drawn.named()["obstacles.size"], np.array(ranges.sizes)[drawn.size])
+    assert np.array_equal(
+        drawn.named()["obstacles.size"], np.array(ranges.sizes)[drawn.size]
+    )
     assert np.array_equal(drawn.named()["obstacles.count"], drawn.count)
 
 

@@ -32,7 +32,9 @@ def solid(sampler, body):
     if isinstance(shape, Circle):
         return shapely.Point(body[:2])
     make = shapely.LineString if len(shape.outline) == 2 else shapely.Polygon
-    turned = affinity.rotate(make(shape.outline), body[HEADING], (0, 0), use_radians=True)
+    turned = affinity.rotate(
+        make(shape.outline), body[HEADING], (0, 0), use_radians=True
+    )
     return affinity.translate(turned, *body[:2])
 
 
@@ -65,7 +67,11 @@ def check_obstacles(world, sampler, scene, static):
         for other_k, other in there[:i]:
             if groups[k].at and groups[other_k].at:
                 continue
-            gap = shapely.distance(one, solid(sampler, other)) - thick - thickness(sampler, other)
+            gap = (
+                shapely.distance(one, solid(sampler, other))
+                - thick
+                - thickness(sampler, other)
+            )
             assert gap >= max(groups[k].gap, groups[other_k].gap) - SLACK
             assert gap > 0.0
     return there, groups
@@ -77,7 +83,9 @@ def check_places(world, sampler, scene, static, there):
         point = shapely.Point(place)
         assert shapely.distance(point, static) >= room
         for _, body in there:
-            gap = shapely.distance(point, solid(sampler, body)) - thickness(sampler, body)
+            gap = shapely.distance(point, solid(sampler, body)) - thickness(
+                sampler, body
+            )
             assert gap >= room
     least, greatest = world.goal_distance
     distance = np.linalg.norm(scene.goals - scene.starts[:, :2], axis=1)
@@ -115,7 +123,9 @@ def check_way(world, sampler, scene, static, there, groups, fine=FINE):
 )
 def test_every_scene_of_a_shipped_world_is_as_its_file_says(name, seeds, fine):
     world = load_world(name)
-    sampler = SceneSampler(world, ROBOT, robots=2 if name in ("arena", "clutter") else 1)
+    sampler = SceneSampler(
+        world, ROBOT, robots=2 if name in ("arena", "clutter") else 1
+    )
     static = static_of(world)
     for row, scene in enumerate(sampler.draw(range(seeds))):
         there, groups = check_obstacles(world, sampler, scene, static)
@@ -133,7 +143,10 @@ def test_a_seed_gives_the_same_scene_in_every_batch_and_another_seed_another(wor
     sampler = SceneSampler(world, FOOTPRINT, robots=2)
     together = sampler.draw(SEEDS)
     for seed in (0, 1, 17, 49):
-        for alone in (sampler.draw([seed])[0], sample_scene(world, FOOTPRINT, seed, robots=2)):
+        for alone in (
+            sampler.draw([seed])[0],
+            sample_scene(world, FOOTPRINT, seed, robots=2),
+        ):
             for name, array in vars(alone).items():
                 assert np.array_equal(array, getattr(together[seed], name))
     assert len({scene.bodies.tobytes() for scene in together}) == len(SEEDS)
@@ -148,7 +161,11 @@ def test_a_seed_gives_the_same_scene_in_another_process(world):
         "print((scene.bodies.tobytes() + scene.starts.tobytes() + scene.goals.tobytes()).hex())"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ,
     )
     scene = sample_scene(load_world("clutter"), 0.2, 7)
     expected = scene.bodies.tobytes() + scene.starts.tobytes() + scene.goals.tobytes()
@@ -156,7 +173,9 @@ def test_a_seed_gives_the_same_scene_in_another_process(world):
 
 
 def test_the_scene_of_one_robot_is_the_beginning_of_that_of_two(world):
-    alone, both = (sample_scene(world, FOOTPRINT, 0, robots=robots) for robots in (1, 2))
+    alone, both = (
+        sample_scene(world, FOOTPRINT, 0, robots=robots) for robots in (1, 2)
+    )
     assert np.array_equal(alone.bodies, both.bodies)
     assert np.array_equal(alone.starts, both.starts[:1])
 
@@ -179,16 +198,31 @@ def there_are(scenes):
 
 
 def test_each_number_of_obstacles_from_least_to_greatest_occurs():
-    counts = there_are(SceneSampler(field(8.0, obstacles=[circles([2, 5])]), 0.1).draw(range(200)))
+    counts = there_are(
+        SceneSampler(field(8.0, obstacles=[circles([2, 5])]), 0.1).draw(range(200))
+    )
     assert np.bincount(counts, minlength=6)[2:] == pytest.approx(50, abs=20)
     assert counts.min() == 2
 
 
 def test_a_given_count_is_kept_and_shared_among_the_groups():
-    groups = [circles(4), circles([0, 2], (0.1,)), circles(None) | {"at": [[0.0, 0.0, 0.0]]}]
+    groups = [
+        circles(4),
+        circles([0, 2], (0.1,)),
+        circles(None) | {"at": [[0.0, 0.0, 0.0]]},
+    ]
     sampler = SceneSampler(field(9.0, obstacles=groups), 0.1)
     scenes = sampler.draw(range(8), count=[-3, 0, 1, 2, 3, 5, 6, 99])
-    assert there_are(scenes).tolist() == [1, 1, 2, 3, 4, 6, 7, 7]  # one always stands there
+    assert there_are(scenes).tolist() == [
+        1,
+        1,
+        2,
+        3,
+        4,
+        6,
+        7,
+        7,
+    ]  # one always stands there
     second = (scenes.bodies[:, 4:6, BODY_RADIUS] > 0.0).sum(axis=1)
     assert second.tolist()[-2:] == [2, 2]
 
@@ -211,17 +245,21 @@ def test_obstacles_stand_where_the_file_says_and_know_how_they_move():
     world = load_world("crowd")
     sampler = SceneSampler(world, ROBOT)
     scenes = sampler.draw(SEEDS)
-    assert np.array_equal(scenes.bodies[:, -2:, :3], np.tile(world.obstacles[2].at, (50, 1, 1)))
+    assert np.array_equal(
+        scenes.bodies[:, -2:, :3], np.tile(world.obstacles[2].at, (50, 1, 1))
+    )
     kinds = [motion and motion.kind for motion in sampler.motions]
     assert kinds == ["pedestrian"] * 8 + ["patrol", None, None]
 
 
 def test_starts_and_goals_keep_to_their_places():
     world = field(
-        8.0, count=2, goal_distance=[0.5, 9.0],
+        8.0,
+        count=2,
+        goal_distance=[0.5, 9.0],
         starts={"at": [[-2.0, -1.0, 0.5], [-3.0, 1.0, -0.5]]},
         goals={"regions": [[1.0, -1.0, 3.0, 1.0], [3.0, 2.0, 2.0, 3.0]]},
-    )  # fmt: skip
+    )
     scenes = SceneSampler(world, FOOTPRINT).draw(range(200))
     assert {tuple(start) for start in scenes.starts[:, 0]} == set(world.starts.at)
     x, y = scenes.goals[:, 0].T
@@ -242,10 +280,13 @@ def test_start_and_goal_lie_on_one_side_of_a_wall_without_a_door():
 @pytest.mark.slow
 def test_an_obstacle_never_shuts_the_only_door():
     world = field(
-        4.0, obstacles=[circles(3, (0.3,), 0.0)], goal_distance=[1.0, 4.0],
+        4.0,
+        obstacles=[circles(3, (0.3,), 0.0)],
+        goal_distance=[1.0, 4.0],
         walls=[[0.0, -2.0, 0.0, -0.5], [0.0, 0.5, 0.0, 2.0]],
-        starts={"regions": [[-1.9, -1.9, -0.3, 1.9]]}, goals={"regions": [[0.3, -1.9, 1.9, 1.9]]},
-    )  # fmt: skip
+        starts={"regions": [[-1.9, -1.9, -0.3, 1.9]]},
+        goals={"regions": [[0.3, -1.9, 1.9, 1.9]]},
+    )
     sampler, static = SceneSampler(world, ROBOT), static_of(world)
     for scene in sampler.draw(range(8)):
         there, groups = check_obstacles(world, sampler, scene, static)
@@ -255,7 +296,9 @@ def test_an_obstacle_never_shuts_the_only_door():
 def test_starts_are_spread_evenly_over_the_free_space():
     world = field(6.0, clearance=0.3, goal_distance=[1.0, 9.0])
     starts = SceneSampler(world, FOOTPRINT).draw(range(4000)).starts[:, 0]
-    counts, _, _ = np.histogram2d(starts[:, 0], starts[:, 1], bins=5, range=[[-2.4, 2.4]] * 2)
+    counts, _, _ = np.histogram2d(
+        starts[:, 0], starts[:, 1], bins=5, range=[[-2.4, 2.4]] * 2
+    )
     assert counts.sum() / 4000 == pytest.approx((4.8 / 5.0) ** 2, abs=0.03)
     assert counts == pytest.approx(np.full((5, 5), counts.mean()), rel=0.3)
     assert np.abs(np.mean(np.cos(starts[:, 2]))) < 0.05
@@ -298,7 +341,9 @@ def test_a_world_that_is_too_full_is_refused_with_what_to_change():
     with pytest.raises(ConfigError, match="no free place for 200 obstacles") as caught:
         sample_scene(field(2.0, count=200), FOOTPRINT, 0)
     assert "enlarge the field" in str(caught.value)
-    with pytest.raises(ConfigError, match="key 'goal_distance': no free places for 9 start"):
+    with pytest.raises(
+        ConfigError, match="key 'goal_distance': no free places for 9 start"
+    ):
         sample_scene(field(2.0), FOOTPRINT, 0, robots=9)
 
 

@@ -44,7 +44,9 @@ def write(tmp_path):
 
     def written(inside, version="1.10", name="my.world"):
         file = tmp_path / name
-        file.write_text(f"<sdf version='{version}'><world name='w'>{inside}</world></sdf>")
+        file.write_text(
+            f"<sdf version='{version}'><world name='w'>{inside}</world></sdf>"
+        )
         return file
 
     return written
@@ -70,7 +72,9 @@ def rows():
     if not BARN.is_dir():
         pytest.skip("the benchmark's worlds are not on this machine")
     with (BARN / "cylinders.csv").open() as file:
-        return np.array([[float(value) for value in row] for row in list(csv.reader(file))[1:]])
+        return np.array(
+            [[float(value) for value in row] for row in list(csv.reader(file))[1:]]
+        )
 
 
 @pytest.mark.parametrize("number", [1, 2, 50, 151, 200, 299])
@@ -103,8 +107,13 @@ def test_a_saved_state_replaces_the_poses_of_models_and_moves_nothing_twice():
 
 
 def test_models_are_looked_for_on_the_paths_of_gazebo(write, tmp_path, monkeypatch):
-    file = write("<include><uri>model://pillar</uri><pose>1 2 0.5 0 0 0</pose></include>")
-    assert "'model://pillar', which is neither beside the file nor on GZ_SIM" in refused(file)
+    file = write(
+        "<include><uri>model://pillar</uri><pose>1 2 0.5 0 0 0</pose></include>"
+    )
+    assert (
+        "'model://pillar', which is neither beside the file nor on GZ_SIM"
+        in refused(file)
+    )
     for key in ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH"):
         with monkeypatch.context() as patch:
             patch.setenv(key, f"{tmp_path}:{HERE / 'models'}")
@@ -113,7 +122,9 @@ def test_models_are_looked_for_on_the_paths_of_gazebo(write, tmp_path, monkeypat
 
 def test_a_file_of_models_without_a_world_is_read_too(tmp_path):
     file = tmp_path / "pile.sdf"
-    file.write_text(f"<sdf version='1.9'>{model(DISC, pose='<pose>1 2 0 0 0 0</pose>')}</sdf>")
+    file.write_text(
+        f"<sdf version='1.9'>{model(DISC, pose='<pose>1 2 0 0 0 0</pose>')}</sdf>"
+    )
     assert only(file) == (Circle(radius=0.1), (1.0, 2.0, 0.0))
 
 
@@ -123,7 +134,10 @@ def test_a_file_of_models_without_a_world_is_read_too(tmp_path):
         ("<pose>1 2 0 0 0 0.5</pose>", (1.0, 2.0, 0.5)),
         ("<pose degrees='true'>1 2 0 0 0 90</pose>", (1.0, 2.0, math.pi / 2.0)),
         ("<pose degrees='false'>1 2 0 0 0 0.5</pose>", (1.0, 2.0, 0.5)),
-        ("<pose rotation_format='quat_xyzw'>1 2 0  0 0 0.6 0.8</pose>", (1.0, 2.0, 1.287002)),
+        (
+            "<pose rotation_format='quat_xyzw'>1 2 0  0 0 0.6 0.8</pose>",
+            (1.0, 2.0, 1.287002),
+        ),
         ("<pose frame=''>1 2 0 0 -0 0</pose>", (1.0, 2.0, 0.0)),
         ("<pose/>", (0.0, 0.0, 0.0)),
         ("", (0.0, 0.0, 0.0)),
@@ -134,7 +148,9 @@ def test_a_file_of_models_without_a_world_is_read_too(tmp_path):
 def test_poses_are_read_in_each_of_their_forms(write, pose, place):
     frame = "<frame name='f'><pose degrees='1'>3 0 0 0 0 90</pose></frame>"
     box = "<box><size>1 2 1</size></box>"
-    assert only(write(frame + model(box, pose=pose)))[1] == pytest.approx(place, abs=1e-5)
+    assert only(write(frame + model(box, pose=pose)))[1] == pytest.approx(
+        place, abs=1e-5
+    )
 
 
 def test_a_pose_may_be_relative_to_a_link_of_another_model_or_to_a_joint(write):
@@ -146,19 +162,27 @@ def test_a_pose_may_be_relative_to_a_link_of_another_model_or_to_a_joint(write):
     )
     for frame, y in (("first::arm", 2.0), ("first::elbow", 2.5), ("first", 0.0)):
         pose = f"<pose relative_to='{frame}'>3 0 0 0 0 0</pose>"
-        assert only(write(first + model(DISC, pose=pose)))[1] == pytest.approx((4.0, y, 0.0))
-    attached = "<frame name='f' attached_to='first::arm'><pose>0 1 0 0 0 0</pose></frame>"
+        assert only(write(first + model(DISC, pose=pose)))[1] == pytest.approx(
+            (4.0, y, 0.0)
+        )
+    attached = (
+        "<frame name='f' attached_to='first::arm'><pose>0 1 0 0 0 0</pose></frame>"
+    )
     pose = "<pose relative_to='f'/>"
     assert only(write(first + attached + model(DISC, pose=pose)))[1] == (1.0, 3.0, 0.0)
 
 
 def test_the_height_decides_what_counts(write):
     low = model("<box><size>1 1 0.1</size></box>", "low")
-    table = model("<box><size>2 1 0.1</size></box>", "table", "<pose>0 0 0.7 0 0 0</pose>")
+    table = model(
+        "<box><size>2 1 0.1</size></box>", "table", "<pose>0 0 0.7 0 0 0</pose>"
+    )
     file = write(low + table)
     assert read_sdf(file, 0.04).placed[0][0] == Rectangle(size=(1.0, 1.0))
     assert read_sdf(file, 0.7).placed[0][0] == Rectangle(size=(2.0, 1.0))
-    sentence = "none of its 2 collision geometries stands at a height of 0.2 m; choose another"
+    sentence = (
+        "none of its 2 collision geometries stands at a height of 0.2 m; choose another"
+    )
     assert sentence in refused(file)
 
 
@@ -172,19 +196,39 @@ def test_the_ground_is_nothing_to_run_into(write):
 @pytest.mark.parametrize(
     ("inside", "what"),
     [
-        (model(MESH, "table"), "model 'table' has a mesh model://table/table.dae, which is no"),
-        (model("<heightmap><uri>hill.png</uri></heightmap>"), "model 'm' has a heightmap hill.png"),
+        (
+            model(MESH, "table"),
+            "model 'table' has a mesh model://table/table.dae, which is no",
+        ),
+        (
+            model("<heightmap><uri>hill.png</uri></heightmap>"),
+            "model 'm' has a heightmap hill.png",
+        ),
         (posed(">0 0 0 0.3 0 0</pose>"), "model 'm' has a cylinder that leans"),
-        (model("<ellipsoid><radii>1 2 3</radii></ellipsoid>"), "model 'm' has an ellipsoid"),
+        (
+            model("<ellipsoid><radii>1 2 3</radii></ellipsoid>"),
+            "model 'm' has an ellipsoid",
+        ),
         (f"<model name='a'>{model(MESH, 'b')}</model>", "model 'a::b' has a mesh"),
-        ("<actor name='walker'/>", "model 'walker' has an actor, which moves by a script"),
+        (
+            "<actor name='walker'/>",
+            "model 'walker' has an actor, which moves by a script",
+        ),
         ("<population name='cans'/>", "model 'cans' has a population of models"),
-        ("<include><uri>model://desk</uri></include>", "model 'desk' has 'model://desk', which is"),
-        ("<include><uri>https://fuel.org/1.0/x/models/Desk</uri></include>", "model 'Desk' has"),
+        (
+            "<include><uri>model://desk</uri></include>",
+            "model 'desk' has 'model://desk', which is",
+        ),
+        (
+            "<include><uri>https://fuel.org/1.0/x/models/Desk</uri></include>",
+            "model 'Desk' has",
+        ),
         (model(2 * POINT), "model 'm' has a polyline with holes, which"),
     ],
-)  # fmt: skip
-def test_what_is_no_shape_is_named_in_one_sentence_or_left_out_and_listed(write, inside, what):
+)
+def test_what_is_no_shape_is_named_in_one_sentence_or_left_out_and_listed(
+    write, inside, what
+):
     file = write(inside + model(DISC, "disc"))
     sentence = refused(file)
     assert what in sentence
@@ -195,12 +239,16 @@ def test_what_is_no_shape_is_named_in_one_sentence_or_left_out_and_listed(write,
     assert left_out in sentence
 
 
-def test_a_file_of_which_all_would_be_left_out_is_refused_for_that_and_not_for_the_height(write):
+def test_a_file_of_which_all_would_be_left_out_is_refused_for_that_and_not_for_the_height(
+    write,
+):
     sentence = r"holds nothing but what is no shape .*'table' has a mesh"
     with pytest.raises(ConfigError, match=sentence):
         read_sdf(write(model(MESH, "table")), HEIGHT, skip_unknown=True)
     low = write(model(MESH, "table") + model(DISC, "disc"))
-    with pytest.raises(ConfigError, match="none of its 1 collision geometries stands at a height"):
+    with pytest.raises(
+        ConfigError, match="none of its 1 collision geometries stands at a height"
+    ):
         read_sdf(low, 99.0, skip_unknown=True)
 
 
@@ -209,7 +257,10 @@ def test_one_sentence_tells_all_of_a_model_and_how_many_more_there_are(write):
     more = f"<collision name='d'><geometry>{leg}</geometry></collision></link>"
     pair = model(MESH, "a").replace("</link>", more)
     sentence = refused(write(pair + model(MESH, "b") + model(MESH, "c")))
-    assert "table.dae, a mesh model://table/leg.stl (as 2 more models), which is" in sentence
+    assert (
+        "table.dae, a mesh model://table/leg.stl (as 2 more models), which is"
+        in sentence
+    )
 
 
 def test_a_model_may_be_left_out_by_its_name(write):
@@ -217,63 +268,97 @@ def test_a_model_may_be_left_out_by_its_name(write):
     assert "robot_2" in refused(file, without=("robot_1",))
     assert only(file, without=("robot_*",))[0] == Circle(radius=0.1)
     include = "<include><uri>model://desk</uri></include>"
-    assert only(write(include + model(DISC)), without=("desk",))[0] == Circle(radius=0.1)
+    assert only(write(include + model(DISC)), without=("desk",))[0] == Circle(
+        radius=0.1
+    )
 
 
-CYCLE = "<frame name='a'><pose relative_to='b'/></frame><frame name='b' attached_to='a'/>"
+CYCLE = (
+    "<frame name='a'><pose relative_to='b'/></frame><frame name='b' attached_to='a'/>"
+)
 
 
 @pytest.mark.parametrize(
     ("inside", "sentence"),
     [
-        (posed(" unit='deg'>0 0 0 0 0 0</pose>"), "unknown attribute 'unit' of a <pose>"),
+        (
+            posed(" unit='deg'>0 0 0 0 0 0</pose>"),
+            "unknown attribute 'unit' of a <pose>",
+        ),
         (posed(" degree='true'>0 0 0 0 0 0</pose>"), "did you mean 'degrees'?"),
-        (posed(" degrees='yes'>0 0 0 0 0 0</pose>"), "attribute degrees='yes' of a <pose>"),
+        (
+            posed(" degrees='yes'>0 0 0 0 0 0</pose>"),
+            "attribute degrees='yes' of a <pose>",
+        ),
         (posed(" rotation_format='quat'>0 0 0 0</pose>"), "did you mean 'quat_xyzw'?"),
         (posed(" rotation_format='quat_xyzw'>0 0 0 0 0 0 0</pose>"), "quaternion"),
         (posed(">0 0 0</pose>"), "<pose> must be 6 numbers, not '0 0 0'."),
         (posed(">0 0 x 0 0 0</pose>"), "model 'm': <pose> must be 6 numbers"),
         (posed(">0 0 nan 0 0 0</pose>"), "<pose> must be 6 numbers"),
-        (posed(" relative_to='stag'/>") + "<frame name='stage'/>", "did you mean 'stage'?"),
+        (
+            posed(" relative_to='stag'/>") + "<frame name='stage'/>",
+            "did you mean 'stage'?",
+        ),
         (posed(" relative_to='a'/>") + CYCLE, "relative to itself"),
         (model("<box/>"), "collision 'c': <size> of its <box> is missing; add it."),
         (model("<box><size>1 1</size></box>"), "must be 3 numbers, not '1 1'"),
         (model("<sphere><radius>-1</radius></sphere>"), "must be above 0 and at most"),
         (model(POINT), "needs three different points"),
-        (model(FINE), "collision 'c': <polyline> has 20000 points, a shape at most 16384; coarsen"),
-        (model(FAR), "collision 'c': its shape at a height of 0.2 m is none of a world (Input"),
+        (
+            model(FINE),
+            "collision 'c': <polyline> has 20000 points, a shape at most 16384; coarsen",
+        ),
+        (
+            model(FAR),
+            "collision 'c': its shape at a height of 0.2 m is none of a world (Input",
+        ),
         ("", "none of its 0 collision geometries"),
         ("</world><world name='v'>", "holds 2 worlds; give a file with one."),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_file_is_refused_with_what_to_mend(write, inside, sentence):
     assert sentence in refused(write(inside))
 
 
 def test_a_world_of_too_many_bodies_is_refused_by_its_own_name(write):
     bodies = "".join(model(DISC, f"m{k}") for k in range(sdf.MOST_OBSTACLES + 1))
-    assert "holds more than 10000 bodies at a height of 0.2 m; leave some out" in refused(
-        write(bodies)
+    assert (
+        "holds more than 10000 bodies at a height of 0.2 m; leave some out"
+        in refused(write(bodies))
     )
 
 
 @pytest.mark.parametrize("version", ["1.3", "2.0", "", "x"])
 def test_another_version_of_sdf_is_refused(write, version):
-    assert f"SDF version {version!r} is not read, 1.4 to 1.12 are" in refused(write("", version))
+    assert f"SDF version {version!r} is not read, 1.4 to 1.12 are" in refused(
+        write("", version)
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("<sdf version='1.6'>\n<a></b></sdf>", ", line 2, column 6: is no XML: mismatched tag"),
+        (
+            "<sdf version='1.6'>\n<a></b></sdf>",
+            ", line 2, column 6: is no XML: mismatched tag",
+        ),
         ("", ", line 1, column 1: is no XML: no element found"),
         ("<robot name='r'/>", ": is no SDF but <robot>"),
         ("<sdf version='1.6'/>", ": holds 0 worlds"),
-        ("<?xml version='1.0' encoding='klingon'?><sdf/>", "is no XML: unknown encoding"),
-        ("<!DOCTYPE s [<!ENTITY c 'dd'>]>\n<sdf>&c;</sdf>", ", line 1: declares a document type"),
-        ("<!DOCTYPE s SYSTEM '/etc/passwd'><sdf/>", ", line 1: declares a document type"),
+        (
+            "<?xml version='1.0' encoding='klingon'?><sdf/>",
+            "is no XML: unknown encoding",
+        ),
+        (
+            "<!DOCTYPE s [<!ENTITY c 'dd'>]>\n<sdf>&c;</sdf>",
+            ", line 1: declares a document type",
+        ),
+        (
+            "<!DOCTYPE s SYSTEM '/etc/passwd'><sdf/>",
+            ", line 1: declares a document type",
+        ),
     ],
-)  # fmt: skip
+)
 def test_broken_and_malicious_xml_is_refused_with_its_line(tmp_path, text, sentence):
     file = tmp_path / "my.world"
     file.write_text(text)
@@ -289,7 +374,9 @@ def test_a_file_that_is_missing_a_folder_or_too_large_is_refused(tmp_path, monke
     assert ": is larger than 0 MB" in refused(tmp_path / "my.world")
 
 
-def test_models_that_include_themselves_or_without_end_are_refused(write, tmp_path, monkeypatch):
+def test_models_that_include_themselves_or_without_end_are_refused(
+    write, tmp_path, monkeypatch
+):
     include = "<include><uri>loop.sdf</uri></include>"
     (tmp_path / "loop.sdf").write_text(
         f"<sdf version='1.7'><model name='a'>{include}{include}</model></sdf>"

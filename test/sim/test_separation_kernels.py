@@ -10,7 +10,13 @@ from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.collision_kernels import on_wall
-from nics_drl_bridge.sim.separation_kernels import PLAN, Traffic, clearance, map_distance, restrain
+from nics_drl_bridge.sim.separation_kernels import (
+    PLAN,
+    Traffic,
+    clearance,
+    map_distance,
+    restrain,
+)
 from nics_drl_bridge.sim.state import NO_FIELD
 
 HALF = np.array([1.5, 1.0])
@@ -52,7 +58,9 @@ def test_whatever_all_of_them_wish_nothing_touches_at_any_time_of_the_period(ben
             assert np.linalg.norm(moved[k]) <= np.linalg.norm(wishes[k]) + TOUCH
         for share in (0.3, 0.7, 1.0):
             now = bodies[:, :2] + share * moved
-            away = np.linalg.norm(now[:, None] - now, axis=-1) - (radii[:, None] + radii)
+            away = np.linalg.norm(now[:, None] - now, axis=-1) - (
+                radii[:, None] + radii
+            )
             assert away[:5, :5][~np.eye(5, dtype=bool)].min() > -TOUCH
 
 
@@ -114,7 +122,9 @@ def test_nobody_jumps_through_a_thin_wall_of_a_map(bends, way):
     _, bodies = crowd(0, count=1, robots=0)
     bodies[0, :2], bodies[0, 5] = 0.0, 0.2
     thin = map_field(GridMap(cells, 0.05, (-1.5, -1.5, 0.0)))
-    around = traffic(bodies, [at.WANDER], walls=WALLS[:0], half=np.full(2, 5.0), grid=thin)
+    around = traffic(
+        bodies, [at.WANDER], walls=WALLS[:0], half=np.full(2, 5.0), grid=thin
+    )
     for _ in range(20):
         moved = restrain(way, 0.0, 0, around, bends)
         bodies[0, :2] += moved
@@ -137,7 +147,11 @@ def test_clearance_is_the_distance_to_the_nearest_thing_and_points_at_it():
         x, y = rng.uniform(-1.0, 1.0, 2) * HALF
         least, nx, ny = clearance(x, y, 3, traffic(bodies, [at.WANDER] * 5))
         walls = [LineString(wall.reshape(2, 2)) for wall in WALLS]
-        discs = [Point(*body[:2]).buffer(body[5], 256) for k, body in enumerate(bodies) if k != 3]
+        discs = [
+            Point(*body[:2]).buffer(body[5], 256)
+            for k, body in enumerate(bodies)
+            if k != 3
+        ]
         spot = Point(x, y)
         if any(disc.contains(spot) for disc in discs):
             continue
@@ -158,7 +172,9 @@ def test_the_distance_to_a_map_is_that_of_its_field_in_any_frame():
     cells[10:12, 20:22] = 100
     grid = GridMap(cells, 0.1, (-1.0, 2.0, 0.7))
     arrays = map_field(grid)
-    centres = np.stack(np.meshgrid(np.arange(30), np.arange(40), indexing="ij"), axis=-1)
+    centres = np.stack(
+        np.meshgrid(np.arange(30), np.arange(40), indexing="ij"), axis=-1
+    )
     for cell, (x, y) in zip(
         centres.reshape(-1, 2), grid.cell_to_world(centres).reshape(-1, 2), strict=True
     ):

@@ -15,7 +15,12 @@ from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim.allocation import SLICES
-from nics_drl_bridge.sim.simulator import EVERY, CommandBox, FastSimulator, OutsideValidityWarning
+from nics_drl_bridge.sim.simulator import (
+    EVERY,
+    CommandBox,
+    FastSimulator,
+    OutsideValidityWarning,
+)
 from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import load_world
 
@@ -35,7 +40,9 @@ def drive(simulator, seeds, commands, starts=None):
     history = []
     for command in commands:
         simulator.step(command)
-        history.append({name: array.copy() for name, array in simulator.data._asdict().items()})
+        history.append(
+            {name: array.copy() for name, array in simulator.data._asdict().items()}
+        )
     return history
 
 
@@ -59,7 +66,8 @@ def test_the_same_seeds_give_the_same_bits_in_another_simulator(renderer):
     model, world = noisy_model(), field(5.0, count=4)
     commands = random_commands(model, 15, 3, 2)
     one, other = (
-        drive(FastSimulator(model, world, 3, 2, renderer), [4, 5, 6], commands) for _ in range(2)
+        drive(FastSimulator(model, world, 3, 2, renderer), [4, 5, 6], commands)
+        for _ in range(2)
     )
     assert_same(one, other, ALL)
     again = drive(FastSimulator(model, world, 3, 2, renderer), [7, 5, 6], commands)
@@ -94,24 +102,32 @@ def test_beginning_one_world_anew_leaves_the_others_alone():
             simulator.reset([9], worlds=[1])
         simulator.step(command)
     for name in ALL:
-        assert np.array_equal(getattr(simulator.data, name)[[0, 2]], plain[-1][name][[0, 2]])
+        assert np.array_equal(
+            getattr(simulator.data, name)[[0, 2]], plain[-1][name][[0, 2]]
+        )
     assert simulator.data.steps.tolist() == [10, 5, 10]
     fresh = drive(FastSimulator(model, world), [9], commands[5:, 1:2])
     for name in ALL:
-        assert np.array_equal(getattr(simulator.data, name)[1], fresh[-1][name][0]), name
+        assert np.array_equal(getattr(simulator.data, name)[1], fresh[-1][name][0]), (
+            name
+        )
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.01, 0.03, 0.09, 0.1, 0.11, 0.25, 0.4])
 def test_a_command_takes_effect_after_exactly_its_latency(latency):
     commands = np.zeros((12, 1, 1, 3))
     commands[:, 0, 0, 0] = np.random.default_rng(1).uniform(-1.0, 1.0, 12)
-    history = drive(FastSimulator(direct_model(latency), field()), [0], commands, ORIGIN)
+    history = drive(
+        FastSimulator(direct_model(latency), field()), [0], commands, ORIGIN
+    )
     # A command of period k acts during [k T + latency, (k + 1) T + latency).
     for period, data in enumerate(history):
         now = (period + 1) * PERIOD
         acted = np.clip(now - latency - np.arange(12) * PERIOD, 0.0, PERIOD)
         expected = acted @ commands[:, 0, 0, 0]
-        assert data["pose"][0, 0] == pytest.approx([expected, 0.0, 0.0], abs=1e-12), period
+        assert data["pose"][0, 0] == pytest.approx([expected, 0.0, 0.0], abs=1e-12), (
+            period
+        )
         newest = np.floor((now - 0.01 - latency) / PERIOD + 1e-9)
         speed = commands[int(newest), 0, 0, 0] if newest >= 0 else 0.0
         assert data["twist"][0, 0, 0] == pytest.approx(speed)
@@ -135,14 +151,18 @@ def test_robots_move_as_the_readable_model_does():
         for _ in range(model.timing[1]):
             pose, state = model.kinematics.step(pose, state, command[0, 0])
         assert data["state"][0, 0] == pytest.approx(state, abs=1e-10)
-        assert geometry.between(pose, data["pose"][0, 0]) == pytest.approx(np.zeros(3), abs=1e-10)
+        assert geometry.between(pose, data["pose"][0, 0]) == pytest.approx(
+            np.zeros(3), abs=1e-10
+        )
 
 
 def test_a_robot_stops_at_a_wall_and_is_marked():
     history = drive(
-        FastSimulator(direct_model(), field(2.0)), [0], np.tile([1.0, 0.0, 0.0], (15, 1, 1, 1)),
+        FastSimulator(direct_model(), field(2.0)),
+        [0],
+        np.tile([1.0, 0.0, 0.0], (15, 1, 1, 1)),
         ORIGIN,
-    )  # fmt: skip
+    )
     x = np.array([data["pose"][0, 0, 0] for data in history])
     collided = np.array([data["collided"][0, 0] for data in history])
     assert x[:7] == pytest.approx(0.1 * np.arange(1, 8))
@@ -163,14 +183,19 @@ def test_no_robot_ever_enters_anything():
         for n, scene in enumerate(scenes):
             away = np.linalg.norm(pose[n, :, None, :2] - scene.bodies[:, :2], axis=-1)
             assert (away >= FOOTPRINT + RADIUS - OVERLAP).all()
-            others = np.linalg.norm(pose[n, :, None, :2] - pose[n, None, :, :2], axis=-1)
+            others = np.linalg.norm(
+                pose[n, :, None, :2] - pose[n, None, :, :2], axis=-1
+            )
             assert (others + np.eye(3) >= 2.0 * FOOTPRINT - OVERLAP).all()
     assert 0 < simulator.data.collided.sum() < 96
 
 
 def test_a_robot_that_touched_nothing_is_not_marked():
     history = drive(
-        FastSimulator(direct_model(), field()), [0], np.tile([0.0, 0.0, 2.0], (30, 1, 1, 1)), ORIGIN
+        FastSimulator(direct_model(), field()),
+        [0],
+        np.tile([0.0, 0.0, 2.0], (30, 1, 1, 1)),
+        ORIGIN,
     )
     assert not history[-1]["collided"].any()
 
@@ -195,7 +220,9 @@ def test_a_skewed_scan_is_put_together_from_where_the_robot_was(skew, renderer):
     model, world = direct_model(sensor=spec), field(6.0, 4)
     simulator = FastSimulator(model, world, 2, 2, renderer)
     simulator.reset([3, 4])
-    command = np.array([[[1.0, 0.2, 1.5], [-0.5, 0.0, -1.0]], [[0.3, 0.0, 2.0], [0.5, 0.5, 0.0]]])
+    command = np.array(
+        [[[1.0, 0.2, 1.5], [-0.5, 0.0, -1.0]], [[0.3, 0.0, 2.0], [0.5, 0.5, 0.0]]]
+    )
     for _ in range(3):
         simulator.step(command)
     data = simulator.data
@@ -204,7 +231,9 @@ def test_a_skewed_scan_is_put_together_from_where_the_robot_was(skew, renderer):
         for m in range(2):
             others = data.bodies[n].copy()
             others[-2 + m, 5] = 0.0  # it does not see itself
-            poses = slice_poses(data.pose[n, m], command[n, m], spec.sweep_time, SLICES, skew)
+            poses = slice_poses(
+                data.pose[n, m], command[n, m], spec.sweep_time, SLICES, skew
+            )
             expected = scan_skewed(
                 lambda p, b=others: scanner.scan(p, b, world.all_walls())[0], poses
             )
@@ -216,17 +245,24 @@ def test_a_skewed_scan_is_put_together_from_where_the_robot_was(skew, renderer):
 def test_robots_that_touch_are_both_marked():
     starts = np.array([[[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]]])
     commands = np.tile([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], (6, 1, 1, 1))
-    history = drive(FastSimulator(direct_model(), field(8.0), 1, 2), [0], commands, starts)
+    history = drive(
+        FastSimulator(direct_model(), field(8.0), 1, 2), [0], commands, starts
+    )
     assert history[-1]["pose"][0, 0, 0] == pytest.approx(0.2, abs=OVERLAP)
     assert history[-1]["collided"][0].tolist() == [1, 1]
 
 
 def test_a_robot_that_touched_a_wall_may_leave_it_again():
-    there, back = np.tile([1.0, 0.0, 0.0], (10, 1, 1, 1)), np.tile([-1.0, 0.0, 0.0], (5, 1, 1, 1))
+    there, back = (
+        np.tile([1.0, 0.0, 0.0], (10, 1, 1, 1)),
+        np.tile([-1.0, 0.0, 0.0], (5, 1, 1, 1)),
+    )
     simulator = FastSimulator(direct_model(), field(2.0))
     history = drive(simulator, [0], np.concatenate([there, back]), ORIGIN)
     assert history[9]["collided"].all()
-    assert history[-1]["pose"][0, 0, 0] == pytest.approx(history[9]["pose"][0, 0, 0] - 0.5)
+    assert history[-1]["pose"][0, 0, 0] == pytest.approx(
+        history[9]["pose"][0, 0, 0] - 0.5
+    )
 
 
 def test_without_noise_odometry_is_the_truth():
@@ -250,10 +286,14 @@ def test_odometry_drifts_with_the_configured_deviation():
     assert np.abs(twists.mean(axis=(0, 1))).max() < 0.001
     final = history[-1]["odom"][:, 0]
     walk = PERIOD * np.sqrt(steps)
-    assert final.std(axis=0) == pytest.approx(np.array([linear, linear, angular]) * walk, rel=0.05)
+    assert final.std(axis=0) == pytest.approx(
+        np.array([linear, linear, angular]) * walk, rel=0.05
+    )
     assert not history[-1]["pose"].any()
     for k in range(3):  # each period draws anew, independent of the one before
-        correlation = np.corrcoef(twists[:-1, :, k].ravel(), twists[1:, :, k].ravel())[0, 1]
+        correlation = np.corrcoef(twists[:-1, :, k].ravel(), twists[1:, :, k].ravel())[
+            0, 1
+        ]
         assert abs(correlation) < 0.02
 
 
@@ -303,9 +343,15 @@ def test_more_copies_or_robots_than_fit_are_refused_before_any_is_made(worlds, r
 def model():
     spec = load_robot("ackermann")
     return TaylorModel(
-        spec.variable_names, spec.dof_names, spec.dof_units, np.eye(4, dtype=np.int64),
-        np.zeros((5, 4)), 0.01, np.array([0.0, -0.4, 0.1, -0.4]), np.array([1.0, -0.4, 0.8, -0.4]),
-    )  # fmt: skip
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        np.eye(4, dtype=np.int64),
+        np.zeros((5, 4)),
+        0.01,
+        np.array([0.0, -0.4, 0.1, -0.4]),
+        np.array([1.0, -0.4, 0.8, -0.4]),
+    )
 
 
 def box(model):
@@ -316,7 +362,9 @@ def test_a_command_outside_the_drive_warns_once_per_episode(model):
     checked = box(model)
     for _ in range(2):
         checked.begin()
-        with pytest.warns(OutsideValidityWarning, match=r"speed_command is 1, .* 0.1 to 0.8"):
+        with pytest.warns(
+            OutsideValidityWarning, match=r"speed_command is 1, .* 0.1 to 0.8"
+        ):
             checked.check(np.array([[[1.0, -0.4]]]))
         with warnings.catch_warnings():
             warnings.simplefilter("error")

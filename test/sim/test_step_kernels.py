@@ -36,7 +36,9 @@ def test_robots_side_by_side_keep_latencies_of_their_own():
     mixed.data.delay[:, 0] = latencies
     commands = random_commands(len(latencies), 12)
     mixed.reset(range(len(latencies)))
-    alone = [FastSimulator(direct_model(0.01 * latency), field()) for latency in latencies]
+    alone = [
+        FastSimulator(direct_model(0.01 * latency), field()) for latency in latencies
+    ]
     for n, simulator in enumerate(alone):
         simulator.reset([n])
     for command in commands:
@@ -50,7 +52,10 @@ def test_robots_side_by_side_keep_latencies_of_their_own():
 
 
 def test_a_robot_near_a_wall_keeps_its_latency_as_one_in_the_open():
-    near, far = (FastSimulator(direct_model(), field(size), 3, longest_delay=15) for size in (2, 9))
+    near, far = (
+        FastSimulator(direct_model(), field(size), 3, longest_delay=15)
+        for size in (2, 9)
+    )
     for simulator in (near, far):
         simulator.data.delay[:, 0] = [0, 4, 13]
         simulator.reset(range(3), starts=np.zeros((3, 1, 3)))
@@ -106,7 +111,9 @@ def test_what_a_robot_is_told_is_of_its_age(age):
         high = min(low + 1, step)
         for m in range(2):
             a, b = poses[low][m], poses[high][m]
-            expected = a + (told - low) * np.array([*(b - a)[:2], geometry.wrap_angle(b[2] - a[2])])
+            expected = a + (told - low) * np.array(
+                [*(b - a)[:2], geometry.wrap_angle(b[2] - a[2])]
+            )
             off = late.data.odom[0, m] - expected
             assert np.abs([*off[:2], geometry.wrap_angle(off[2])]).max() < 1e-9
             speed = twists[low][m] + (told - low) * (twists[high][m] - twists[low][m])
@@ -119,7 +126,9 @@ def test_what_a_robot_is_told_is_of_its_age(age):
         for m in range(2):
             others = bodies.copy()
             others[0, 4 + m, 5] = 0.0
-            seen = now._scanner.scan(bodies[0, 4 + m, :3], others, now.world.all_walls())[0]
+            seen = now._scanner.scan(
+                bodies[0, 4 + m, :3], others, now.world.all_walls()
+            )[0]
             both = np.isfinite(seen) & np.isfinite(late.data.ranges[0, m])
             assert both.sum() > 20
             off = np.abs(late.data.ranges[0, m][both] - seen[both])
@@ -174,7 +183,11 @@ def test_a_moving_obstacle_is_where_its_velocity_takes_it_near_and_far_from_a_ro
     simulator = one_obstacle(3)
     simulator.data.bodies[1:, 0, :2] = [[3.0, 3.0], [-0.6, 0.0]]
     before = simulator.data.bodies[:, 0, :3].copy()
-    simulator.data.velocity[:, 0] = [[0.1, -0.2, 0.5], [0.3, 0.3, -1.0], [-0.01, 0.5, 2.0]]
+    simulator.data.velocity[:, 0] = [
+        [0.1, -0.2, 0.5],
+        [0.3, 0.3, -1.0],
+        [-0.01, 0.5, 2.0],
+    ]
     still(simulator, 7)
     after = simulator.data.bodies[:, 0]
     expected = before + 7 * PERIOD * simulator.data.velocity[:, 0]
@@ -201,7 +214,9 @@ def test_an_obstacle_that_would_pass_within_a_period_stops_at_the_robot():
     assert simulator.data.collided[0, 0] == 1
     stopped = FOOTPRINT + RADIUS
     assert simulator.data.bodies[0, 0, 1] == pytest.approx(stopped, abs=OVERLAP)
-    assert simulator.data.velocity[0, 0, 1] == pytest.approx((stopped - 1.0) / PERIOD, abs=1e-4)
+    assert simulator.data.velocity[0, 0, 1] == pytest.approx(
+        (stopped - 1.0) / PERIOD, abs=1e-4
+    )
 
 
 def test_a_late_scan_shows_a_moving_obstacle_where_it_was():
@@ -227,7 +242,9 @@ def test_a_long_robot_passes_a_gap_lengthwise_and_not_across():
     walls = [(0.6, 0.15, 0.6, 2.0), (0.6, -2.0, 0.6, -0.15)]
     world = field(8.0, walls=walls)
     simulator = FastSimulator(box_model(BOX), world, 2)
-    simulator.reset([0, 0], starts=np.array([[[0.0, 0.0, 0.0]], [[0.0, 0.0, np.pi / 2.0]]]))
+    simulator.reset(
+        [0, 0], starts=np.array([[[0.0, 0.0, 0.0]], [[0.0, 0.0, np.pi / 2.0]]])
+    )
     for _ in range(15):
         simulator.step([[[1.0, 0.0, 0.0]], [[0.0, -1.0, 0.0]]])
     assert simulator.data.pose[0, 0, 0] == pytest.approx(1.5)
@@ -306,7 +323,9 @@ STEPS = 120
 
 
 def model():
-    return direct_model(latency=0.03, odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01))
+    return direct_model(
+        latency=0.03, odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01)
+    )
 
 
 def vary(simulator, seed=0):
@@ -325,9 +344,14 @@ def vary(simulator, seed=0):
 def digests(worlds, threads=1, robots=2, steps=STEPS, parts=False):
     """SHA-256 of all that each world came to in a drive."""
     simulator = FastSimulator(
-        model(), field(4.0, count=3), worlds, robots, threads=threads, longest_delay=25,
+        model(),
+        field(4.0, count=3),
+        worlds,
+        robots,
+        threads=threads,
+        longest_delay=25,
         longest_age=25,
-    )  # fmt: skip
+    )
     vary(simulator)
     simulator.reset(range(worlds))
     found = [hashlib.sha256() for _ in range(worlds)]
@@ -382,17 +406,23 @@ def drive_among(world, worlds=3, threads=1, steps=200):
             scenes = simulator.reset(np.arange(worlds) + t)
             assert np.array_equal(scenes.bodies, simulator.obstacles)
             drawn = simulator.scenes(np.arange(worlds) + t).bodies
-            assert np.array_equal(np.sort(scenes.bodies, axis=1), np.sort(drawn, axis=1))
+            assert np.array_equal(
+                np.sort(scenes.bodies, axis=1), np.sort(drawn, axis=1)
+            )
             command = rng.uniform(-1.0, 1.0, (worlds, 2, 3))
         simulator.step(command)
         touched += int(simulator.data.collided.sum())
-        in_order = np.sort(simulator.data.bodies, axis=1)  # the order is the simulator's own
+        in_order = np.sort(
+            simulator.data.bodies, axis=1
+        )  # the order is the simulator's own
         found += [array.copy() for array in simulator.data._replace(bodies=in_order)]
     assert touched > 0
     return found
 
 
-def test_obstacles_in_cells_are_seen_and_touched_like_those_that_are_all_looked_at(monkeypatch):
+def test_obstacles_in_cells_are_seen_and_touched_like_those_that_are_all_looked_at(
+    monkeypatch,
+):
     world, made = field(12.0, count=40), []
     monkeypatch.setattr(
         sizes, "body_cells", lambda n, *rest: made.append(n) or body_cells(n, *rest)
@@ -412,7 +442,9 @@ def test_the_parts_are_all_worlds_in_order():
     for worlds, threads in ((1, 1), (5, 2), (7, 3), (2, 8)):
         parts = FastSimulator(model(), field(), worlds, threads=threads).parts
         assert len(parts) == min(worlds, threads)
-        assert [n for part in parts for n in range(part.start, part.stop)] == list(range(worlds))
+        assert [n for part in parts for n in range(part.start, part.stop)] == list(
+            range(worlds)
+        )
 
 
 def test_what_runs_in_parts_comes_back_in_their_order():
@@ -428,7 +460,9 @@ def test_commands_of_another_shape_are_refused():
         simulator.step_part(simulator.parts[0], np.zeros((2, 1, 3)))
 
 
-@pytest.mark.parametrize("changes", [{"threads": 0}, {"longest_delay": 2}, {"longest_age": -1}])
+@pytest.mark.parametrize(
+    "changes", [{"threads": 0}, {"longest_delay": 2}, {"longest_age": -1}]
+)
 def test_a_simulator_without_threads_or_room_is_refused(changes):
     with pytest.raises(ConfigError, match="at least 1 world, robot and thread"):
         FastSimulator(model(), field(), 3, **changes)

@@ -25,7 +25,9 @@ def walls_of(world):
 def test_the_field_is_closed_by_its_walls():
     walls = field(4.0, walls=[[0.0, 0.0, 1.0, 0.0]]).all_walls()
     assert walls.shape == (5, 4)
-    ring = shapely.polygonize([shapely.linestrings(wall.reshape(2, 2)) for wall in walls[:4]])
+    ring = shapely.polygonize(
+        [shapely.linestrings(wall.reshape(2, 2)) for wall in walls[:4]]
+    )
     assert shapely.area(ring) == pytest.approx(16.0)
 
 
@@ -45,7 +47,8 @@ def test_a_field_of_bounds_has_no_walls_and_lies_where_they_say():
 def test_the_fingerprint_of_a_world_without_bounds_is_that_of_worlds_made_before():
     assert load_world("arena").fingerprint == "arena-00ae64c9"
     fields = [
-        World(name="open", bounds=(0.0, 0.0, 6.0, y), goal_distance=(1.0, 2.0)) for y in (6.0, 7.0)
+        World(name="open", bounds=(0.0, 0.0, 6.0, y), goal_distance=(1.0, 2.0))
+        for y in (6.0, 7.0)
     ]
     assert fields[0].fingerprint != fields[1].fingerprint
 
@@ -56,7 +59,9 @@ def test_an_obstacle_beyond_the_bounds_is_refused(tmp_path):
         "name: open\nbounds: [2.0, 2.0, 5.0, 5.0]\ngoal_distance: [1.0, 2.0]\n"
         "obstacles: [{shapes: [{kind: circle, radius: 0.1}], at: [[1.0, 3.0, 0.0]]}]\n"
     )
-    with pytest.raises(ConfigError, match=r"'obstacles.0.at.0': .* is outside the world"):
+    with pytest.raises(
+        ConfigError, match=r"'obstacles.0.at.0': .* is outside the world"
+    ):
         load_world(file)
 
 
@@ -72,7 +77,12 @@ def test_wall_distance_is_that_of_plane_geometry():
 
 def test_worlds_of_equal_content_share_a_fingerprint_and_others_do_not():
     assert field().fingerprint == field().fingerprint
-    others = [field(5.0), field(count=1), field(walls=[[0.0, 0.0, 1.0, 0.0]]), load_world("room")]
+    others = [
+        field(5.0),
+        field(count=1),
+        field(walls=[[0.0, 0.0, 1.0, 0.0]]),
+        load_world("room"),
+    ]
     assert len({world.fingerprint for world in (field(), *others)}) == 5
 
 
@@ -92,7 +102,9 @@ def test_a_map_is_looked_for_from_the_folder_of_the_world_file(own_world):
     assert np.array_equal(load_world(str(own_world)).grid.cells, load_map("room").cells)
 
 
-def test_the_fingerprint_changes_with_the_content_of_the_map_but_not_with_its_path(own_world):
+def test_the_fingerprint_changes_with_the_content_of_the_map_but_not_with_its_path(
+    own_world,
+):
     before = load_world(str(own_world)).fingerprint
     named = World(name="room", map="room", goal_distance=(1.0, 2.0))
     assert before == named.fingerprint
@@ -104,7 +116,9 @@ def test_the_fingerprint_changes_with_the_content_of_the_map_but_not_with_its_pa
 
 
 def test_a_missing_map_is_refused_when_the_world_is_loaded(own_world):
-    own_world.write_text("name: room\nmap: maps/rooom.yaml\ngoal_distance: [1.0, 2.0]\n")
+    own_world.write_text(
+        "name: room\nmap: maps/rooom.yaml\ngoal_distance: [1.0, 2.0]\n"
+    )
     with pytest.raises(ConfigError, match=r"rooom.yaml: no such file"):
         load_world(str(own_world))
     own_world.write_text("name: room\nmap: rom\ngoal_distance: [1.0, 2.0]\n")
@@ -124,27 +138,64 @@ def test_an_unknown_key_is_named_with_the_file_and_the_nearest_key(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"size": [0.0, 3.0]}, "key 'size.0': input should be greater than or equal to 0.01"),
+        (
+            {"size": [0.0, 3.0]},
+            "key 'size.0': input should be greater than or equal to 0.01",
+        ),
         ({"size": None}, "needs a `size`, `bounds`, or a `map`"),
-        ({"bounds": [0.0, 0.0, 1.0, 1.0]}, "either a `size` and walls, or `bounds` and none"),
-        ({"size": None, "bounds": [1.0, 0.0, 0.0, 1.0]}, "bounds must be [least x, least y"),
-        ({"size": None, "bounds": [0.0, 0.0, 1.0, 2e4]}, "bounds must be [least x, least y"),
-        ({"size": None, "bounds": [0.0, 0.0, 1.0]}, "'bounds': number of entries must be more"),
+        (
+            {"bounds": [0.0, 0.0, 1.0, 1.0]},
+            "either a `size` and walls, or `bounds` and none",
+        ),
+        (
+            {"size": None, "bounds": [1.0, 0.0, 0.0, 1.0]},
+            "bounds must be [least x, least y",
+        ),
+        (
+            {"size": None, "bounds": [0.0, 0.0, 1.0, 2e4]},
+            "bounds must be [least x, least y",
+        ),
+        (
+            {"size": None, "bounds": [0.0, 0.0, 1.0]},
+            "'bounds': number of entries must be more",
+        ),
         ({"goal_distance": [3.0, 1.0]}, "goal_distance must be"),
-        ({"obstacles": [circles(1, (0.0,))]}, "key 'obstacles.0.shapes.0.circle.radius'"),
+        (
+            {"obstacles": [circles(1, (0.0,))]},
+            "key 'obstacles.0.shapes.0.circle.radius'",
+        ),
         ({"obstacles": [circles(1, ())]}, "key 'obstacles.0.shapes'"),
-        ({"obstacles": [circles(-1)]}, "count must be a whole number, or [least, greatest]"),
-        ({"obstacles": [circles([3, 1])]}, "count must be a whole number, or [least, greatest]"),
-        ({"obstacles": [circles("many")]}, "key 'obstacles.0.count': count must be a whole number"),
+        (
+            {"obstacles": [circles(-1)]},
+            "count must be a whole number, or [least, greatest]",
+        ),
+        (
+            {"obstacles": [circles([3, 1])]},
+            "count must be a whole number, or [least, greatest]",
+        ),
+        (
+            {"obstacles": [circles("many")]},
+            "key 'obstacles.0.count': count must be a whole number",
+        ),
         ({"obstacles": [circles(9_000), circles(9_000)]}, "together may have 10000"),
-        ({"obstacles": [circles(1) | {"at": [[0.0, 0.0, 0.0]]}]}, "either `count` or `at`"),
+        (
+            {"obstacles": [circles(1) | {"at": [[0.0, 0.0, 0.0]]}]},
+            "either `count` or `at`",
+        ),
         ({"obstacles": [{"shapes": [CIRCLE]}]}, "either `count` or `at`"),
         ({"obstacles": [circles(1) | {"gab": 0.1}]}, "did you mean 'gap'"),
         (
-            {"obstacles": [{"shapes": [{"kind": "rectangle", "sise": [1, 1]}], "count": 1}]},
+            {
+                "obstacles": [
+                    {"shapes": [{"kind": "rectangle", "sise": [1, 1]}], "count": 1}
+                ]
+            },
             "did you mean 'size'",
         ),
-        ({"obstacles": [circles(1) | {"motion": {"kind": "fly"}}]}, "key 'obstacles.0.motion'"),
+        (
+            {"obstacles": [circles(1) | {"motion": {"kind": "fly"}}]},
+            "key 'obstacles.0.motion'",
+        ),
         ({"walls": [[0.0, 1.0]]}, "key 'walls.0"),
         ({"starts": {}}, "either `regions` or `at`"),
         ({"goals": {"at": [[0.0, 0.0, 0.0]]}}, "key 'goals.at.0"),
@@ -168,14 +219,22 @@ def patrolled(*waypoints):
 @pytest.mark.parametrize(
     ("group", "sentence"),
     [
-        ({"shapes": [CIRCLE], "at": [[0, 0, 0], [9, 0, 0]]}, "'obstacles.0.at.1': [9.0, 0.0, 0.0]"),
-        (patrolled([0, 0], [9, 0]), "'obstacles.0.motion.waypoints.1': an obstacle of radius 0.2"),
+        (
+            {"shapes": [CIRCLE], "at": [[0, 0, 0], [9, 0, 0]]},
+            "'obstacles.0.at.1': [9.0, 0.0, 0.0]",
+        ),
+        (
+            patrolled([0, 0], [9, 0]),
+            "'obstacles.0.motion.waypoints.1': an obstacle of radius 0.2",
+        ),
         (patrolled([-1.9, 0], [0, 0]), "'obstacles.0.motion.waypoints.0'"),
         (patrolled([0, 0], [0.1, 1]), "'obstacles.0.motion.waypoints.1'"),
     ],
     ids=["at", "outside", "at a side", "at a wall"],
 )
-def test_a_place_where_an_obstacle_cant_be_is_refused_by_name_at_load(tmp_path, group, sentence):
+def test_a_place_where_an_obstacle_cant_be_is_refused_by_name_at_load(
+    tmp_path, group, sentence
+):
     file = tmp_path / "own.yaml"
     wall = [0.0, 0.5, 0.0, 1.5]
     about = {"name": "own", "size": [4, 4], "walls": [wall], "goal_distance": [1, 2]}
@@ -199,8 +258,15 @@ def test_a_waypoint_within_the_solid_of_a_map_is_refused(own_world):
 
 def test_what_concerns_several_keys_is_said_without_the_whole_file():
     with pytest.raises(ConfigError) as caught:
-        validate(field().model_dump(mode="json") | {"goal_distance": [3, 1]}, World, "world.yaml")
-    assert str(caught.value) == "world.yaml: goal_distance must be [least, greatest] in metres."
+        validate(
+            field().model_dump(mode="json") | {"goal_distance": [3, 1]},
+            World,
+            "world.yaml",
+        )
+    assert (
+        str(caught.value)
+        == "world.yaml: goal_distance must be [least, greatest] in metres."
+    )
 
 
 def world_with(**changes):
@@ -226,11 +292,23 @@ def copies(**keys):
         ({"clearance": 1e300}, "clearance"),
         ({"goal_distance": [1.0, 1e308]}, "goal_distance.1"),
         ({"starts": {"regions": [[1e300] * 4]}}, "starts.regions.0.0"),
-        ({"starts": {"at": [[1.0, 1.0, 90]]}}, "starts.at.0.2': must be in radians, within 2 pi"),
-        ({"obstacles": copies(at=[[1, 1, -90]])}, "obstacles.0.at.0.2': must be in radians"),
+        (
+            {"starts": {"at": [[1.0, 1.0, 90]]}},
+            "starts.at.0.2': must be in radians, within 2 pi",
+        ),
+        (
+            {"obstacles": copies(at=[[1, 1, -90]])},
+            "obstacles.0.at.0.2': must be in radians",
+        ),
         ({"goals": {"at": [[0.0, 0.0]] * 20_000}}, "goals.at"),
-        ({"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e308}]}]}, "radius"),
-        ({"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e-320}]}]}, "radius"),
+        (
+            {"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e308}]}]},
+            "radius",
+        ),
+        (
+            {"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e-320}]}]},
+            "radius",
+        ),
         ({"obstacles": [{"count": 1, "shapes": [CIRCLE] * 2000}]}, "shapes"),
     ],
 )

@@ -15,7 +15,9 @@ from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.sim.world_set import WorldSet, load_worlds
 
 MODEL = direct_model(odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01))
-MIXED = WorldSet("mixed", tuple(load_world(n) for n in ("crowd", "room", "doorway", "circles")))
+MIXED = WorldSet(
+    "mixed", tuple(load_world(n) for n in ("crowd", "room", "doorway", "circles"))
+)
 STEPS, PERIOD = 12, 0.1
 
 
@@ -33,7 +35,14 @@ def drive(world, seeds, given, **options):
     for each in given:
         simulator.step(each)
         data = simulator.data
-        seen.append([data.ranges.copy(), data.pose.copy(), data.odom.copy(), data.collided.copy()])
+        seen.append(
+            [
+                data.ranges.copy(),
+                data.pose.copy(),
+                data.odom.copy(),
+                data.collided.copy(),
+            ]
+        )
     return [np.array(one) for one in zip(*seen, strict=True)]
 
 
@@ -83,7 +92,8 @@ def test_every_member_has_the_same_chance_and_its_own_scenes():
         alone = sample_scene(MIXED.members[scenes.member[seed]], 0.2, seed)
         there = scenes[seed].bodies[:, 5] > 0.0
         assert np.array_equal(
-            scenes[seed].bodies[there][:, :6], alone.bodies[alone.bodies[:, 5] > 0][:, :6]
+            scenes[seed].bodies[there][:, :6],
+            alone.bodies[alone.bodies[:, 5] > 0][:, :6],
         )
         assert np.array_equal(scenes[seed].starts, alone.starts)
         shapes = [sampler.shapes[int(body[6])] for body in scenes[seed].bodies[there]]
@@ -92,8 +102,13 @@ def test_every_member_has_the_same_chance_and_its_own_scenes():
 
 
 def test_sizes_and_numbers_of_a_randomisation_hold_in_every_member():
-    worlds = WorldSet("two", (field(8.0, obstacles=[circles(3, (0.1, 0.3), 0.1)]),
-                              field(9.0, obstacles=[circles(6, (0.2,), 0.1)])))  # fmt: skip
+    worlds = WorldSet(
+        "two",
+        (
+            field(8.0, obstacles=[circles(3, (0.1, 0.3), 0.1)]),
+            field(9.0, obstacles=[circles(6, (0.2,), 0.1)]),
+        ),
+    )
     sampler = SetSampler(worlds, 0.1, sizes=(1.0, 0.5))
     scenes = sampler.draw(range(50), count=np.full(50, 2), size=np.arange(50) % 2)
     for seed, scene in enumerate(scenes):
@@ -102,8 +117,10 @@ def test_sizes_and_numbers_of_a_randomisation_hold_in_every_member():
         there = scene.bodies[:, 5] > 0.0
         named = [sampler.shapes[int(body[6])].radius for body in scene.bodies[there]]
         assert radii.tolist() == pytest.approx(named)
-        own = {shape.radius * (0.5 if seed % 2 else 1.0)
-               for shape in worlds.members[scene.member].shapes}  # fmt: skip
+        own = {
+            shape.radius * (0.5 if seed % 2 else 1.0)
+            for shape in worlds.members[scene.member].shapes
+        }
         assert set(np.round(radii, 9)) <= set(np.round(list(own), 9))
 
 
@@ -124,7 +141,9 @@ def test_a_set_is_a_folder_a_glob_a_list_or_a_file(folder):
     file.parent.mkdir()
     file.write_text("name: some\nworlds: [../*.yaml, circles]\nwithout: [../b.yaml]\n")
     assert (
-        names(load_worlds(str(folder))) == names(load_worlds(f"{folder}/*.yaml")) == ["a", "b", "c"]
+        names(load_worlds(str(folder)))
+        == names(load_worlds(f"{folder}/*.yaml"))
+        == ["a", "b", "c"]
     )
     assert load_worlds(folder).name == folder.name
     assert names(load_worlds(f"{folder}/[ac].yaml")) == ["a", "c"]
@@ -135,7 +154,9 @@ def test_a_set_is_a_folder_a_glob_a_list_or_a_file(folder):
 
 
 def test_the_maps_of_worlds_in_a_folder_are_no_members(folder):
-    (folder / "b_map.yaml").write_text("image: b.png\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    (folder / "b_map.yaml").write_text(
+        "image: b.png\nresolution: 0.05\norigin: [0, 0, 0]\n"
+    )
     assert names(load_worlds(folder)) == ["a", "b", "c"]
     with pytest.raises(ConfigError, match="no world file"):
         load_worlds(f"{folder}/*_map.yaml")
@@ -174,7 +195,9 @@ def test_a_wrong_set_is_refused_in_one_sentence(tmp_path, text, reason):
     assert str(refused.value).count("\n") == 0
 
 
-def test_no_name_is_no_world_although_it_would_be_the_present_folder(folder, monkeypatch):
+def test_no_name_is_no_world_although_it_would_be_the_present_folder(
+    folder, monkeypatch
+):
     monkeypatch.chdir(folder)
     (folder / "set.yaml").write_text("name: s\nworlds: ['']\n")
     for given in ("", [""], "set.yaml"):
@@ -182,10 +205,14 @@ def test_no_name_is_no_world_although_it_would_be_the_present_folder(folder, mon
             load_worlds(given)
 
 
-def test_a_member_that_is_unknown_is_told_with_the_file_of_its_set_and_the_names_of_sets(tmp_path):
+def test_a_member_that_is_unknown_is_told_with_the_file_of_its_set_and_the_names_of_sets(
+    tmp_path,
+):
     file = tmp_path / "set.yaml"
     file.write_text("name: s\nworlds: [nope]\n")
-    with pytest.raises(ConfigError, match=rf"^{file}: unknown world 'nope'; valid are: ") as told:
+    with pytest.raises(
+        ConfigError, match=rf"^{file}: unknown world 'nope'; valid are: "
+    ) as told:
         load_worlds(file)
     assert "'barn', 'cellular', 'circles'" in str(told.value)
     with pytest.raises(ConfigError, match="did you mean 'cellular'"):
@@ -243,12 +270,16 @@ def test_a_set_of_a_benchmark_is_driven_with_narrow_places_and_all():
 
 def test_what_worlds_share_is_stored_once():
     fields = tuple(
-        field(5.0, obstacles=[circles(2, (0.1 + 0.01 * n,))]).model_copy(update={"name": f"f{n}"})
+        field(5.0, obstacles=[circles(2, (0.1 + 0.01 * n,))]).model_copy(
+            update={"name": f"f{n}"}
+        )
         for n in range(5)
     )
     samplers = SetSampler(WorldSet("alike", fields), 0.2).samplers
     assert all(one.plan.space is samplers[0].plan.space for one in samplers)
-    rooms = WorldSet("rooms", (load_world("room"), load_world("room"), load_world("circles")))
+    rooms = WorldSet(
+        "rooms", (load_world("room"), load_world("room"), load_world("circles"))
+    )
     fixtures = FastSimulator(MODEL, rooms)._members.fixtures
     assert fixtures.maps[0].tolist() == fixtures.maps[1].tolist()
     assert fixtures.squares.size == fixtures.maps[0, 1] * fixtures.maps[0, 2]

@@ -22,17 +22,30 @@ SEVERED = ("SIGTERM", "SIGKILL", "process has died", "Traceback", "Segmentation"
 class Launched(AbstractContextManager["Launched", None]):
     """A launch in a session of its own, so that its processes get Ctrl-C together."""
 
-    def __init__(self, file: str, folder: Path, domain_id: int, **arguments: Any) -> None:
+    def __init__(
+        self, file: str, folder: Path, domain_id: int, **arguments: Any
+    ) -> None:
         words = [f"{name}:={value}" for name, value in arguments.items()]
-        chosen = {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        chosen = {
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
         self.domain_id, self.log = domain_id, folder / "launch.log"
-        env = os.environ | chosen | {"ROS_LOG_DIR": str(folder), "ROS_HOME": str(folder)}
+        env = (
+            os.environ | chosen | {"ROS_LOG_DIR": str(folder), "ROS_HOME": str(folder)}
+        )
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
-                ["ros2", "launch", PACKAGE, file, *words], env=env, stdin=subprocess.DEVNULL,
-                stdout=log, stderr=log, start_new_session=True,
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-            )  # fmt: skip
+                ["ros2", "launch", PACKAGE, file, *words],
+                env=env,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                preexec_fn=lambda: signal.signal(
+                    signal.SIGINT, signal.default_int_handler
+                ),
+            )
         self.seen: set[psutil.Process] = set()
 
     @property
@@ -40,7 +53,9 @@ class Launched(AbstractContextManager["Launched", None]):
         """What it said so far."""
         return self.log.read_text(encoding="utf-8", errors="replace")
 
-    def told(self, pattern: str, times: int = 1, within_s: float = COMPILED_S) -> list[str]:
+    def told(
+        self, pattern: str, times: int = 1, within_s: float = COMPILED_S
+    ) -> list[str]:
         """Waits until lines match, and returns what they hold."""
         deadline = time.monotonic() + within_s
         while len(found := re.findall(pattern, self.text)) < times:
@@ -74,7 +89,9 @@ class Launched(AbstractContextManager["Launched", None]):
         code, took_s = self.end()
         text = self.text
         # Python's own race: to signal a child that has just ended takes its exit code away.
-        for pid in re.findall(r"Unknown child process pid (\d+), will report returncode 255", text):
+        for pid in re.findall(
+            r"Unknown child process pid (\d+), will report returncode 255", text
+        ):
             text = text.replace(f"process has died [pid {pid}, exit code 255", "")
         assert code == 0, text
         assert not [word for word in SEVERED if word in text], text

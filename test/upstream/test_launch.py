@@ -26,14 +26,20 @@ NODES = {
     "bridge": BRIDGE,
     "description": (),
     "fleet": (
-        "simulator_node", *(f"robot{k}.{node}" for k in (1, 2) for node in BRIDGE)
+        "simulator_node",
+        *(f"robot{k}.{node}" for k in (1, 2) for node in BRIDGE),
     ),
     "simulation": ("simulator_node", *BRIDGE),
     "simulator": ("simulator_node",),
     "vehicle": BRIDGE,
-}  # fmt: skip
+}
 SUFFIXES = ("py", "xml")
-FILES = [f"{name}.launch.{suffix}" for name, nodes in NODES.items() if nodes for suffix in SUFFIXES]
+FILES = [
+    f"{name}.launch.{suffix}"
+    for name, nodes in NODES.items()
+    if nodes
+    for suffix in SUFFIXES
+]
 TIMES, MOMENTS_S = 10, 4.0
 
 
@@ -90,31 +96,59 @@ def test_the_twin_in_xml_has_the_same_arguments(name):
 
 def test_arguments_reach_every_node(launch, told):
     launched = launch(
-        "simulation.launch.py", namespace="car", model="differential", world="corridor",
-        policy="go_to_goal", fallback="dynamic_window", stamped="false", start="1.0, 0.5, 0.25",
-        autostart="false", log_level="warn",
-    )  # fmt: skip
+        "simulation.launch.py",
+        namespace="car",
+        model="differential",
+        world="corridor",
+        policy="go_to_goal",
+        fallback="dynamic_window",
+        stamped="false",
+        start="1.0, 0.5, 0.25",
+        autostart="false",
+        log_level="warn",
+    )
     names = "model", "world", "enable_stamped_cmd_vel", "episode_start"
-    assert told(launched, "/car/simulator_node", *names)[:3] == ["differential", "corridor", False]
+    assert told(launched, "/car/simulator_node", *names)[:3] == [
+        "differential",
+        "corridor",
+        False,
+    ]
     (start,) = told(launched, "/car/simulator_node", "episode_start")
     assert list(start) == [1.0, 0.5, 0.25]
-    names = "model", "enable_stamped_cmd_vel", "limits", "e_stop_required", "use_sim_time"
+    names = (
+        "model",
+        "enable_stamped_cmd_vel",
+        "limits",
+        "e_stop_required",
+        "use_sim_time",
+    )
     given = ["differential", False, "differential", False, True]
     assert told(launched, "/car/command_gate", *names) == given
-    names = "policy", "fallback", "model", "enable_stamped_cmd_vel", "autostart", "base_frame"
+    names = (
+        "policy",
+        "fallback",
+        "model",
+        "enable_stamped_cmd_vel",
+        "autostart",
+        "base_frame",
+    )
     given = ["go_to_goal", "dynamic_window", "differential", False, False, "base_link"]
     assert told(launched, "/car/policy_node", *names) == given
     launched.ends_well()
 
 
-def test_a_fleet_has_a_bridge_in_each_namespace_with_the_frames_of_its_robot(launch, told):
+def test_a_fleet_has_a_bridge_in_each_namespace_with_the_frames_of_its_robot(
+    launch, told
+):
     launched = launch(
         "fleet.launch.py", robots="[ant, bee]", start="-1 0 0 1 0 0", autostart="false"
     )
     assert list(*told(launched, "/simulator_node", "robots")) == ["ant", "bee"]
     for robot in ("ant", "bee"):
         launched.runs(f"{robot}.command_gate")
-        assert told(launched, f"/{robot}/policy_node", "base_frame") == [f"{robot}/base_link"]
+        assert told(launched, f"/{robot}/policy_node", "base_frame") == [
+            f"{robot}/base_link"
+        ]
     launched.ends_well()
 
 
@@ -125,7 +159,10 @@ def test_what_is_not_given_stands_in_the_file_of_parameters(launch, told, tmp_pa
     file = tmp_path / "car.yaml"
     file.write_text(own, encoding="utf-8")
     launched = launch("vehicle.launch.py", params_file=file, autostart="false")
-    assert told(launched, "/policy_node", "fallback", "policy") == ["mppi", "dynamic_window"]
+    assert told(launched, "/policy_node", "fallback", "policy") == [
+        "mppi",
+        "dynamic_window",
+    ]
     # But a vehicle requires an emergency stop, whatever its file says.
     names = "e_stop_required", "limits", "use_sim_time"
     assert told(launched, "/command_gate", *names) == [True, "differential", False]
@@ -141,7 +178,9 @@ def test_what_is_not_given_stands_in_the_file_of_parameters(launch, told, tmp_pa
         ({"params_file": "none.yaml"}, "none.yaml: no such file"),
     ],
 )
-def test_an_argument_that_can_not_be_used_ends_it_with_a_sentence(launch, words, sentence):
+def test_an_argument_that_can_not_be_used_ends_it_with_a_sentence(
+    launch, words, sentence
+):
     launched = launch("simulation.launch.xml", **words)
     assert launched.wait() == 1
     assert re.search(sentence, launched.text), launched.text
@@ -169,4 +208,6 @@ def test_ctrl_c_ends_it_ten_times_beside_two_busy_loops(launch, busy, name):
             launched.runs(*NODES[name])
         time.sleep(MOMENTS_S * k / TIMES)
         took.append(launched.ends_well())
-    print(f"{name}: ended after {sorted(took)[TIMES // 2]:.2f} s, at most {max(took):.2f} s")
+    print(
+        f"{name}: ended after {sorted(took)[TIMES // 2]:.2f} s, at most {max(took):.2f} s"
+    )

@@ -36,8 +36,13 @@ SPIN_S = "5"  # how long `ros2` looks around, without a daemon
 def ros2(*words: str, domain_id: int | None = None) -> str:
     env = dict(os.environ)
     if domain_id is not None:
-        env |= {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    done = subprocess.run(["ros2", *words], env=env, capture_output=True, text=True, timeout=120)
+        env |= {
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+    done = subprocess.run(
+        ["ros2", *words], env=env, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -47,10 +52,17 @@ def running(tmp_path_factory):
     """`ros2` beside a simulation that runs."""
     with (
         claimed_domain() as domain_id,
-        Launched("simulation.launch.py", tmp_path_factory.mktemp("launch"), domain_id,
-                 model="differential", world="corridor") as launched,
-    ):  # fmt: skip
-        launched.runs("simulator_node", "policy_node", "command_gate", "middleware_node")
+        Launched(
+            "simulation.launch.py",
+            tmp_path_factory.mktemp("launch"),
+            domain_id,
+            model="differential",
+            world="corridor",
+        ) as launched,
+    ):
+        launched.runs(
+            "simulator_node", "policy_node", "command_gate", "middleware_node"
+        )
         yield lambda *words: ros2(*words, domain_id=domain_id)
         launched.ends_well()
 
@@ -71,29 +83,44 @@ def test_ros2_topic_lists_and_hears_what_the_hardware_would_send(running):
     for topic, kind in TOPICS.items():
         assert f"{topic} [{kind}]" in listed
     assert "frame_id: odom" in running("topic", "echo", "--once", *look, "/odom")
-    assert "range_max: " in running("topic", "echo", "--once", "/scan", "sensor_msgs/msg/LaserScan")
+    assert "range_max: " in running(
+        "topic", "echo", "--once", "/scan", "sensor_msgs/msg/LaserScan"
+    )
 
 
 def test_ros2_node_and_param_show_the_nodes_and_what_they_were_given(running):
     nodes = running("node", "list", "--no-daemon", "--spin-time", SPIN_S).split()
-    assert {"/simulator_node", "/policy_node", "/command_gate", "/middleware_node"} <= set(nodes)
+    assert {
+        "/simulator_node",
+        "/policy_node",
+        "/command_gate",
+        "/middleware_node",
+    } <= set(nodes)
     asked = ("/simulator_node", "world", "--no-daemon", "--spin-time", SPIN_S)
     assert "corridor" in running("param", "get", *asked)
     assert "world" in running("param", "list", *asked[:1], *asked[2:])
 
 
 def test_ros2_service_and_topic_pub_arm_the_gate_and_send_the_robot_to_a_goal(running):
-    assert "success=True" in running("service", "call", "/command_gate/arm", "std_srvs/srv/Trigger")
+    assert "success=True" in running(
+        "service", "call", "/command_gate/arm", "std_srvs/srv/Trigger"
+    )
     goal = "{pose: {position: {x: 1.0}}}"
-    running("topic", "pub", "--once", "/goal_pose", "geometry_msgs/msg/PoseStamped", goal)
+    running(
+        "topic", "pub", "--once", "/goal_pose", "geometry_msgs/msg/PoseStamped", goal
+    )
     assert "linear" in running("topic", "echo", "--once", "/cmd_vel")
 
 
 def test_ros2_lifecycle_takes_the_policy_through_its_states(running):
     look = ("--no-daemon", "--spin-time", SPIN_S)
     for change, state in (
-        ("deactivate", "inactive"), ("cleanup", "unconfigured"), ("configure", "inactive"),
+        ("deactivate", "inactive"),
+        ("cleanup", "unconfigured"),
+        ("configure", "inactive"),
         ("activate", "active"),
-    ):  # fmt: skip
-        assert "successful" in running("lifecycle", "set", "/policy_node", change, *look)
+    ):
+        assert "successful" in running(
+            "lifecycle", "set", "/policy_node", change, *look
+        )
         assert running("lifecycle", "get", "/policy_node", *look).startswith(state)

@@ -65,7 +65,9 @@ class Client:
         """The next message of a kind that fits."""
         deadline = time.monotonic() + DEADLINE_S
         while True:
-            message = json.loads(self.socket.recv(timeout=max(0.0, deadline - time.monotonic())))
+            message = json.loads(
+                self.socket.recv(timeout=max(0.0, deadline - time.monotonic()))
+            )
             if message["kind"] == kind and fits(message):
                 return message
 

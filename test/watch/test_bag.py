@@ -17,16 +17,24 @@ DURATION_S, STEP_S = 4.0, 0.05
 
 
 def odometry(t):
-    inner = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(0.5 * t, 0, 0), np.zeros(36))
-    twist = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0, 0), np.zeros(36))
-    return bags.new("nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", inner, twist)
+    inner = bags.new(
+        "geometry_msgs/PoseWithCovariance", bags.pose(0.5 * t, 0, 0), np.zeros(36)
+    )
+    twist = bags.new(
+        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0, 0), np.zeros(36)
+    )
+    return bags.new(
+        "nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", inner, twist
+    )
 
 
 def bag(folder, **topics):
     """Straight ahead with 0.5 m/s."""
     known = {
         "/odom": [(t, odometry(t)) for t in bags.times(STEP_S, DURATION_S)],
-        "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.0)) for t in bags.times(0.1, DURATION_S)],
+        "/cmd_vel": [
+            (t, bags.twist(0.5, 0.0, 0.0)) for t in bags.times(0.1, DURATION_S)
+        ],
     }
     return bags.write(folder / "bag", known | topics)
 
@@ -76,6 +84,8 @@ def test_the_place_holds_the_whole_drive_and_what_was_seen(tmp_path):
 
 
 def test_a_bag_without_odometry_is_one_sentence(tmp_path):
-    where = bags.write(tmp_path / "bag", {"/cmd_vel": [(0.0, bags.twist(0.5, 0.0, 0.0))]})
+    where = bags.write(
+        tmp_path / "bag", {"/cmd_vel": [(0.0, bags.twist(0.5, 0.0, 0.0))]}
+    )
     with pytest.raises(RecordingError, match="has no odometry"):
         BagSource(where, MODEL, {})

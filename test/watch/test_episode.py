@@ -35,7 +35,9 @@ def pose(made):
 
 def free_spot(made):
     """A place amid the field that no disc and no robot is near."""
-    spots = np.stack(np.meshgrid(*[np.linspace(-2.0, 2.0, 9)] * 2), axis=-1).reshape(-1, 2)
+    spots = np.stack(np.meshgrid(*[np.linspace(-2.0, 2.0, 9)] * 2), axis=-1).reshape(
+        -1, 2
+    )
     taken = np.concatenate([bodies(made)[:, [X, Y]], pose(made)[None, :2]])
     apart = np.linalg.norm(spots[:, None] - taken, axis=-1).min(axis=1)
     return spots[apart.argmax()].tolist()
@@ -68,7 +70,9 @@ def test_a_goal_that_is_dragged_moves(driven):
 )
 def test_a_goal_off_the_field_is_refused_and_all_else_goes_on(driven, x, reason):
     driven.take(Request(kind="goal", x=1.25, y=-0.5))
-    told = re.escape(f"goal: ({x:g}, 0) m {reason}; the field is -3 to 3 m by -3 to 3 m.")
+    told = re.escape(
+        f"goal: ({x:g}, 0) m {reason}; the field is -3 to 3 m by -3 to 3 m."
+    )
     with pytest.raises(ConfigError, match=f"^{told}$"):
         driven.take(Request(kind="goal", x=x))
     assert driven.frame().worlds[0].shot.goals.tolist() == [[1.25, -0.5]]
@@ -134,19 +138,27 @@ def test_a_person_drives_while_keys_are_held_and_the_robot_stops_once_they_are_s
     driven, monkeypatch
 ):
     clock = [100.0]
-    monkeypatch.setattr("nics_drl_bridge.watch.episode.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(
+        "nics_drl_bridge.watch.episode.time.monotonic", lambda: clock[0]
+    )
     driven.take(Request(kind="drive", twist=(-0.5, 0.0, 1.0)))
     driven.advance()
-    assert driven.frame().worlds[0].shot.commands[0] == pytest.approx([-1.0, 0.0, 2.0], abs=1e-6)
+    assert driven.frame().worlds[0].shot.commands[0] == pytest.approx(
+        [-1.0, 0.0, 2.0], abs=1e-6
+    )
     clock[0] += 0.6
     driven.advance()
-    assert driven.frame().worlds[0].shot.commands[0] == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+    assert driven.frame().worlds[0].shot.commands[0] == pytest.approx(
+        [0.0, 0.0, 0.0], abs=1e-6
+    )
     driven.take(Request(kind="drive", on=False))
     driven.advance()
     assert driven.frame().worlds[0].shot.commands[0] == pytest.approx([2.0, 0.0, 0.0])
 
 
-def test_another_policy_goes_on_from_here_and_one_that_does_not_open_changes_nothing(driven):
+def test_another_policy_goes_on_from_here_and_one_that_does_not_open_changes_nothing(
+    driven,
+):
     driven.advance()
     stood = pose(driven)
     assert driven.take(Request(kind="policy", name="other"))
@@ -179,7 +191,9 @@ def test_a_page_asks_for_all_of_it_over_its_socket():
         assert {"goal", "obstacle", "drive", "policy", "speed"} <= set(stage["can"])
         client.ask("pause", on=True)
         client.ask("goal", x=1.0, y=1.5)
-        client.next("frame", lambda frame: frame["worlds"][0]["goals"] == [[1000, 1500]])
+        client.next(
+            "frame", lambda frame: frame["worlds"][0]["goals"] == [[1000, 1500]]
+        )
         client.ask("obstacle", x=50.0, y=0.0)
         assert "outside the world" in client.next("notice")["text"]
         client.ask("clear")
@@ -231,6 +245,8 @@ def test_an_obstacle_that_has_turned_round_and_round_stands_in_a_world():
     count = sum(group.counts[1] for group in world.obstacles)
     bodies = np.zeros((count, 7))
     bodies[:, [HEADING, RADIUS]] = 40.0, 0.2
-    env = SimpleNamespace(snapshot=lambda: SimpleNamespace(member=0, bodies=bodies), world=world)
+    env = SimpleNamespace(
+        snapshot=lambda: SimpleNamespace(member=0, bodies=bodies), world=world
+    )
     (_, _, heading), *_ = standing(env).obstacles[0].at
     assert heading == pytest.approx(wrap_angle(40.0))

@@ -42,7 +42,9 @@ def test_the_ellipse_holds_95_percent_of_the_positions():
     covariance = np.zeros((1, 3, 3))
     covariance[0, :2, :2] = turn @ np.diag([0.09, 0.01]) @ turn.T
     large, small, angle = plain(covariance=covariance)["worlds"][0]["ellipses"][0]
-    drawn = np.random.default_rng(0).multivariate_normal([0, 0], covariance[0, :2, :2], 20_000)
+    drawn = np.random.default_rng(0).multivariate_normal(
+        [0, 0], covariance[0, :2, :2], 20_000
+    )
     along = drawn @ np.array([np.cos(angle), np.sin(angle)]) / large
     across = drawn @ np.array([-np.sin(angle), np.cos(angle)]) / small
     assert (along**2 + across**2 < 1.0).mean() == pytest.approx(0.95, abs=0.01)
@@ -60,7 +62,9 @@ def test_a_trail_begins_anew_with_each_episode_and_never_grows_without_end():
 
 
 def test_a_stage_tells_all_that_is_drawn_once():
-    stage = Stage("a title", direct_model(), (field(count=2), load_worlds("room"))).plain()
+    stage = Stage(
+        "a title", direct_model(), (field(count=2), load_worlds("room"))
+    ).plain()
     one, room = json.loads(json.dumps(stage))["places"]
     assert one["extent"] == [-3.0, -3.0, 3.0, 3.0]
     assert len(one["walls"]) == 4
@@ -69,4 +73,6 @@ def test_a_stage_tells_all_that_is_drawn_once():
     cells = base64.b64decode(room["map"]["cells"])
     assert len(cells) == room["map"]["rows"] * room["map"]["columns"]
     assert set(cells) <= {0, 1, 2}
-    assert max(np.hypot(*np.transpose(room["shapes"][0]))) == pytest.approx(1.0, abs=1e-3)
+    assert max(np.hypot(*np.transpose(room["shapes"][0]))) == pytest.approx(
+        1.0, abs=1e-3
+    )

@@ -14,7 +14,9 @@ from nics_drl_bridge.watch.server import Request
 from watch.rig import Client
 
 
-def test_render_mode_human_tells_where_its_page_is_and_shows_each_step(monkeypatch, capsys):
+def test_render_mode_human_tells_where_its_page_is_and_shows_each_step(
+    monkeypatch, capsys
+):
     monkeypatch.setattr("nics_drl_bridge.watch.show.os.environ", {})
     env = BridgeEnv(model=direct_model(), world=field(count=2), render_mode="human")
     with closing(env):
@@ -25,10 +27,14 @@ def test_render_mode_human_tells_where_its_page_is_and_shows_each_step(monkeypat
         with closing(Client(server)) as client:
             client.next("stage", lambda stage: len(stage["places"]) == 1)
             env.step(np.array([1.0, 0.0, 0.0], np.float32))
-            frame = client.next("frame", lambda frame: len(frame["worlds"][0]["trails"][0]) == 2)
+            frame = client.next(
+                "frame", lambda frame: len(frame["worlds"][0]["trails"][0]) == 2
+            )
             assert frame["worlds"][0]["poses"][0][0] > 150
             env.reset(seed=1)
-            client.next("frame", lambda frame: len(frame["worlds"][0]["trails"][0]) == 1)
+            client.next(
+                "frame", lambda frame: len(frame["worlds"][0]["trails"][0]) == 1
+            )
 
 
 def test_the_pace_of_the_page_holds_the_program_until_the_next_step():

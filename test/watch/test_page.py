@@ -64,7 +64,9 @@ def test_the_robot_is_drawn_where_it_stands(browser, page):
     browser.open(page[0], *SIZES[0])
     browser.ask("$('pause').click()")
     until(lambda: browser.ask("nics.frame.paused"), "the pause")
-    until(lambda: browser.ask("performance.now() > arrived + 2 * interval"), "stillness")
+    until(
+        lambda: browser.ask("performance.now() > arrived + 2 * interval"), "stillness"
+    )
     x, y = page[1].lanes[0].env.snapshot().poses[0, :2] + (-0.1, -0.1)
     px, py = at(browser, x, y)
     colour = browser.ask(
@@ -84,7 +86,10 @@ def test_the_goal_is_dragged_by_the_mouse(browser, page):
     for part in (0.5, 1.0):
         browser.mouse("Moved", *at(browser, *(goal + part * (0.5 - goal))))
     browser.mouse("Released", *at(browser, 0.5, 0.5))
-    until(lambda: abs(page[1].lanes[0].env.snapshot().goals[0] - 0.5).max() < 0.02, "the goal")
+    until(
+        lambda: abs(page[1].lanes[0].env.snapshot().goals[0] - 0.5).max() < 0.02,
+        "the goal",
+    )
 
 
 def test_a_click_adds_an_obstacle_and_keys_drive(browser, page):
@@ -92,7 +97,10 @@ def test_a_click_adds_an_obstacle_and_keys_drive(browser, page):
     browser.ask("$('pause').click()")
     until(lambda: browser.ask("nics.frame.paused"), "the pause")
     browser.ask("$('clear').click()")
-    until(lambda: browser.ask("nics.frame.worlds[0].bodies.length === 0"), "an empty field")
+    until(
+        lambda: browser.ask("nics.frame.worlds[0].bodies.length === 0"),
+        "an empty field",
+    )
     browser.ask("document.querySelector('[data-tool=box]').click()")
     x, y = page[1].lanes[0].env.snapshot().poses[0, :2]
     place = at(browser, -2.5 if x > 0 else 2.5, -2.5 if y > 0 else 2.5)
@@ -103,7 +111,9 @@ def test_a_click_adds_an_obstacle_and_keys_drive(browser, page):
     browser.call("Input.dispatchKeyEvent", type="keyDown", **key)
     until(lambda: browser.ask("byHand"), "driving by hand")
     browser.ask("$('pause').click()")
-    until(lambda: browser.ask("nics.frame.worlds[0].commands[0][0]") == -2.0, "reversing")
+    until(
+        lambda: browser.ask("nics.frame.worlds[0].commands[0][0]") == -2.0, "reversing"
+    )
     browser.call("Input.dispatchKeyEvent", type="keyUp", **key)
     until(lambda: browser.ask("nics.frame.worlds[0].commands[0][0]") == 0.0, "standing")
 
@@ -121,4 +131,6 @@ def test_30_frames_a_second_of_720_beams(browser, page):
         "return [(end[1] - begin[1]) / seconds, (end[2] - begin[2]) / seconds]; })()"
     )
     assert browser.ask("nics.frame.worlds[0].ranges[0].length") == 720
-    assert min(draws, frames) > 30.0, f"{draws:.1f} drawn, {frames:.1f} received a second"
+    assert min(draws, frames) > 30.0, (
+        f"{draws:.1f} drawn, {frames:.1f} received a second"
+    )

@@ -30,7 +30,11 @@ def test_a_gif_has_each_frame_and_moves(made, tmp_path):
     path = tmp_path / "new" / "episode.gif"
     write(path, made.stage(), frames(made), 10.0)
     with Image.open(path) as image:
-        assert (image.n_frames, image.info["duration"], image.info["loop"]) == (4, 100, 0)
+        assert (image.n_frames, image.info["duration"], image.info["loop"]) == (
+            4,
+            100,
+            0,
+        )
         shown = []
         for n in range(4):
             image.seek(n)
@@ -75,7 +79,9 @@ def test_an_unknown_kind_of_file_is_one_sentence(tmp_path, name):
         check_file(tmp_path / name)
 
 
-@pytest.mark.parametrize(("suffix", "module"), [("mp4", "imageio_ffmpeg"), ("rrd", "rerun")])
+@pytest.mark.parametrize(
+    ("suffix", "module"), [("mp4", "imageio_ffmpeg"), ("rrd", "rerun")]
+)
 def test_a_missing_library_is_one_sentence(made, tmp_path, monkeypatch, suffix, module):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ConfigError, match=r"pip install 'nics_drl_bridge\[video\]'"):

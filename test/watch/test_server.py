@@ -29,7 +29,9 @@ def server():
 
 
 def get(url, **headers):
-    return urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=30)
+    return urllib.request.urlopen(
+        urllib.request.Request(url, headers=headers), timeout=30
+    )
 
 
 def status(url, **headers):
@@ -90,7 +92,10 @@ def test_the_page_of_a_foreign_site_can_not_open_the_socket(server):
     from websockets.sync.client import connect
 
     address = f"{server.url.replace('http', 'ws')}socket"
-    with pytest.raises(InvalidStatus, match="403"), connect(address, origin="https://evil.example"):
+    with (
+        pytest.raises(InvalidStatus, match="403"),
+        connect(address, origin="https://evil.example"),
+    ):
         pass
     with connect(address, origin=server.url.rstrip("/")):
         pass
@@ -114,7 +119,12 @@ def test_requests_arrive_and_nonsense_is_told_in_a_sentence(server):
         client.ask("goal", x=1.0, y=-2.0)
         request = server.request(30.0)
         assert (request.kind, request.x, request.y) == ("goal", 1.0, -2.0)
-        for nonsense in ("no json", '{"kind": "fly"}', '{"kind": "goal", "x": 1e999}', "[]"):
+        for nonsense in (
+            "no json",
+            '{"kind": "fly"}',
+            '{"kind": "goal", "x": 1e999}',
+            "[]",
+        ):
             client.socket.send(nonsense)
             assert "is not understood" in client.next("notice")["text"]
         assert server.request(0.0) is None

@@ -46,7 +46,9 @@ def test_a_paused_source_goes_on_step_by_step():
             client.ask("step")
             client.next("frame", lambda frame, k=k: frame["time"] == before + k)
         client.ask("pause", on=False)
-        client.next("frame", lambda frame: frame["time"] > before + 10 and not frame["paused"])
+        client.next(
+            "frame", lambda frame: frame["time"] > before + 10 and not frame["paused"]
+        )
 
 
 def test_an_error_is_told_on_the_page_and_pauses_it():
@@ -93,7 +95,9 @@ def test_without_a_display_one_line_says_where_the_page_is(monkeypatch, capsys):
 def test_with_a_display_the_browser_opens_it(monkeypatch, capsys):
     opened = []
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(module.webbrowser, "open", lambda url: opened.append(url) or True)
+    monkeypatch.setattr(
+        module.webbrowser, "open", lambda url: opened.append(url) or True
+    )
     open_page("http://127.0.0.1:1/")
     assert opened == ["http://127.0.0.1:1/"]
     assert capsys.readouterr().err == ""

@@ -67,7 +67,9 @@ def test_frames_are_far_enough_apart_not_to_slow_the_training(server, monkeypatc
     envs, sent = Envs(2), []
     view = TrainingView(server, envs)
     clock = [10.0]
-    monkeypatch.setattr("nics_drl_bridge.watch.training.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(
+        "nics_drl_bridge.watch.training.time.monotonic", lambda: clock[0]
+    )
     monkeypatch.setattr(server, "publish", sent.append)
     with closing(Client(server)):
         until(lambda: server.watched, "the page")

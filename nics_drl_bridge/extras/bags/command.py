@@ -13,32 +13,43 @@ from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros
 from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
-bag = typer.Typer(help="Records, describes, replays, exports, salvages bags.", no_args_is_help=True)
+bag = typer.Typer(
+    help="Records, describes, replays, exports, salvages bags.", no_args_is_help=True
+)
 
 STORAGES = ("mcap", "sqlite3")
 TASK = "Drive to the goal without touching anything."
 BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
-StorageOption = Annotated[str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")]
+StorageOption = Annotated[
+    str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")
+]
 
 
 @bag.command()
 def record(
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
-    topics: Annotated[list[str] | None, Option(help="A topic to record; repeatable.")] = None,
+    topics: Annotated[
+        list[str] | None, Option(help="A topic to record; repeatable.")
+    ] = None,
     everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
-    duration: Annotated[float | None, Option(min=0.0,
-        help="Stop after this time [s]; else at Ctrl-C.")] = None,
+    duration: Annotated[
+        float | None, Option(min=0.0, help="Stop after this time [s]; else at Ctrl-C.")
+    ] = None,
     storage: StorageOption = "mcap",
-    use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
+    use_sim_time: Annotated[
+        bool, Option("--use-sim-time", help="Take time from /clock.")
+    ] = False,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Records a robot's topics without driving it."""
     kind = _storage(storage)
     with needs_ros("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
     names, say = tuple(topics or ()), partial(typer.echo, err=True)
-    order = BagOrder(out, names, everything, namespace_of(namespace), duration, kind, use_sim_time)
+    order = BagOrder(
+        out, names, everything, namespace_of(namespace), duration, kind, use_sim_time
+    )
     counts = dict(sorted(record_bag(order, say).items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")
@@ -47,8 +58,10 @@ def record(
 
 @bag.command()
 def info(
-    path: BagArgument, as_json: console.JsonOption = False, salvage: SalvageOption = False
-) -> None:  # fmt: skip
+    path: BagArgument,
+    as_json: console.JsonOption = False,
+    salvage: SalvageOption = False,
+) -> None:
     """Shows a bag's topics, rates, gaps, and the clock of its stamps."""
     from nics_drl_bridge.extras.bags.info import bag_info
 
@@ -56,7 +69,16 @@ def info(
         told = bag_info(whole)
     span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
     line = f"{path}: {told.messages} messages in {span}, {size}"
-    heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
+    heads = (
+        "topic",
+        "type",
+        "count",
+        "Hz",
+        "from, to [s]",
+        "gaps",
+        "clock",
+        "delay [ms]",
+    )
     table = console.table(heads, [_row(each) for each in told.topics])
     console.say(as_json, f"{line}\n{table}", **asdict(told) | {"path": str(path)})
 
@@ -64,36 +86,67 @@ def info(
 @bag.command()
 def replay(
     path: BagArgument,
-    rate: Annotated[float, Option(min=0.001, help="Seconds of the bag per second.")] = 1.0,
+    rate: Annotated[
+        float, Option(min=0.001, help="Seconds of the bag per second.")
+    ] = 1.0,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
     clock: Annotated[bool, Option(help="Publish the bag's time on /clock.")] = True,
-    topics: Annotated[list[str] | None, Option(help="Play this topic only; repeatable.")] = None,
+    topics: Annotated[
+        list[str] | None, Option(help="Play this topic only; repeatable.")
+    ] = None,
     namespace: Annotated[str, Option(help="Prefix of the topics' names.")] = "",
-    lockstep: Annotated[str | None, Option(metavar="NODE",
-        help="Wait after each message until this node has received it.")] = None,
-    estimate: Annotated[bool, Option("--estimate",
-        help="Run the middleware on the bag in process instead.")] = False,
-    model: Annotated[str, Option("--model", "--robot", autocompletion=console.ROBOTS,
-        help="For --estimate: folder of a model, or a shipped robot.")] = DEFAULT_ROBOT,
-    topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
-        help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
-    out: Annotated[Path | None, Option(help="For --estimate: .npz or .csv to write.")] = None,
+    lockstep: Annotated[
+        str | None,
+        Option(
+            metavar="NODE",
+            help="Wait after each message until this node has received it.",
+        ),
+    ] = None,
+    estimate: Annotated[
+        bool,
+        Option("--estimate", help="Run the middleware on the bag in process instead."),
+    ] = False,
+    model: Annotated[
+        str,
+        Option(
+            "--model",
+            "--robot",
+            autocompletion=console.ROBOTS,
+            help="For --estimate: folder of a model, or a shipped robot.",
+        ),
+    ] = DEFAULT_ROBOT,
+    topic: Annotated[
+        list[str] | None,
+        Option(
+            metavar="ROLE=TOPIC",
+            help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, Option(help="For --estimate: .npz or .csv to write.")
+    ] = None,
     salvage: SalvageOption = False,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Plays a bag over ROS 2, or runs the middleware's estimator on it."""
     with intact(path, salvage) as whole:
         if estimate:
             from nics_drl_bridge.generator import open_model
             from nics_drl_bridge.middleware import playback
 
-            made = playback.estimate(whole, open_model(model), console.roles_of(topic or []))
+            made = playback.estimate(
+                whole, open_model(model), console.roles_of(topic or [])
+            )
             if out is not None:
                 playback.write_estimate(made, out)
             rejected, number = dict(sorted(made.rejected.items())), len(made.stamp_ns)
             x, y, heading = last = made.pose[-1].tolist()
-            lines = [f"not used: {count} of {reason}" for reason, count in rejected.items()]
-            lines.append(f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
+            lines = [
+                f"not used: {count} of {reason}" for reason, count in rejected.items()
+            ]
+            lines.append(
+                f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}"
+            )
             told = {"estimates": number, "last": last, "not_used": rejected}
             line = "\n".join((*lines, f"sha256 {made.digest}"))
             console.say(as_json, line, **told, sha256=made.digest)
@@ -101,39 +154,65 @@ def replay(
         with needs_ros("nics bag replay"):
             from nics_drl_bridge.extras.bags.live import play_bag
         say = partial(typer.echo, err=True)
-        sent = play_bag(whole, topics or (), rate, loop, clock, namespace, lockstep, say)
+        sent = play_bag(
+            whole, topics or (), rate, loop, clock, namespace, lockstep, say
+        )
         console.say(as_json, f"{sent} messages were published", published=sent)
 
 
 @bag.command()
 def export(
     path: BagArgument,
-    lerobot: Annotated[Path | None, Option(metavar="FOLDER",
-        help="Write a LeRobot dataset, format v3.0.")] = None,
-    mcap: Annotated[Path | None, Option(metavar="FOLDER",
-        help="Write an MCAP bag for Foxglove.")] = None,
-    model: Annotated[str | None,
-        Option("--model", "--robot",
-        help="A model's folder, or a shipped robot: for commands, lidar and its mount.",
-        autocompletion=console.ROBOTS)] = None,
-    topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
-        help="For example odom=/car/odom. Roles: scan, odom, cmd_vel, pose.")] = None,
-    fps: Annotated[int | None, Option(min=1,
-        help="Frames per second; the commands' rate by default.")] = None,
-    gap: Annotated[float, Option(help="Data older than this end an episode [s].")] = 0.5,
+    lerobot: Annotated[
+        Path | None,
+        Option(metavar="FOLDER", help="Write a LeRobot dataset, format v3.0."),
+    ] = None,
+    mcap: Annotated[
+        Path | None, Option(metavar="FOLDER", help="Write an MCAP bag for Foxglove.")
+    ] = None,
+    model: Annotated[
+        str | None,
+        Option(
+            "--model",
+            "--robot",
+            help="A model's folder, or a shipped robot: for commands, lidar and its mount.",
+            autocompletion=console.ROBOTS,
+        ),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        Option(
+            metavar="ROLE=TOPIC",
+            help="For example odom=/car/odom. Roles: scan, odom, cmd_vel, pose.",
+        ),
+    ] = None,
+    fps: Annotated[
+        int | None,
+        Option(min=1, help="Frames per second; the commands' rate by default."),
+    ] = None,
+    gap: Annotated[
+        float, Option(help="Data older than this end an episode [s].")
+    ] = 0.5,
     task: Annotated[str, Option(help="The robot's task, in words.")] = TASK,
-    succeeded: Annotated[str | None, Option(metavar="all|none|NUMBERS",
-        help="Episodes that succeeded, such as 0,2,5; if known.")] = None,
+    succeeded: Annotated[
+        str | None,
+        Option(
+            metavar="all|none|NUMBERS",
+            help="Episodes that succeeded, such as 0,2,5; if known.",
+        ),
+    ] = None,
     salvage: SalvageOption = False,
     as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Converts a bag to a LeRobot dataset, or to MCAP for Foxglove."""
     with intact(path, salvage) as whole:
         from nics_drl_bridge.errors import ConfigError
         from nics_drl_bridge.generator import open_model
 
         if lerobot is None and mcap is None:
-            raise ConfigError("nothing to write; say --lerobot FOLDER or --mcap FOLDER.")
+            raise ConfigError(
+                "nothing to write; say --lerobot FOLDER or --mcap FOLDER."
+            )
         known = None if model is None else open_model(model)
         lines, told = [], dict[str, Any]()
         if lerobot is not None:
@@ -153,11 +232,20 @@ def export(
             frames = frames_of(whole, console.roles_of(topic or []), known, fps, gap)
             episodes, total = len(frames.lengths), int(frames.lengths.sum())
             reached = _numbers(succeeded, episodes)
-            write_dataset(frames, lerobot, task, known.robot.name if known else None, reached)
+            write_dataset(
+                frames, lerobot, task, known.robot.name if known else None, reached
+            )
             if frames.dropped:
-                typer.echo(f"left out: {frames.dropped} episodes of a single frame", err=True)
-            told |= {"lerobot": str(lerobot), "episodes": episodes, "frames": total,
-                     "fps": frames.fps, "left_out": frames.dropped}  # fmt: skip
+                typer.echo(
+                    f"left out: {frames.dropped} episodes of a single frame", err=True
+                )
+            told |= {
+                "lerobot": str(lerobot),
+                "episodes": episodes,
+                "frames": total,
+                "fps": frames.fps,
+                "left_out": frames.dropped,
+            }
             counts = f"{episodes} episodes, {total} frames at {frames.fps} Hz"
             lines.append(f"{counts}, written to {lerobot}")
         console.say(as_json, "\n".join(lines), **told)
@@ -167,8 +255,9 @@ def export(
 def salvage(
     path: BagArgument,
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
-    storage: StorageOption = "mcap", as_json: console.JsonOption = False,
-) -> None:  # fmt: skip
+    storage: StorageOption = "mcap",
+    as_json: console.JsonOption = False,
+) -> None:
     """Writes the intact part of a damaged bag to a new one."""
     from nics_drl_bridge.recording.messages import check_libraries
 
@@ -176,7 +265,9 @@ def salvage(
     from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
 
     lines = salvage_bag(path, out, _storage(storage)).lines()
-    console.say(as_json, "\n".join((*lines, f"bag written to {out}")), path=str(out), told=lines)
+    console.say(
+        as_json, "\n".join((*lines, f"bag written to {out}")), path=str(out), told=lines
+    )
 
 
 def _storage(name: str) -> Any:
@@ -196,13 +287,23 @@ def _numbers(given: str | None, episodes: int) -> set[int] | None:
         return set(range(episodes)) if given == "all" else set()
     words = [word.strip() for word in given.split(",")]
     if not all(word.isdecimal() for word in words):
-        raise ConfigError(f"--succeeded {given!r}: must be all, none, or numbers as in 0,2,5.")
+        raise ConfigError(
+            f"--succeeded {given!r}: must be all, none, or numbers as in 0,2,5."
+        )
     return {int(word) for word in words}
 
 
 def _row(each: Any) -> tuple[str, ...]:
     span = "" if each.first_s is None else f"{each.first_s:.2f}, {each.last_s:.2f}"
-    gaps = "" if each.longest_gap_s is None else f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
-    delay = "" if each.delay_s is None else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"
+    gaps = (
+        ""
+        if each.longest_gap_s is None
+        else f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
+    )
+    delay = (
+        ""
+        if each.delay_s is None
+        else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"
+    )
     rate = "" if each.rate_hz is None else f"{each.rate_hz:.2f}"
     return each.topic, each.type, str(each.count), rate, span, gaps, each.clock, delay

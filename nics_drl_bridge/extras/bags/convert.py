@@ -20,7 +20,9 @@ Row = tuple[str, int, bytes]
 """Topic, time of receipt [ns] and bytes of a message."""
 
 
-def convert(path: str | Path, out: str | Path, model: SimulatorModel | None = None) -> list[str]:
+def convert(
+    path: str | Path, out: str | Path, model: SimulatorModel | None = None
+) -> list[str]:
     """Writes a bag of ROS 2 or 1 as MCAP, and returns the topics that were added to it.
 
     A bag without transforms gets those of its odometry and, with a model, of the lidar's mount:
@@ -29,7 +31,9 @@ def convert(path: str | Path, out: str | Path, model: SimulatorModel | None = No
     with opened(path) as bag, bag_sink(out) as sink:
         rows = list[Row]()
         for topic, kind in bag.types.items():
-            sink.add_topic(topic, kind, bag.offers(topic), definition=bag.definition(topic))
+            sink.add_topic(
+                topic, kind, bag.offers(topic), definition=bag.definition(topic)
+            )
             rows += ((topic, ns, data) for ns, data in bag.serialized(topic))
         made = [*_moving(bag, sink.store), *_fixed(bag, sink.store, model)]
         added = list(dict.fromkeys(topic for topic, _, _ in made))
@@ -41,11 +45,15 @@ def convert(path: str | Path, out: str | Path, model: SimulatorModel | None = No
 
 
 def _moving(bag: BagFile, store: Any) -> Iterator[Row]:
-    for message in [] if MOVING in bag.types else _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY):
+    for message in (
+        [] if MOVING in bag.types else _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
+    ):
         told = message.content
         where = told.pose.pose
         place = where.position.x, where.position.y, where.position.z
-        made = _transform(store, told.header, told.child_frame_id, place, where.orientation)
+        made = _transform(
+            store, told.header, told.child_frame_id, place, where.orientation
+        )
         yield MOVING, message.receive_ns, made
 
 
@@ -55,11 +63,20 @@ def _fixed(bag: BagFile, store: Any, model: SimulatorModel | None) -> Iterator[R
         return
     x, y, heading = model.lidar.mount
     half = heading / 2.0
-    turned = store.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, np.sin(half), np.cos(half))
-    bases = [m.content.child_frame_id for m in _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)]
+    turned = store.types["geometry_msgs/msg/Quaternion"](
+        0.0, 0.0, np.sin(half), np.cos(half)
+    )
+    bases = [
+        m.content.child_frame_id
+        for m in _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
+    ]
     scan = scans[0].content.header
     header = type(scan)(scan.stamp, (*bases, FRAMES[1])[0])
-    yield FIXED, bag.span_ns[0], _transform(store, header, scan.frame_id, (x, y, 0.0), turned)
+    yield (
+        FIXED,
+        bag.span_ns[0],
+        _transform(store, header, scan.frame_id, (x, y, 0.0), turned),
+    )
 
 
 def _messages(bag: BagFile, topic: str, kind: str) -> list[Message]:
@@ -70,6 +87,10 @@ def _transform(
     store: Any, header: Any, child: str, place: tuple[float, float, float], turned: Any
 ) -> bytes:
     types = store.types
-    moved = types["geometry_msgs/msg/Transform"](types["geometry_msgs/msg/Vector3"](*place), turned)
-    message = types[topic_roles.TRANSFORMS]([types[topic_roles.TRANSFORM](header, child, moved)])
+    moved = types["geometry_msgs/msg/Transform"](
+        types["geometry_msgs/msg/Vector3"](*place), turned
+    )
+    message = types[topic_roles.TRANSFORMS](
+        [types[topic_roles.TRANSFORM](header, child, moved)]
+    )
     return bytes(store.serialize_cdr(message, topic_roles.TRANSFORMS))

@@ -29,7 +29,9 @@ MOST_FRAMES = 50_000_000
 # A pose that is farther from the one before than this many times the way that the speed explains,
 # and a margin [m, rad], was set anew; so was a clock that runs back by more than data come late.
 EXPLAINED, MARGIN_M, MARGIN_RAD, BACK_NS = 3.0, 0.2, 0.5, NS_PER_S
-ANY_LIDAR = LidarSpec(beams=2, angle_min=0.0, angle_max=1.0, range_min=0.0, range_max=1.0, rate=1.0)
+ANY_LIDAR = LidarSpec(
+    beams=2, angle_min=0.0, angle_max=1.0, range_min=0.0, range_max=1.0, rate=1.0
+)
 
 Nanoseconds = NDArray[np.int64]
 Indices = NDArray[np.intp]
@@ -56,9 +58,12 @@ class BagFrames:
 
 
 def frames_of(
-    path: str | Path, topics: Mapping[str, str], model: SimulatorModel | None = None,
-    fps: int | None = None, gap_s: float = 0.5,
-) -> BagFrames:  # fmt: skip
+    path: str | Path,
+    topics: Mapping[str, str],
+    model: SimulatorModel | None = None,
+    fps: int | None = None,
+    gap_s: float = 0.5,
+) -> BagFrames:
     """Reads a bag as frames at `fps`, by default the rate of its commands in whole hertz.
 
     A frame has the newest datum of each topic that was received by its time, none older than
@@ -78,20 +83,31 @@ def frames_of(
     if fps is None:
         apart = np.diff(received[CMD_VEL])
         if not (apart > 0).any():
-            raise RecordingError(f"{path}: its commands have no rate; say one with --fps.")
+            raise RecordingError(
+                f"{path}: its commands have no rate; say one with --fps."
+            )
         fps = max(1, round(NS_PER_S / float(np.median(apart[apart > 0]))))
     ticks = _ticks(str(path), received, fps)
-    rows = {role: np.searchsorted(ns, ticks, side="right") - 1 for role, ns in received.items()}
+    rows = {
+        role: np.searchsorted(ns, ticks, side="right") - 1
+        for role, ns in received.items()
+    }
     episode = _episodes(ticks, rows, received, resets(messages[ODOM]), gap_s)
     numbers, lengths = np.unique(episode[episode >= 0], return_counts=True)
     long_enough = lengths >= LEAST_FRAMES
     if not long_enough.any():
         reason = f"at no time were {', '.join(sorted(rows))} all newer than {gap_s:g} s"
-        raise RecordingError(f"{path}: {reason}; give a longer --gap, or leave a topic out.")
+        raise RecordingError(
+            f"{path}: {reason}; give a longer --gap, or leave a topic out."
+        )
     kept = np.isin(episode, numbers[long_enough])
-    made = _features(str(path), messages, {role: row[kept] for role, row in rows.items()}, model)
+    made = _features(
+        str(path), messages, {role: row[kept] for role, row in rows.items()}, model
+    )
     left_out = int((~long_enough).sum())
-    return BagFrames(made, lengths[long_enough].astype(np.int64), fps, ticks[kept], left_out)
+    return BagFrames(
+        made, lengths[long_enough].astype(np.int64), fps, ticks[kept], left_out
+    )
 
 
 def _received(messages: Sequence[Message]) -> Nanoseconds:
@@ -103,7 +119,9 @@ def _ticks(place: str, received: Mapping[str, Nanoseconds], fps: int) -> Nanosec
     count = (max(int(ns[-1]) for ns in received.values()) - first) * fps // NS_PER_S + 1
     if count > MOST_FRAMES:
         most = f"may have {MOST_FRAMES} frames and would have {count}"
-        raise RecordingError(f"{place}: {most}; give a smaller --fps, or a part of the bag.")
+        raise RecordingError(
+            f"{place}: {most}; give a smaller --fps, or a part of the bag."
+        )
     # In whole numbers, as a period need not be one of nanoseconds.
     return first + np.arange(max(count, 0), dtype=np.int64) * NS_PER_S // fps
 
@@ -123,9 +141,12 @@ def resets(odometry: Sequence[Message]) -> Indices:
 
 
 def _episodes(
-    ticks: Nanoseconds, rows: Mapping[str, Indices], received: Mapping[str, Nanoseconds],
-    set_anew: Indices, gap_s: float,
-) -> NDArray[np.int64]:  # fmt: skip
+    ticks: Nanoseconds,
+    rows: Mapping[str, Indices],
+    received: Mapping[str, Nanoseconds],
+    set_anew: Indices,
+    gap_s: float,
+) -> NDArray[np.int64]:
     """Returns the episode (T,) of each tick; -1 where a datum is old, or of before a reset."""
     reset_ns = np.append(np.int64(np.iinfo(np.int64).min), received[ODOM][set_anew])
     after = np.searchsorted(set_anew, rows[ODOM], side="right")
@@ -139,9 +160,11 @@ def _episodes(
 
 
 def _features(
-    place: str, messages: Mapping[str, list[Message]], rows: Mapping[str, Indices],
+    place: str,
+    messages: Mapping[str, list[Message]],
+    rows: Mapping[str, Indices],
     model: SimulatorModel | None,
-) -> dict[str, Feature]:  # fmt: skip
+) -> dict[str, Feature]:
     where = POSE if POSE in messages else ODOM
     pose = _table(place, where, [msgs.pose_row(m.content) for m in messages[where]])
     twist = _table(place, ODOM, [msgs.twist_row(m.content) for m in messages[ODOM]])
@@ -191,11 +214,15 @@ def _scans(
     table = np.array([np.asarray(m.content.ranges, np.float32) for m in scans])
     ranges = from_device(reader.ordered(table), reader.lidar)
     low, high = np.float32(reader.lidar.range_min), np.float32(reader.lidar.range_max)
-    ranges = np.where(np.isneginf(ranges), low, np.where(np.isfinite(ranges), ranges, high))
+    ranges = np.where(
+        np.isneginf(ranges), low, np.where(np.isfinite(ranges), ranges, high)
+    )
     angles = reader.lidar.angles
     info = {
-        "angle_min": float(angles[0]), "angle_max": float(angles[-1]),
+        "angle_min": float(angles[0]),
+        "angle_max": float(angles[-1]),
         "angle_increment": float(reader.lidar.angle_increment),
-        "range_min": float(reader.lidar.range_min), "range_max": float(reader.lidar.range_max),
-    }  # fmt: skip
+        "range_min": float(reader.lidar.range_min),
+        "range_max": float(reader.lidar.range_max),
+    }
     return Feature(ranges[rows], None, info)

@@ -22,7 +22,9 @@ class BagTopic:
     type: str
     count: int  # number of messages
     rate_hz: float | None = None  # from the median time between receipts
-    first_s: float | None = None  # receipt of the first message, from the start of the bag
+    first_s: float | None = (
+        None  # receipt of the first message, from the start of the bag
+    )
     last_s: float | None = None
     gaps: int = 0  # number of silences of more than three usual periods
     longest_gap_s: float | None = None
@@ -51,23 +53,38 @@ def bag_info(path: str | Path) -> BagInfo:
         received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
         times = np.concatenate([ns for ns, _ in received.values()])
         start, end = int(times.min()), int(times.max())
-        topics = tuple(_topic(t, bag.types[t], ns - start, s) for t, (ns, s) in received.items())
-    files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
+        topics = tuple(
+            _topic(t, bag.types[t], ns - start, s) for t, (ns, s) in received.items()
+        )
+    files = (
+        [path]
+        if path.is_file()
+        else [file for file in path.iterdir() if file.is_file()]
+    )
     size = sum(file.stat().st_size for file in files)
     return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
 
 
 def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
     if not bag.knows(topic):
-        return np.array([ns for ns, _ in bag.serialized(topic)], dtype=np.int64), UNKNOWN
+        return np.array(
+            [ns for ns, _ in bag.serialized(topic)], dtype=np.int64
+        ), UNKNOWN
     receive, stamps = times_of(bag.messages(topic))
     if stamps is None:
         return receive, NO_HEADER
     return receive, receive - stamps if stamps.any() else UNSTAMPED
 
 
-def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str) -> BagTopic:
-    clock, delay, jitter, backwards = delays if isinstance(delays, str) else "", None, None, 0
+def _topic(
+    topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str
+) -> BagTopic:
+    clock, delay, jitter, backwards = (
+        delays if isinstance(delays, str) else "",
+        None,
+        None,
+        0,
+    )
     if not isinstance(delays, str):
         low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
         delay, jitter = float(middle), float(high - low)
@@ -79,9 +96,16 @@ def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str)
     apart = np.diff(since) * S_PER_NS
     usual = float(np.median(apart)) if len(apart) else 0.0
     return BagTopic(
-        topic, kind, len(since), rate_hz=1.0 / usual if usual > 0.0 else None,
-        first_s=float(since[0] * S_PER_NS), last_s=float(since[-1] * S_PER_NS),
+        topic,
+        kind,
+        len(since),
+        rate_hz=1.0 / usual if usual > 0.0 else None,
+        first_s=float(since[0] * S_PER_NS),
+        last_s=float(since[-1] * S_PER_NS),
         gaps=int((apart > GAP * usual).sum()) if usual > 0.0 else 0,
         longest_gap_s=float(apart.max()) if len(apart) else None,
-        clock=clock, delay_s=delay, jitter_s=jitter, backwards=backwards,
-    )  # fmt: skip
+        clock=clock,
+        delay_s=delay,
+        jitter_s=jitter,
+        backwards=backwards,
+    )

@@ -20,7 +20,11 @@ VERSION = "v3.0"
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 NUMBERED = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA, EPISODES = f"data/{NUMBERED}", f"meta/episodes/{NUMBERED}"
-CHUNK_FILES, FILE_MB, VIDEO_MB = 1000, 100, 200  # files of a folder, and their greatest sizes
+CHUNK_FILES, FILE_MB, VIDEO_MB = (
+    1000,
+    100,
+    200,
+)  # files of a folder, and their greatest sizes
 SUCCESS = "next.success"
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 INDEX = "__index_level_0__"  # as pandas names the column of an index without a name
@@ -30,14 +34,19 @@ Columns = dict[str, NDArray[Any]]
 def check_output(folder: str | Path) -> None:
     """Raises ConfigError if a dataset can't be written to a folder, before the bag is read."""
     if find_spec("pyarrow") is None:
-        raise ConfigError(f"{folder}: a dataset needs the library pyarrow; pip install pyarrow.")
+        raise ConfigError(
+            f"{folder}: a dataset needs the library pyarrow; pip install pyarrow."
+        )
     check_folder(folder, INFO)
 
 
 def write_dataset(
-    frames: BagFrames, folder: str | Path, task: str, robot: str | None = None,
+    frames: BagFrames,
+    folder: str | Path,
+    task: str,
+    robot: str | None = None,
     succeeded: Collection[int] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Writes a dataset, whole or not at all; it replaces one that is there. Raises ConfigError.
 
     `task` says in words what the robot was to do; `succeeded` are the numbers of the episodes in
@@ -52,8 +61,12 @@ def write_dataset(
     with whole_folder(folder, INFO, _is_of_a_dataset) as root:
         rows = []
         for k, (end, length) in enumerate(zip(ends, frames.lengths, strict=True)):
-            part = {name: column[end - length : end] for name, column in columns.items()}
-            rows.append(_episode_row(k, int(end), int(length), task, files[k], _stats(part)))
+            part = {
+                name: column[end - length : end] for name, column in columns.items()
+            }
+            rows.append(
+                _episode_row(k, int(end), int(length), task, files[k], _stats(part))
+            )
         for number in dict.fromkeys(files):
             inside = [k for k, each in enumerate(files) if each == number]
             begin, end = ends[inside[0]] - frames.lengths[inside[0]], ends[inside[-1]]
@@ -61,7 +74,10 @@ def write_dataset(
             _write(_table(some), root / _numbered(DATA, number))
         _write(pyarrow.Table.from_pylist(rows), root / _numbered(EPISODES, 0))
         _write(_tasks(task), root / TASKS)
-        for name, told in ((INFO, _info(frames, columns, robot)), (STATS, _stats(columns))):
+        for name, told in (
+            (INFO, _info(frames, columns, robot)),
+            (STATS, _stats(columns)),
+        ):
             write_text(root / name, json.dumps(told, indent=4) + "\n")
 
 
@@ -75,7 +91,9 @@ def _columns(frames: BagFrames, succeeded: Collection[int] | None) -> Columns:
     lengths, total = frames.lengths, int(frames.lengths.sum())
     episode = np.repeat(np.arange(len(lengths)), lengths)
     frame = np.arange(total) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    columns: Columns = {name: feature.values for name, feature in frames.features.items()}
+    columns: Columns = {
+        name: feature.values for name, feature in frames.features.items()
+    }
     if succeeded is not None:
         for k in sorted(succeeded):
             if not 0 <= k < len(lengths):
@@ -84,15 +102,19 @@ def _columns(frames: BagFrames, succeeded: Collection[int] | None) -> Columns:
         reached = np.isin(episode, sorted(succeeded))
         columns[SUCCESS] = reached & (frame == np.repeat(lengths, lengths) - 1)
     return columns | {
-        "timestamp": (frame / frames.fps).astype(np.float32), "frame_index": frame,
-        "episode_index": episode, "index": np.arange(total),
+        "timestamp": (frame / frames.fps).astype(np.float32),
+        "frame_index": frame,
+        "episode_index": episode,
+        "index": np.arange(total),
         "task_index": np.zeros(total, dtype=np.int64),
-    }  # fmt: skip
+    }
 
 
 def _files(frames: BagFrames) -> list[int]:
     """The number of the file of each episode; one that is too large has a file for itself."""
-    width = sum(4 * feature.values.shape[1] for feature in frames.features.values()) + 40
+    width = (
+        sum(4 * feature.values.shape[1] for feature in frames.features.values()) + 40
+    )
     numbers, number, filled = [], 0, 0
     for length in frames.lengths:
         size = width * int(length)
@@ -117,18 +139,28 @@ def _stats(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[Any]
         table = column.reshape(len(column), -1).astype(np.float64)
         told = {"min": table.min(0), "max": table.max(0), "mean": table.mean(0)}
         told |= {"std": table.std(0), "count": np.array([len(table)])}
-        told |= dict(zip(QUANTILES, np.quantile(table, list(QUANTILES.values()), 0), strict=True))
+        told |= dict(
+            zip(QUANTILES, np.quantile(table, list(QUANTILES.values()), 0), strict=True)
+        )
         found[name] = {key: values.tolist() for key, values in told.items()}
     return found
 
 
 def _episode_row(
-    k: int, end: int, length: int, task: str, file: int, stats: Mapping[str, Mapping[str, Any]]
+    k: int,
+    end: int,
+    length: int,
+    task: str,
+    file: int,
+    stats: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     told: dict[str, Any] = {
-        "episode_index": k, "tasks": [task], "length": length,
-        "dataset_from_index": end - length, "dataset_to_index": end,
-    }  # fmt: skip
+        "episode_index": k,
+        "tasks": [task],
+        "length": length,
+        "dataset_from_index": end - length,
+        "dataset_to_index": end,
+    }
     told |= {f"data/{key}": value for key, value in _place(file).items()}
     told |= {f"meta/episodes/{key}": value for key, value in _place(0).items()}
     for name, each in stats.items():
@@ -139,14 +171,23 @@ def _episode_row(
 def _info(frames: BagFrames, columns: Columns, robot: str | None) -> dict[str, Any]:
     episodes = len(frames.lengths)
     return {
-        "codebase_version": VERSION, "robot_type": robot, "total_episodes": episodes,
-        "total_frames": int(frames.lengths.sum()), "total_tasks": 1, "chunks_size": CHUNK_FILES,
-        "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": VIDEO_MB, "fps": frames.fps,
-        "splits": {"train": f"0:{episodes}"}, "data_path": DATA, "video_path": None,
+        "codebase_version": VERSION,
+        "robot_type": robot,
+        "total_episodes": episodes,
+        "total_frames": int(frames.lengths.sum()),
+        "total_tasks": 1,
+        "chunks_size": CHUNK_FILES,
+        "data_files_size_in_mb": FILE_MB,
+        "video_files_size_in_mb": VIDEO_MB,
+        "fps": frames.fps,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": DATA,
+        "video_path": None,
         "features": {
-            name: _described(column, frames.features.get(name)) for name, column in columns.items()
+            name: _described(column, frames.features.get(name))
+            for name, column in columns.items()
         },
-    }  # fmt: skip
+    }
 
 
 def _described(column: NDArray[Any], feature: Feature | None) -> dict[str, Any]:
@@ -163,7 +204,11 @@ def _table(columns: Columns) -> "Table":
         # What has one element is a scalar to LeRobot, and else a list of a fixed length.
         flat = pyarrow.array(np.ascontiguousarray(column).reshape(-1))
         wide = column.ndim > 1 and column.shape[1] > 1
-        return pyarrow.FixedSizeListArray.from_arrays(flat, column.shape[1]) if wide else flat
+        return (
+            pyarrow.FixedSizeListArray.from_arrays(flat, column.shape[1])
+            if wide
+            else flat
+        )
 
     return pyarrow.table({name: array(column) for name, column in columns.items()})
 
@@ -174,10 +219,15 @@ def _tasks(task: str) -> "Table":
 
     kinds = {"task_index": ("int64", "int64"), INDEX: ("unicode", "object")}
     described = [
-        {"name": None if name == INDEX else name, "field_name": name, "pandas_type": kind,
-         "numpy_type": numpy_kind, "metadata": None}
+        {
+            "name": None if name == INDEX else name,
+            "field_name": name,
+            "pandas_type": kind,
+            "numpy_type": numpy_kind,
+            "metadata": None,
+        }
         for name, (kind, numpy_kind) in kinds.items()
-    ]  # fmt: skip
+    ]
     pandas = {"index_columns": [INDEX], "column_indexes": [], "columns": described}
     table = pyarrow.table({"task_index": [0], INDEX: [task]})
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})

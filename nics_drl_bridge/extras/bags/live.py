@@ -23,25 +23,45 @@ from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
-from nics_drl_bridge.nodes.runner import DELIVERY_S, holds, open_context, run_node, steadily
+from nics_drl_bridge.nodes.runner import (
+    DELIVERY_S,
+    holds,
+    open_context,
+    run_node,
+    steadily,
+)
 from nics_drl_bridge.recording.bag_file import BagFile, opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
 
 ROBOT = (  # topics of a robot, in its namespace
-    "scan", "odom", "cmd_vel", "cmd_vel_raw", "joint_states", "imu", "imu/data", "pose",
-    "ground_truth", "odometry/filtered", "e_stop", "goal_pose",
-)  # fmt: skip
+    "scan",
+    "odom",
+    "cmd_vel",
+    "cmd_vel_raw",
+    "joint_states",
+    "imu",
+    "imu/data",
+    "pose",
+    "ground_truth",
+    "odometry/filtered",
+    "e_stop",
+    "goal_pose",
+)
 SHARED = ("/tf", "/tf_static", "/clock", "/diagnostics")
 LOOK_S = 0.25  # period of the search for new topics [s]
 FLUSH_S = 1.0  # greatest span that is lost if the process is killed [s]
 QUEUE = 1000
 CLOCK = "/clock"
-CLOCK_PERIOD_NS = 10_000_000  # of wall time between messages; `/clock` also precedes each
+CLOCK_PERIOD_NS = (
+    10_000_000  # of wall time between messages; `/clock` also precedes each
+)
 USUAL_DEPTH = 100  # for a topic whose publishers' quality of service is not in the bag
 NAP_S = 0.05
 PATIENCE_S = 60.0
-DISCOVERY_S = 1.0  # time for subscribers to discover the topics before the first message [s]
+DISCOVERY_S = (
+    1.0  # time for subscribers to discover the topics before the first message [s]
+)
 ALONE_S = 5.0  # longest wait for a first subscriber; after it, the bag is played without one [s]
 
 
@@ -51,7 +71,9 @@ class BagOrder:
 
     out: Path  # folder of the bag
     topics: tuple[str, ...] = ()  # their names; those of `ROBOT` and `SHARED` if empty
-    everything: bool = False  # records every topic; with a namespace, all of it and `SHARED`
+    everything: bool = (
+        False  # records every topic; with a namespace, all of it and `SHARED`
+    )
     namespace: str = ""  # of the robot; prefix of topic names without a leading slash
     duration: float | None = None  # stops after this time [s]; None for never
     storage: Storage = "mcap"  # format of the file
@@ -63,20 +85,28 @@ class BagOrder:
         if self.everything:
             return not space or topic.startswith(f"{space}/") or topic in SHARED
         names = self.topics or (*ROBOT, *SHARED)
-        return topic in {name if name.startswith("/") else f"{space}/{name}" for name in names}
+        return topic in {
+            name if name.startswith("/") else f"{space}/{name}" for name in names
+        }
 
 
 class BagRecorder(QosWatch):
     """Writes wanted topics into a bag as received; `say` hears of each that begins or can't be."""
 
     def __init__(
-        self, context: Context, order: BagOrder, sink: BagSink, say: Callable[[str], None]
+        self,
+        context: Context,
+        order: BagOrder,
+        sink: BagSink,
+        say: Callable[[str], None],
     ) -> None:
         given = [Parameter("use_sim_time", value=order.use_sim_time)]
         super().__init__(
-            "bag_recorder", context=context, parameter_overrides=given,
+            "bag_recorder",
+            context=context,
+            parameter_overrides=given,
             start_parameter_services=False,
-        )  # fmt: skip
+        )
         self._order, self._sink, self._say = order, sink, say
         self.skipped: dict[str, str] = {}  # a sentence by topic
         self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
@@ -89,7 +119,10 @@ class BagRecorder(QosWatch):
         if now - self._flushed >= FLUSH_S:
             self._flushed = now
             self._sink.flush()
-        if self._order.duration is not None and now - self._began >= self._order.duration:
+        if (
+            self._order.duration is not None
+            and now - self._began >= self._order.duration
+        ):
             self.context.try_shutdown()
             return
         for topic, kinds in self.get_topic_names_and_types():
@@ -120,7 +153,10 @@ class BagRecorder(QosWatch):
         else:
             self.destroy_subscription(known[1])
         take, profile = partial(self._take, topic), profile_of(wanted)
-        self._heard[topic] = wanted, self.create_subscription(kind, topic, take, profile, raw=True)
+        self._heard[topic] = (
+            wanted,
+            self.create_subscription(kind, topic, take, profile, raw=True),
+        )
 
     def _take(self, topic: str, data: bytes, info: Any) -> None:
         received = info.get("received_timestamp") or time.time_ns()
@@ -133,12 +169,16 @@ class BagRecorder(QosWatch):
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     """Records until the duration or a signal; counts by topic. BackendError, RecordingError."""
     with bag_sink(order.out, order.storage, keep=True) as sink:
-        node = run_node(lambda context: BagRecorder(context, order, sink, say), ["nics"])
+        node = run_node(
+            lambda context: BagRecorder(context, order, sink, say), ["nics"]
+        )
         if not sum(sink.counts.values()):
             skipped = " ".join(node.skipped.values())
             fix = "start the robot, or correct --topics, --namespace or ROS_DOMAIN_ID."
             fix += f" Not recorded: {skipped}" if skipped else ""
-            raise BackendError(f"nothing was heard on any topic, so no bag is written; {fix}")
+            raise BackendError(
+                f"nothing was heard on any topic, so no bag is written; {fix}"
+            )
     return sink.counts
 
 
@@ -147,9 +187,14 @@ Timed = tuple[int, str, bytes]  # receipt [ns], topic, data
 
 class _Player:
     def __init__(
-        self, node: Node, stopping: threading.Event, rate: float, clock: bool, namespace: str,
+        self,
+        node: Node,
+        stopping: threading.Event,
+        rate: float,
+        clock: bool,
+        namespace: str,
         lockstep: str | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._node, self._stopping, self._rate = node, stopping, rate
         self._lockstep, self._space = lockstep, namespace_of(namespace)
         self.publishers: dict[str, Publisher] = {}
@@ -165,26 +210,38 @@ class _Player:
         found = message_type(kind)
         if found is None:
             return False
-        name = topic if topic in (CLOCK, "/tf", "/tf_static") else f"{self._space}{topic}"
+        name = (
+            topic if topic in (CLOCK, "/tf", "/tf_static") else f"{self._space}{topic}"
+        )
         best = Offer(  # matches any subscriber of one of the publishers
             max((offer.depth for offer in offers), default=USUAL_DEPTH),
             not offers or any(offer.reliable for offer in offers),
             any(offer.transient_local for offer in offers),
         )
-        self.publishers[topic] = self._node.create_publisher(found, name, profile_of(best))
+        self.publishers[topic] = self._node.create_publisher(
+            found, name, profile_of(best)
+        )
         return True
 
     def ready(self) -> None:
         publishers, known = self.publishers.values(), self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
-        self._wait(lambda: any(each.get_subscription_count() for each in publishers), ALONE_S)
+        self._wait(
+            lambda: any(each.get_subscription_count() for each in publishers), ALONE_S
+        )
         self._wait(  # for all known subscribers to find their topic
-            lambda: all(p.get_subscription_count() >= known(p.topic_name) for p in publishers),
+            lambda: all(
+                p.get_subscription_count() >= known(p.topic_name) for p in publishers
+            ),
             PATIENCE_S,
         )
-        if self._barrier is not None and not self._wait(self._barrier.service_is_ready, PATIENCE_S):
+        if self._barrier is not None and not self._wait(
+            self._barrier.service_is_ready, PATIENCE_S
+        ):
             fix = "start it, or correct its name, namespace or ROS_DOMAIN_ID."
-            raise BackendError(f"node {self._lockstep!r}: not found within {PATIENCE_S:g} s; {fix}")
+            raise BackendError(
+                f"node {self._lockstep!r}: not found within {PATIENCE_S:g} s; {fix}"
+            )
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
         return holds(lambda: condition() or self._stopping.is_set(), patience_s, NAP_S)
@@ -222,9 +279,15 @@ class _Player:
 
 
 def play_bag(
-    path: Path, topics: Sequence[str], rate: float, loop: bool, clock: bool, namespace: str,
-    lockstep: str | None, say: Callable[[str], None],
-) -> int:  # fmt: skip
+    path: Path,
+    topics: Sequence[str],
+    rate: float,
+    loop: bool,
+    clock: bool,
+    namespace: str,
+    lockstep: str | None,
+    say: Callable[[str], None],
+) -> int:
     """Publishes a bag until its end, SIGINT or SIGTERM; returns the number of published messages.
 
     The rate is in seconds of the bag per second; `clock` publishes the times of receipt on `/clock`
@@ -242,11 +305,19 @@ def play_bag(
     node = Node("bag_player", context=context, start_parameter_services=False)
     try:
         player = _Player(node, stopping, rate, clock, namespace, lockstep)
-        played = {t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])}
+        played = {
+            t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])
+        }
         for topic in sorted(kinds.keys() - played.keys()):
-            say(f"left out: {topic} is of {kinds[topic]}, whose package is not installed.")
+            say(
+                f"left out: {topic} is of {kinds[topic]}, whose package is not installed."
+            )
         # In the order of receipt, at equal times in that of their topics.
-        timed = [(ns, topic, data) for topic, some in sorted(played.items()) for ns, data in some]
+        timed = [
+            (ns, topic, data)
+            for topic, some in sorted(played.items())
+            for ns, data in some
+        ]
         timed.sort(key=lambda one: one[:2])
         if not timed:
             raise RecordingError(f"{path}: holds nothing that can be played here.")
@@ -266,6 +337,8 @@ def _wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
     names = [name if name.startswith("/") else f"/{name}" for name in topics]
     for name in names:
         if name not in bag.types:
-            raise RecordingError(f"{bag.place}: has no topic {name!r}; {nearest(name, bag.types)}")
+            raise RecordingError(
+                f"{bag.place}: has no topic {name!r}; {nearest(name, bag.types)}"
+            )
     left_out = {*bag.empty, *([CLOCK] if clock else [])}
     return [topic for topic in sorted(names or bag.types) if topic not in left_out]

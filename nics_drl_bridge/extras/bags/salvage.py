@@ -18,7 +18,12 @@ from mcap.records import Chunk, Message, Statistics
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording import mcap
-from nics_drl_bridge.recording.bag_file import COMPRESSED, DATABASE, is_storage, metadata_of
+from nics_drl_bridge.recording.bag_file import (
+    COMPRESSED,
+    DATABASE,
+    is_storage,
+    metadata_of,
+)
 from nics_drl_bridge.recording.messages import typestore
 from nics_drl_bridge.recording.write import Storage, bag_sink
 
@@ -26,7 +31,10 @@ ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message compressed on its own; a plain on
 LATEST_NS = 1 << 62
 SMALLEST_ROW = 16  # minimum size of a message [bytes], which bounds their number
 SMALLEST_PAGE = 512
-BESIDE = ("-wal", "-journal")  # next to an unclosed database; SQLite needs them to recover it
+BESIDE = (
+    "-wal",
+    "-journal",
+)  # next to an unclosed database; SQLite needs them to recover it
 CHUNK_OP = bytes([Opcode.CHUNK])
 
 
@@ -35,7 +43,9 @@ class Salvage:
     """Result of a salvage."""
 
     kept: Mapping[str, int]  # number of saved messages by topic
-    promised: Mapping[str, int] | None  # original number of messages by topic; None if unknown
+    promised: (
+        Mapping[str, int] | None
+    )  # original number of messages by topic; None if unknown
     span_s: float  # from the first saved message to the last one [s]
 
     @property
@@ -43,11 +53,16 @@ class Salvage:
         """Number of lost messages; None if unknown."""
         if self.promised is None:
             return None
-        return sum(max(n - self.kept.get(topic, 0), 0) for topic, n in self.promised.items())
+        return sum(
+            max(n - self.kept.get(topic, 0), 0) for topic, n in self.promised.items()
+        )
 
     def lines(self) -> tuple[str, ...]:
         """Returns one line for the whole bag and one per topic."""
-        promised, lost = self.promised or {}, "; how many there were, nothing in the bag tells"
+        promised, lost = (
+            self.promised or {},
+            "; how many there were, nothing in the bag tells",
+        )
         if self.lost is not None:
             total = sum(promised.values())
             share = 100.0 * self.lost / max(total, 1)
@@ -55,15 +70,21 @@ class Salvage:
         head = f"{sum(self.kept.values())} messages are kept{lost}; they span {self.span_s:.3f} s"
         of = {topic: f" of {count}" for topic, count in promised.items()}
         names = sorted({*self.kept, *promised})
-        return head, *(f"  {name}: {self.kept.get(name, 0)}{of.get(name, '')}" for name in names)
+        return head, *(
+            f"  {name}: {self.kept.get(name, 0)}{of.get(name, '')}" for name in names
+        )
 
 
 @dataclass
 class _Found:
     kinds: dict[str, str] = field(default_factory=dict)  # type by topic
     definitions: dict[str, str] = field(default_factory=dict)  # text by type
-    messages: list[tuple[str, int, bytes]] = field(default_factory=list)  # topic, receipt, data
-    promised: Counter[str] = field(default_factory=Counter)  # original number of messages by topic
+    messages: list[tuple[str, int, bytes]] = field(
+        default_factory=list
+    )  # topic, receipt, data
+    promised: Counter[str] = field(
+        default_factory=Counter
+    )  # original number of messages by topic
     told: bool = True  # False if a file does not contain that number
 
 
@@ -74,7 +95,9 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
         (_read_database if file.suffix == DATABASE else _read_mcap)(file, found)
     messages = sorted(_decodable(found), key=lambda message: message[1])
     if not messages:
-        raise RecordingError(f"{path}: holds no message that is intact; record the drive anew.")
+        raise RecordingError(
+            f"{path}: holds no message that is intact; record the drive anew."
+        )
     with bag_sink(out, storage) as sink:
         for topic, kind in found.kinds.items():
             sink.add_topic(topic, kind, definition=found.definitions.get(kind))
@@ -93,7 +116,9 @@ def salvaged(path: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
         lines = salvage(path, out).lines()
         try:
             yield out, lines
-        except RecordingError as error:  # it names the copy, which the user does not know
+        except (
+            RecordingError
+        ) as error:  # it names the copy, which the user does not know
             raise RecordingError(str(error).replace(str(out), str(path))) from None
 
 
@@ -104,10 +129,14 @@ def _files(path: Path) -> list[Path]:
     files = [path] if path.is_file() else sorted(path.rglob("*"), key=_number)
     found = [file for file in files if file.is_file() and is_storage(file)]
     if not found:
-        raise RecordingError(f"{path}: holds no .mcap or .db3 file; give the folder of a rosbag2.")
+        raise RecordingError(
+            f"{path}: holds no .mcap or .db3 file; give the folder of a rosbag2."
+        )
     for file in found:
         if file.suffix in COMPRESSED:
-            raise RecordingError(f"{file}: is compressed as a whole; unpack it with `zstd -d`.")
+            raise RecordingError(
+                f"{file}: is compressed as a whole; unpack it with `zstd -d`."
+            )
     return found
 
 
@@ -133,7 +162,9 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
 
 def _promised(path: Path) -> dict[str, int] | None:
     try:
-        topics = metadata_of(path if path.is_dir() else path.parent)["topics_with_message_count"]
+        topics = metadata_of(path if path.is_dir() else path.parent)[
+            "topics_with_message_count"
+        ]
         return {t["topic_metadata"]["name"]: int(t["message_count"]) for t in topics}
     except (OSError, ValueError, TypeError, KeyError):
         return None
@@ -149,7 +180,10 @@ def _read_mcap(file: Path, found: _Found) -> None:
             record = next(mcap.records(data, place))
             whole, end = isinstance(record.content, Chunk), record.end
             if whole:
-                span = record.content.message_start_time, record.content.message_end_time
+                span = (
+                    record.content.message_start_time,
+                    record.content.message_end_time,
+                )
                 with suppress(mcap.DamageError):
                     waiting += _until_damage(mcap.unpacked(record), span)
             elif isinstance(record.content, mcap.INSIDE):
@@ -183,7 +217,9 @@ def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
     start = place + mcap.PREFIX + 40
     if data[place] != Opcode.CHUNK or start >= len(data):
         return []
-    first, last, size, crc, letters = struct.unpack_from("<QQQII", data, place + mcap.PREFIX)
+    first, last, size, crc, letters = struct.unpack_from(
+        "<QQQII", data, place + mcap.PREFIX
+    )
     content, compressed = data[start : start + size], letters > 0
     if compressed or (len(content) == size and crc and crc32(content) != crc):
         return []
@@ -198,7 +234,10 @@ def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.R
                 found = record.content
                 if not isinstance(found, mcap.INSIDE):
                     return
-                if not isinstance(found, Message) or span_ns[0] <= found.log_time <= span_ns[1]:
+                if (
+                    not isinstance(found, Message)
+                    or span_ns[0] <= found.log_time <= span_ns[1]
+                ):
                     yield record
             return
         except mcap.DamageError as damage:
@@ -207,7 +246,9 @@ def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.R
 
 def _next_chunk(data: memoryview, start: int, end: int) -> int:
     file, place = data.obj, start - 1
-    while isinstance(file, mmap) and (place := file.find(CHUNK_OP, place + 1, end)) >= 0:
+    while (
+        isinstance(file, mmap) and (place := file.find(CHUNK_OP, place + 1, end)) >= 0
+    ):
         if _looks_like_chunk(data, place):
             return place
     return end
@@ -218,7 +259,9 @@ def _looks_like_chunk(data: memoryview, place: int) -> bool:
     if name + 12 > len(data):
         return False
     *_, letters = struct.unpack_from("<QQQII", data, place + mcap.PREFIX)
-    if letters > 4 or bytes(data[name : name + letters]) not in map(str.encode, mcap.COMPRESSIONS):
+    if letters > 4 or bytes(data[name : name + letters]) not in map(
+        str.encode, mcap.COMPRESSIONS
+    ):
         return False
     (length,) = struct.unpack_from("<Q", data, place + 1)
     (packed,) = struct.unpack_from("<Q", data, name + letters)
@@ -234,18 +277,28 @@ def _read_database(file: Path, found: _Found) -> None:
         for ending in BESIDE:
             with suppress(FileNotFoundError):
                 shutil.copyfile(f"{file}{ending}", f"{copy}{ending}")
-        bound = sum(each.stat().st_size for each in Path(folder).iterdir()) // SMALLEST_ROW
+        bound = (
+            sum(each.stat().st_size for each in Path(folder).iterdir()) // SMALLEST_ROW
+        )
         with closing(sqlite3.connect(copy)) as base, suppress(sqlite3.Error):
             base.text_factory = lambda raw: raw.decode("utf-8", "replace")
             # With this, SQLite opens a truncated file.
             base.execute("PRAGMA writable_schema = ON")
             topics = dict(base.execute("SELECT id, name FROM topics").fetchall())
-            found.kinds |= dict(base.execute("SELECT name, type FROM topics").fetchall())
+            found.kinds |= dict(
+                base.execute("SELECT name, type FROM topics").fetchall()
+            )
             for row in _rows(base, bound):
                 key, ns, data = row
-                if [type(value) for value in row] == [int, int, bytes] and key in topics:
+                if [type(value) for value in row] == [
+                    int,
+                    int,
+                    bytes,
+                ] and key in topics:
                     found.messages.append((topics[key], ns, data))
-            ask = "SELECT topic_type, encoded_message_definition FROM message_definitions"
+            ask = (
+                "SELECT topic_type, encoded_message_definition FROM message_definitions"
+            )
             found.definitions |= dict(base.execute(ask).fetchall())
 
 

@@ -15,17 +15,25 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Parameters = dict[str, float]
 
-TORQUE_RESERVE = 1.5  # torque limit of a motor, relative to that for the maximum acceleration
+TORQUE_RESERVE = (
+    1.5  # torque limit of a motor, relative to that for the maximum acceleration
+)
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
-STIFF_SERVO_LAG_S = 0.001  # the same, of one that keeps its speed though its tyres are dragged
+STIFF_SERVO_LAG_S = (
+    0.001  # the same, of one that keeps its speed though its tyres are dragged
+)
 ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's
 # Resistance of tyres to skidding relative to that to being pressed in, MuJoCo's `impratio`: at 1,
 # its convex contacts lift what slides so far that wheels hop off the floor.
 SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
 MISFIT = 0.01  # greatest error of the angle to which a tie rod leads a wheel [rad]
-STEERING_TORQUE = 1.0  # torque limit of a steering servo [N m], that of a small hobby servo
-THICKNESS = 0.25  # radius of a roller at its middle, relative to the radius of the wheel
+STEERING_TORQUE = (
+    1.0  # torque limit of a steering servo [N m], that of a small hobby servo
+)
+THICKNESS = (
+    0.25  # radius of a roller at its middle, relative to the radius of the wheel
+)
 ROLLER_MASS = 0.005
 ROLLED = 1.0, 0.9884, 1.0  # by rollers under load, as drives sideways show
 
@@ -38,8 +46,12 @@ class Physics:
     mass: float = 4.0  # of the chassis with its load, without wheels [kg]
     wheel_mass: float = 0.15  # of a wheel [kg]
     friction: float = 1.0  # between tyre and floor
-    acceleration: float = 5.0  # of the robot after the maximum step of a command [m/s^2]
-    softness: float = 0.005  # time constant of a tyre that was pressed into the floor [s]
+    acceleration: float = (
+        5.0  # of the robot after the maximum step of a command [m/s^2]
+    )
+    softness: float = (
+        0.005  # time constant of a tyre that was pressed into the floor [s]
+    )
     bearing: float = 1e-6  # viscous friction of free wheels and rollers [N m s/rad]
     rollers: int = 12  # of a mecanum wheel
 
@@ -50,16 +62,29 @@ class Machine:
 
     xml: str  # the MJCF model; its body `base_link` has the only free joint
     joints: tuple[str, ...]  # J names of the joints with encoders
-    controls: Callable[[Array], Array]  # maps a wanted state (S,) to the actuators' inputs (U,)
-    state: Callable[[Array, Array], Array]  # positions [rad] and speeds [rad/s] (J,) to state (S,)
-    calibrated: tuple[float, float, float] = (1.0, 1.0, 1.0)  # driven twist, by that of the wheels
+    controls: Callable[
+        [Array], Array
+    ]  # maps a wanted state (S,) to the actuators' inputs (U,)
+    state: Callable[
+        [Array, Array], Array
+    ]  # positions [rad] and speeds [rad/s] (J,) to state (S,)
+    calibrated: tuple[float, float, float] = (
+        1.0,
+        1.0,
+        1.0,
+    )  # driven twist, by that of the wheels
     gyro: bool = False  # tells odometry how the robot turns, instead of the wheels
 
 
 def _motor(
-    transmission: str, inertia: float, lag: float, radius: float, step: float, physics: Physics,
+    transmission: str,
+    inertia: float,
+    lag: float,
+    radius: float,
+    step: float,
+    physics: Physics,
     servo_lag: float = SERVO_LAG_S,
-) -> str:  # fmt: skip
+) -> str:
     # Torque = gain x (wanted - actual speed), up to a limit. The wanted speed follows the command
     # with a first-order lag [s], so that the servo is stiff and keeps its speed under load.
     # Spinning or locked wheels do not steer, so the lag is longer if the maximum step [m/s] would
@@ -74,7 +99,12 @@ def _motor(
 
 
 def _document(
-    name: str, physics: Physics, height: float, robot: str, actuators: str, impratio: float = 1.0
+    name: str,
+    physics: Physics,
+    height: float,
+    robot: str,
+    actuators: str,
+    impratio: float = 1.0,
 ) -> str:
     return f"""
 <mujoco model="{name}">
@@ -98,7 +128,9 @@ def _document(
 """
 
 
-def _chassis(mass: float, centre: tuple[float, float, float], size: tuple[float, ...]) -> str:
+def _chassis(
+    mass: float, centre: tuple[float, float, float], size: tuple[float, ...]
+) -> str:
     half = " ".join(f"{0.5 * s:.6g}" for s in size)
     x, y, z = centre
     return f"""
@@ -106,9 +138,13 @@ def _chassis(mass: float, centre: tuple[float, float, float], size: tuple[float,
 
 
 def _wheel(
-    name: str, radius: float, width: float, physics: Physics, damping: float = 0.0,
+    name: str,
+    radius: float,
+    width: float,
+    physics: Physics,
+    damping: float = 0.0,
     rotor: float = 0.0,
-) -> str:  # fmt: skip
+) -> str:
     return f"""
         <joint name="{name}" axis="0 1 0" damping="{damping}" armature="{rotor:.8g}"/>
         <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
@@ -132,13 +168,17 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
     kind = require_textbook(spec)
     if kind not in _BUILDERS:
         fix = f"take one of {', '.join(_BUILDERS)}, or the fast simulator."
-        raise ConfigError(f"robot {spec.name!r}: MuJoCo has no machine of the kind {kind!r}; {fix}")
+        raise ConfigError(
+            f"robot {spec.name!r}: MuJoCo has no machine of the kind {kind!r}; {fix}"
+        )
     if any(v.twist is not None for v in spec.state):
         fault = "MuJoCo's machines measure actuators, not a twist"
         raise ConfigError(f"robot {spec.name!r}: {fault}; correct `state:`.")
     try:
         step = max(c.max - c.min for c in spec.command if not c.turns)
-        steepest = max((max(-v.min, v.max) for v in spec.state if v.unit == "rad"), default=0.0)
+        steepest = max(
+            (max(-v.min, v.max) for v in spec.state if v.unit == "rad"), default=0.0
+        )
         given = {**spec.parameters, "steepest": steepest}, step, physics or Physics()
         return _BUILDERS[kind](*given)
     except KeyError as error:
@@ -164,21 +204,30 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
 
     def controls(state: Array) -> Array:
         speed, steering = state
-        t = np.tan(steering)  # of a virtual wheel in the middle; both turn about one centre
+        t = np.tan(
+            steering
+        )  # of a virtual wheel in the middle; both turn about one centre
         left, right = t / (1.0 - half_ratio * t), t / (1.0 + half_ratio * t)
         return np.array([speed / radius, np.arctan(left), np.arctan(right)])
 
     def measured(position: Array, speed: Array) -> Array:
         each = np.tan(position[2:])
         middle = each / (1.0 + half_ratio * np.array([1.0, -1.0]) * each)
-        return np.array([0.5 * radius * (speed[0] + speed[1]), np.arctan(np.mean(middle))])
+        return np.array(
+            [0.5 * radius * (speed[0] + speed[1]), np.arctan(np.mean(middle))]
+        )
 
     joints = ("rear_left", "rear_right", "steer_left", "steer_right")
     return Machine(xml, joints, controls, measured)
 
 
 def _car_wheels(
-    wheelbase: float, track: float, radius: float, lag: float, physics: Physics, rotor: float
+    wheelbase: float,
+    track: float,
+    radius: float,
+    lag: float,
+    physics: Physics,
+    rotor: float,
 ) -> str:
     parts = ""
     for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
@@ -200,7 +249,9 @@ def _car_wheels(
 def _tie_rod(half_ratio: float, steepest: float) -> str:
     # Servos that are not joined pass through angles at which the wheels scrub.
     middle = np.tan(np.linspace(-steepest, steepest, 101))
-    left, right = (np.arctan2(middle, 1.0 + side * half_ratio * middle) for side in (-1.0, 1.0))
+    left, right = (
+        np.arctan2(middle, 1.0 + side * half_ratio * middle) for side in (-1.0, 1.0)
+    )
     row = polynomial.polyfit(left, right, [1, 2, 3, 4])
     if np.abs(polynomial.polyval(left, row) - right).max() > MISFIT:
         return ""
@@ -245,7 +296,9 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
         <joint type="ball" damping="{physics.bearing}"/>
         <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
       </body>{wheels}"""
-    motors = _motors(names := ("left", "right"), inertia, p["wheel_lag"], radius, step, physics)
+    motors = _motors(
+        names := ("left", "right"), inertia, p["wheel_lag"], radius, step, physics
+    )
     xml = _document("differential", physics, radius, robot, motors)
     return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
@@ -267,7 +320,9 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     xml = _document("mecanum", physics, radius, body, motors)
     # On a diagonal two wheels stand, each on a roller that it meets anywhere along its length: they
     # turn the robot by up to 0.03 rad/s. Only a gyro can tell.
-    return Machine(xml, names, lambda state: state, lambda _, speed: speed, ROLLED, gyro=True)
+    return Machine(
+        xml, names, lambda state: state, lambda _, speed: speed, ROLLED, gyro=True
+    )
 
 
 def _skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
@@ -282,7 +337,9 @@ def _skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
       <body pos="{px:.6g} {py:.6g} 0">{_wheel(name, radius, 0.4 * radius, physics, rotor=rotor)}
       </body>"""
     names = tuple(places)
-    motors = _motors(names, inertia, p["wheel_lag"], radius, step, physics, STIFF_SERVO_LAG_S)
+    motors = _motors(
+        names, inertia, p["wheel_lag"], radius, step, physics, STIFF_SERVO_LAG_S
+    )
     xml = _document("skid_steer", physics, radius, body, motors, SKIDDING)
     both = lambda _, speed: 0.5 * (speed[:2] + speed[2:])  # noqa: E731
     # How far it skids differs with speed and curve; such robots' odometry turns by their gyro.
@@ -297,9 +354,11 @@ def _motors(names: tuple[str, ...], *servo: Any) -> str:
 
 
 _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
-    "ackermann": _ackermann, "differential": _differential, "mecanum": _mecanum,
+    "ackermann": _ackermann,
+    "differential": _differential,
+    "mecanum": _mecanum,
     "skid_steer": _skid_steer,
-}  # fmt: skip
+}
 
 
 def roller_size(radius: float, rollers: int) -> tuple[float, float]:
@@ -310,7 +369,12 @@ def roller_size(radius: float, rollers: int) -> tuple[float, float]:
 
 
 def _roller_wheel(
-    name: str, place: tuple[float, float], lean: int, radius: float, physics: Physics, rotor: float
+    name: str,
+    place: tuple[float, float],
+    lean: int,
+    radius: float,
+    physics: Physics,
+    rotor: float,
 ) -> str:
     # It leans by +1 if the axle of the roller on the floor points forward and left, else by -1.
     a, b = roller_size(radius, physics.rollers)

@@ -28,9 +28,16 @@ def prefix_of(robot: int) -> str:
 
 
 def compile_scene(
-    mujoco: Any, machine: Machine, physics: Physics, footprint: Shape, robots: int, world: World,
-    motions: Sequence[Motion | None], shapes: Sequence[Shape], bodies: Array,
-) -> Any:  # fmt: skip
+    mujoco: Any,
+    machine: Machine,
+    physics: Physics,
+    footprint: Shape,
+    robots: int,
+    world: World,
+    motions: Sequence[Motion | None],
+    shapes: Sequence[Shape],
+    bodies: Array,
+) -> Any:
     """Compiles robots of one kind in a world; those of its bodies (K, 7) that move are mocaps."""
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
@@ -46,7 +53,9 @@ def compile_scene(
         maker.map(world.grid)
     for k, body in enumerate(bodies):
         if body[RADIUS] > 0.0:
-            maker.obstacle(k, shapes[int(body[SHAPE])], body[:3], motions[k] is not None)
+            maker.obstacle(
+                k, shapes[int(body[SHAPE])], body[:3], motions[k] is not None
+            )
     return spec.compile()
 
 
@@ -54,7 +63,10 @@ def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
     """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
     heads = [f"{prefix_of(m)}{BUMPER_NAME}" for m in range(robots)]
-    found = [next((m for m, head in enumerate(heads) if n.startswith(head)), -1) for n in names]
+    found = [
+        next((m for m, head in enumerate(heads) if n.startswith(head)), -1)
+        for n in names
+    ]
     return np.array(found, dtype=np.int64)
 
 
@@ -68,7 +80,10 @@ class _Maker:
         half, own = 0.5 * float(base.pos[2]), {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
             # Its round edge touches a wall in one point, at the height of the axles.
-            size, kind = [footprint.radius, footprint.radius, half], self._kinds.mjGEOM_ELLIPSOID
+            size, kind = (
+                [footprint.radius, footprint.radius, half],
+                self._kinds.mjGEOM_ELLIPSOID,
+            )
             self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **own)
         else:
             for i, part in enumerate(convex_parts(footprint.outline)):
@@ -82,38 +97,64 @@ class _Maker:
     def map(self, grid: GridMap) -> None:
         heading, side = grid.origin[2], grid.resolution
         for first_row, first, row, column in rectangles(grid.blocked):
-            middle = grid.cell_to_world([0.5 * (first_row + row - 1), 0.5 * (first + column - 1)])
-            size = [0.5 * side * (column - first), 0.5 * side * (row - first_row), 0.5 * HEIGHT]
+            middle = grid.cell_to_world(
+                [0.5 * (first_row + row - 1), 0.5 * (first + column - 1)]
+            )
+            size = [
+                0.5 * side * (column - first),
+                0.5 * side * (row - first_row),
+                0.5 * HEIGHT,
+            ]
             self._box(self._spec.worldbody, middle, heading, size)
 
     def obstacle(self, k: int, shape: Shape, pose: Array, moves: bool) -> None:
         x, y, heading = pose
         body = self._spec.worldbody.add_body(
-            name=f"{OBSTACLE_NAME}{k}", pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
+            name=f"{OBSTACLE_NAME}{k}",
+            pos=[x, y, 0.0],
+            quat=quaternion(heading),
+            mocap=moves,
         )
         if isinstance(shape, Circle):
             size = [shape.radius, 0.5 * HEIGHT, 0.0]
-            self._add(body, type=self._kinds.mjGEOM_CYLINDER, size=size, pos=[0, 0, 0.5 * HEIGHT])
+            self._add(
+                body,
+                type=self._kinds.mjGEOM_CYLINDER,
+                size=size,
+                pos=[0, 0, 0.5 * HEIGHT],
+            )
         elif isinstance(shape, Rectangle):
-            self._box(body, np.zeros(2), 0.0, [*(0.5 * s for s in shape.size), 0.5 * HEIGHT])
+            self._box(
+                body, np.zeros(2), 0.0, [*(0.5 * s for s in shape.size), 0.5 * HEIGHT]
+            )
         elif isinstance(shape, Segment):
             self.wall(body, *shape.outline)
         else:
             for part in convex_parts(shape.outline):
                 self._prism(body, part, (0.0, HEIGHT))
 
-    def _box(self, body: Any, middle: Array, heading: float, size: Sequence[float]) -> None:
+    def _box(
+        self, body: Any, middle: Array, heading: float, size: Sequence[float]
+    ) -> None:
         pos, turned = [middle[0], middle[1], 0.5 * HEIGHT], quaternion(heading)
         self._add(body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=turned)
 
-    def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
+    def _prism(
+        self, body: Any, corners: Array, z: tuple[float, float], **others: Any
+    ) -> None:
         mesh = self._spec.add_mesh(name=f"prism_{len(self._spec.meshes)}")
-        layers = [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
+        layers = [
+            np.column_stack([corners, np.full(len(corners), height)]) for height in z
+        ]
         mesh.uservert = np.concatenate(layers).ravel()
         self._add(body, type=self._kinds.mjGEOM_MESH, meshname=mesh.name, **others)
 
     def _add(self, body: Any, **values: Any) -> None:
-        common = {"conaffinity": BUMPER, "condim": 3, "friction": [BUMPER_FRICTION, 0.005, 0.0001]}
+        common = {
+            "conaffinity": BUMPER,
+            "condim": 3,
+            "friction": [BUMPER_FRICTION, 0.005, 0.0001],
+        }
         body.add_geom(**common, solref=self._solref, **values)
 
 
@@ -146,7 +187,9 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
     if _area(a, b, c) <= 0.0:
         return False
     others = (outline[k] for k in rest if k not in (before, here, after))
-    return not any(min(_area(a, b, p), _area(b, c, p), _area(c, a, p)) >= 0.0 for p in others)
+    return not any(
+        min(_area(a, b, p), _area(b, c, p), _area(c, a, p)) >= 0.0 for p in others
+    )
 
 
 def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -11,7 +11,12 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco import scenery
-from nics_drl_bridge.extras.mujoco.machines import Machine, Physics, build_machine, load_mujoco
+from nics_drl_bridge.extras.mujoco.machines import (
+    Machine,
+    Physics,
+    build_machine,
+    load_mujoco,
+)
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
@@ -25,7 +30,9 @@ from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator, Indices, Starts
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
+ENCODER_PERIOD_S = (
+    0.01  # approximate period of encoder readings and of updates of moving obstacles
+)
 LARGEST_TILT_RAD = 0.5
 SETTLING_S = 0.5
 MOTION = ("pose", "twist", "state")
@@ -44,7 +51,9 @@ class Reading:
 class Rig:
     """Access to one machine, of a number, in the arrays of a MuJoCo model."""
 
-    def __init__(self, spec: RobotSpec, machine: Machine, model: Any, number: int = 0) -> None:
+    def __init__(
+        self, spec: RobotSpec, machine: Machine, model: Any, number: int = 0
+    ) -> None:
         self.spec, self.machine = spec, machine
         self._target, prefix = textbook(spec).target, scenery.prefix_of(number)
         base = model.joint(int(model.body(f"{prefix}base_link").jntadr[0]))
@@ -72,7 +81,9 @@ class Rig:
     def motion(self, data: Any, rest: Array) -> tuple[Array, Array]:
         """Returns copies of positions (nq,) and speeds (nq - 1,) of the body and all its parts."""
         positions = data.qpos[self._place : self._place + len(rest)]
-        return positions.copy(), data.qvel[self._drift : self._drift + len(rest) - 1].copy()
+        return positions.copy(), data.qvel[
+            self._drift : self._drift + len(rest) - 1
+        ].copy()
 
     def resume(self, data: Any, motion: tuple[Array, Array]) -> None:
         """Goes on with the motion that another rig of this machine had."""
@@ -86,7 +97,9 @@ class Rig:
         if command.shape != (count,) or not np.isfinite(command).all():
             reason = f"must be {count} finite numbers, as robot {self.spec.name!r} takes them."
             raise BackendError(f"command {command.tolist()} {reason}")
-        wanted = self._target(np.clip(command, self.spec.command_low, self.spec.command_high))
+        wanted = self._target(
+            np.clip(command, self.spec.command_low, self.spec.command_high)
+        )
         data.ctrl[self._controls] = self.machine.controls(wanted)
 
     def read(self, data: Any) -> Reading:
@@ -98,13 +111,19 @@ class Rig:
             time=float(data.time),
             pose=np.array([place[0], place[1], heading]),
             twist=np.array([ahead, aside, velocity[5]]),
-            state=self.machine.state(data.qpos[self._positions], data.qvel[self._speeds]),
+            state=self.machine.state(
+                data.qpos[self._positions], data.qvel[self._speeds]
+            ),
         )
 
     def heading(self, data: Any) -> float:
         """Returns the heading [rad]."""
         w, x, y, z = data.qpos[self._place + 3 : self._place + 7]
-        return float(geometry.wrap_angle(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
+        return float(
+            geometry.wrap_angle(
+                np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+            )
+        )
 
     def encoders(self, data: Any) -> Array:
         """(J,) positions of the joints that have encoders [rad]."""
@@ -116,7 +135,9 @@ class Rig:
         if not 1.0 - 2.0 * (x * x + y * y) > np.cos(LARGEST_TILT_RAD):
             fix = "lower the acceleration of its Physics, or its command limits."
             when = f"at {data.time:.2f} s"
-            raise BackendError(f"robot {self.spec.name!r} has fallen over {when}; {fix}")
+            raise BackendError(
+                f"robot {self.spec.name!r} has fallen over {when}; {fix}"
+            )
 
 
 class MujocoRobot:
@@ -131,7 +152,9 @@ class MujocoRobot:
         self._rig = Rig(spec, self.machine, self._model)
         self.timestep = float(self._model.opt.timestep)
         self._advance(SETTLING_S)
-        self.rest = self._data.qpos.copy()  # (nq,) positions in MuJoCo at rest at the origin
+        self.rest = (
+            self._data.qpos.copy()
+        )  # (nq,) positions in MuJoCo at rest at the origin
         self.reset(np.zeros(3))
 
     def reset(self, pose: ArrayLike) -> Reading:
@@ -153,7 +176,9 @@ class MujocoRobot:
         return self._rig.read(self._data)
 
     def _advance(self, duration: float) -> None:
-        self._mujoco.mj_step(self._model, self._data, nstep=round(duration / self.timestep))
+        self._mujoco.mj_step(
+            self._model, self._data, nstep=round(duration / self.timestep)
+        )
 
 
 class MujocoSimulator(DrivenSimulator):
@@ -165,12 +190,19 @@ class MujocoSimulator(DrivenSimulator):
     """
 
     def __init__(
-        self, model: SimulatorModel, world: AnyWorld, robots: int = 1, renderer: Renderer = "auto",
-        physics: Physics | None = None, randomisation: Randomisation | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        robots: int = 1,
+        renderer: Renderer = "auto",
+        physics: Physics | None = None,
+        randomisation: Randomisation | None = None,
+    ) -> None:
         self._mujoco = load_mujoco()
         physics = physics or Physics()
-        self._subperiods, self._steps, timestep = divide(model.control_period, physics.timestep)
+        self._subperiods, self._steps, timestep = divide(
+            model.control_period, physics.timestep
+        )
         self._physics = replace(physics, timestep=timestep)
         alone = MujocoRobot(model.robot, self._physics)
         self._machine, self._rest = alone.machine, alone.rest
@@ -205,12 +237,16 @@ class MujocoSimulator(DrivenSimulator):
         rig.launch(self._data, self._rest, self._twist(state), pose[2])
         self._mujoco.mj_forward(self._simulation, self._data)
 
-    def take_over(self, other: FastSimulator, robots: Indices, obstacles: Indices) -> None:
+    def take_over(
+        self, other: FastSimulator, robots: Indices, obstacles: Indices
+    ) -> None:
         """Goes on with another's episode; see `FastSimulator.take_over`."""
         super().take_over(other, robots, obstacles)
         if isinstance(other, MujocoSimulator):
             self.wheels[: len(robots)] = other.wheels[robots]
-            self._resume([other._rigs[r].motion(other._data, self._rest) for r in robots])
+            self._resume(
+                [other._rigs[r].motion(other._data, self._rest) for r in robots]
+            )
 
     def _resume(self, motions: Sequence[tuple[Array, Array]]) -> None:
         for rig, motion in zip(self._rigs, motions, strict=False):
@@ -219,16 +255,28 @@ class MujocoSimulator(DrivenSimulator):
 
     def _compile(self, bodies: Array) -> None:
         """Compiles the scene with obstacles (K, 7), whose robots are then to be put."""
-        spec, robots, member = self.model.robot, self.data.pose.shape[1], int(self.data.member[0])
+        spec, robots, member = (
+            self.model.robot,
+            self.data.pose.shape[1],
+            int(self.data.member[0]),
+        )
         compiled = self._simulation = scenery.compile_scene(
-            self._mujoco, self._machine, self._physics, footprint_shape(spec), robots,
-            self.world.members[member], self.sampler.motions[member],
-            self.sampler.shapes, bodies,
-        )  # fmt: skip
+            self._mujoco,
+            self._machine,
+            self._physics,
+            footprint_shape(spec),
+            robots,
+            self.world.members[member],
+            self.sampler.motions[member],
+            self.sampler.shapes,
+            bodies,
+        )
         self._data = self._mujoco.MjData(compiled)
         self._rigs = [Rig(spec, self._machine, compiled, m) for m in range(robots)]
         there = np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist()
-        ids = [int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0]) for k in there]
+        ids = [
+            int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0]) for k in there
+        ]
         self._mocap = [(k, one) for k, one in zip(there, ids, strict=True) if one >= 0]
         self._bumper_of = scenery.bumpers(compiled, robots)
 
@@ -249,13 +297,22 @@ class MujocoSimulator(DrivenSimulator):
         if any(warning.number for warning in self._data.warning):
             what = f"the motion of robot {self.model.robot.name!r} diverges"
             fix = "shorten the timestep of its Physics."
-            raise BackendError(f"MuJoCo warns at {self._data.time:.2f} s that {what}; {fix}")
+            raise BackendError(
+                f"MuJoCo warns at {self._data.time:.2f} s that {what}; {fix}"
+            )
 
     def _move(self) -> None:
-        rigs, data, part_s = self._rigs, self._data, self.model.control_period / self._subperiods
+        rigs, data, part_s = (
+            self._rigs,
+            self._data,
+            self.model.control_period / self._subperiods,
+        )
         wheels, counted = self.wheels.copy(), np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
-        turned, facing = [rig.encoders(data) for rig in rigs], [rig.heading(data) for rig in rigs]
+        turned, facing = (
+            [rig.encoders(data) for rig in rigs],
+            [rig.heading(data) for rig in rigs],
+        )
         for part in range(self._subperiods):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(data, command)
@@ -269,13 +326,18 @@ class MujocoSimulator(DrivenSimulator):
             before, turned = turned, [rig.encoders(data) for rig in rigs]
             faced, facing = facing, [rig.heading(data) for rig in rigs]
             both, mean = zip(before, turned, strict=True), self._machine.state
-            means = [mean(0.5 * (first + last), (last - first) / part_s) for first, last in both]
+            means = [
+                mean(0.5 * (first + last), (last - first) / part_s)
+                for first, last in both
+            ]
             counted = self._twist(np.array(means)) * self._machine.calibrated
             if self._machine.gyro:
                 counted[:, 2] = geometry.wrap_angle(np.subtract(facing, faced)) / part_s
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]
-        pose, twist, state = (np.array([getattr(r, n) for r in readings]) for n in MOTION)
+        pose, twist, state = (
+            np.array([getattr(r, n) for r in readings]) for n in MOTION
+        )
         self.end_period(pose, twist, state, wheels, counted, touched)
 
 
@@ -287,9 +349,12 @@ def divide(period: float, longest: float) -> tuple[int, int, float]:
 
 
 def record(
-    robot: MujocoRobot, rng: np.random.Generator, duration: float = 60.0, dt: float = 0.01,
+    robot: MujocoRobot,
+    rng: np.random.Generator,
+    duration: float = 60.0,
+    dt: float = 0.01,
     hold: float = 0.5,
-) -> Recording:  # fmt: skip
+) -> Recording:
     """Drives at random, a new command each `hold` [s], and records each `dt` [s]; BackendError."""
     spec = robot.spec
     per_hold, holds = round(hold / dt), int(np.ceil(duration / hold))
@@ -304,5 +369,8 @@ def record(
     t = np.asarray(np.arange(len(commands)) * dt, dtype=np.float64)
     drive = Stream(t, commands), Stream(t, np.array(poses)), Stream(t, np.array(states))
     return Recording(
-        *drive, source=f"MuJoCo {spec.name}", variables=spec.variable_names, measured_by="truth"
+        *drive,
+        source=f"MuJoCo {spec.name}",
+        variables=spec.variable_names,
+        measured_by="truth",
     )

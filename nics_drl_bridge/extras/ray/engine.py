@@ -35,16 +35,26 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.policy import train, train_algorithms
-from nics_drl_bridge.policy.train_checkpoint import RECENT, Progress, read_checkpoint, write_content
+from nics_drl_bridge.policy.train_checkpoint import (
+    RECENT,
+    Progress,
+    read_checkpoint,
+    write_content,
+)
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
-VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # parameters of the loss, as in Stable-Baselines3
+VALUE_WEIGHT, GRADIENT_LIMIT = (
+    0.5,
+    0.5,
+)  # parameters of the loss, as in Stable-Baselines3
 SILENCE_S = 600.0  # without a step from any env runner, after which a run ends; it can be resumed
 TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
-PROBE_S = 1.0  # time that a roll-out waits for a lost env runner [s]; later ones try again
+PROBE_S = (
+    1.0  # time that a roll-out waits for a lost env runner [s]; later ones try again
+)
 ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping_s"
 """Names of a runner's metrics: numbers of episodes, and time in the simulator [s]."""
 
@@ -53,7 +63,9 @@ ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping
 class Rollout:
     """T steps of N worlds."""
 
-    seen: NDArray[np.float32]  # (T + 1, N, O); after an episode, the first of the next one
+    seen: NDArray[
+        np.float32
+    ]  # (T + 1, N, O); after an episode, the first of the next one
     actions: NDArray[Any]  # (T, N, ...)
     logits: NDArray[np.float32]  # (T, N, ...) parameters of the distribution of actions
     logp: NDArray[np.float32]  # (T, N) log probabilities of the actions
@@ -108,7 +120,9 @@ class WorldsRunner(SingleAgentEnvRunner):
     def get_spaces(self) -> dict[str, Any]:
         """Spaces of observations and actions, as RLlib names them."""
         pair = self.config.observation_space, self.config.action_space
-        return dict.fromkeys((INPUT_ENV_SPACES, INPUT_ENV_SINGLE_SPACES, DEFAULT_MODULE_ID), pair)
+        return dict.fromkeys(
+            (INPUT_ENV_SPACES, INPUT_ENV_SINGLE_SPACES, DEFAULT_MODULE_ID), pair
+        )
 
     def _sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
         """Runs one roll-out; its length is fixed, whatever RLlib requests."""
@@ -197,11 +211,15 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
         if address not in (None, "auto"):  # Ray itself would try for minutes
             host, _, port = str(address).rpartition(":")
             socket.create_connection((host, int(port)), TRIED_S).close()
-        ray.init(address or "local", log_to_driver=False, logging_level="ERROR", **local)
+        ray.init(
+            address or "local", log_to_driver=False, logging_level="ERROR", **local
+        )
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
         first = str(error).strip().partition("\n")[0].rstrip(".")
         fix = "start one on the first machine with 'ray start --head', and name its HOST:PORT."
-        raise ConfigError(f"--address {address}: no Ray cluster answers ({first}); {fix}") from None
+        raise ConfigError(
+            f"--address {address}: no Ray cluster answers ({first}); {fix}"
+        ) from None
     try:
         yield _runners(runners, int(ray.cluster_resources().get("CPU", 0)), worlds)
     finally:
@@ -213,33 +231,49 @@ def _runners(runners: int | None, cpus: int, worlds: int) -> int:
         return max(1, min(cpus, worlds))
     if runners > cpus:
         fix = "each env runner takes one; add machines with 'ray start', or ask for fewer."
-        raise ConfigError(f"--env-runners {runners}: the cluster has {cpus} CPUs, and {fix}")
+        raise ConfigError(
+            f"--env-runners {runners}: the cluster has {cpus} CPUs, and {fix}"
+        )
     if runners > worlds:
         fix = "give them more, or ask for fewer."
-        raise ConfigError(f"--env-runners {runners}: the settings have {worlds} worlds; {fix}")
+        raise ConfigError(
+            f"--env-runners {runners}: the settings have {worlds} worlds; {fix}"
+        )
     return runners
 
 
 def train_on_ray(
-    settings: TrainingSettings, seed: int, folder: Path, tell: train.Tell = lambda _: None,
-    resumed: bool = False, runners: int = 1,
-) -> train.Trained:  # fmt: skip
+    settings: TrainingSettings,
+    seed: int,
+    folder: Path,
+    tell: train.Tell = lambda _: None,
+    resumed: bool = False,
+    runners: int = 1,
+) -> train.Trained:
     """`policy.train.train` on the connected cluster; ConfigError also if no runner answers."""
     if settings.algorithm != "ppo":
         given = settings.algorithm
         raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
     if settings.memory is not None:
-        raise ConfigError("--engine ray learns no memory; leave out --engine, or memory.")
+        raise ConfigError(
+            "--engine ray learns no memory; leave out --engine, or memory."
+        )
     if settings.ppo.mirror:
-        raise ConfigError("--engine ray mirrors nothing; leave out --engine, or ppo.mirror.")
+        raise ConfigError(
+            "--engine ray mirrors nothing; leave out --engine, or ppo.mirror."
+        )
     if settings.stop is not None:
-        raise ConfigError("--engine ray does not stop early; leave out --engine, or stop.")
+        raise ConfigError(
+            "--engine ray does not stop early; leave out --engine, or stop."
+        )
     begin, path = time.perf_counter(), folder / train.CHECKPOINT
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     content = read_checkpoint(path, FORMAT) if resumed else None
     if content is not None:
         train.check_same(content["about"], about, path)
-    algorithm = _algorithm(settings, seed, 0 if content is None else content["steps"], runners)
+    algorithm = _algorithm(
+        settings, seed, 0 if content is None else content["steps"], runners
+    )
     try:
         learning = Learning(algorithm, settings, seed, path, runners)
         if content is not None:
@@ -248,7 +282,9 @@ def train_on_ray(
         actor = learning.module.actor.eval().cpu()
     finally:
         algorithm.stop()
-    return train.Trained(actor, learning.steps, time.perf_counter() - begin, learning.stepping_s)
+    return train.Trained(
+        actor, learning.steps, time.perf_counter() - begin, learning.stepping_s
+    )
 
 
 @dataclass
@@ -305,7 +341,9 @@ class Learning:
         found = result.get(ENV_RUNNER_RESULTS, {})
         self.steps += int(found.get(NUM_ENV_STEPS_SAMPLED, 0))
         self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
-        ended, success, collision = (int(found.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION))
+        ended, success, collision = (
+            int(found.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION)
+        )
         self.recent.append((ended, success, collision))
         while sum(one[0] for one in self.recent) - self.recent[0][0] >= RECENT:
             self.recent.popleft()
@@ -320,7 +358,9 @@ class Learning:
         ended, *counts = np.sum(list(self.recent), axis=0)
         success, collision = (float(n / ended) if ended else np.nan for n in counts)
         speed, busy = (self.steps - first) / taken, self.stepping_s / taken
-        return Progress(self.seed, self.steps, self.settings.steps, success, collision, speed, busy)
+        return Progress(
+            self.seed, self.steps, self.settings.steps, success, collision, speed, busy
+        )
 
     def save(self, about: dict[str, Any]) -> None:
         """Saves network and optimiser."""
@@ -335,7 +375,8 @@ class Learning:
         self.module.load_state_dict(content["network"])
         self.learner.get_optimizer().load_state_dict(content["optimiser"])
         self.algorithm.env_runner_group.sync_weights(
-            from_worker_or_learner_group=self.algorithm.learner_group, inference_only=True
+            from_worker_or_learner_group=self.algorithm.learner_group,
+            inference_only=True,
         )
 
 
@@ -354,49 +395,73 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     env_config = {"make": make, "seed": (seed, done), "threads": settings.threads}
     env_config["rollout"] = settings.ppo.rollout
     config = _config(settings, seed, done, normaliser, spaces).env_runners(
-        env_runner_cls=WorldsRunner, num_env_runners=runners, rollout_fragment_length="auto",
+        env_runner_cls=WorldsRunner,
+        num_env_runners=runners,
+        rollout_fragment_length="auto",
         sample_timeout_s=SILENCE_S,
-    )  # fmt: skip
+    )
     algorithm = config.environment(env_config=env_config).build_algo()
     Path(algorithm.logdir).rmdir()  # RLlib creates it and leaves it empty
     return algorithm
 
 
 def share_of_worlds(
-    settings: TrainingSettings, model: SimulatorModel, scenes: Mapping[str, AnyWorld], runner: int,
+    settings: TrainingSettings,
+    model: SimulatorModel,
+    scenes: Mapping[str, AnyWorld],
+    runner: int,
     runners: int,
-) -> TrainVecEnv:  # fmt: skip
+) -> TrainVecEnv:
     """The worlds of env runner number `runner`: every `runners`-th."""
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     share = dict(Counter(names[runner::runners]))
-    return train.make_train_env(settings.model_copy(update={"worlds": share}), model, scenes)
+    return train.make_train_env(
+        settings.model_copy(update={"worlds": share}), model, scenes
+    )
 
 
 def _config(
-    settings: TrainingSettings, seed: int, done: int, normaliser: tuple[Array, Array],
+    settings: TrainingSettings,
+    seed: int,
+    done: int,
+    normaliser: tuple[Array, Array],
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
-) -> PPOConfig:  # fmt: skip
+) -> PPOConfig:
     chosen, left = settings.ppo, max(settings.steps - done, 1)
     rate = chosen.learning_rate
     now = rate * max(1.0 - done / settings.steps, train_algorithms.LEAST_RATE)
-    network = {"hidden": settings.hidden, "normaliser": normaliser, "log_std": chosen.log_std}
+    network = {
+        "hidden": settings.hidden,
+        "normaliser": normaliser,
+        "log_std": chosen.log_std,
+    }
     return (
         PPOConfig()
         .framework("torch")
         .environment(observation_space=spaces[0], action_space=spaces[1])
-        .rl_module(rl_module_spec=RLModuleSpec(module_class=ActorCritic, model_config=network))
+        .rl_module(
+            rl_module_spec=RLModuleSpec(module_class=ActorCritic, model_config=network)
+        )
         .learners(num_learners=0)
         .training(
             lr=[[0, now], [left, rate * train_algorithms.LEAST_RATE]],
             train_batch_size_per_learner=chosen.rollout * settings.num_envs,
-            minibatch_size=chosen.batch, num_epochs=chosen.epochs, gamma=chosen.discount,
-            lambda_=chosen.gae_lambda, clip_param=chosen.clip, entropy_coeff=chosen.entropy,
-            vf_loss_coeff=VALUE_WEIGHT, vf_clip_param=np.inf, use_kl_loss=False,
-            grad_clip=GRADIENT_LIMIT, grad_clip_by="global_norm",
+            minibatch_size=chosen.batch,
+            num_epochs=chosen.epochs,
+            gamma=chosen.discount,
+            lambda_=chosen.gae_lambda,
+            clip_param=chosen.clip,
+            entropy_coeff=chosen.entropy,
+            vf_loss_coeff=VALUE_WEIGHT,
+            vf_clip_param=np.inf,
+            use_kl_loss=False,
+            grad_clip=GRADIENT_LIMIT,
+            grad_clip_by="global_norm",
         )
         .fault_tolerance(
-            restart_failed_env_runners=True, delay_between_env_runner_restarts_s=PROBE_S,
+            restart_failed_env_runners=True,
+            delay_between_env_runner_restarts_s=PROBE_S,
             env_runner_health_probe_timeout_s=PROBE_S,
         )
         .debugging(seed=seed, log_level="ERROR")
-    )  # fmt: skip
+    )

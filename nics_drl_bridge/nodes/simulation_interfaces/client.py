@@ -24,11 +24,16 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 PACKAGE = "simulation_interfaces"
 # Feature -> the service behind it, all of which a client needs.
 NEEDED = {
-    "SIMULATION_STATE_SETTING": "SetSimulationState", "SIMULATION_STATE_PAUSE": "",
-    "SIMULATION_RESET": "ResetSimulation", "STEP_SIMULATION_SINGLE": "StepSimulation",
-    "ENTITY_STATE_SETTING": "SetEntityState", "ENTITY_STATE_GETTING": "GetEntityState",
-}  # fmt: skip
-TOLERANCE = 1e-3  # of a control period, as a share of a step; and of stamps, of a period
+    "SIMULATION_STATE_SETTING": "SetSimulationState",
+    "SIMULATION_STATE_PAUSE": "",
+    "SIMULATION_RESET": "ResetSimulation",
+    "STEP_SIMULATION_SINGLE": "StepSimulation",
+    "ENTITY_STATE_SETTING": "SetEntityState",
+    "ENTITY_STATE_GETTING": "GetEntityState",
+}
+TOLERANCE = (
+    1e-3  # of a control period, as a share of a step; and of stamps, of a period
+)
 
 
 class StandardOptions(Schema):
@@ -36,21 +41,31 @@ class StandardOptions(Schema):
 
     services: str = ""  # what their names begin with: `/gzserver` for Gazebo
     entity: str = ""  # name of the robot's entity; that of the model's robot by default
-    step_s: PositiveFloat | None = None  # of a step of the simulator; None: measured on /clock
-    slack_s: float = Field(0.0, ge=0.0)  # by which data may be older than the end of a period
-    obstacles: bool = True  # puts those of the episode's scene, where entities have their names
+    step_s: PositiveFloat | None = (
+        None  # of a step of the simulator; None: measured on /clock
+    )
+    slack_s: float = Field(
+        0.0, ge=0.0
+    )  # by which data may be older than the end of a period
+    obstacles: bool = (
+        True  # puts those of the episode's scene, where entities have their names
+    )
 
 
 def snake_case(name: str) -> str:
     """Returns the name of a service as all simulators write it: `get_entities`."""
-    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix("_")
+    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix(
+        "_"
+    )
 
 
 def module(kind: str) -> Any:
     """Returns the module `srv` or `msg` of the messages. ConfigError if missing or too old."""
     if conversions.message_type(NEWEST) is None:
         fix = f"install {PACKAGE} 2.1 or newer with your ROS 2 distribution, and source it"
-        raise ConfigError(f"simulator {PACKAGE!r} needs the messages of that name; {fix}.")
+        raise ConfigError(
+            f"simulator {PACKAGE!r} needs the messages of that name; {fix}."
+        )
     return import_module(f"{PACKAGE}.{kind}")
 
 
@@ -62,10 +77,19 @@ class StandardEpisodes:
     """
 
     def __init__(
-        self, link: Link, model: SimulatorModel, world: AnyWorld, options: StandardOptions,
+        self,
+        link: Link,
+        model: SimulatorModel,
+        world: AnyWorld,
+        options: StandardOptions,
         mail: Any,
-    ) -> None:  # fmt: skip
-        self._link, self._model, self._world, self._options = link, model, world, options
+    ) -> None:
+        self._link, self._model, self._world, self._options = (
+            link,
+            model,
+            world,
+            options,
+        )
         self._mail = mail  # of the data, see `backends`
         self._types, self._messages = module("srv"), module("msg")
         self._entity = options.entity or model.robot.name
@@ -75,7 +99,9 @@ class StandardEpisodes:
         self._entities = self._client("GetEntities")
         self.clients = [self._features]  # the one that all simulators have
         self._known: frozenset[int] = frozenset()
-        self._stood: dict[str, Pose] = {}  # of entities after a reset: heights and tilts are kept
+        self._stood: dict[
+            str, Pose
+        ] = {}  # of entities after a reset: heights and tilts are kept
         self._steps, self._period_ns = 0, round(model.control_period * NS_PER_S)
         self._pending: list[Any] = []
         self._clock: list[Any] = []
@@ -85,14 +111,18 @@ class StandardEpisodes:
             )
 
     def _client(self, name: str) -> Any:
-        prefix = f"{self._options.services.rstrip('/')}/" if self._options.services else ""
+        prefix = (
+            f"{self._options.services.rstrip('/')}/" if self._options.services else ""
+        )
         kind = getattr(self._types, name)
         return self._link.node.create_client(kind, f"{prefix}{snake_case(name)}")
 
     def _call(self, name: str, timeout_s: float, *fine: int, **fields: Any) -> Any:
         """Calls a service. Raises BackendError for a result that is neither OK nor `fine`."""
         kind = getattr(self._types, name)
-        response = self._link.call(self._services[name], kind.Request(**fields), timeout_s)
+        response = self._link.call(
+            self._services[name], kind.Request(**fields), timeout_s
+        )
         if response.result.result not in (self._messages.Result.RESULT_OK, *fine):
             told = response.result.error_message or f"result {response.result.result}"
             raise BackendError(f"the simulator refused {name}: {told}")
@@ -106,18 +136,26 @@ class StandardEpisodes:
         for feature, service in NEEDED.items():
             self._require(feature, f", which {service} serves" if service else "")
         self.clients += self._services.values()
-        self._paused = {"state": kinds.SimulationState(state=kinds.SimulationState.STATE_PAUSED)}
+        self._paused = {
+            "state": kinds.SimulationState(state=kinds.SimulationState.STATE_PAUSED)
+        }
         self._pause(timeout_s)
-        step_ns = self._measured(timeout_s) if self._options.step_s is None else round(
-            self._options.step_s * NS_PER_S
-        )  # fmt: skip
+        step_ns = (
+            self._measured(timeout_s)
+            if self._options.step_s is None
+            else round(self._options.step_s * NS_PER_S)
+        )
         self._steps = max(1, round(self._period_ns / step_ns))
         if abs(self._steps * step_ns - self._period_ns) > TOLERANCE * step_ns:
             parts = f"a control period of {self._period_ns / NS_PER_S:g} s is no whole number of"
             fix = "give the simulator a step that divides it"
-            raise BackendError(f"{parts} the simulator's steps of {step_ns / NS_PER_S:g} s; {fix}.")
+            raise BackendError(
+                f"{parts} the simulator's steps of {step_ns / NS_PER_S:g} s; {fix}."
+            )
         if self._steps > 1:
-            self._require("STEP_SIMULATION_MULTIPLE", ", as a control period is several steps")
+            self._require(
+                "STEP_SIMULATION_MULTIPLE", ", as a control period is several steps"
+            )
 
     def _require(self, feature: str, clause: str) -> None:
         if getattr(self._messages.SimulatorFeatures, feature) not in self._known:
@@ -140,7 +178,9 @@ class StandardEpisodes:
             stamps.append(conversions.stamp_from_ros(self._clock[-1].clock))
         self._link.node.destroy_subscription(self._listening)
         if stamps[1] <= stamps[0]:
-            raise BackendError("time does not pass in a step; give its seconds as option step_s.")
+            raise BackendError(
+                "time does not pass in a step; give its seconds as option step_s."
+            )
         return stamps[1] - stamps[0]
 
     def begin(self, start: Start, timeout_s: float) -> int:
@@ -150,7 +190,10 @@ class StandardEpisodes:
         holds(lambda: all(each.done() for each in self._pending), timeout_s, POLL_S)
         self._pending.clear()
         self._pause(timeout_s)
-        scopes, known = self._types.ResetSimulation.Request, self._messages.SimulatorFeatures
+        scopes, known = (
+            self._types.ResetSimulation.Request,
+            self._messages.SimulatorFeatures,
+        )
         of_state = known.SIMULATION_RESET_STATE in self._known
         scope = scopes.SCOPE_STATE if of_state else scopes.SCOPE_ALL
         self._call("ResetSimulation", timeout_s, scope=scope)
@@ -165,7 +208,11 @@ class StandardEpisodes:
         if time_ns:
             return time_ns + self._period_ns
         # An answer without a stamp: by the first data, of several steps the last.
-        holds(lambda: self._pending[-1].done() and self._mail.newest_ns() >= 0, timeout_s, POLL_S)
+        holds(
+            lambda: self._pending[-1].done() and self._mail.newest_ns() >= 0,
+            timeout_s,
+            POLL_S,
+        )
         time.sleep(POLL_S)
         return max(0, int(self._mail.newest_ns()))
 
@@ -174,14 +221,18 @@ class StandardEpisodes:
             return
         request = self._types.GetEntities.Request()
         there = set(self._link.call(self._entities, request, timeout_s).entities)
-        scene = sample_scene(self._world, self._model.robot.footprint_radius, int(start.seed))
+        scene = sample_scene(
+            self._world, self._model.robot.footprint_radius, int(start.seed)
+        )
         for k, body in enumerate(scene.bodies):
             if body[RADIUS] > 0.0 and f"{OBSTACLE}{k}" in there:
                 self._put(f"{OBSTACLE}{k}", body[:3], timeout_s)
 
     def _put(self, entity: str, pose: Array, timeout_s: float) -> None:
         if entity not in self._stood:
-            self._stood[entity] = self._call("GetEntityState", timeout_s, entity=entity).state.pose
+            self._stood[entity] = self._call(
+                "GetEntityState", timeout_s, entity=entity
+            ).state.pose
         state, stood = self._messages.EntityState(), self._stood[entity]
         x, y, heading = map(float, pose)
         state.pose.position = Point(x=x, y=y, z=stood.position.z)

@@ -4,7 +4,13 @@ import re
 from typing import Any
 
 from geometry_msgs.msg import Accel, Twist
-from simulation_interfaces.msg import EntityCategory, EntityInfo, EntityState, Result, TagsFilter
+from simulation_interfaces.msg import (
+    EntityCategory,
+    EntityInfo,
+    EntityState,
+    Result,
+    TagsFilter,
+)
 from simulation_interfaces.srv import SetEntityState
 
 from nics_drl_bridge import geometry as planar
@@ -23,23 +29,39 @@ CATEGORIES = {
 }
 # Classes of POSIX's bracket expressions, which Python writes otherwise.
 CLASSES = {
-    "alpha": "A-Za-z", "digit": "0-9", "alnum": "A-Za-z0-9", "upper": "A-Z", "lower": "a-z",
-    "space": r"\s", "blank": r" \t", "punct": r"!-/:-@\[-`{-~", "xdigit": "0-9A-Fa-f",
-    "word": r"\w", "print": " -~", "graph": "!-~", "cntrl": r"\x00-\x1f",
-}  # fmt: skip
+    "alpha": "A-Za-z",
+    "digit": "0-9",
+    "alnum": "A-Za-z0-9",
+    "upper": "A-Z",
+    "lower": "a-z",
+    "space": r"\s",
+    "blank": r" \t",
+    "punct": r"!-/:-@\[-`{-~",
+    "xdigit": "0-9A-Fa-f",
+    "word": r"\w",
+    "print": " -~",
+    "graph": "!-~",
+    "cntrl": r"\x00-\x1f",
+}
 # What is escaped, a bracket expression (its `^`, and what it holds), or one that can't be had.
 BRACKET = re.compile(
-    rf"\\.|\[(\^?)(\]?(?:\[:(?:{'|'.join(CLASSES)}):\]|\[(?![:.=])|[^][])*)\]|(\[)", re.DOTALL
+    rf"\\.|\[(\^?)(\]?(?:\[:(?:{'|'.join(CLASSES)}):\]|\[(?![:.=])|[^][])*)\]|(\[)",
+    re.DOTALL,
 )
 HELD = re.compile(r"\[:(\w+):\]|[][\\&|~]")
-MOST_CHARACTERS, MOST_REPEATS = 1000, 3  # of a filter: it is matched while the simulator waits
+MOST_CHARACTERS, MOST_REPEATS = (
+    1000,
+    3,
+)  # of a filter: it is matched while the simulator waits
 TOO_LONG = "it repeats what repeats or branches, or more than 3 times, or has over 1000 characters"
 
 
 def pattern_of(expression: str) -> re.Pattern[str]:
     """Compiles a POSIX extended regular expression. Raises RefusalError for none."""
     try:
-        if len(expression) > MOST_CHARACTERS or _runs_away(BRACKET.sub(".", expression)):
+        if len(expression) > MOST_CHARACTERS or _runs_away(
+            BRACKET.sub(".", expression)
+        ):
             raise re.error(TOO_LONG)
         return re.compile(BRACKET.sub(_bracket, expression))
     except (re.error, OverflowError, RecursionError) as error:
@@ -50,7 +72,9 @@ def pattern_of(expression: str) -> re.Pattern[str]:
 def _bracket(found: re.Match[str]) -> str:
     if found[3]:
         raise re.error("a '[' has no end, or holds [. or [= or an unknown class")
-    held = HELD.sub(lambda one: CLASSES[one[1]] if one[1] else f"\\{one[0]}", found[2] or "")
+    held = HELD.sub(
+        lambda one: CLASSES[one[1]] if one[1] else f"\\{one[0]}", found[2] or ""
+    )
     return found[0] if found[2] is None else f"[{found[1]}{held}]"
 
 
@@ -68,7 +92,10 @@ def _runs_away(plain: str) -> bool:
 
 def tags_match(wanted: Any, tags: Any) -> bool:
     """True if tags pass a TagsFilter; one without tags lets all pass. Raises RefusalError."""
-    if wanted.filter_mode not in (TagsFilter.FILTER_MODE_ANY, TagsFilter.FILTER_MODE_ALL):
+    if wanted.filter_mode not in (
+        TagsFilter.FILTER_MODE_ANY,
+        TagsFilter.FILTER_MODE_ALL,
+    ):
         told = f"filter_mode {wanted.filter_mode} of the tags is none; give 0 (any) or 1 (all)."
         raise RefusalError(FAILED, told)
     if not wanted.tags:
@@ -110,7 +137,10 @@ class EntityServices:
         found = []
         for entity in entities:
             info, pose = self.info(entity), entities.pose(entity)
-            outlines = (planar.rotate(one, pose[2]) + pose[:2] for one in entities.outlines(entity))
+            outlines = (
+                planar.rotate(one, pose[2]) + pose[:2]
+                for one in entities.outlines(entity)
+            )
             if (
                 pattern.search(entity.name)
                 and (not categories or info.category.category in categories)

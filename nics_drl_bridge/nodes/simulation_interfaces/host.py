@@ -69,7 +69,14 @@ class RefusalError(BridgeError):
 
 
 Handler = Callable[[Any, Any], None]
-ABSENT = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP)
+ABSENT = (
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EACCES,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+)
 
 
 def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
@@ -84,7 +91,9 @@ def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
         return Result.RESULT_OPERATION_FAILED, str(error)
     except Exception as error:  # noqa: BLE001  (the other robots and clients go on)
         if isinstance(error, OSError) and error.errno in ABSENT:
-            return Result.RESULT_NOT_FOUND, str(BridgeError(f"{error}; check the path."))
+            return Result.RESULT_NOT_FOUND, str(
+                BridgeError(f"{error}; check the path.")
+            )
         told = f"the simulator failed: {type(error).__name__}: {error}"
         host.get_logger().error(told)
         return Result.RESULT_OPERATION_FAILED, " ".join(told.split())

@@ -18,7 +18,11 @@ from nics_drl_bridge.sim.entities import Entities, overlap
 
 HEIGHT = 0.5  # of whatever stands in a plane world, as in MuJoCo [m]
 LEAN = 0.02  # greatest angle of what stands upright [rad]
-SIZES = {Bounds.TYPE_BOX: "two", Bounds.TYPE_SPHERE: "two", Bounds.TYPE_CONVEX_HULL: "three"}
+SIZES = {
+    Bounds.TYPE_BOX: "two",
+    Bounds.TYPE_SPHERE: "two",
+    Bounds.TYPE_CONVEX_HULL: "three",
+}
 
 
 def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
@@ -32,20 +36,29 @@ def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
     if not all(map(math.isfinite, (place.x, place.y, place.z, *quaternion))):
         raise RefusalError(code, "the pose holds NaN or inf; give finite numbers.")
     if not is_rotation(*quaternion):
-        raise RefusalError(code, f"the {given} is no rotation; give one of unit length.")
+        raise RefusalError(
+            code, f"the {given} is no rotation; give one of unit length."
+        )
     if 1.0 - 2.0 * (turn.x**2 + turn.y**2) < math.cos(LEAN):
-        raise RefusalError(code, f"the {given} leans, but the world is flat; turn about z alone.")
+        raise RefusalError(
+            code, f"the {given} leans, but the world is flat; turn about z alone."
+        )
     local = np.array([place.x, place.y, conversions.heading_of(*quaternion)])
     found: Array = geometry.compose(base, local)
     return found
 
 
-def frame_pose(frame: str, entities: Entities, frames: Sequence[Any], code: int) -> Array:
+def frame_pose(
+    frame: str, entities: Entities, frames: Sequence[Any], code: int
+) -> Array:
     """Returns the pose (3,) of a frame in `map`: itself, or an entity's; RefusalError."""
     known = {"", "world", *(each.map for each in frames)}
     if frame in known:
         return np.zeros(3)
-    bases = {each.base: name for each, name in zip(frames, entities.robot_names, strict=False)}
+    bases = {
+        each.base: name
+        for each, name in zip(frames, entities.robot_names, strict=False)
+    }
     name = bases.get(frame, frame)
     found = next((entity for entity in entities if entity.name == name), None)
     if found is None:
@@ -66,7 +79,10 @@ def box_to_ros(outlines: Sequence[Array]) -> Bounds:
     """Returns the box around outlines (V, 2): its upper right corner, then its lower left one."""
     points = np.concatenate([np.zeros((0, 2)), *outlines])
     high, low = points.max(axis=0).tolist(), points.min(axis=0).tolist()
-    corners = [Vector3(x=high[0], y=high[1], z=HEIGHT), Vector3(x=low[0], y=low[1], z=0.0)]
+    corners = [
+        Vector3(x=high[0], y=high[1], z=HEIGHT),
+        Vector3(x=low[0], y=low[1], z=0.0),
+    ]
     return Bounds(type=Bounds.TYPE_BOX, points=corners)
 
 
@@ -79,7 +95,9 @@ class Region:
         self.empty = kind == Bounds.TYPE_EMPTY
         if kind not in (Bounds.TYPE_EMPTY, *SIZES):
             told = f"bounds of type {kind} are none of the standard"
-            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, f"{told}; give 0 to 3.")
+            raise RefusalError(
+                Result.RESULT_FEATURE_UNSUPPORTED, f"{told}; give 0 to 3."
+            )
         self._sphere, count = kind == Bounds.TYPE_SPHERE, len(self._points)
         hull = kind == Bounds.TYPE_CONVEX_HULL
         if not (count == 0 if self.empty else count >= 3 if hull else count == 2):
@@ -102,7 +120,9 @@ class Region:
         if kind == Bounds.TYPE_CONVEX_HULL:
             corners = convex_hull(flat)
             if len(corners) < 3:
-                told = "the points of the convex hull lie on one line; give one beside it."
+                told = (
+                    "the points of the convex hull lie on one line; give one beside it."
+                )
                 raise RefusalError(Result.RESULT_OPERATION_FAILED, told)
             return corners
         return flat
@@ -113,8 +133,12 @@ class Region:
             return True
         low, high = self._points[:, 2].min(), self._points[:, 2].max()
         if not self._sphere:
-            return bool(low <= HEIGHT and high >= 0.0 and overlap(self._corners, outline))
+            return bool(
+                low <= HEIGHT and high >= 0.0 and overlap(self._corners, outline)
+            )
         x, y, z = self._points[0]
         room = self._points[1, 0] ** 2 - max(-z, z - HEIGHT, 0.0) ** 2
-        apart = -float(geometry.depths(np.array([[x, y]]), outline)[0])  # below 0 inside
+        apart = -float(
+            geometry.depths(np.array([[x, y]]), outline)[0]
+        )  # below 0 inside
         return bool(room >= 0.0 and apart <= math.sqrt(room))

@@ -32,9 +32,12 @@ class Codes(NamedTuple):
     def of(cls, response: Any) -> Codes:
         """Returns the codes that are constants of a response's class."""
         return cls(
-            response.UNSUPPORTED_FORMAT, response.NO_RESOURCE, response.RESOURCE_PARSE_ERROR,
-            response.MISSING_ASSETS, response.UNSUPPORTED_ASSETS,
-        )  # fmt: skip
+            response.UNSUPPORTED_FORMAT,
+            response.NO_RESOURCE,
+            response.RESOURCE_PARSE_ERROR,
+            response.MISSING_ASSETS,
+            response.UNSUPPORTED_ASSETS,
+        )
 
 
 class Found(NamedTuple):
@@ -61,7 +64,9 @@ def files_of(source: str) -> list[Path] | None:
     """Returns the files of a folder, or a file with a known suffix; None for any other source."""
     path = local(source)
     with suppress(OSError):
-        if path and (path.is_dir() or (path.suffix.lower() in SUFFIXES and path.is_file())):
+        if path and (
+            path.is_dir() or (path.suffix.lower() in SUFFIXES and path.is_file())
+        ):
             return sorted(path.iterdir()) if path.is_dir() else [path]
     return None
 
@@ -88,7 +93,9 @@ def _of_uri(uri: str, codes: Codes) -> Found:
         told = f"uri {uri!r}: is not on this machine; give file:// or a path."
         raise RefusalError(codes.unsupported_format, told)
     suffix = path.suffix.lower()
-    named = path.is_dir() or (any(sign in uri for sign in SPECIAL) and not path.is_file())
+    named = path.is_dir() or (
+        any(sign in uri for sign in SPECIAL) and not path.is_file()
+    )
     if named or not suffix:
         return Found("", "", str(path), path)
     if suffix not in SUFFIXES:

@@ -9,21 +9,47 @@ from simulation_interfaces.msg import Result, SimulatorFeatures
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.simulation_interfaces.client import PACKAGE, snake_case
 from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
-from nics_drl_bridge.nodes.simulation_interfaces.host import Handler, RefusalError, served
+from nics_drl_bridge.nodes.simulation_interfaces.host import (
+    Handler,
+    RefusalError,
+    served,
+)
 from nics_drl_bridge.nodes.simulation_interfaces.spawning import FORMATS, Spawning
 from nics_drl_bridge.nodes.simulation_interfaces.state import WITHOUT_WORLD, Simulation
 from nics_drl_bridge.nodes.simulation_interfaces.worlds import Worlds
 
 FEATURES = (
-    "SPAWNING", "DELETING", "ENTITY_TAGS", "ENTITY_BOUNDS", "ENTITY_BOUNDS_BOX",
-    "ENTITY_BOUNDS_CONVEX", "ENTITY_CATEGORIES", "SPAWNING_RESOURCE_STRING",
-    "ENTITY_STATE_GETTING", "ENTITY_STATE_SETTING", "ENTITY_INFO_GETTING", "ENTITY_INFO_SETTING",
-    "SPAWNABLES", "SIMULATION_RESET", "SIMULATION_RESET_TIME", "SIMULATION_RESET_STATE",
-    "SIMULATION_RESET_SPAWNED", "SIMULATION_STATE_GETTING", "SIMULATION_STATE_SETTING",
-    "SIMULATION_STATE_PAUSE", "STEP_SIMULATION_SINGLE", "STEP_SIMULATION_MULTIPLE",
-    "STEP_SIMULATION_ACTION", "WORLD_LOADING", "WORLD_RESOURCE_STRING", "WORLD_TAGS",
-    "WORLD_UNLOADING", "WORLD_INFO_GETTING", "AVAILABLE_WORLDS", "SPAWNING_ENTITIES",
-)  # fmt: skip
+    "SPAWNING",
+    "DELETING",
+    "ENTITY_TAGS",
+    "ENTITY_BOUNDS",
+    "ENTITY_BOUNDS_BOX",
+    "ENTITY_BOUNDS_CONVEX",
+    "ENTITY_CATEGORIES",
+    "SPAWNING_RESOURCE_STRING",
+    "ENTITY_STATE_GETTING",
+    "ENTITY_STATE_SETTING",
+    "ENTITY_INFO_GETTING",
+    "ENTITY_INFO_SETTING",
+    "SPAWNABLES",
+    "SIMULATION_RESET",
+    "SIMULATION_RESET_TIME",
+    "SIMULATION_RESET_STATE",
+    "SIMULATION_RESET_SPAWNED",
+    "SIMULATION_STATE_GETTING",
+    "SIMULATION_STATE_SETTING",
+    "SIMULATION_STATE_PAUSE",
+    "STEP_SIMULATION_SINGLE",
+    "STEP_SIMULATION_MULTIPLE",
+    "STEP_SIMULATION_ACTION",
+    "WORLD_LOADING",
+    "WORLD_RESOURCE_STRING",
+    "WORLD_TAGS",
+    "WORLD_UNLOADING",
+    "WORLD_INFO_GETTING",
+    "AVAILABLE_WORLDS",
+    "SPAWNING_ENTITIES",
+)
 ABOUT = "nics_drl_bridge: a 2-D world of shapes and robots of one kind; docs/simulator_node.md"
 
 
@@ -34,28 +60,44 @@ class Server:
         self._host, self._simulation = host, Simulation(host)
         simulation = self._simulation
         entities = EntityServices(host, simulation)
-        spawning, worlds = Spawning(host, simulation, entities), Worlds(host, simulation)
+        spawning, worlds = (
+            Spawning(host, simulation, entities),
+            Worlds(host, simulation),
+        )
         handlers: dict[str, Handler] = {
-            "GetSimulationState": simulation.get_state, "SetSimulationState": simulation.set_state,
-            "ResetSimulation": simulation.reset, "StepSimulation": simulation.step,
-            "GetEntities": entities.list_names, "GetEntitiesStates": entities.list_states,
-            "GetEntityInfo": entities.get_info, "SetEntityInfo": entities.set_info,
-            "GetEntityState": entities.get_state, "SetEntityState": entities.set_state,
-            "GetEntityBounds": entities.get_bounds, "DeleteEntity": entities.delete,
-            "SpawnEntity": spawning.spawn, "SpawnEntities": spawning.spawn_all,
-            "GetSpawnables": spawning.list_spawnables, "LoadWorld": worlds.load,
-            "UnloadWorld": worlds.unload, "GetCurrentWorld": worlds.current,
-            "GetAvailableWorlds": worlds.available, "GetNamedPoses": _no_named_poses,
+            "GetSimulationState": simulation.get_state,
+            "SetSimulationState": simulation.set_state,
+            "ResetSimulation": simulation.reset,
+            "StepSimulation": simulation.step,
+            "GetEntities": entities.list_names,
+            "GetEntitiesStates": entities.list_states,
+            "GetEntityInfo": entities.get_info,
+            "SetEntityInfo": entities.set_info,
+            "GetEntityState": entities.get_state,
+            "SetEntityState": entities.set_state,
+            "GetEntityBounds": entities.get_bounds,
+            "DeleteEntity": entities.delete,
+            "SpawnEntity": spawning.spawn,
+            "SpawnEntities": spawning.spawn_all,
+            "GetSpawnables": spawning.list_spawnables,
+            "LoadWorld": worlds.load,
+            "UnloadWorld": worlds.unload,
+            "GetCurrentWorld": worlds.current,
+            "GetAvailableWorlds": worlds.available,
+            "GetNamedPoses": _no_named_poses,
             "GetNamedPoseBounds": _no_named_poses,
-        }  # fmt: skip
+        }
         for name, handler in handlers.items():
             self._offer(name, served(handler, host))
         self._offer("GetSimulatorFeatures", self._tell)
         if kind := conversions.message_type(f"{PACKAGE}/action/SimulateSteps"):
             self._action = ActionServer(
-                host, kind, "simulate_steps", simulation.simulate,
+                host,
+                kind,
+                "simulate_steps",
+                simulation.simulate,
                 cancel_callback=lambda _: CancelResponse.ACCEPT,
-            )  # fmt: skip
+            )
 
     @property
     def has_world(self) -> bool:
@@ -70,7 +112,9 @@ class Server:
     @staticmethod
     def _tell(_: Any, response: Any) -> Any:
         told: SimulatorFeatures = response.features
-        told.features = [getattr(told, name) for name in FEATURES if hasattr(told, name)]
+        told.features = [
+            getattr(told, name) for name in FEATURES if hasattr(told, name)
+        ]
         told.spawn_formats, told.custom_info = FORMATS, ABOUT
         return response
 

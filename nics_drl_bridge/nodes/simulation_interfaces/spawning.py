@@ -5,7 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from simulation_interfaces.msg import EntityInfo, Resource, Result, Spawnable, SpawnResult
+from simulation_interfaces.msg import (
+    EntityInfo,
+    Resource,
+    Result,
+    Spawnable,
+    SpawnResult,
+)
 from simulation_interfaces.srv import SpawnEntities
 
 from nics_drl_bridge import geometry
@@ -21,7 +27,9 @@ from nics_drl_bridge.sim.models import Model, model_of_sdf, model_of_yaml
 from nics_drl_bridge.sim.sdf import AssetsError
 
 # With room for the names of topics, which may have 255 characters in all.
-NAMESPACE = re.compile(r"(?=.{1,120}\Z)/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+NAMESPACE = re.compile(
+    r"(?=.{1,120}\Z)/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
+)
 FORMATS = ["sdf", "yaml"]
 FOLDER = "entities"  # of the shipped ones, in config/
 
@@ -29,7 +37,9 @@ FOLDER = "entities"  # of the shipped ones, in config/
 class Spawning:
     """Answers SpawnEntity, SpawnEntities and GetSpawnables."""
 
-    def __init__(self, host: Host, simulation: Simulation, entities: EntityServices) -> None:
+    def __init__(
+        self, host: Host, simulation: Simulation, entities: EntityServices
+    ) -> None:
         self._host, self._simulation, self._entities = host, simulation, entities
         self._codes = resources.Codes.of(SpawnResult)
 
@@ -42,7 +52,9 @@ class Spawning:
         space = self._namespace(request.entity_namespace, name, model is None)
         entities, code = self._simulation.entities, SpawnResult.INVALID_POSE
         posed = request.initial_pose
-        base = plane.frame_pose(posed.header.frame_id, entities, self._host.frames, code)
+        base = plane.frame_pose(
+            posed.header.frame_id, entities, self._host.frames, code
+        )
         pose = plane.pose_from_ros(posed.pose, base, code)
         try:
             if model is None:
@@ -74,7 +86,9 @@ class Spawning:
                 return None
             try:
                 path = find_config(found.source, FOLDER)
-                found = resources.Found(resources.YAML, read_text(path), path.stem, path)
+                found = resources.Found(
+                    resources.YAML, read_text(path), path.stem, path
+                )
             except ConfigError as error:
                 held = f"robots here are {self._host.model.robot.name!r}"
                 told = str(error).replace("entitie ", "entity ")
@@ -82,11 +96,15 @@ class Spawning:
         try:
             if found.form == resources.SDF:
                 z = request.initial_pose.pose.position.z
-                return model_of_sdf(found.text, z if np.isfinite(z) else 0.0, found.source)
+                return model_of_sdf(
+                    found.text, z if np.isfinite(z) else 0.0, found.source
+                )
             model = model_of_yaml(found.text, found.source)
-            return model if found.path is None or model.name else model._replace(
-                name=found.path.stem
-            )  # fmt: skip
+            return (
+                model
+                if found.path is None or model.name
+                else model._replace(name=found.path.stem)
+            )
         except AssetsError as error:
             code = codes.missing_assets if error.missing else codes.unsupported_assets
             raise RefusalError(code, str(error)) from None
@@ -106,7 +124,9 @@ class Spawning:
         free = entities.free_name(wanted)
         if free != wanted and not may_rename:
             fix = "give another, or set allow_renaming"
-            raise RefusalError(SpawnResult.NAME_NOT_UNIQUE, f"the name {wanted!r} is taken; {fix}.")
+            raise RefusalError(
+                SpawnResult.NAME_NOT_UNIQUE, f"the name {wanted!r} is taken; {fix}."
+            )
         return free
 
     def _namespace(self, given: str, name: str, robot: bool) -> str:
@@ -114,12 +134,20 @@ class Spawning:
         host: Any = self._host
         space, code = given or re.sub(r"\W", "_", name), SpawnResult.NAMESPACE_INVALID
         if (robot or given) and not NAMESPACE.fullmatch(space):
-            told = f"entity_namespace {given!r} is" if given else f"the name {name!r} makes"
+            told = (
+                f"entity_namespace {given!r} is"
+                if given
+                else f"the name {name!r} makes"
+            )
             code = code if given else SpawnResult.NAME_INVALID
-            raise RefusalError(code, f"{told} no namespace of ROS; write it as in 'robot_1'.")
+            raise RefusalError(
+                code, f"{told} no namespace of ROS; write it as in 'robot_1'."
+            )
         scan = robot and host.resolve_topic_name(f"{space}/scan")
         taken = scan in [each.topic_name for each in host.publishers]
-        if robot and (taken or device_parameters.frames(host, space.strip("/")) in host.frames):
+        if robot and (
+            taken or device_parameters.frames(host, space.strip("/")) in host.frames
+        ):
             told = f"the namespace {space!r} is that of another robot; give one as entity_namespace"
             raise RefusalError(code, f"{told}.")
         return space
@@ -143,7 +171,9 @@ class Spawning:
         """Answers GetSpawnables."""
         robot, unknown = self._host.model.robot, list[str]()
         hull = hull_of(self._simulation.entities.simulator.footprint)
-        response.spawnables.append(_spawnable(robot.name, f"another robot {robot.name}", [hull]))
+        response.spawnables.append(
+            _spawnable(robot.name, f"another robot {robot.name}", [hull])
+        )
         shipped = share_folder() / "config" / FOLDER
         found = [(file.stem, file) for file in sorted(shipped.iterdir())]
         for source in request.sources:
@@ -157,19 +187,35 @@ class Spawning:
         if unknown:
             response.result.result = Result.RESULT_OK
             told = f"sources that are not known: {', '.join(map(repr, unknown))}"
-            response.result.error_message = f"{told}; give folders or files of this machine."
+            response.result.error_message = (
+                f"{told}; give folders or files of this machine."
+            )
 
     def _list(self, file: Path, uri: str, response: Any) -> None:
-        read = model_of_sdf if resources.SUFFIXES[file.suffix.lower()] == resources.SDF else None
+        read = (
+            model_of_sdf
+            if resources.SUFFIXES[file.suffix.lower()] == resources.SDF
+            else None
+        )
         try:
             text = read_text(file, resources.MOST_BYTES)
-            model = model_of_yaml(text, str(file)) if read is None else read(text, 0.0, str(file))
+            model = (
+                model_of_yaml(text, str(file))
+                if read is None
+                else read(text, 0.0, str(file))
+            )
         except (BridgeError, OSError):
             return  # a world, or something else that is no entity
-        hulls = [geometry.rotate(hull_of(shape), at[2]) + at[:2] for shape, at in model.parts]
-        response.spawnables.append(_spawnable(uri, model.description or model.name, hulls))
+        hulls = [
+            geometry.rotate(hull_of(shape), at[2]) + at[:2] for shape, at in model.parts
+        ]
+        response.spawnables.append(
+            _spawnable(uri, model.description or model.name, hulls)
+        )
 
 
 def _spawnable(uri: str, about: str, hulls: list[Any]) -> Spawnable:
     bounds = plane.box_to_ros(hulls)
-    return Spawnable(entity_resource=Resource(uri=uri), description=about, spawn_bounds=bounds)
+    return Spawnable(
+        entity_resource=Resource(uri=uri), description=about, spawn_bounds=bounds
+    )

@@ -9,12 +9,19 @@ from simulation_interfaces.srv import ResetSimulation, SetSimulationState
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.nodes.simulation_interfaces.host import NO_WORLD, Host, RefusalError, outcome
+from nics_drl_bridge.nodes.simulation_interfaces.host import (
+    NO_WORLD,
+    Host,
+    RefusalError,
+    outcome,
+)
 from nics_drl_bridge.sim.entities import Entities
 
 STOPPED, PLAYING, PAUSED = (
-    SimulationState.STATE_STOPPED, SimulationState.STATE_PLAYING, SimulationState.STATE_PAUSED,
-)  # fmt: skip
+    SimulationState.STATE_STOPPED,
+    SimulationState.STATE_PLAYING,
+    SimulationState.STATE_PAUSED,
+)
 QUITTING, WITHOUT_WORLD = SimulationState.STATE_QUITTING, SimulationState.STATE_NO_WORLD
 NAMES = {STOPPED: "stopped", PLAYING: "playing", PAUSED: "paused", QUITTING: "quitting"}
 MOST_STEPS = 100_000  # of one call of a service, which answers nothing else meanwhile
@@ -36,14 +43,18 @@ class Simulation:
     def __init__(self, host: Host) -> None:
         self._host, self._stepping = host, False
         self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
-        self._halted = STOPPED  # or paused, or without a world, while the host is paused
+        self._halted = (
+            STOPPED  # or paused, or without a world, while the host is paused
+        )
         self._turn: Any = host.create_guard_condition(lambda: None)  # type: ignore[attr-defined]
         self.renew()
 
     def renew(self) -> None:
         """Lists the entities of a world that the host simulates anew."""
         host = self._host
-        self.entities = Entities(host.device, host.world, host.robot_names, host.make_simulator)
+        self.entities = Entities(
+            host.device, host.world, host.robot_names, host.make_simulator
+        )
 
     @property
     def state(self) -> int:
@@ -69,14 +80,22 @@ class Simulation:
 
     def set_state(self, request: Any, _: Any) -> None:
         """Answers SetSimulationState."""
-        codes, wanted, state = SetSimulationState.Response, request.state.state, self.state
+        codes, wanted, state = (
+            SetSimulationState.Response,
+            request.state.state,
+            self.state,
+        )
         if wanted == state:
-            already = f"the simulation is {NAMES.get(state, 'without a world')} already."
+            already = (
+                f"the simulation is {NAMES.get(state, 'without a world')} already."
+            )
             raise RefusalError(codes.ALREADY_IN_TARGET_STATE, already)
         if wanted not in NAMES:
             known = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
             told = f"state {wanted} can't be set; choose one of {known}"
-            raise RefusalError(codes.INCORRECT_TRANSITION, f"{told}, or load or unload a world.")
+            raise RefusalError(
+                codes.INCORRECT_TRANSITION, f"{told}, or load or unload a world."
+            )
         if wanted == QUITTING:
             self.halt(QUITTING)
             runner.steadily(self._host, GOODBYE_S, self._host.context.try_shutdown)
@@ -112,8 +131,12 @@ class Simulation:
         """Answers StepSimulation."""
         self.require_paused(request.steps)
         if request.steps > MOST_STEPS:
-            told = f"steps is {request.steps}, and {MOST_STEPS} are the most of one call"
-            raise RefusalError(Result.RESULT_OPERATION_FAILED, f"{told}; use simulate_steps.")
+            told = (
+                f"steps is {request.steps}, and {MOST_STEPS} are the most of one call"
+            )
+            raise RefusalError(
+                Result.RESULT_OPERATION_FAILED, f"{told}; use simulate_steps."
+            )
         for _ in range(request.steps):
             self._host.step()
 
@@ -129,10 +152,14 @@ class Simulation:
             return result
         self._stepping, done, why = True, 0, ""
         try:
-            while done < steps and not (why := why or outcome(self._host.step, self._host)[1]):
+            while done < steps and not (
+                why := why or outcome(self._host.step, self._host)[1]
+            ):
                 done += 1
                 goal.publish_feedback(
-                    SimulateSteps.Feedback(completed_steps=done, remaining_steps=steps - done)
+                    SimulateSteps.Feedback(
+                        completed_steps=done, remaining_steps=steps - done
+                    )
                 )
                 self._turn.trigger()
                 await Turn()
@@ -153,14 +180,18 @@ class Simulation:
         if goal.is_cancel_requested:
             return f"cancelled after {done} of {steps} steps."
         if self.state != PAUSED or not self._stepping:
-            return f"the simulation was changed after {done} of {steps} steps; ask again."
+            return (
+                f"the simulation was changed after {done} of {steps} steps; ask again."
+            )
         return ""
 
     def reset(self, request: Any, _: Any) -> None:
         """Answers ResetSimulation."""
         self.require_world()
         scope = request.scope or SCOPES.SCOPE_ALL
-        if not scope & EVERY_SCOPE or (scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL):
+        if not scope & EVERY_SCOPE or (
+            scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL
+        ):
             known = "1 (time), 2 (state) and 4 (spawned)"
             told = f"scope {scope} has bits that mean nothing; add up {known}, or give 0 for all."
             raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, told)

@@ -15,7 +15,11 @@ from nics_drl_bridge.lidar.maps import FREE
 from nics_drl_bridge.nodes.simulation_interfaces import resources
 from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
-from nics_drl_bridge.nodes.simulation_interfaces.state import STOPPED, WITHOUT_WORLD, Simulation
+from nics_drl_bridge.nodes.simulation_interfaces.state import (
+    STOPPED,
+    WITHOUT_WORLD,
+    Simulation,
+)
 from nics_drl_bridge.sim.models import HEIGHT, file_of
 from nics_drl_bridge.sim.occupancy import occupancy
 from nics_drl_bridge.sim.sdf import ABSENT, AssetsError, read_sdf, root_of
@@ -25,15 +29,52 @@ from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
 
 CODES = LoadWorld.Response
 CLEARANCE, NEAREST = 0.1, 2.0  # of worlds of SDF, as with `nics world import` [m]
-EMPTY = (-4.0, -4.0), (4.0, 4.0)  # places in the field of a world without walls around it [m]
-CELL, MOST_OPEN = 0.05, 0.5  # [m]; share of what is free in a field that may be open to all around
+EMPTY = (
+    (-4.0, -4.0),
+    (4.0, 4.0),
+)  # places in the field of a world without walls around it [m]
+CELL, MOST_OPEN = (
+    0.05,
+    0.5,
+)  # [m]; share of what is free in a field that may be open to all around
 # Tags of SDF that are read, or say nothing of what stands in a plane.
 READ = {
-    "sdf", "world", "model", "include", "uri", "name", "pose", "placement_frame", "frame", "link",
-    "joint", "parent", "child", "collision", "geometry", "box", "size", "cylinder", "radius",
-    "length", "sphere", "capsule", "plane", "normal", "polyline", "point", "height", "static",
-    "state", "visual", "inertial", "mass", "inertia", "mesh", "scale",
-}  # fmt: skip
+    "sdf",
+    "world",
+    "model",
+    "include",
+    "uri",
+    "name",
+    "pose",
+    "placement_frame",
+    "frame",
+    "link",
+    "joint",
+    "parent",
+    "child",
+    "collision",
+    "geometry",
+    "box",
+    "size",
+    "cylinder",
+    "radius",
+    "length",
+    "sphere",
+    "capsule",
+    "plane",
+    "normal",
+    "polyline",
+    "point",
+    "height",
+    "static",
+    "state",
+    "visual",
+    "inertial",
+    "mass",
+    "inertia",
+    "mesh",
+    "scale",
+}
 
 
 class Worlds:
@@ -95,12 +136,18 @@ class Worlds:
         except ConfigError as error:
             if not found.form and "unknown world" in str(error):
                 raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
-            code = codes.missing_assets if "no such file" in str(error) else codes.parse_error
+            code = (
+                codes.missing_assets
+                if "no such file" in str(error)
+                else codes.parse_error
+            )
             raise RefusalError(code, str(error)) from None
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
         skip = bool(request.ignore_missing_or_unsupported_assets)
-        strange = sorted({each.tag for each in root_of(file).iter() if ":" not in each.tag} - READ)
+        strange = sorted(
+            {each.tag for each in root_of(file).iter() if ":" not in each.tag} - READ
+        )
         if request.fail_on_unsupported_element and strange:
             told = f"{name}: holds <{strange[0]}>, which is not simulated"
             fix = "remove it, or do not ask for fail_on_unsupported_element"
@@ -108,9 +155,15 @@ class Worlds:
         standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
             missing = any(ABSENT in each for each in standing.left_out)
-            code = self._codes.missing_assets if missing else self._codes.unsupported_assets
+            code = (
+                self._codes.missing_assets
+                if missing
+                else self._codes.unsupported_assets
+            )
             told = f"{name}: {standing.left_out[0]}, which is no shape of a world"
-            raise RefusalError(code, f"{told}; put a box in its place, or ignore such assets.")
+            raise RefusalError(
+                code, f"{told}; put a box in its place, or ignore such assets."
+            )
         return world_of(standing, name)
 
     def available(self, request: Any, response: Any) -> None:
@@ -127,17 +180,26 @@ class Worlds:
             except (BridgeError, OSError) as error:
                 failed.append(f"{source!r}: {error}")
         if failed and not request.continue_on_error:
-            raise RefusalError(Result.RESULT_NOT_FOUND, f"a source can't be read, {failed[0]}")
-        sets = [BARN, *(each.stem for each in sorted((folder / "world_sets").glob("*.yaml")))]
+            raise RefusalError(
+                Result.RESULT_NOT_FOUND, f"a source can't be read, {failed[0]}"
+            )
+        sets = [
+            BARN,
+            *(each.stem for each in sorted((folder / "world_sets").glob("*.yaml"))),
+        ]
         told = [told_of(world, Resource(uri=uri)) for uri, world in found]
         for name in sets:  # whose many worlds would take long to read
             about = f"the worlds of {name}, of which every episode draws one"
             told.append(WorldResource(name=name, description=about, tags=["set"]))
             told[-1].world_resource = Resource(uri=name)
-        response.worlds = [each for each in told if tags_match(request.filter, each.tags)]
+        response.worlds = [
+            each for each in told if tags_match(request.filter, each.tags)
+        ]
         if failed or skipped:
             response.result.result = Result.RESULT_OK
-            response.result.error_message = f"left out: {'; '.join([*failed, *skipped])}"
+            response.result.error_message = (
+                f"left out: {'; '.join([*failed, *skipped])}"
+            )
 
 
 def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
@@ -148,7 +210,9 @@ def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         form = resources.SUFFIXES.get(file.suffix.lower())
         try:
-            if form == resources.SDF and (root_of(file).find("world") is not None or file == path):
+            if form == resources.SDF and (
+                root_of(file).find("world") is not None or file == path
+            ):
                 standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
                 found.append((str(file), world_of(standing, file.stem)))
             elif form == resources.YAML or file == path:
@@ -165,16 +229,22 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     members = world.members
     groups = [group for member in members for group in member.obstacles]
     about = {
-        "set": len(members) > 1, "map": any(member.map is not None for member in members),
+        "set": len(members) > 1,
+        "map": any(member.map is not None for member in members),
         "walled": any(member.size is not None or member.walls for member in members),
-        "obstacles": bool(groups), "random": any(group.count is not None for group in groups),
+        "obstacles": bool(groups),
+        "random": any(group.count is not None for group in groups),
         "moving": any(group.motion is not None for group in groups),
-    }  # fmt: skip
+    }
     x1, y1, x2, y2 = world.extent
     size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
-    told = f"{len(members)} worlds in {size}" if len(members) > 1 else f"a field of {size}"
+    told = (
+        f"{len(members)} worlds in {size}" if len(members) > 1 else f"a field of {size}"
+    )
     tags = [tag for tag, holds in about.items() if holds]
-    return WorldResource(name=world.name, world_resource=resource, description=told, tags=tags)
+    return WorldResource(
+        name=world.name, world_resource=resource, description=told, tags=tags
+    )
 
 
 def world_of(standing: Standing, name: str) -> World:
@@ -186,24 +256,33 @@ def world_of(standing: Standing, name: str) -> World:
         return _in_field(standing, name, standing.bounds(*EMPTY))
     tight = standing.bounds()
     wide = standing.bounds(*EMPTY, *np.add(np.reshape(tight, (2, 2)), [[-1.0], [1.0]]))
-    return _in_field(standing, name, tight if _encloses(standing, tight, wide) else wide)
+    return _in_field(
+        standing, name, tight if _encloses(standing, tight, wide) else wide
+    )
 
 
 def _in_field(standing: Standing, name: str, bounds: Region) -> World:
     x1, y1, x2, y2 = bounds
     far = round(math.hypot(x2 - x1, y2 - y1), 3)
     content = {
-        "name": name, "bounds": bounds, "obstacles": standing.obstacles, "clearance": CLEARANCE,
+        "name": name,
+        "bounds": bounds,
+        "obstacles": standing.obstacles,
+        "clearance": CLEARANCE,
         "goal_distance": (min(NEAREST, round(far / 4.0, 3)), far),
-    }  # fmt: skip
+    }
     return validate(content, World, name)
 
 
 def _encloses(standing: Standing, tight: Region, wide: Region) -> bool:
     """True if most of what is free within a field can't be reached from around it."""
     made = occupancy(_in_field(standing, "field", wide), standing.placed, CELL)
-    free = ndimage.distance_transform_edt(made.cells == FREE) * made.resolution > CLEARANCE
+    free = (
+        ndimage.distance_transform_edt(made.cells == FREE) * made.resolution > CLEARANCE
+    )
     area, _ = ndimage.label(free)
     first, last = made.world_to_cell(np.reshape(tight, (2, 2)))
     within = area[first[0] : last[0], first[1] : last[1]]
-    return bool((within > 0).any() and np.mean(within[within > 0] == area[2, 2]) < MOST_OPEN)
+    return bool(
+        (within > 0).any() and np.mean(within[within > 0] == area[2, 2]) < MOST_OPEN
+    )

@@ -21,11 +21,17 @@ whole = LeRobotDataset("local/drive", root=sys.argv[1], video_backend="pyav")
 told: dict[str, list] = {}
 for frame in whole:
     for key, value in frame.items():
-        told.setdefault(key, []).append(value if isinstance(value, str) else value.tolist())
+        told.setdefault(key, []).append(
+            value if isinstance(value, str) else value.tolist()
+        )
 step = 1.0 / whole.fps
 ahead = {"action": [0.0, step, 2.0 * step]}
 second = LeRobotDataset(
-    "local/drive", root=sys.argv[1], episodes=[1], delta_timestamps=ahead, video_backend="pyav"
+    "local/drive",
+    root=sys.argv[1],
+    episodes=[1],
+    delta_timestamps=ahead,
+    video_backend="pyav",
 )
 told["ahead"] = second[0]["action"].tolist()
 print(json.dumps(told))

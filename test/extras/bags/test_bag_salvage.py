@@ -62,7 +62,9 @@ def test_a_whole_bag_is_saved_whole(sealed, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("share", [0.5, 0.6, 0.8])
-def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(tmp_path, storage, share):
+def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(
+    tmp_path, storage, share
+):
     bag = bags.write(tmp_path / "bag", bags.drive(), storage)
     before, file = held(bag), storage_file(bag)
     data = file.read_bytes()
@@ -140,7 +142,10 @@ def small_disk(tmp_path):
     place = tmp_path / "small"
     place.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+    if (
+        shutil.which("mount") is None
+        or subprocess.run(mount, capture_output=True).returncode
+    ):
         pytest.skip("no file system can be mounted here")
     yield place
     subprocess.run(["umount", "-l", str(place)], check=True)
@@ -161,7 +166,9 @@ def record(place, storage, count, keep=True, then=None, flush_every=10):
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_full_disk_keeps_what_was_recorded(small_disk, tmp_path, storage):
-    with pytest.raises(RecordingError, match="what was written until then lies in") as refused:
+    with pytest.raises(
+        RecordingError, match="what was written until then lies in"
+    ) as refused:
         record(small_disk / "drive", storage, 100_000)
     assert "full" in str(refused.value) or "No space left" in str(refused.value)
     (left,) = small_disk.glob(".drive.*/drive")
@@ -172,7 +179,8 @@ def test_a_full_disk_keeps_what_was_recorded(small_disk, tmp_path, storage):
 
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize(
-    "fault", [sqlite3.OperationalError("database or disk is full"), ValueError("of any kind")]
+    "fault",
+    [sqlite3.OperationalError("database or disk is full"), ValueError("of any kind")],
 )
 @pytest.mark.parametrize("method", ["write", "close"])
 def test_an_error_of_the_storage_of_any_type_keeps_what_was_recorded(
@@ -189,11 +197,15 @@ def test_an_error_of_the_storage_of_any_type_keeps_what_was_recorded(
         return working(self, *given)
 
     monkeypatch.setattr(Writer, method, fail)
-    with pytest.raises(RecordingError, match=f"drive: {fault}; what was written until then lies"):
+    with pytest.raises(
+        RecordingError, match=f"drive: {fault}; what was written until then lies"
+    ):
         record(tmp_path / "drive", storage, 60)
     (left,) = tmp_path.glob(".drive.*/drive")
     monkeypatch.undo()
-    assert salvage(left, tmp_path / "kept").kept["/cmd_vel"] == (50 if method == "write" else 60)
+    assert salvage(left, tmp_path / "kept").kept["/cmd_vel"] == (
+        50 if method == "write" else 60
+    )
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -223,7 +235,9 @@ def test_a_bag_whose_place_was_taken_meanwhile_is_kept(tmp_path, monkeypatch):
         finish(unfinished, path, storage)
 
     monkeypatch.setattr(write, "_finish", taken)
-    with pytest.raises(RecordingError, match=r"was made meanwhile.* lies in") as refused:
+    with pytest.raises(
+        RecordingError, match=r"was made meanwhile.* lies in"
+    ) as refused:
         record(tmp_path / "drive", "mcap", 12)
     (left,) = tmp_path.glob(".drive.*/drive")
     assert str(left) in str(refused.value)
@@ -242,7 +256,10 @@ def test_what_publishers_offer_is_kept(tmp_path, storage):
 
 
 def test_a_type_that_nobody_knows_is_written_with_its_text(tmp_path):
-    texts = {"my_msgs/msg/Own": "int32 x\nmy_msgs/Part part", "my_msgs/msg/Part": "float64 y"}
+    texts = {
+        "my_msgs/msg/Own": "int32 x\nmy_msgs/Part part",
+        "my_msgs/msg/Part": "float64 y",
+    }
     data = b"\x00\x01\x00\x00\x01\x00\x00\x00\x00\x00\x00\x00" + b"\x00" * 8
     with bag_sink(tmp_path / "bag") as sink:
         sink.add_topic("/own", "my_msgs/msg/Own", texts=texts)
@@ -281,7 +298,10 @@ def test_info_tells_rates_gaps_and_clocks(tmp_path):
 
 
 def test_stamps_of_several_clocks_are_told(tmp_path):
-    poses = [(t, bags.pose_stamped(t + 50.0 * (t > 3.0), 0.0, 0.0, 0.0)) for t in bags.times()]
+    poses = [
+        (t, bags.pose_stamped(t + 50.0 * (t > 3.0), 0.0, 0.0, 0.0))
+        for t in bags.times()
+    ]
     bag = bags.write(tmp_path / "bag", {"/pose": poses})
     (pose,) = bag_info(bag).topics
     assert pose.clock == "several"
@@ -319,9 +339,19 @@ with bag_sink(Path(sys.argv[1]), keep=sys.argv[2] == "keep") as sink:
 
 @pytest.mark.process
 @pytest.mark.parametrize("kept", [True, False])
-def test_what_a_killed_recorder_left_stays_and_what_a_conversion_left_does_not(tmp_path, kept):
-    words = [sys.executable, "-c", KILLED, str(tmp_path / "drive"), "keep" if kept else "no"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+def test_what_a_killed_recorder_left_stays_and_what_a_conversion_left_does_not(
+    tmp_path, kept
+):
+    words = [
+        sys.executable,
+        "-c",
+        KILLED,
+        str(tmp_path / "drive"),
+        "keep" if kept else "no",
+    ]
+    with subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as writer:
         assert writer.stdout.readline() == b"begun\n"
         record(tmp_path / "first", "mcap", 12)
         assert len(list(tmp_path.glob(".drive.*"))) == 1, "its writer lives"

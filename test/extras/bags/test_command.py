@@ -46,7 +46,12 @@ def test_info_prints_a_table_or_json(tmp_path):
 
 @pytest.mark.parametrize(
     "words",
-    [("bag", "info"), ("bag", "replay", "--estimate"), ("doctor",), ("generate", "--out", "model")],
+    [
+        ("bag", "info"),
+        ("bag", "replay", "--estimate"),
+        ("doctor",),
+        ("generate", "--out", "model"),
+    ],
 )
 def test_a_damaged_bag_is_one_sentence_for_every_command(damaged, words):
     told = nics(*words, damaged)
@@ -58,7 +63,14 @@ def test_a_damaged_bag_is_one_sentence_for_every_command(damaged, words):
 
 @pytest.mark.process
 def test_a_damaged_bag_is_one_sentence_for_the_process_too(damaged):
-    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "bag", "info", str(damaged)]
+    command = [
+        sys.executable,
+        "-m",
+        "nics_drl_bridge.commands.cli",
+        "bag",
+        "info",
+        str(damaged),
+    ]
     told = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert told.returncode == 2
     (sentence,) = told.stderr.splitlines()
@@ -70,7 +82,9 @@ def test_what_is_intact_is_saved_and_the_loss_is_told(damaged, tmp_path):
     assert told.exit_code == 0, told.output
     assert "of 360 are lost" in told.stdout
     assert nics("bag", "info", tmp_path / "saved").exit_code == 0
-    facts = json.loads(nics("bag", "salvage", damaged, tmp_path / "anew", "--json").stdout)
+    facts = json.loads(
+        nics("bag", "salvage", damaged, tmp_path / "anew", "--json").stdout
+    )
     assert facts["path"] == str(tmp_path / "anew")
     assert facts["told"] == told.stdout.splitlines()[:-1]
     looked = nics("bag", "info", damaged, "--salvage")

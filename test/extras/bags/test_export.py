@@ -46,7 +46,9 @@ def drive(duration=3.0, silent=(), anew_s=None, beams=6):
     return {
         "/odom": [(t, bags.odometry(t, *where(t))) for t in heard(0.02)],
         "/scan": scans,
-        "/cmd_vel": [(t + 0.013, bags.twist(0.1 * t, 0.0, 0.2)) for t in heard(1.0 / FPS)],
+        "/cmd_vel": [
+            (t + 0.013, bags.twist(0.1 * t, 0.0, 0.2)) for t in heard(1.0 / FPS)
+        ],
     }
 
 
@@ -88,12 +90,17 @@ def test_what_is_received_later_changes_no_frame(tmp_path):
     topics = drive()
     whole = frames_of(bags.write(tmp_path / "whole", topics), {}, fps=FPS)
     until = bags.ns(2.0)
-    early = {name: [r for r in rows if bags.ns(r[0]) <= until] for name, rows in topics.items()}
+    early = {
+        name: [r for r in rows if bags.ns(r[0]) <= until]
+        for name, rows in topics.items()
+    }
     cut = frames_of(bags.write(tmp_path / "cut", early), {}, fps=FPS)
     same = int((cut.received_ns <= until).sum())
     assert same > 30
     for name, feature in cut.features.items():
-        np.testing.assert_array_equal(feature.values[:same], whole.features[name].values[:same])
+        np.testing.assert_array_equal(
+            feature.values[:same], whole.features[name].values[:same]
+        )
 
 
 def test_an_episode_ends_in_a_silence_and_where_the_robot_is_placed_anew(exported):
@@ -143,13 +150,17 @@ def test_the_dataset_is_of_the_format_v3(exported):
     for name, feature in info["features"].items():
         (width,), kind = feature["shape"], kinds[feature["dtype"]]
         wide = f"fixed_size_list<element: {kind}>[{width}]"
-        assert str(table.schema.field(name).type) in (kind if width == 1 else wide,), name
+        assert str(table.schema.field(name).type) in (kind if width == 1 else wide,), (
+            name
+        )
     stats = json.loads((folder / "meta/stats.json").read_text())
     assert stats.keys() == info["features"].keys()
     action = np.array(table["action"].to_pylist())
     assert stats["action"]["mean"] == pytest.approx(action.mean(0))
     assert stats["action"]["count"] == [table.num_rows]
-    episodes = parquet.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    episodes = parquet.read_table(
+        folder / "meta/episodes/chunk-000/file-000.parquet"
+    ).to_pylist()
     assert [each["dataset_from_index"] for each in episodes[1:]] == [
         each["dataset_to_index"] for each in episodes[:-1]
     ]
@@ -173,7 +184,11 @@ def test_times_are_regular_and_indices_count(exported):
 def test_success_stands_in_the_last_frame_of_the_episodes_that_had_it(exported):
     _, folder, _ = exported
     rows = rows_of(folder)
-    reached = [e for e, yes in zip(rows["episode_index"], rows["next.success"], strict=True) if yes]
+    reached = [
+        e
+        for e, yes in zip(rows["episode_index"], rows["next.success"], strict=True)
+        if yes
+    ]
     assert reached == [0, 2]
 
 
@@ -206,7 +221,9 @@ def test_with_a_model_actions_are_the_robots_commands(tmp_path):
 
 def test_commands_of_a_car_keep_their_names(tmp_path):
     topics = drive()
-    topics["/cmd_vel"] = [(t, bags.ackermann_stamped(t, 0.5, 0.1)) for t in bags.times(0.05, 3.0)]
+    topics["/cmd_vel"] = [
+        (t, bags.ackermann_stamped(t, 0.5, 0.1)) for t in bags.times(0.05, 3.0)
+    ]
     action = frames_of(bags.write(tmp_path / "bag", topics), {}).features["action"]
     assert action.names == ("speed", "steering_angle")
     np.testing.assert_allclose(action.values[0], [0.5, 0.1], rtol=1e-6)
@@ -214,7 +231,9 @@ def test_commands_of_a_car_keep_their_names(tmp_path):
 
 def test_a_named_pose_takes_the_place_of_the_odometrys(tmp_path):
     topics = drive()
-    topics["/mocap"] = [(t, bags.pose_stamped(t, 7.0, 8.0, 0.5)) for t in bags.times(0.05, 3.0)]
+    topics["/mocap"] = [
+        (t, bags.pose_stamped(t, 7.0, 8.0, 0.5)) for t in bags.times(0.05, 3.0)
+    ]
     frames = frames_of(bags.write(tmp_path / "bag", topics), {"pose": "/mocap"})
     state = frames.features["observation.state"].values
     np.testing.assert_allclose(state[:, :3], [[7.0, 8.0, 0.5]] * len(state), rtol=1e-6)
@@ -276,12 +295,17 @@ def test_the_mcap_tells_all_that_a_viewer_needs(tmp_path, storage):
     bag = bags.write(tmp_path / "bag", topics, storage)
     both = ("--mcap", tmp_path / "shown", "--lerobot", tmp_path / "set")
     told = json.loads(export(bag, *both, "--model", "ackermann", "--json").stdout)
-    assert {told["mcap"], told["lerobot"]} == {str(tmp_path / "shown"), str(tmp_path / "set")}
+    assert {told["mcap"], told["lerobot"]} == {
+        str(tmp_path / "shown"),
+        str(tmp_path / "set"),
+    }
     assert (told["episodes"], told["left_out"], told["fps"]) == (1, 0, FPS)
     assert len(told["added"]) == 2
     found = messages_in(tmp_path / "shown")
     assert found.keys() == {*topics, "/tf", "/tf_static"}
-    assert [len(found[topic]) for topic in topics] == [len(rows) for rows in topics.values()]
+    assert [len(found[topic]) for topic in topics] == [
+        len(rows) for rows in topics.values()
+    ]
     received, (first,) = found["/tf"][0][0], found["/tf"][0][1].transforms
     assert received == bags.ns(topics["/odom"][0][0])
     assert (first.header.frame_id, first.child_frame_id) == ("odom", "base_link")
@@ -302,13 +326,19 @@ def test_transforms_that_a_bag_has_are_left_as_they_are(tmp_path):
 
 
 @pytest.mark.process
-@pytest.mark.skipif(LEROBOT is None, reason="make test-lerobot installs lerobot and runs it")
+@pytest.mark.skipif(
+    LEROBOT is None, reason="make test-lerobot installs lerobot and runs it"
+)
 def test_lerobot_opens_a_dataset_and_gives_its_frames(exported, tmp_path):
     _, folder, bag = exported
     reader = Path(__file__).with_name("read_lerobot.py")
     where = os.environ | {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "cache")}
     told = subprocess.run(
-        [LEROBOT, reader, folder], env=where, capture_output=True, text=True, timeout=240
+        [LEROBOT, reader, folder],
+        env=where,
+        capture_output=True,
+        text=True,
+        timeout=240,
     )
     assert told.returncode == 0, told.stderr
     given = json.loads(told.stdout.splitlines()[-1])
@@ -316,7 +346,9 @@ def test_lerobot_opens_a_dataset_and_gives_its_frames(exported, tmp_path):
     for name, feature in frames.features.items():
         np.testing.assert_array_equal(np.array(given[name], np.float32), feature.values)
     begins = np.cumsum(frames.lengths) - frames.lengths
-    since = (frames.received_ns - np.repeat(frames.received_ns[begins], frames.lengths)) / NS_PER_S
+    since = (
+        frames.received_ns - np.repeat(frames.received_ns[begins], frames.lengths)
+    ) / NS_PER_S
     np.testing.assert_allclose(given["timestamp"], since, atol=1e-6)
     assert set(given["task"]) == {"Go round."}
     second = frames.features["action"].values[frames.lengths[0] :][:3]

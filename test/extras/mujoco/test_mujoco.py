@@ -8,7 +8,12 @@ import pytest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.extras.mujoco.machines import Physics, build_machine, load_mujoco, roller_size
+from nics_drl_bridge.extras.mujoco.machines import (
+    Physics,
+    build_machine,
+    load_mujoco,
+    roller_size,
+)
 from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, Reading, record
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.kinds import textbook
@@ -90,13 +95,17 @@ def test_a_mecanum_robot_moves_sideways_to_the_left(robots):
 
 @needs_mujoco
 @pytest.mark.parametrize("command", [[0.0, 0.5], [0.0, 2.0], [1.0, 1.0], [2.0, 1.0]])
-def test_a_jackal_skids_in_turns_and_so_about_reaches_the_commanded_rate(robots, command):
+def test_a_jackal_skids_in_turns_and_so_about_reaches_the_commanded_rate(
+    robots, command
+):
     """Wheels whose speeds are made by 1.5 times the distance between them."""
     robot = robots["jackal"]
     robot.reset(np.zeros(3))
     robot.step(command, 2.5)
     readings = [robot.step(command, 0.01) for _ in range(50)]
-    state, twist = (np.mean([getattr(r, k) for r in readings], axis=0) for k in ("state", "twist"))
+    state, twist = (
+        np.mean([getattr(r, k) for r in readings], axis=0) for k in ("state", "twist")
+    )
     assert twist[2] == pytest.approx(command[1], rel=0.04)
     p = robot.spec.parameters
     turned_by = (state[1] - state[0]) * p["wheel_radius"] / twist[2]
@@ -122,7 +131,9 @@ def test_the_encoders_agree_with_the_motion(robots, name):
     robot.reset(np.zeros(3))
     robot.step(command, STEADY_S)
     readings = [robot.step(command, 0.01) for _ in range(50)]
-    state, twist = (np.mean([getattr(r, k) for r in readings], axis=0) for k in ("state", "twist"))
+    state, twist = (
+        np.mean([getattr(r, k) for r in readings], axis=0) for k in ("state", "twist")
+    )
     assert np.allclose(textbook(robot.spec).twist(state), twist, rtol=0.1, atol=0.02)
 
 
@@ -134,7 +145,10 @@ def test_a_robot_that_turns_round_knows_where_it_is_by_its_encoders(robots, name
     low, high = robot.spec.command_low, robot.spec.command_high
     reading = robot.reset(pose)
     for step in range(200):
-        before, reading = reading, robot.step(high * [1.0, 0.0] if step > 100 else low, 0.01)
+        before, reading = (
+            reading,
+            robot.step(high * [1.0, 0.0] if step > 100 else low, 0.01),
+        )
         twist = textbook(robot.spec).twist(0.5 * (before.state + reading.state))
         pose = geometry.compose(pose, geometry.exp(0.01 * twist))
     off = geometry.between(reading.pose, pose)
@@ -198,7 +212,12 @@ def test_a_drive_is_a_recording_of_this_robot(robots, name):
     assert check(recording, spec) is recording
     assert recording.variables == spec.variable_names
     assert recording.state is not None
-    assert len(recording.pose.t) == len(recording.state.t) == len(recording.command.t) == 500
+    assert (
+        len(recording.pose.t)
+        == len(recording.state.t)
+        == len(recording.command.t)
+        == 500
+    )
 
 
 @pytest.mark.slow
@@ -207,7 +226,9 @@ def test_a_model_is_identified_from_a_drive(robots):
     from nics_drl_bridge.identify.identify import identify
 
     spec = robots["differential"].spec
-    found = identify(record(robots["differential"], np.random.default_rng(0), 30.0), spec)
+    found = identify(
+        record(robots["differential"], np.random.default_rng(0), 30.0), spec
+    )
     assert found.held_out is not None
     assert found.held_out.mean_position_error_m < 0.03 * found.held_out.mean_path_m
 
@@ -216,7 +237,9 @@ def test_rollers_make_a_wheel_round():
     radius, count = 0.05, 12
     a, b = roller_size(radius, count)
     q = np.linspace(0.0, np.pi / count, 50)
-    reach = (radius - a) * np.cos(q) + np.sqrt(a**2 + (b**2 - a**2) * np.sin(q) ** 2 / 2.0)
+    reach = (radius - a) * np.cos(q) + np.sqrt(
+        a**2 + (b**2 - a**2) * np.sin(q) ** 2 / 2.0
+    )
     assert reach == pytest.approx(radius, rel=2e-3)
     assert reach[[0, -1]] == pytest.approx(radius)
 

@@ -23,11 +23,18 @@ from nics_drl_bridge.sim.world import World, load_world
 from nics_drl_bridge.sim.world_set import load_worlds
 
 OTHERS = ("ackermann", "mecanum", "jackal")
-NAMES = ["differential", *(pytest.param(name, marks=pytest.mark.campaign) for name in OTHERS)]
+NAMES = [
+    "differential",
+    *(pytest.param(name, marks=pytest.mark.campaign) for name in OTHERS),
+]
 WORLDS = [
-    "crowd", "room",
-    *(pytest.param(name, marks=pytest.mark.campaign) for name in ("arena", "clutter", "doorway")),
-]  # fmt: skip
+    "crowd",
+    "room",
+    *(
+        pytest.param(name, marks=pytest.mark.campaign)
+        for name in ("arena", "clutter", "doorway")
+    ),
+]
 pytestmark = pytest.mark.slow
 EYE_HEIGHT = 0.3
 ICE = replace(Physics(), friction=0.1)
@@ -65,11 +72,14 @@ def test_an_episode_begins_as_in_the_fast_simulator(name):
 def test_a_latency_that_is_drawn_delays_the_motors_and_the_rest_is_drawn_as_elsewhere():
     model, world = builtin_model("differential"), load_world("empty")
     late = Randomisation(
-        name="late", action_latency=(1.0, 1.0), lidar={"dropout": (0.5, 0.5)},
+        name="late",
+        action_latency=(1.0, 1.0),
+        lidar={"dropout": (0.5, 0.5)},
         odometry={"odom_linear": (0.1, 0.1)},
-    )  # fmt: skip
+    )
     ours, theirs = (
-        kind(model, world, randomisation=late) for kind in (MujocoSimulator, FastSimulator)
+        kind(model, world, randomisation=late)
+        for kind in (MujocoSimulator, FastSimulator)
     )
     prompt = MujocoSimulator(model, world)
     for simulator in (ours, theirs, prompt):
@@ -83,9 +93,13 @@ def test_a_latency_that_is_drawn_delays_the_motors_and_the_rest_is_drawn_as_else
         paths.append([])
         for _ in range(4):
             drive(simulator, forward(model, 0.5), 1)
-            paths[-1].append(float(np.linalg.norm(simulator.data.pose[0, 0, :2] - start)))
+            paths[-1].append(
+                float(np.linalg.norm(simulator.data.pose[0, 0, :2] - start))
+            )
     assert paths[0][0] < 1e-3 < paths[1][0]
-    assert paths[0][1:] == pytest.approx(paths[1][:-1], abs=1e-3)  # a period later, the same
+    assert paths[0][1:] == pytest.approx(
+        paths[1][:-1], abs=1e-3
+    )  # a period later, the same
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -99,9 +113,13 @@ def test_what_the_lidar_sees_is_what_stands_in_mujoco(name):
     mujoco.mj_forward(engine, data)
     x, y, heading = simulator.data.pose[0, 0]
     hit, near = np.zeros(1, np.int32), 0
-    for angle, seen in zip(model.lidar.angles, simulator.data.ranges[0, 0], strict=True):
+    for angle, seen in zip(
+        model.lidar.angles, simulator.data.ranges[0, 0], strict=True
+    ):
         ray = np.array([np.cos(heading + angle), np.sin(heading + angle), 0.0])
-        away = mujoco.mj_ray(engine, data, np.array([x, y, EYE_HEIGHT]), ray, None, 1, -1, hit)
+        away = mujoco.mj_ray(
+            engine, data, np.array([x, y, EYE_HEIGHT]), ray, None, 1, -1, hit
+        )
         if 0.0 <= away < model.lidar.range_max - 0.05:
             # A wall is 1 mm thicker on each side, which is more along a slanting beam.
             near += abs(away - seen) > 0.01
@@ -109,7 +127,10 @@ def test_what_the_lidar_sees_is_what_stands_in_mujoco(name):
 
 
 def test_each_episode_stands_in_its_world_of_a_set():
-    model, worlds = builtin_model("differential"), load_worlds(["room", "crowd", "corridor"])
+    model, worlds = (
+        builtin_model("differential"),
+        load_worlds(["room", "crowd", "corridor"]),
+    )
     both = MujocoSimulator(model, worlds), FastSimulator(model, worlds)
     seen = set()
     for seed in range(6):
@@ -190,12 +211,16 @@ def test_odometry_of_mecanum_wheels_knows_turns_of_a_diagonal_on_which_two_wheel
     model = builtin_model("mecanum")
     simulator = MujocoSimulator(model, load_world("empty"))
     simulator.reset([0], starts=np.array([[[2.0, -2.0, 0.0]]]))
-    drive(simulator, np.array([[[0.4, 0.2, 0.3]]]), 8)  # they stop beside their rollers' middles
+    drive(
+        simulator, np.array([[[0.4, 0.2, 0.3]]]), 8
+    )  # they stop beside their rollers' middles
     start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
     drive(simulator, np.array([[[-0.7, 0.7, 0.0]]]), 30)
     turned = geometry.between(start, simulator.data.pose[0, 0])[2]
     assert abs(turned) > 0.05
-    assert geometry.between(believed, simulator.wheels[0])[2] == pytest.approx(turned, abs=1e-3)
+    assert geometry.between(believed, simulator.wheels[0])[2] == pytest.approx(
+        turned, abs=1e-3
+    )
 
 
 def test_odometry_of_a_robot_that_skids_turns_by_its_gyro():
@@ -204,9 +229,13 @@ def test_odometry_of_a_robot_that_skids_turns_by_its_gyro():
     simulator = MujocoSimulator(model, world)
     simulator.reset([0], starts=np.zeros((1, 1, 3)))
     start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
-    drive(simulator, np.array([[[1.8, 2.0]]]), 20)  # where it turns faster than its wheels tell
+    drive(
+        simulator, np.array([[[1.8, 2.0]]]), 20
+    )  # where it turns faster than its wheels tell
     turned = geometry.between(start, simulator.data.pose[0, 0])[2]
-    assert geometry.between(believed, simulator.wheels[0])[2] == pytest.approx(turned, abs=0.01)
+    assert geometry.between(believed, simulator.wheels[0])[2] == pytest.approx(
+        turned, abs=0.01
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -275,7 +304,8 @@ def test_two_robots_see_each_other_and_collide():
 
 
 @pytest.mark.parametrize(
-    ("period", "longest"), [(0.1, 0.001), (0.02, 0.001), (1 / 30, 0.001), (0.0005, 0.001)]
+    ("period", "longest"),
+    [(0.1, 0.001), (0.02, 0.001), (1 / 30, 0.001), (0.0005, 0.001)],
 )
 def test_a_control_period_is_a_whole_number_of_time_steps(period, longest):
     parts, steps, timestep = divide(period, longest)

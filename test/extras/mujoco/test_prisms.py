@@ -7,9 +7,18 @@ from shapely.ops import unary_union
 
 from nics_drl_bridge.extras.mujoco.scenery import convex_parts, rectangles
 
-L_SHAPE = [[-0.3, -0.3], [0.3, -0.3], [0.3, -0.1], [-0.1, -0.1], [-0.1, 0.3], [-0.3, 0.3]]
+L_SHAPE = [
+    [-0.3, -0.3],
+    [0.3, -0.3],
+    [0.3, -0.1],
+    [-0.1, -0.1],
+    [-0.1, 0.3],
+    [-0.3, 0.3],
+]
 ANGLES = np.linspace(0.0, 2.0 * np.pi, 10, endpoint=False)
-STAR = [(r * np.cos(a), r * np.sin(a)) for a, r in zip(ANGLES, [1.0, 0.3] * 5, strict=True)]
+STAR = [
+    (r * np.cos(a), r * np.sin(a)) for a, r in zip(ANGLES, [1.0, 0.3] * 5, strict=True)
+]
 COMB = [
     [0, 0],
     [5, 0],

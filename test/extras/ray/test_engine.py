@@ -16,15 +16,24 @@ from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-pytest.importorskip("ray", reason="needs Ray, in an environment of its own; run 'make test-ray'")
+pytest.importorskip(
+    "ray", reason="needs Ray, in an environment of its own; run 'make test-ray'"
+)
 
 from ray.cluster_utils import Cluster
 
-from nics_drl_bridge.extras.ray.engine import FORMAT, connected, share_of_worlds, train_on_ray
+from nics_drl_bridge.extras.ray.engine import (
+    FORMAT,
+    connected,
+    share_of_worlds,
+    train_on_ray,
+)
 from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, run
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 
-pytestmark = pytest.mark.timeout(600)  # processes begin slowly on a machine with other work
+pytestmark = pytest.mark.timeout(
+    600
+)  # processes begin slowly on a machine with other work
 
 STORE_BYTES = 100_000_000
 RUNNERS = 2
@@ -39,8 +48,14 @@ def cluster():
     """Two nodes with one CPU each: two env runners have to share them."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patched.setenv("RAY_worker_niceness", "0")  # else other work may starve the workers
-        node = {"num_cpus": 1, "object_store_memory": STORE_BYTES, "include_dashboard": False}
+        patched.setenv(
+            "RAY_worker_niceness", "0"
+        )  # else other work may starve the workers
+        node = {
+            "num_cpus": 1,
+            "object_store_memory": STORE_BYTES,
+            "include_dashboard": False,
+        }
         made = Cluster(initialize_head=True, head_node_args=node)
         made.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
         yield made
@@ -118,7 +133,10 @@ def acts_alone(path: Path) -> bool:
         "assert np.isfinite(action).all() and np.abs(action).max() <= 1.0\n"
         "assert not {'torch', 'ray', 'stable_baselines3'} & set(sys.modules)\n"
     )
-    return subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode == 0
+    return (
+        subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode
+        == 0
+    )
 
 
 def test_a_killed_worker_is_begun_anew_and_an_interrupted_run_goes_on_where_it_was(
@@ -156,9 +174,19 @@ def test_the_command_trains_on_a_cluster_and_leaves_what_training_on_one_machine
     path, out = tmp_path / "settings.yaml", tmp_path / "run"
     path.write_text(settings(steps=144).model_dump_json())
     done = nics(
-        "--engine", "ray", "--address", cluster.address, "--env-runners", RUNNERS,
-        "--settings", path, "--episodes", 5, "--out", out,
-    )  # fmt: skip
+        "--engine",
+        "ray",
+        "--address",
+        cluster.address,
+        "--env-runners",
+        RUNNERS,
+        "--settings",
+        path,
+        "--episodes",
+        5,
+        "--out",
+        out,
+    )
     assert done.exit_code == 0, done.output
     assert done.output.count("of 5 episodes") == 2
     names = {file.name.partition(".out")[0] for file in (out / "seed_0").iterdir()}
@@ -175,7 +203,9 @@ def test_the_command_trains_on_a_cluster_and_leaves_what_training_on_one_machine
         (["--algorithm", "sac"], "--engine ray learns with ppo, not 'sac'"),
     ],
 )
-def test_what_a_cluster_can_not_train_gives_one_sentence(cluster, tmp_path, arguments, sentence):
+def test_what_a_cluster_can_not_train_gives_one_sentence(
+    cluster, tmp_path, arguments, sentence
+):
     where = ["--engine", "ray", "--address", cluster.address, "--out", tmp_path / "run"]
     done = nics(*where, *arguments)
     assert done.exit_code == 2
@@ -187,14 +217,17 @@ def test_what_a_cluster_can_not_train_gives_one_sentence(cluster, tmp_path, argu
 def test_an_address_where_no_cluster_is_gives_one_sentence(address, tmp_path):
     done = nics("--engine", "ray", "--address", address, "--out", tmp_path)
     assert done.exit_code == 2
-    assert f"--address {address}: no Ray cluster answers" in " ".join(done.output.split())
+    assert f"--address {address}: no Ray cluster answers" in " ".join(
+        done.output.split()
+    )
 
 
 def test_env_runners_share_all_worlds_among_them():
     from nics_drl_bridge.generator import open_model
 
     shares = [
-        share_of_worlds(settings(), open_model("differential"), {}, k, 4).num_envs for k in range(4)
+        share_of_worlds(settings(), open_model("differential"), {}, k, 4).num_envs
+        for k in range(4)
     ]
     assert shares == [3, 2, 2, 2]
 

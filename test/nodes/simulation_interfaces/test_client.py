@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
+pytest.importorskip(
+    "simulation_interfaces", reason="needs what `make test-messages` builds"
+)
 
 from builtin_interfaces.msg import Time
 from simulation_interfaces import msg
@@ -34,10 +36,14 @@ def make(model):
         given = {"domain_id": domain_id, "timeout_s": TIMEOUT_S, **options}
         made.append(
             gymnasium.make(
-                NAVIGATION, backend="ros", simulator="simulation_interfaces", model=model,
-                world=world, backend_options=given,
+                NAVIGATION,
+                backend="ros",
+                simulator="simulation_interfaces",
+                model=model,
+                world=world,
+                backend_options=given,
             )
-        )  # fmt: skip
+        )
         return made[-1]
 
     yield env_of
@@ -50,8 +56,12 @@ def test_an_env_places_and_steps_a_simulator_by_the_standard_alone(
     launch, domain_id, make, client_of, mode
 ):
     launch("simulator_node", domain_id, world="circles", mode=mode, scan_rate=10.0)
-    env = make(domain_id, truth=True, standard={} if mode == "lockstep" else {"slack_s": 0.05})
-    ours = gymnasium.make(NAVIGATION, model=env.unwrapped.model, world="circles", estimator=True)
+    env = make(
+        domain_id, truth=True, standard={} if mode == "lockstep" else {"slack_s": 0.05}
+    )
+    ours = gymnasium.make(
+        NAVIGATION, model=env.unwrapped.model, world="circles", estimator=True
+    )
     action = np.array([0.6, 0.3], np.float32)
     for seed in (3, 4):
         first, info = env.reset(seed=seed)
@@ -106,16 +116,22 @@ def test_steps_of_a_rounded_length_are_followed(launch, domain_id, make, monkeyp
     timing = device_parameters.timing
     rounded = {"step_ns": 100_000_002, "odom_ns": 100_000_002, "scan_ns": 100_000_002}
     monkeypatch.setattr(
-        device_parameters, "timing", lambda node, model: timing(node, model)._replace(**rounded)
+        device_parameters,
+        "timing",
+        lambda node, model: timing(node, model)._replace(**rounded),
     )
     launch("simulator_node", domain_id, world="circles", mode="lockstep")
     env = make(domain_id)
     env.reset(seed=3)
-    stamps = [env.step(np.array([0.6, 0.0], np.float32))[4]["stamp_ns"] for _ in range(STEPS)]
+    stamps = [
+        env.step(np.array([0.6, 0.0], np.float32))[4]["stamp_ns"] for _ in range(STEPS)
+    ]
     assert set(np.diff(stamps)) == {100_000_002}
 
 
-def test_what_stands_above_the_floor_or_tilted_stays_so(launch, domain_id, make, monkeypatch):
+def test_what_stands_above_the_floor_or_tilted_stays_so(
+    launch, domain_id, make, monkeypatch
+):
     state, put = EntityServices.state, EntityServices.set_state
     placed = {}
 
@@ -148,7 +164,9 @@ def test_a_feature_that_is_missing_is_named_when_the_env_is_made(
     fewer = tuple(name for name in server.FEATURES if name != "ENTITY_STATE_SETTING")
     monkeypatch.setattr(server, "FEATURES", fewer)
     launch("simulator_node", domain_id, world="circles", mode="lockstep")
-    with pytest.raises(BackendError, match="does not have the feature ENTITY_STATE_SETTING"):
+    with pytest.raises(
+        BackendError, match="does not have the feature ENTITY_STATE_SETTING"
+    ):
         make(domain_id)
 
 
@@ -169,7 +187,9 @@ def test_steps_that_are_refused_are_told(launch, domain_id, make, client_of):
 def test_the_robot_has_another_name_in_another_simulator(launch, domain_id, make):
     launch("simulator_node", domain_id, world="circles", mode="lockstep")
     env = make(domain_id, standard={"entity": "waffle"})
-    with pytest.raises(BackendError, match="refused GetEntityState: there is no entity 'waffle'"):
+    with pytest.raises(
+        BackendError, match="refused GetEntityState: there is no entity 'waffle'"
+    ):
         env.reset(seed=0)
 
 

@@ -17,7 +17,10 @@ from nics_drl_bridge.nodes.simulation_interfaces import client
 @pytest.fixture(params=["1.x", "2.0"])
 def older(request, monkeypatch):
     """Messages of another version, in place of those that may be installed."""
-    package, kinds = ModuleType("simulation_interfaces"), ModuleType("simulation_interfaces.srv")
+    package, kinds = (
+        ModuleType("simulation_interfaces"),
+        ModuleType("simulation_interfaces.srv"),
+    )
     package.__path__ = []
     kinds.GetSimulatorFeatures = object
     if request.param == "2.0":
@@ -44,5 +47,7 @@ def test_a_simulator_goes_on_without_the_services_and_tells_why(older):
 
 
 def test_a_client_tells_which_version_it_needs(older):
-    with pytest.raises(ConfigError, match=r"install simulation_interfaces 2\.1 or newer"):
+    with pytest.raises(
+        ConfigError, match=r"install simulation_interfaces 2\.1 or newer"
+    ):
         client.module("srv")

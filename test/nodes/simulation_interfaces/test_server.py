@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
+pytest.importorskip(
+    "simulation_interfaces", reason="needs what `make test-messages` builds"
+)
 
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
@@ -26,7 +28,9 @@ pytestmark = pytest.mark.ros
 STATES, OK = msg.SimulationState, msg.Result.RESULT_OK
 
 
-MESH = "<collision name='c'><geometry><mesh><uri>a.dae</uri></mesh></geometry></collision>"
+MESH = (
+    "<collision name='c'><geometry><mesh><uri>a.dae</uri></mesh></geometry></collision>"
+)
 FIELD = "name: {}\nsize: [{}, 4.0]\ngoal_distance: [1.0, 3.0]\n"
 
 
@@ -53,7 +57,9 @@ def spawned(**fields):
 
 @pytest.fixture(scope="module")
 def simulator(launch, module_domain_id):
-    process = launch("simulator_node", module_domain_id, world="empty", robots=["left", "right"])
+    process = launch(
+        "simulator_node", module_domain_id, world="empty", robots=["left", "right"]
+    )
     yield module_domain_id
     process.check()
 
@@ -95,20 +101,31 @@ def test_robots_in_mujoco_serve_the_same(launch, domain_id, client_of):
 
 def test_a_spawned_robot_has_topics_until_it_is_deleted(client, meet, simulator):
     spawned = client.spawn(
-        "third", 1.0, entity_resource=msg.Resource(uri="ackermann"), entity_namespace="third"
+        "third",
+        1.0,
+        entity_resource=msg.Resource(uri="ackermann"),
+        entity_namespace="third",
     )
     assert spawned.result.result == OK, spawned.result.error_message
     peer = meet(simulator)
-    scans, odoms = peer.listen(LaserScan, "third/scan"), peer.listen(Odometry, "third/odom")
+    scans, odoms = (
+        peer.listen(LaserScan, "third/scan"),
+        peer.listen(Odometry, "third/odom"),
+    )
     commands = peer.speak(Twist, "third/cmd_vel")
     command = Twist()
     command.linear.x = 0.5
     commands.publish(command)
     client.set_state(STATES.STATE_PLAYING)
-    peer.until(lambda: scans and odoms and odoms[-1].twist.twist.linear.x > 0.1, "it drives")
+    peer.until(
+        lambda: scans and odoms and odoms[-1].twist.twist.linear.x > 0.1, "it drives"
+    )
     assert client.code("DeleteEntity", entity="third") == OK
     peer.until(lambda: peer.node.count_publishers("/third/scan") == 0, "its topics end")
-    assert client.names(categories=[msg.EntityCategory(category=1)]) == ["left", "right"]
+    assert client.names(categories=[msg.EntityCategory(category=1)]) == [
+        "left",
+        "right",
+    ]
 
 
 def test_a_robot_that_was_deleted_comes_back_with_a_reset(client, meet, simulator):
@@ -127,16 +144,39 @@ def test_a_robot_that_was_deleted_comes_back_with_a_reset(client, meet, simulato
     [
         ("3rd", "", msg.SpawnResult.NAME_INVALID, "the name '3rd' makes no namespace"),
         ("x" * 121, "", msg.SpawnResult.NAME_INVALID, "use up to 120 letters"),
-        ("third", "y" * 300, msg.SpawnResult.NAMESPACE_INVALID, "is no namespace of ROS"),
-        ("third", "left", msg.SpawnResult.NAMESPACE_INVALID, "is that of another robot"),
-        ("third", "/right", msg.SpawnResult.NAMESPACE_INVALID, "is that of another robot"),
+        (
+            "third",
+            "y" * 300,
+            msg.SpawnResult.NAMESPACE_INVALID,
+            "is no namespace of ROS",
+        ),
+        (
+            "third",
+            "left",
+            msg.SpawnResult.NAMESPACE_INVALID,
+            "is that of another robot",
+        ),
+        (
+            "third",
+            "/right",
+            msg.SpawnResult.NAMESPACE_INVALID,
+            "is that of another robot",
+        ),
     ],
 )
-def test_a_robot_whose_topics_can_not_be_named_is_refused(client, name, space, code, sentence):
+def test_a_robot_whose_topics_can_not_be_named_is_refused(
+    client, name, space, code, sentence
+):
     robot = msg.Resource(uri="ackermann")
     answer = client.spawn(name, 1.0, entity_resource=robot, entity_namespace=space)
-    assert (answer.result.result, sentence in answer.result.error_message) == (code, True), answer
-    assert client.names(categories=[msg.EntityCategory(category=1)]) == ["left", "right"]
+    assert (answer.result.result, sentence in answer.result.error_message) == (
+        code,
+        True,
+    ), answer
+    assert client.names(categories=[msg.EntityCategory(category=1)]) == [
+        "left",
+        "right",
+    ]
     client.set_state(STATES.STATE_PLAYING)
     assert client.code("GetEntityState", entity="left") == OK  # it lives
 
@@ -155,9 +195,14 @@ def test_a_robot_that_can_not_have_its_topics_is_not_there(client, monkeypatch):
         raise RuntimeError("no topics")
 
     monkeypatch.setattr(DeviceNode, "add_robot", broken)
-    refused = client.spawn("third", 1.0, entity_resource=msg.Resource(uri="ackermann")).result
+    refused = client.spawn(
+        "third", 1.0, entity_resource=msg.Resource(uri="ackermann")
+    ).result
     assert "no topics" in refused.error_message
-    assert client.names(categories=[msg.EntityCategory(category=1)]) == ["left", "right"]
+    assert client.names(categories=[msg.EntityCategory(category=1)]) == [
+        "left",
+        "right",
+    ]
 
 
 def test_what_was_told_of_an_entity_goes_with_it(client):
@@ -173,7 +218,10 @@ def test_what_was_told_of_an_entity_goes_with_it(client):
 
 def test_what_was_told_of_the_worlds_own_goes_with_a_full_reset(client):
     told = msg.EntityInfo(description="mine", tags=["mine"])
-    for reset in ("ResetSimulation", "SetSimulationState"):  # stopped, which is the default
+    for reset in (
+        "ResetSimulation",
+        "SetSimulationState",
+    ):  # stopped, which is the default
         assert client.code("SetEntityInfo", entity="left", info=told) == OK
         assert client.code(reset) == OK
         assert client("GetEntityInfo", entity="left").info.description != "mine"
@@ -182,11 +230,16 @@ def test_what_was_told_of_the_worlds_own_goes_with_a_full_reset(client):
 def test_the_last_robot_is_not_removed_as_spawned_and_nothing_else_is(client):
     client.spawn("disc", 2.0)
     assert (
-        client.spawn("r2", 1.0, entity_resource=msg.Resource(uri="ackermann")).result.result == OK
+        client.spawn(
+            "r2", 1.0, entity_resource=msg.Resource(uri="ackermann")
+        ).result.result
+        == OK
     )
     for own in ("left", "right"):
         assert client.code("DeleteEntity", entity=own) == OK
-    refused = client("ResetSimulation", scope=srv.ResetSimulation.Request.SCOPE_SPAWNED).result
+    refused = client(
+        "ResetSimulation", scope=srv.ResetSimulation.Request.SCOPE_SPAWNED
+    ).result
     assert refused.result == msg.Result.RESULT_OPERATION_FAILED
     assert "a simulator needs a robot, and all were spawned" in refused.error_message
     assert client.names() == ["r2", "disc"] or client.names() == ["disc", "r2"]
@@ -220,7 +273,11 @@ def test_after_one_robot_is_deleted_the_others_keep_their_topics_and_starts(
 ):
     start = [-1.0, 0.0, 0.0, 1.0, -1.0, 0.5]
     node = launch(
-        "simulator_node", domain_id, world="empty", robots=["left", "right"], episode_start=start
+        "simulator_node",
+        domain_id,
+        world="empty",
+        robots=["left", "right"],
+        episode_start=start,
     )
     client, peer = client_of(domain_id), meet(domain_id)
     truths = peer.listen(Odometry, "right/ground_truth")
@@ -228,7 +285,11 @@ def test_after_one_robot_is_deleted_the_others_keep_their_topics_and_starts(
     assert peer.call(Trigger, "simulator_node/reset").success
 
     def stands(x, y):
-        return truths and math.dist(conversions.odometry_from_ros(truths[-1])[0][:2], (x, y)) < 0.01
+        return (
+            truths
+            and math.dist(conversions.odometry_from_ros(truths[-1])[0][:2], (x, y))
+            < 0.01
+        )
 
     peer.until(lambda: stands(1.0, -1.0), "the robot at its own start")
     pose = PoseWithCovarianceStamped()
@@ -252,11 +313,17 @@ def test_worlds_of_gazebo_are_listed_too(client, tmp_path):
 
 def test_poses_may_be_given_in_the_frame_of_an_entity(client):
     base = msg.EntityState()
-    base.pose.position.x, base.pose.orientation.z, base.pose.orientation.w = 1.0, 1.0, 0.0
+    base.pose.position.x, base.pose.orientation.z, base.pose.orientation.w = (
+        1.0,
+        1.0,
+        0.0,
+    )
     assert client.code("SetEntityState", entity="left", state=base, set_pose=True) == OK
     beside = msg.EntityState()
     beside.header.frame_id, beside.pose.position.x = "left", 0.5
-    assert client.code("SetEntityState", entity="right", state=beside, set_pose=True) == OK
+    assert (
+        client.code("SetEntityState", entity="right", state=beside, set_pose=True) == OK
+    )
     found = client("GetEntityState", entity="right").state
     assert found.pose.position.x == pytest.approx(0.5, abs=1e-6)
     beside.header.frame_id = "nowhere"
@@ -269,7 +336,12 @@ def test_poses_may_be_given_in_the_frame_of_an_entity(client):
     ("name", "fields", "code", "sentence"),
     [
         ("GetEntityState", {"entity": "x"}, 2, "there is no entity 'x'"),
-        ("GetEntities", {"filters": msg.EntityFilters(filter="(")}, 4, "no regular expression"),
+        (
+            "GetEntities",
+            {"filters": msg.EntityFilters(filter="(")},
+            4,
+            "no regular expression",
+        ),
         (
             "GetEntities",
             {"filters": msg.EntityFilters(categories=[msg.EntityCategory(category=9)])},
@@ -282,25 +354,90 @@ def test_poses_may_be_given_in_the_frame_of_an_entity(client):
             4,
             "filter_mode 7",
         ),
-        ("GetEntities", {"filters": msg.EntityFilters(bounds=msg.Bounds(type=1))}, 4, "0 points"),
-        ("GetEntities", {"filters": msg.EntityFilters(bounds=msg.Bounds(type=9))}, 0, "type 9"),
+        (
+            "GetEntities",
+            {"filters": msg.EntityFilters(bounds=msg.Bounds(type=1))},
+            4,
+            "0 points",
+        ),
+        (
+            "GetEntities",
+            {"filters": msg.EntityFilters(bounds=msg.Bounds(type=9))},
+            0,
+            "type 9",
+        ),
         ("StepSimulation", {"steps": 0}, 4, "steps is 0"),
         ("StepSimulation", {"steps": 2**63}, 4, "are the most of one call"),
         ("ResetSimulation", {"scope": 8}, 0, "scope 8"),
-        ("LoadWorld", {"world_resource": msg.Resource(uri="nowhere")}, 2, "unknown world"),
-        ("LoadWorld", {"world_resource": msg.Resource(uri="/no/a.yaml")}, 2, "no such file"),
-        ("LoadWorld", {"world_resource": msg.Resource(uri="/no/[ab].yaml")}, 103, "no world file"),
-        ("LoadWorld", {"world_resource": msg.Resource(uri="x" * 253)}, 2, "name too long"),
-        ("LoadWorld", {"world_resource": msg.Resource(uri="x" * 300)}, 2, "name too long"),
+        (
+            "LoadWorld",
+            {"world_resource": msg.Resource(uri="nowhere")},
+            2,
+            "unknown world",
+        ),
+        (
+            "LoadWorld",
+            {"world_resource": msg.Resource(uri="/no/a.yaml")},
+            2,
+            "no such file",
+        ),
+        (
+            "LoadWorld",
+            {"world_resource": msg.Resource(uri="/no/[ab].yaml")},
+            103,
+            "no world file",
+        ),
+        (
+            "LoadWorld",
+            {"world_resource": msg.Resource(uri="x" * 253)},
+            2,
+            "name too long",
+        ),
+        (
+            "LoadWorld",
+            {"world_resource": msg.Resource(uri="x" * 300)},
+            2,
+            "name too long",
+        ),
         ("SpawnEntity", spawned(uri="x" * 300), 2, "name too long"),
         ("SpawnEntity", spawned(uri="/no/[ab].yaml"), 2, "no such file"),
-        ("SpawnEntity", spawned(resource_string=sdf("<model name='m'>")), 106, "is no XML"),
-        ("SpawnEntity", spawned(resource_string=sdf(model(101 * box(1)))), 4, "more than 100"),
-        ("LoadWorld", {"world_resource": in_sdf(model(box(9000)))}, 103, "goal_distance"),
+        (
+            "SpawnEntity",
+            spawned(resource_string=sdf("<model name='m'>")),
+            106,
+            "is no XML",
+        ),
+        (
+            "SpawnEntity",
+            spawned(resource_string=sdf(model(101 * box(1)))),
+            4,
+            "more than 100",
+        ),
+        (
+            "LoadWorld",
+            {"world_resource": in_sdf(model(box(9000)))},
+            103,
+            "goal_distance",
+        ),
         ("LoadWorld", {"world_resource": in_sdf(model(MESH))}, 105, "has a mesh"),
-        ("LoadWorld", {"world_resource": msg.Resource(uri="http://a/b.sdf")}, 101, "this machine"),
-        ("LoadWorld", {"world_resource": msg.Resource(uri="file://[")}, 101, "this machine"),
-        ("SetSimulationState", {"state": STATES(state=77)}, 103, "state 77 can't be set"),
+        (
+            "LoadWorld",
+            {"world_resource": msg.Resource(uri="http://a/b.sdf")},
+            101,
+            "this machine",
+        ),
+        (
+            "LoadWorld",
+            {"world_resource": msg.Resource(uri="file://[")},
+            101,
+            "this machine",
+        ),
+        (
+            "SetSimulationState",
+            {"state": STATES(state=77)},
+            103,
+            "state 77 can't be set",
+        ),
     ],
 )
 def test_a_wrong_argument_is_answered_by_a_code_and_one_sentence(
@@ -317,7 +454,9 @@ def test_names_are_matched_by_posix_expressions(client):
     assert client.names(filter="left|right") == ["left", "right"]
     assert client.names(filter="^(lef|righ)+t$") == ["left", "right"]
     for filter_ in (r"[a\]", "[]a]", "[^]a]", "[a[]", "[&&x]", r"\[a"):
-        assert client.code("GetEntities", filters=msg.EntityFilters(filter=filter_)) == OK
+        assert (
+            client.code("GetEntities", filters=msg.EntityFilters(filter=filter_)) == OK
+        )
     assert client.names(filter=r"_[\d]$") == []
     assert client.names(filter=r"^[[:alpha:]\]+$") == ["left", "right"]
 
@@ -337,12 +476,16 @@ def test_names_are_matched_by_posix_expressions(client):
         ("a" * 1001, "it repeats"),
     ],
 )
-def test_an_expression_that_is_none_of_posix_or_takes_forever_is_refused(client, expression, why):
+def test_an_expression_that_is_none_of_posix_or_takes_forever_is_refused(
+    client, expression, why
+):
     result = client("GetEntities", filters=msg.EntityFilters(filter=expression)).result
     assert (result.result, why in result.error_message) == (4, True), result
 
 
-def test_a_simulator_that_was_asked_to_quit_answers_and_ends(launch, domain_id, client_of):
+def test_a_simulator_that_was_asked_to_quit_answers_and_ends(
+    launch, domain_id, client_of
+):
     process = launch("simulator_node", domain_id, world="empty")
     assert client_of(domain_id).set_state(STATES.STATE_QUITTING) == OK
     assert process.wait() == 0
@@ -366,7 +509,9 @@ def test_the_map_is_that_of_the_world_that_is_loaded_also_where_nothing_stands(
         world = msg.Resource(resource_string=FIELD.format("text", side))
         assert client.code("LoadWorld", world_resource=world) == OK
         peer.until(
-            lambda side=side: maps and maps[-1].info.width * maps[-1].info.resolution // 1 == side,
+            lambda side=side: (
+                maps and maps[-1].info.width * maps[-1].info.resolution // 1 == side
+            ),
             "the map of the world",
         )
 
@@ -402,27 +547,40 @@ def test_steps_that_fail_abort_the_action_with_the_reason(client, monkeypatch):
 def test_a_source_that_is_none_hinders_no_other(client, tmp_path):
     (tmp_path / "notes.txt").write_text("kind: circle\nradius: 0.1\n", encoding="utf-8")
     (tmp_path / "far.sdf").write_text(
-        sdf(f"<model name='m'><include><uri>{'x' * 300}</uri></include></model>"), encoding="utf-8"
+        sdf(f"<model name='m'><include><uri>{'x' * 300}</uri></include></model>"),
+        encoding="utf-8",
     )
     (tmp_path / "free.sdf").write_text(sdf(f"<gz:x/>{model(box(1))}"), encoding="utf-8")
-    strange = ["", "x" * 300, "/dev/null", str(tmp_path / "notes.txt"), "https://a/b.sdf"]
+    strange = [
+        "",
+        "x" * 300,
+        "/dev/null",
+        str(tmp_path / "notes.txt"),
+        "https://a/b.sdf",
+    ]
     told = client("GetSpawnables", sources=[*strange, str(tmp_path)])
     assert told.result.result == OK
     for source in strange:
         assert repr(source) in told.result.error_message
     uris = [each.entity_resource.uri for each in told.spawnables]
     assert [uri for uri in uris if str(tmp_path) in uri] == [str(tmp_path / "free.sdf")]
-    assert not [uri for uri in uris if uri.endswith((".toml", ".world"))]  # of no folder here
+    assert not [
+        uri for uri in uris if uri.endswith((".toml", ".world"))
+    ]  # of no folder here
 
 
 def test_a_source_of_worlds_that_can_not_be_read_is_left_out_if_that_is_asked(client):
     strange = ["", "x" * 300, "/dev/null"]
     refused = client("GetAvailableWorlds", additional_sources=strange)
     assert refused.result.result == msg.Result.RESULT_NOT_FOUND
-    told = client("GetAvailableWorlds", additional_sources=strange, continue_on_error=True)
+    told = client(
+        "GetAvailableWorlds", additional_sources=strange, continue_on_error=True
+    )
     assert told.result.result == OK
     assert all(repr(source) in told.result.error_message for source in strange)
-    remote = client("GetAvailableWorlds", additional_sources=["https://a/b.sdf"], offline_only=True)
+    remote = client(
+        "GetAvailableWorlds", additional_sources=["https://a/b.sdf"], offline_only=True
+    )
     assert (remote.result.result, remote.result.error_message) == (OK, "")
     assert remote.worlds
 
@@ -434,7 +592,9 @@ def test_what_is_no_world_in_a_folder_is_told_and_hinders_no_other(client, tmp_p
     told = client("GetAvailableWorlds", additional_sources=[str(tmp_path)])
     assert told.result.result == OK, told.result.error_message
     uris = [each.world_resource.uri for each in told.worlds]
-    assert [uri for uri in uris if str(tmp_path) in uri] == [str(tmp_path / "field.yaml")]
+    assert [uri for uri in uris if str(tmp_path) in uri] == [
+        str(tmp_path / "field.yaml")
+    ]
     assert "disc.yaml" in told.result.error_message
 
 
@@ -447,7 +607,9 @@ WALLS = "".join(
 )
 
 
-@pytest.mark.parametrize(("stands", "field"), [(box(1), "10 m x 10 m"), (WALLS, "4.1 m x 4.1 m")])
+@pytest.mark.parametrize(
+    ("stands", "field"), [(box(1), "10 m x 10 m"), (WALLS, "4.1 m x 4.1 m")]
+)
 def test_a_world_of_gazebo_has_room_around_what_stands_unless_that_encloses_it(
     client, stands, field
 ):
@@ -461,13 +623,21 @@ def test_a_world_of_gazebo_in_which_nothing_stands_is_an_empty_field(client):
     loaded = client("LoadWorld", world_resource=sun)
     assert loaded.result.result == OK, loaded.result.error_message
     assert loaded.world.description == "a field of 10 m x 10 m"
-    meshes = {"world_resource": in_sdf(model(MESH)), "ignore_missing_or_unsupported_assets": True}
+    meshes = {
+        "world_resource": in_sdf(model(MESH)),
+        "ignore_missing_or_unsupported_assets": True,
+    }
     assert client.code("LoadWorld", **meshes) == OK
 
 
-def test_a_launched_robot_comes_back_where_another_took_its_name(client, meet, simulator):
+def test_a_launched_robot_comes_back_where_another_took_its_name(
+    client, meet, simulator
+):
     assert client.code("DeleteEntity", entity="left") == OK
-    robot = {"entity_resource": msg.Resource(uri="ackermann"), "entity_namespace": "other"}
+    robot = {
+        "entity_resource": msg.Resource(uri="ackermann"),
+        "entity_namespace": "other",
+    }
     assert client.spawn("left", 1.0, **robot).result.result == OK
     assert client.code("DeleteEntity", entity="right") == OK
     robot["entity_namespace"] = "third"
@@ -485,7 +655,10 @@ def test_a_launched_robot_comes_back_where_another_took_its_name(client, meet, s
 
 def test_two_robots_never_share_their_topics(launch, domain_id, client_of):
     launch("simulator_node", domain_id, world="empty", namespace="sim")
-    robot = {"entity_resource": msg.Resource(uri="ackermann"), "entity_namespace": "/sim"}
+    robot = {
+        "entity_resource": msg.Resource(uri="ackermann"),
+        "entity_namespace": "/sim",
+    }
     refused = client_of(domain_id, "sim").spawn("second", 1.0, **robot).result
     assert refused.result == msg.SpawnResult.NAMESPACE_INVALID
     assert "is that of another robot" in refused.error_message
@@ -496,7 +669,9 @@ def test_the_world_that_a_node_began_with_can_be_loaded_again(
     launch, domain_id, client_of, tmp_path, world
 ):
     for name in ("one", "two"):
-        (tmp_path / f"{name}.yaml").write_text(FIELD.format(name, 5.0), encoding="utf-8")
+        (tmp_path / f"{name}.yaml").write_text(
+            FIELD.format(name, 5.0), encoding="utf-8"
+        )
     launch("simulator_node", domain_id, world=world.format(tmp_path))
     client = client_of(domain_id)
     told = client("GetCurrentWorld").world
