@@ -277,7 +277,8 @@ def table(result: dict[str, Any]) -> str:
             f"{PAPER[name][3]:.2e}",
             "",
         )
-    text += f"Ackermann heading with order 4: {result['ackermann_order4_rmse_heading_rad']:.2e} rad\n"
+    heading_rmse = result["ackermann_order4_rmse_heading_rad"]
+    text += f"Ackermann heading with order 4: {heading_rmse:.2e} rad\n"
     text += f"plain Python: {result['python_reference_steps_per_s']:.2e} steps/s\n"
     return text
 

@@ -347,7 +347,10 @@ TRANSFER = Table(
             f"transfer_{robot}",
             f"{title}, `{world}`",
             *(
-                f"{{success.{at} x100|.0f}}, {{collision.{at} x100|.0f}}, {{believed.{at} x100|.0f}}"
+                ", ".join(
+                    f"{{{share}.{at} x100|.0f}}"
+                    for share in ("success", "collision", "believed")
+                )
                 for at in (
                     f"{robot}.{world}.{place}"
                     for place in ("fast", "dds", "mujoco_dds")

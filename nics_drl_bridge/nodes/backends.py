@@ -186,11 +186,8 @@ class DdsBackend:
                 kind = LaserScan if topic == SCAN else Odometry
                 if topic in self._sensors:
                     kind = sensor_type(self._sensors[topic])
-                put = lambda message, mail=self._mail, topic=topic: mail.put(
-                    topic, message
-                )  # noqa: E731
                 self._link.node.create_subscription(
-                    kind, topic, put, qos.SENSOR, raw=True
+                    kind, topic, partial(self._mail.put, topic), qos.SENSOR, raw=True
                 )
             self._episodes = self._services(
                 model, world, simulator, options, randomisation

@@ -89,7 +89,8 @@ def _robot_line(guess: CommandGuess, radius: float) -> str:
         example = f"{{kind: differential, footprint_radius: {radius}}}"
         return f"robot:  # which kind is not certain, as in {example}"
     alike = "".join(f", or {each}" for each in look_alikes(guess.kind))
-    return f"robot: {{kind: {guess.kind}, footprint_radius: {radius}}}  {GUESSED}{alike}; radius in m"
+    robot = f"robot: {{kind: {guess.kind}, footprint_radius: {radius}}}"
+    return f"{robot}  {GUESSED}{alike}; radius in m"
 
 
 def _command_lines(

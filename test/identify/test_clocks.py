@@ -99,6 +99,9 @@ def test_what_the_pose_tells_is_not_asked_to_be_measured(car, differential):
         update={"state": (speed, steering.model_copy(update={"follows": None}))}
     )
     assert not any(v.must_be_measured for v in told.state)
-    sentence = "'steering' of robot 'ackermann' follows no command; .*`nics inspect .* --map my.yaml`"
+    sentence = (
+        "'steering' of robot 'ackermann' follows no command; "
+        ".*`nics inspect .* --map my.yaml`"
+    )
     with pytest.raises(RecordingError, match=sentence):
         timing_of(Drive(recording, untold))
