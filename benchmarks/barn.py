@@ -88,7 +88,8 @@ class Runs:
 
     def figures(self, rows: Any = slice(None)) -> dict[str, float | None]:
         """Shares, and the mean time of the successful runs; `rows` are some of the runs."""
-        success, collision = self.success[rows], self.collision[rows]
+        success = self.success[rows]
+        collision = self.collision[rows]
         time = self.time_s[rows][success]
         return {
             "success": float(success.mean()),
@@ -245,7 +246,9 @@ def drive_folds(
 
     Returns the runs, and the time of the longest training [s].
     """
-    chosen, driven, longest_s = load_training(settings), [], 0.0
+    chosen = load_training(settings)
+    driven = []
+    longest_s = 0.0
     if BARN not in chosen.worlds:
         raise ConfigError(
             f"{settings}: --five-fold replaces the world {BARN!r}, which it lacks."
@@ -311,7 +314,8 @@ def missed(
     """A sentence for each bar that a policy missed, and its training, if there was one."""
     said = []
     for name, bar in BARS[place].items():
-        value, least = figures[name], name != "collision"
+        value = figures[name]
+        least = name != "collision"
         if not (value >= bar if least else value <= bar):
             said.append(f"{policy}: {name} {value:.3f}, bar {bar}")
     if training_s is not None and not training_s <= TRAINING_BAR_S:

@@ -49,7 +49,8 @@ def missed(figures: dict[str, dict[str, Any]]) -> list[str]:
     said = []
     for place, told in figures.items():
         world, _, name = place.split("/")
-        success, length = told["success"]["value"], told["length"]["value"]
+        success = told["success"]["value"]
+        length = told["length"]["value"]
         floor = FLOORS.get(name, 0.0) if world == "circles" else 0.0
         if not success >= floor:
             said.append(f"{place}: {success:.0%} success, less than {floor:.0%}")
@@ -66,7 +67,8 @@ def main() -> None:
     parser.add_argument("--policy", nargs="+", default=list(POLICIES))
     parser.add_argument("--episodes", type=int, default=500)
     given = parser.parse_args()
-    figures, table = {}, ""
+    figures = {}
+    table = ""
     for world in given.world:
         for robot in given.robot:
             own = [robot] if robot in shipped_policies() else []

@@ -22,7 +22,9 @@ CONTROLS = {
     "no_cache": "every process finds an empty cache of kernels",
     "compiled": "all kernels were compiled before the time is taken",
 }
-DEMO_S, COMPILE_S, TIMEOUT_S = 180.0, 60.0, 1800.0
+DEMO_S = 180.0
+COMPILE_S = 60.0
+TIMEOUT_S = 1800.0
 FIRST_RESET = """
 import time
 begin = time.monotonic()
@@ -79,7 +81,8 @@ def waited(
 
 def measure(folder: Path, control: str | None) -> dict[str, Any]:
     """All figures, see the head of this file."""
-    clone, around = folder / "clone", environment(folder, control)
+    clone = folder / "clone"
+    around = environment(folder, control)
     waited(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
     began = time.time()
     demo_s, told = waited(["make", "demo"], clone, around)

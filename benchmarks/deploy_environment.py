@@ -23,7 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 ROBOT = "differential"
 FORBIDDEN = ("torch", "stable_baselines3", "mujoco", "tensorboard")
 STAND_IN = Path(__file__).resolve().parent / "measuring" / "deployed_policy.py"
-INSTALL_S, DRIVE_S = 900, 900
+INSTALL_S = 900
+DRIVE_S = 900
 CONTROLS = {
     "no_policy": "a policy file that is cut short",
     "training_installed": "an environment in which training is installed",

@@ -43,7 +43,10 @@ BARS = {"worlds": 0.5, "robots": 4.0, "obstacles": 12.0, "beams": 12.0, "members
 MEMORY_BAR = 1.5
 """Of the last set's memory, with all its copies, to that of the first one."""
 MODEL = open_model("differential")
-WORLDS, OBSTACLES, SIDE, BEAMS = 256, 10, 8.0, 720
+WORLDS = 256
+OBSTACLES = 10
+SIDE = 8.0
+BEAMS = 720
 SWEEPS: dict[str, tuple[int, ...]] = {
     "worlds": (1, 4, 16, 64, 256, 1024, 4096, 16384),
     "robots": (1, 2, 4, 8, 16, 32, 64),
@@ -142,7 +145,8 @@ def stepper(env: BridgeVectorEnv, times: int, in_pairs: bool) -> Callable[[], No
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(16)]
-    count, looks = [0], env.model.timing[1] if in_pairs and env.robots > 1 else 0
+    count = [0]
+    looks = env.model.timing[1] if in_pairs and env.robots > 1 else 0
 
     def step() -> None:
         for _ in range(times):
@@ -167,10 +171,8 @@ def measure(
     """The cost of an env step at each point of a curve [us]."""
     costs = []
     for value in values:
-        alone, split = (
-            control == "slow" and name == "worlds",
-            (name, control) == ("members", "apart"),
-        )
+        alone = control == "slow" and name == "worlds"
+        split = (name, control) == ("members", "apart")
         times = min(value, ALONE) if alone else 1
         envs = apart(value) if split else [sweep(name, 1 if alone else value)]
         stepped = sum(env.num_envs for env in envs) * times

@@ -43,7 +43,8 @@ CONTROLS = {
     "standing": "the motion: the robots stand still",
     "blind": "the scan: the lidar has 8 beams",
 }
-FEW_BEAMS, TIMES_SLOWER = 8, 10
+FEW_BEAMS = 8
+TIMES_SLOWER = 10
 EQUAL_WORK_BARS = {"ir_sim": 900.0, "irsim_x": 70.0}
 """How many times a peer's rate with one scan per control period ours is on one thread, at least."""
 WRITE_BAR = 0.01
@@ -62,7 +63,10 @@ SHARES = {
 """In words, for those that miss their bar."""
 SCENES = 50
 """That the peers go through, one for each episode."""
-ACTIONS, CHUNK, SINGLE_CHUNK, WRITES = 64, 50, 500, 50
+ACTIONS = 64
+CHUNK = 50
+SINGLE_CHUNK = 500
+WRITES = 50
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,8 @@ def actions_for(
     """(ACTIONS, ...) random actions, or those of no motion."""
     size = (ACTIONS, *(space.shape or ()))
     if control == "standing":
-        low, high = peers.MODEL.robot.command_low, peers.MODEL.robot.command_high
+        low = peers.MODEL.robot.command_low
+        high = peers.MODEL.robot.command_high
         return np.broadcast_to(-(low + high) / (high - low), size).astype(np.float32)
     return np.random.default_rng(0).uniform(-1.0, 1.0, size).astype(np.float32)
 
@@ -127,10 +132,8 @@ class Worlds:
         self.env = BridgeVectorEnv(worlds, self.model, case.world, **further)
         self.seen, _ = self.env.reset(seed=0)
         self.actions = actions_for(self.env.action_space, case.control)
-        self.times, self.steps = (
-            TIMES_SLOWER if case.control == "slow" else 1,
-            CHUNK * worlds,
-        )
+        self.times = TIMES_SLOWER if case.control == "slow" else 1
+        self.steps = CHUNK * worlds
 
     def chunk(self) -> None:
         """Steps all worlds."""
@@ -140,9 +143,13 @@ class Worlds:
 
     def drove(self) -> dict[str, float]:
         """What shows that robots move and see, in one more chunk."""
-        beams, moved, changed, episodes = self.model.lidar.beams, 0.0, 0.0, 0
+        beams = self.model.lidar.beams
+        moved = 0.0
+        changed = 0.0
+        episodes = 0
         for k in range(CHUNK):
-            was_seen, was = self.seen, self.env.simulator.data.pose[:, 0, :2].copy()
+            was_seen = self.seen
+            was = self.env.simulator.data.pose[:, 0, :2].copy()
             self.seen, _, terminated, truncated, _ = self.env.step(
                 self.actions[k % ACTIONS]
             )
@@ -169,10 +176,8 @@ class Alone:
         )
         self.seen, _ = self.env.reset(seed=0)
         self.actions = actions_for(self.env.action_space, case.control)
-        self.times, self.steps = (
-            TIMES_SLOWER if case.control == "slow" else 1,
-            SINGLE_CHUNK,
-        )
+        self.times = TIMES_SLOWER if case.control == "slow" else 1
+        self.steps = SINGLE_CHUNK
 
     def chunk(self) -> None:
         """Steps the env."""
@@ -183,7 +188,11 @@ class Alone:
 
     def drove(self) -> dict[str, float]:
         """What shows that the robot moves and sees, in one more chunk."""
-        beams, moved, changed, episodes, was = self.model.lidar.beams, 0.0, 0, 0, None
+        beams = self.model.lidar.beams
+        moved = 0.0
+        changed = 0
+        episodes = 0
+        was = None
         for k in range(SINGLE_CHUNK):
             was_seen = self.seen
             self.seen, _, terminated, truncated, info = self.env.step(
@@ -347,11 +356,10 @@ def judge(
 
 def table_of(result: dict[str, Any]) -> str:
     """The figures for people."""
-    row, text = "{:<56}{:>12}\n", ""
-    equal, ten = (
-        "times as fast as {} at equal work",
-        "times as fast as {} with ten of its steps",
-    )
+    row = "{:<56}{:>12}\n"
+    text = ""
+    equal = "times as fast as {} at equal work"
+    ten = "times as fast as {} with ten of its steps"
     for title, key in ((equal, "equal_work"), (ten, "with_ten_scans")):
         key = f"times_as_fast_{'at_' if key == 'equal_work' else ''}{key}"
         for name, ratio in result[key].items():

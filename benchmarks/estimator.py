@@ -162,8 +162,10 @@ def drive(
     start = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     simulator.reset([seed], starts=start[None, None])
     middleware.reset(0, start)
-    truth, underway = [start], deque[tuple[int, str, tuple[Any, ...]]]()
-    raw, estimated = [], []
+    truth = [start]
+    underway = deque[tuple[int, str, tuple[Any, ...]]]()
+    raw = []
+    estimated = []
     for k in range(DRIVE_S * 10):
         if k % 5 == 0:
             command = (
@@ -171,7 +173,8 @@ def drive(
             )
         middleware.command(k * PERIOD, command)
         simulator.step(command[None, None])
-        now, data = (k + 1) * PERIOD, simulator.data
+        now = (k + 1) * PERIOD
+        data = simulator.data
         truth.append(data.pose[0, 0].copy())
         raw.append(np.sum((data.odom[0, 0] - truth[-1])[:2] ** 2))
         odometry = data.odom[0, 0].copy(), data.twist[0, 0].copy()
@@ -209,8 +212,11 @@ def summary(drives: list[Drive]) -> dict[str, Any]:
 
 def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]:
     """Predicts and updates at random, and looks at the covariance after every step."""
-    rng, estimator, now = np.random.default_rng(seed), Estimator(model), 0
-    low, high = model.robot.command_low, model.robot.command_high
+    rng = np.random.default_rng(seed)
+    estimator = Estimator(model)
+    now = 0
+    low = model.robot.command_low
+    high = model.robot.command_high
     sound = True
     for step in range(steps):
         kind = int(rng.integers(5))
@@ -231,7 +237,8 @@ def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]
             estimator.update(
                 Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-6.0, 3.0, 3)
             )
-        mean, covariance = estimator.belief.mean, estimator.belief.covariance
+        mean = estimator.belief.mean
+        covariance = estimator.belief.covariance
         sound = sound and bool(
             np.isfinite(mean).all() and (covariance == covariance.T).all()
         )
@@ -246,7 +253,8 @@ def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]
 
 def cycle_us(model: SimulatorModel, cycles: int) -> float:
     """Median time of what the single env asks of the middleware in a step [us]."""
-    middleware, times = Middleware(model), []
+    middleware = Middleware(model)
+    times = []
     middleware.reset(0, np.zeros(3))
     ranges = np.ones(model.lidar.beams, np.float32)
     command = 0.3 * model.robot.command_high
@@ -264,11 +272,14 @@ def cycle_us(model: SimulatorModel, cycles: int) -> float:
 
 def run(drives: int, steps: int, seed: int, control: str | None) -> dict[str, Any]:
     """Drives every robot, sets its clock, then takes random steps with one after the other."""
-    found, jumped, moving = {}, {}, control != "stands"
+    found = {}
+    jumped = {}
+    moving = control != "stands"
     make = MAKES.get(control, Middleware)
     for robot in ROBOTS:
         model = noisy(robot)
-        simulator, seeds = FastSimulator(model, WIDE), range(seed, seed + drives)
+        simulator = FastSimulator(model, WIDE)
+        seeds = range(seed, seed + drives)
         found[robot] = [
             drive(model, simulator, make(model), one, moving) for one in seeds
         ]

@@ -67,14 +67,16 @@ OBSTACLES: tuple[Shape, ...] = (
 POSES = np.array(
     [(-1.1, 0.3, 0.0), (1.0, -0.2, 0.3), (3.1, 2.2, 0.5), (-3.0, -2.1, -0.7)]
 )
-LAPS, DRIFT = 1.15, np.array([1.02, 1.0, 1.04])
+LAPS = 1.15
+DRIFT = np.array([1.02, 1.0, 1.04])
 ODOMETRY_NOISE = np.array([0.004, 0.002, 0.004])
 
 
 def path(scans: int) -> Array:
     """(N, 3) poses on an ellipse around the middle of the room, a little more than once."""
     t = np.linspace(-0.5 * np.pi, (2.0 * LAPS - 0.5) * np.pi, scans)
-    x, y = 2.7 * np.cos(t), 1.8 * np.sin(t)
+    x = 2.7 * np.cos(t)
+    y = 1.8 * np.sin(t)
     return np.stack([x, y, np.arctan2(1.8 * np.cos(t), -2.7 * np.sin(t))], axis=1)
 
 
@@ -108,7 +110,8 @@ def slam(
     """Poses and map of yag-slam. Raises NotInstalledError where it can't be had."""
     python = python_with("yag_slam", SLAM)
     with tempfile.TemporaryDirectory() as folder:
-        asked, answered = Path(folder) / "scans.npz", Path(folder) / "map.npz"
+        asked = Path(folder) / "scans.npz"
+        answered = Path(folder) / "map.npz"
         limits = np.array([spec.range_min, spec.range_max])
         np.savez(
             asked, ranges=ranges, odometry=odometry, angles=spec.angles, limits=limits
@@ -136,10 +139,8 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         f"{name}: no point" for name, count in result["points"].items() if not count > 0
     ]
     if result["slam"] is not None:
-        after, before = (
-            result["slam"]["path_error_m"],
-            result["slam"]["odometry_error_m"],
-        )
+        after = result["slam"]["path_error_m"]
+        before = result["slam"]["odometry_error_m"]
         if not after <= SLAM_PART * before:
             missed.append(
                 f"yag-slam: the path is off by {after:.3f} m, bar {SLAM_PART:g} of the "
@@ -227,7 +228,8 @@ def measure(
     scans: int, with_slam: bool, out: Path, control: str | None
 ) -> dict[str, Any]:
     """Scans the path, compares the clouds, makes the map and the picture."""
-    spec, truth = load_lidar("paper_12m"), path(scans)
+    spec = load_lidar("paper_12m")
+    truth = path(scans)
     baked = make_scanner(spec, OBSTACLES, "baked")
     exact = Scanner(spec, baked.table, "exact")
     bodies = np.broadcast_to(exact.place(OBSTACLES, POSES), (scans, len(OBSTACLES), 7))
@@ -257,7 +259,8 @@ def measure(
         },
         "slam": None,
     }
-    odometry, mapped = drifting(truth, 0), None
+    odometry = drifting(truth, 0)
+    mapped = None
     if with_slam:
         try:
             found = slam(spec, ranges["baked"], odometry)
@@ -307,10 +310,8 @@ def report(result: dict[str, Any]) -> str:
         beams = result["range_rmse_m"][name]
         text += f"{name:<8}cloud {apart:.2e} m RMSE from scan mode, beam by beam {beams:.2e} m\n"
     if result["slam"] is not None:
-        before, after = (
-            result["slam"]["odometry_error_m"],
-            result["slam"]["path_error_m"],
-        )
+        before = result["slam"]["odometry_error_m"]
+        after = result["slam"]["path_error_m"]
         text += (
             f"yag-slam: path off by {after:.3f} m RMSE, odometry by {before:.3f} m\n"
         )

@@ -46,7 +46,8 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     missed += [
         f"{key} {result[key]}, the bar is 1" for key in MEASURED if not result[key] > 0
     ]
-    during, kills = result["kills_during_a_write"], result["kills"]
+    during = result["kills_during_a_write"]
+    kills = result["kills"]
     if not during >= LEAST_DURING * kills > 0:
         missed.append(
             f"kills_during_a_write {during} of {kills}, the bar is {100 * LEAST_DURING:.0f} %"

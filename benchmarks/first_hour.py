@@ -71,23 +71,27 @@ def travelled(
     folder.mkdir()
     (folder / "examples").symlink_to(clone / "examples")
     (folder / "my_robot.yaml").write_text(BURGER)
-    taken, told = 0.0, []
+    taken = 0.0
+    told = []
     for line in ROADS[name]:
         words = shlex.split(line)
         if control == "untrained" and words[1] == "train":
             words += ["--steps", "2048"]
         words[0] = str(clone / ".venv" / "bin" / "nics")
         seconds, printed = waited(words, folder, around)
-        taken, told = taken + seconds, [*told, printed]
+        taken = taken + seconds
+        told = [*told, printed]
     return taken, told
 
 
 def measure(folder: Path, roads: Sequence[str], control: str | None) -> dict[str, Any]:
     """All figures, see the head of this file."""
-    clone, around = folder / "clone", environment(folder, control)
+    clone = folder / "clone"
+    around = environment(folder, control)
     waited(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
     setup_s, _ = waited(["make", "setup"], clone, around)
-    seconds, success = {}, {}
+    seconds = {}
+    success = {}
     for name in roads:
         seconds[name], told = travelled(name, clone, folder / name, around, control)
         if name in SUCCESS:

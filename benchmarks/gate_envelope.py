@@ -34,7 +34,8 @@ ROBOTS = ("ackermann", "differential", "mecanum")
 LIDAR = LidarSpec(
     beams=8, angle_min=-3.0, angle_max=3.0, range_min=0.05, range_max=3.0, rate=10.0
 )
-SHORTEST_S, LONGEST_S = 1e-3, 0.22
+SHORTEST_S = 1e-3
+LONGEST_S = 0.22
 TOLERANCE = 1e-6
 """Of a finite difference: rounding of the published values, divided by the interval."""
 ODD = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e3])
@@ -66,10 +67,13 @@ class Judge:
         )
         self._slopes = limits is None  # of others, rounding may be all there is
         if limits is not None:
-            self.low, self.high = limits.low, limits.high
+            self.low = limits.low
+            self.high = limits.high
         self._spec = spec
-        self._value, self._slope = np.zeros(len(each)), np.zeros(len(each))
-        self._time, self.sane = -np.inf, True
+        self._value = np.zeros(len(each))
+        self._slope = np.zeros(len(each))
+        self._time = -np.inf
+        self.sane = True
         self.violations = dict.fromkeys(
             ("value", "rate", "jerk", "stop", "odd", "unused"), 0
         )
@@ -95,7 +99,9 @@ class Judge:
         self._count("rate", not (np.abs(slope) <= self._rate * (1 + TOLERANCE)).all())
         change = np.abs(slope - self._slope) / passed
         self._count("jerk", not (change <= self._jerk * (1 + TOLERANCE)).all())
-        self._value, self._slope, self._time = value, slope, now
+        self._value = value
+        self._slope = slope
+        self._time = now
 
     def _count(self, name: str, violated: object) -> None:
         self.violations[name] += bool(violated)
@@ -115,14 +121,17 @@ def drive(
     config = gate_config(spec, LIDAR)
     assert config.limits is not None
     drawn = random_limits(spec, config.limits, rng) if random else None
-    limits, judge = drawn or config.limits, Judge(spec, drawn)
+    limits = drawn or config.limits
+    judge = Judge(spec, drawn)
     if control == "no_limits":
         wide = {
             key: 100.0 * getattr(limits, key) for key in ("low", "high", "rate", "jerk")
         }
         limits = replace(limits, **wide)
     gate = Gate(replace(config, limits=limits), LIDAR)
-    ranges, pose, twist = np.ones(LIDAR.beams, np.float32), np.zeros(3), np.zeros(3)
+    ranges = np.ones(LIDAR.beams, np.float32)
+    pose = np.zeros(3)
+    twist = np.zeros(3)
 
     def see(decision: Decision, now: float) -> None:
         if control == "nan" and rng.random() < 1e-3:
@@ -130,7 +139,8 @@ def drive(
         judge.see(decision, now)
 
     gate.witness = see
-    sensed, moving = -np.inf, 0
+    sensed = -np.inf
+    moving = 0
     gaps = np.exp(rng.uniform(np.log(SHORTEST_S), np.log(LONGEST_S), steps))
     whims = rng.random(steps)
     for gap, whim in zip(gaps, whims, strict=True):
@@ -161,7 +171,8 @@ def drive(
 
 def _wish(judge: Judge, whim: float, rng: np.random.Generator) -> Array:
     """A command (C,): within the limits, at them, beyond them, or nonsense."""
-    low, high = judge.low, judge.high
+    low = judge.low
+    high = judge.high
     share = rng.random(len(low))
     wish = low * share + high * (1.0 - share)
     if whim < 0.2:
@@ -196,24 +207,21 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     total: dict[str, int] = {}
-    table, moving, shipped_steps, moved_random, control = (
-        "",
-        0,
-        0,
-        0,
-        given.control or "",
-    )
+    table = ""
+    moving = 0
+    shipped_steps = 0
+    moved_random = 0
+    control = given.control or ""
     for index, robot in enumerate(ROBOTS):
-        rng, spec = np.random.default_rng([given.seed, index]), load_robot(robot)
+        rng = np.random.default_rng([given.seed, index])
+        spec = load_robot(robot)
         steps = given.steps // len(ROBOTS) + (index < given.steps % len(ROBOTS))
         others = steps // RANDOM_SHARE
         within, moved = drive(spec, steps - others, rng, control, random=False)
         beyond, more = _within_random_limits(spec, others, rng, control)
-        moving, shipped_steps, moved_random = (
-            moving + moved,
-            shipped_steps + steps - others,
-            moved_random + more,
-        )
+        moving = moving + moved
+        shipped_steps = shipped_steps + steps - others
+        moved_random = moved_random + more
         both = {name: count + beyond.get(name, 0) for name, count in within.items()}
         total = {name: total.get(name, 0) + count for name, count in both.items()}
         counts = ", ".join(f"{name} {count}" for name, count in both.items())
@@ -232,11 +240,10 @@ def main() -> None:
 
 def missed_by(result: dict[str, object]) -> list[str]:
     """A sentence for each bar that was missed."""
-    missed, by = [], result["by"]
-    steps, moving = (
-        result["steps_within_shipped_limits"],
-        result["in_motion_within_shipped_limits"],
-    )
+    missed = []
+    by = result["by"]
+    steps = result["steps_within_shipped_limits"]
+    moving = result["in_motion_within_shipped_limits"]
     if result["violations"] != 0:
         missed.append(f"{result['violations']} violations, bar 0: {by}")
     if not steps or not moving / steps >= LEAST_MOTION:  # type: ignore[operator]

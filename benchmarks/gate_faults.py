@@ -41,9 +41,12 @@ CONTROLS = {
 }
 WATCHED_S = 0.8
 MEDIAN_S = 0.30
-LOG_CHARACTERS, MOST_IDLE = 500, 3
-GATE, POLICY = "command_gate", "policy_node"
-PATIENCE_S, SHORT_PATIENCE_S = 60.0, 8.0
+LOG_CHARACTERS = 500
+MOST_IDLE = 3
+GATE = "command_gate"
+POLICY = "policy_node"
+PATIENCE_S = 60.0
+SHORT_PATIENCE_S = 8.0
 AGES = {"scan_age": 3.0, "odom_age": 3.0, "command_age": 3.0, "e_stop_silence": 2.5}
 """Ten times the gate's own [s]."""
 
@@ -97,7 +100,8 @@ def missed_by(name: str, one: dict[str, Any], wanted: int) -> list[str]:
 
 def inject(around: Around, name: str, result: Result, patience_s: float) -> None:
     """Drives, breaks something, and watches what the gate says."""
-    fault, robot = FAULTS[name], around.robot
+    fault = FAULTS[name]
+    robot = around.robot
     ways = [fault.inject] if callable(fault.inject) else fault.inject
     robot.drive(patience_s)
     robot.heard.clear()
@@ -113,7 +117,8 @@ def inject(around: Around, name: str, result: Result, patience_s: float) -> None
     stopped = min((when for when in zeros if when > last), default=float("inf"))
     result.times.append(stopped - good)
     result.after.append(stopped - broken)
-    low, high = np.array([0.0, 0.0, -0.5]), np.array([1.0, 0.0, 0.5])
+    low = np.array([0.0, 0.0, -0.5])
+    high = np.array([1.0, 0.0, 0.5])
     wild = sum(not ((twist >= low) & (twist <= high)).all() for _, twist in robot.heard)
     late = (
         len(moving)
@@ -163,7 +168,8 @@ def measure(
     results = {name: Result() for name in names}
     for name in names:
         with ExitStack() as stack:
-            bench, idle = Bench(name, control, stack), 0
+            bench = Bench(name, control, stack)
+            idle = 0
             while (known := len(results[name].times)) < repeats and idle < MOST_IDLE:
                 _some(bench, name, repeats, results[name])
                 told(f"{name}: {len(results[name].times)} of {repeats}")
@@ -244,7 +250,8 @@ def main() -> None:
         "--seconds", type=float, default=15.0, help=f"of commands for {END}"
     )
     given = parser.parse_args()
-    control, names = given.control or "", given.fault or [*FAULTS, END]
+    control = given.control or ""
+    names = given.fault or [*FAULTS, END]
 
     def told(line: str) -> None:
         sys.stderr.write(f"{line}\n")

@@ -138,7 +138,8 @@ def main() -> None:
     cases = CASES if given.case is None else [CASES[index] for index in given.case]
     seconds = 3600.0 * given.hours / len(cases) / WORLDS
     holds = -(-given.holds // len(cases))
-    free, held = Tally(), Tally()
+    free = Tally()
+    held = Tally()
     for index, case in enumerate(cases):
         seed = given.seed + 1000 * index
         free.add(drive_freely(case, WORLDS, seconds, seed, change))

@@ -45,7 +45,8 @@ CONTROLS = {
     "busy": "the gate reads each message and decides ten times",
     "slow_disk": "the gate waits for a disk that does not answer, at its end",
 }
-GATE, TICK_HZ = "command_gate", 50
+GATE = "command_gate"
+TICK_HZ = 50
 MOST_RATIO = 1.1
 """Of the gate's share of a core to that of a bare node that hears the same."""
 LONGEST_GAP_S = 0.2
@@ -54,7 +55,8 @@ LEAST_SENT, LEAST_MOVING = 0.9, 0.8
 """Shares of the messages that were to be sent, and of the commands that came and moved."""
 LONGEST_EXIT_S = 2.0
 LEAST_STOPS = 3
-BUSY, HUNG_S = 10, 4.0
+BUSY = 10
+HUNG_S = 4.0
 
 
 def bare_node() -> None:
@@ -173,10 +175,12 @@ def share_of_a_core(
 ) -> dict[str, Any]:
     """What the gate and the bare node use while commands pass."""
     robot.heard.clear()
-    began, sent = time.monotonic(), robot.sent
+    began = time.monotonic()
+    sent = robot.sent
     used = [core_seconds(pid) for pid in pids]
     robot.until(lambda: False, seconds)
-    lasted, sent = time.monotonic() - began, robot.sent - sent
+    lasted = time.monotonic() - began
+    sent = robot.sent - sent
     of_gate, of_bare = (
         (core_seconds(pid) - was) / lasted for pid, was in zip(pids, used, strict=True)
     )
@@ -199,10 +203,8 @@ def ended_after_a_burst(
     robot.heard.clear()
     robot.mad = True
     robot.until(lambda: False, seconds)
-    times, moving = (
-        [when for when, _ in robot.heard],
-        [moves for _, moves in robot.heard],
-    )
+    times = [when for when, _ in robot.heard]
+    moving = [moves for _, moves in robot.heard]
     real.send_signal(signal.SIGINT)
     began = time.monotonic()
     robot.until(lambda: real.poll() is not None, PATIENCE_S)

@@ -21,7 +21,8 @@ CONTROLS = {
 }
 LEAST_RULES = 30
 """There are more; a run that found fewer has lost a table."""
-TESTS, OTHER_TEST = "test/gate", "test/gate/test_stopping.py"
+TESTS = "test/gate"
+OTHER_TEST = "test/gate/test_stopping.py"
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = {
     "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
@@ -103,7 +104,8 @@ def main() -> None:
     asked = known if given.rule is None else given.rule
     if control == "untested_rule":
         asked = [name for name in known if name.endswith(_covers_nothing.__name__)]
-    untested, table = [], ""
+    untested = []
+    table = ""
     for name in asked:
         found = tests_fail_without(name, control, given.tests)
         untested += [] if found else [name]

@@ -40,7 +40,8 @@ ROBOTS = ("ackermann", "differential", "mecanum", "jackal")
 FIRST_SEED = 201
 HOLDS_S = (0.5, 1.0, 0.3, 2.0)
 """How long the unseen drives hold a command, in turn [s]."""
-BATCH, HOLDS = 1024, 20
+BATCH = 1024
+HOLDS = 20
 ROUNDS = 3
 
 
@@ -102,8 +103,10 @@ def missed_of(robots: dict[str, dict[str, float]]) -> list[str]:
 
 def batched_speed(model: TaylorModel, spec: RobotSpec) -> float:
     """Simulated robot-seconds per second of many robots; each gets a command every 0.1 s."""
-    rng, size = np.random.default_rng(7), len(spec.state)
-    low, high = spec.command_low[:, None], spec.command_high[:, None]
+    rng = np.random.default_rng(7)
+    size = len(spec.state)
+    low = spec.command_low[:, None]
+    high = spec.command_high[:, None]
     commands = rng.uniform(low, high, (HOLDS, len(low), BATCH))
     terms, per_hold = term_arrays(model), round(0.1 / model.dt)
     terms = terms._replace(
@@ -116,7 +119,8 @@ def batched_speed(model: TaylorModel, spec: RobotSpec) -> float:
 
     def drive() -> None:
         pose = np.zeros((6, BATCH))
-        pose[2], x[:size] = 1.0, 0.0
+        pose[2] = 1.0
+        x[:size] = 0.0
         for command in commands:
             x[size:-1] = command
             run(pose, x, dq, terms, SERIES, model.dt, per_hold)
@@ -152,7 +156,8 @@ def require_finite(poses: np.ndarray) -> None:
 
 def mujoco_speed(robot: MujocoRobot, seconds: float) -> float:
     """Simulated seconds per second, driven at 10 Hz."""
-    rng, spec = np.random.default_rng(7), robot.spec
+    rng = np.random.default_rng(7)
+    spec = robot.spec
     commands = rng.uniform(
         spec.command_low, spec.command_high, (round(10 * seconds), len(spec.command))
     )
@@ -192,7 +197,8 @@ def measure(name: str, given: argparse.Namespace) -> dict[str, Any]:
     ]
     begin = time.perf_counter()
     found = identify(recording, spec, alpha="auto")
-    seconds, model = time.perf_counter() - begin, without(found.model, given.control)
+    seconds = time.perf_counter() - begin
+    model = without(found.model, given.control)
     found = replace(found, model=model)
     physics = mujoco_speed(robot, 4.0)
     if given.control == "slow":
@@ -200,7 +206,8 @@ def measure(name: str, given: argparse.Namespace) -> dict[str, Any]:
     elif given.control == "nan":
         batched = single = float("nan")  # it diverges, which is refused
     else:
-        batched, single = batched_speed(model, spec), single_speed(model, spec)
+        batched = batched_speed(model, spec)
+        single = single_speed(model, spec)
     return {
         **errors(found, drives, spec),
         "speed_up_batched": batched / physics,

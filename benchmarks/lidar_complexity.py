@@ -27,7 +27,9 @@ CONTROLS = {"exact": "the exact scanner in place of the baked one"}
 VERTICES = tuple(2**power for power in range(2, 13))
 PERIMETER = 2.0 * np.pi * 0.2
 FEW = (3, 4, 5, 6, 8)
-BAR, AS_FAST, FASTER = 1.5, 1.1, 3.0
+BAR = 1.5
+AS_FAST = 1.1
+FASTER = 3.0
 WORK = 2**15
 """Vertices that an exact batch visits per obstacle; it bounds how long a batch takes."""
 
@@ -71,7 +73,8 @@ def scans_of(
     result = {}
     for name, size in sizes.items():
         scanner = Scanner(SPEC, table, "exact" if control == "exact" else name)
-        lidar, bodies = batch.lidar[:size], batch.bodies(scanner)[:size]
+        lidar = batch.lidar[:size]
+        bodies = batch.bodies(scanner)[:size]
         out = np.empty((size, SPEC.beams), np.float32)
         result[name] = Scans(partial(scanner.scan, lidar, bodies, out=out), size)
     return result
@@ -101,12 +104,14 @@ def costs(
 
 def missed_of(result: dict[str, Any]) -> list[str]:
     """The bars that were missed."""
-    missed, ratio = [], result["baked_end_to_end"]
+    missed = []
+    ratio = result["baked_end_to_end"]
     if not ratio <= BAR:
         missed.append(
             f"baked costs {ratio:.2f} times as much with other vertices, bar {BAR:g}"
         )
-    exact, baked = result["exact_us"][-1], result["baked_us"][-1]
+    exact = result["exact_us"][-1]
+    baked = result["baked_us"][-1]
     if not exact >= FASTER * baked:
         missed.append(
             f"at {result['vertices'][-1]} vertices exact takes {exact / baked:.2f} times as long "
@@ -153,7 +158,8 @@ def table_of(result: dict[str, Any]) -> str:
     ]
     alone = [(f"1 {name}", cost) for name, cost in result["alone"].items()]
     for name, cost in [*named, *result["few"].items(), *alone]:
-        exact, baked = cost["exact"], cost["baked"]
+        exact = cost["exact"]
+        baked = cost["baked"]
         text += row.format(name, f"{exact:.2f}", f"{baked:.2f}", f"{exact / baked:.2f}")
     ratio = result["baked_end_to_end"]
     met = "met" if ratio <= BAR else "missed"

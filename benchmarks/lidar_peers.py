@@ -60,7 +60,8 @@ class Scans:
     """A batch of scans, each in a scene of its own."""
 
     def __init__(self, table: LidarTable, drawn: list[Scene], often: int) -> None:
-        self.table, self.often = table, often
+        self.table = table
+        self.often = often
         self.starts = np.array([scene.starts[0] for scene in drawn])
         poses = np.zeros((len(drawn), drawn[0].bodies.shape[0], 3))
         poses[..., :2] = [scene.bodies[:, :2] for scene in drawn]
@@ -154,7 +155,8 @@ def table_of(result: dict[str, Any]) -> str:
         if result[name] is None:
             text += f"{name:<9}{result['missing'].get(name, 'not asked for')}\n"
             continue
-        rmse, agreement = result["rmse_m"].get(name), result["agreement"].get(name)
+        rmse = result["rmse_m"].get(name)
+        agreement = result["agreement"].get(name)
         text += row.format(
             name,
             f"{result[name]:.3g}",

@@ -24,7 +24,8 @@ CONTROLS = {
     "plain": "tables without a sensor model in place of those with one",
     "slow": "each scan of a table with a sensor model is made twice",
 }
-DROPOUT, BRIGHT = IncidenceDropout(greatest_incidence=1.3), Intensity(threshold=0.02)
+DROPOUT = IncidenceDropout(greatest_incidence=1.3)
+BRIGHT = Intensity(threshold=0.02)
 MODELS: dict[str, tuple[SensorModel, ...]] = {
     "no model": (),
     "incidence dropout": (DROPOUT,),
@@ -44,7 +45,10 @@ def calls_of(
 
     Also bytes of each table, and how many beams return.
     """
-    batch, calls, sizes, returns = random_batch(SHAPES, scans, 0), {}, {}, {}
+    batch = random_batch(SHAPES, scans, 0)
+    calls = {}
+    sizes = {}
+    returns = {}
     out = np.empty((scans, SPEC.beams), np.float32)
     for name, model in MODELS.items():
         baked = () if control == "plain" else model
@@ -89,7 +93,8 @@ def run(
     """All figures, see the head of this file."""
     calls, sizes, returns = calls_of(density, scans, control)
     times = interleaved(calls, repeats, warm=True)
-    least, middle = shortest(times), medians(times)
+    least = shortest(times)
+    middle = medians(times)
     plain = "no model"
     return {
         "scans_per_s": {name: scans / each for name, each in least.items()},

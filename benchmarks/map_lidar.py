@@ -27,10 +27,13 @@ CONTROLS = {
     "slow": "the walk in place of the jumps",
     "nan": "one range is none",
 }
-SIZE, RESOLUTION = 20.0, 0.05
+SIZE = 20.0
+RESOLUTION = 0.05
 CELLS = round(SIZE / RESOLUTION)
 LIDARS = ("paper", "paper_12m")
-SCANS, REPEATS, CLEARANCE = 1000, 7, 0.2
+SCANS = 1000
+REPEATS = 7
+CLEARANCE = 0.2
 FASTER, RMSE_M, MOST_OFF = 3.0, 1e-5, 1e-5
 """Bars: times the walk's speed, RMSE, and the share of beams that may be off by 1 mm."""
 
@@ -44,7 +47,9 @@ def office(seed: int) -> NDArray[np.bool_]:
     """Rooms of 4 m along a corridor, with doors, furniture and round pillars."""
     rng = np.random.default_rng(seed)
     solid = np.zeros((CELLS, CELLS), bool)
-    wall, low, high = 2, cells(9.0), cells(11.0)
+    wall = 2
+    low = cells(9.0)
+    high = cells(11.0)
     solid[[0, 1, -2, -1]] = solid[:, [0, 1, -2, -1]] = True
     solid[low : low + wall] = solid[high : high + wall] = True
     for x in range(0, CELLS, cells(4.0)):

@@ -36,11 +36,16 @@ CONTROLS = {
 }
 BARS = {"map_agreement": 0.995, "follow_path_success": 0.95, "nav2_names_missing": 0}
 WORLDS = ("arena", "circles", "clutter", "corridor", "doorway", "room", "barn")
-ROBOT, WORLD, LIDAR, POSES = "differential", "room", "rplidar_a2", 100
+ROBOT = "differential"
+WORLD = "room"
+LIDAR = "rplidar_a2"
+POSES = 100
 ROOM = 0.05  # by which planned paths keep away from walls beyond the footprint [m]
 SAME_M = 0.05  # by which two ranges of one beam may differ [m]
 NEAR = 0.35  # from the goal at the end, by the truth [m]
-STARTED_S, BARE_S = 300.0, 60.0  # longest time until all is served [s]
+# longest time until all is served [s]
+STARTED_S = 300.0
+BARE_S = 60.0
 ARCHIVE = (
     Path(__file__).resolve().parents[2]
     / "shared"
@@ -54,14 +59,17 @@ def map_agreement(
     name: str, seeds: range = range(3), bare: bool = False
 ) -> tuple[float, float]:
     """Share of beams that agree, in a world's episodes, and of those whose own range does."""
-    worlds, lidar, shares = load_worlds(name), load_lidar(LIDAR), []
+    worlds = load_worlds(name)
+    lidar = load_lidar(LIDAR)
+    shares = []
     sampler = SetSampler(worlds, load_robot(ROBOT).footprint_radius)
     for seed in seeds:
         scene = sampler.draw([seed])[0]
         world = worlds.members[int(scene.member)]
         placed = standing(sampler, int(scene.member), scene.bodies)
         grid = occupancy(world, [] if bare else placed)
-        shapes, at = [shape for shape, _ in placed], [pose for _, pose in placed]
+        shapes = [shape for shape, _ in placed]
+        at = [pose for _, pose in placed]
         exact = make_scanner(lidar, shapes, "exact", world.grid)
         free = np.argwhere(grid.distance_field > 0.2)
         free = free[np.random.default_rng(seed).integers(len(free), size=POSES)]
@@ -71,11 +79,10 @@ def map_agreement(
         bodies = np.tile(exact.place(shapes, np.reshape(at, (-1, 3))), (POSES, 1, 1))
         true = exact.scan(poses, bodies, world.all_walls())
         seen = make_scanner(lidar, [], "exact", grid).scan(poses, [])
-        around, slack = (
-            np.stack([np.roll(true, k, 1) for k in (-1, 0, 1)]),
-            1.5 * grid.resolution,
-        )
-        low, high = around.min(axis=0) - slack, around.max(axis=0) + slack
+        around = np.stack([np.roll(true, k, 1) for k in (-1, 0, 1)])
+        slack = 1.5 * grid.resolution
+        low = around.min(axis=0) - slack
+        high = around.max(axis=0) + slack
         same = (np.abs(seen - true) <= SAME_M) | (seen == true)  # both may see nothing
         shares.append((np.mean((seen >= low) & (seen <= high)), np.mean(same)))
     agreed, of_one = np.mean(shares, axis=0).tolist()
@@ -94,7 +101,8 @@ def followed(
 
     from nics_drl_bridge.nodes.processes import NodeProcess
 
-    radius, worlds = load_robot(ROBOT).footprint_radius, load_worlds(WORLD)
+    radius = load_robot(ROBOT).footprint_radius
+    worlds = load_worlds(WORLD)
     sampler = SetSampler(worlds, radius)
     common: dict[str, Any] = {"model": ROBOT, "enable_stamped_cmd_vel": False}
     simulated = common | {"world": WORLD, "mode": "lockstep"}
@@ -228,7 +236,8 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     """A sentence for each bar that was missed, or could not be measured."""
     found = []
     for name, bar in BARS.items():
-        value, least = result[name], name != "nav2_names_missing"
+        value = result[name]
+        least = name != "nav2_names_missing"
         if math.isnan(value):
             found.append(
                 f"{name}: not measured; source what `make test-messages` builds"

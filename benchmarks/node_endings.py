@@ -28,7 +28,10 @@ from nics_drl_bridge.nodes.parameters import NODES
 from nics_drl_bridge.nodes.processes import free_domain_id
 
 CONTROLS = {"late": "the handler that ends a node within a step of native code"}
-LIMIT_S, PATIENCE_S, READY_S, POLL_S = 1.0, 60.0, 280.0, 0.01
+LIMIT_S = 1.0
+PATIENCE_S = 60.0
+READY_S = 280.0
+POLL_S = 0.01
 FIRST_LINE_S = 1.0  # until a node says that it starts, on cores that are not busy
 PHASES = {
     "starting": "]: starting",
@@ -98,7 +101,8 @@ def ended(
     node: str, phase: str, number: int, control: str | None, folder: Path
 ) -> dict[str, Any]:
     """Ends a node once in a phase: its exit code, the time [s], and what it wrote if it failed."""
-    log, own = folder / "log", {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
+    log = folder / "log"
+    own = {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
     if phase in COLD:
         own["NUMBA_CACHE_DIR"] = str(folder / "cache")
     words = ["--ros-args", *GIVEN.get(node, MODEL), "-r", f"__ns:=/{phase}_{number}"]

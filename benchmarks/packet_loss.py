@@ -51,8 +51,10 @@ SCAN_AGE_S, TOLERANCE_S = 0.35, 0.05
 """The gate's limit, and what its tick (0.02 s) and the way to the robot may add."""
 SENT_SHARES = (0.8, 1.2)
 """Of the scans that were to be sent; a robot without them tells nothing about the gate."""
-REPEAT_S, SLOW_SKIP = 0.02, 3
-PATIENCE_S, STANDING_S = 90.0, 5.0
+REPEAT_S = 0.02
+SLOW_SKIP = 3
+PATIENCE_S = 90.0
+STANDING_S = 5.0
 NETWORK = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
     "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
@@ -126,8 +128,11 @@ class Robot(_End):
     def __init__(self, control: str = "") -> None:
         super().__init__("robot")
         self.heard: list[tuple[float, list[float]]] = []
-        self._lidar, self._x, self.sent = builtin_model(ROBOT).lidar, 0.0, 0
-        self._timed, self._skip = 0, SLOW_SKIP if control == "slow_robot" else 1
+        self._lidar = builtin_model(ROBOT).lidar
+        self._x = 0.0
+        self.sent = 0
+        self._timed = 0
+        self._skip = SLOW_SKIP if control == "slow_robot" else 1
         self._topics = {
             name: self.node.create_publisher(kind, name, profile)
             for name, kind, profile in (
@@ -225,10 +230,14 @@ def run_robot(seconds: float, folder: Path, control: str) -> None:
 
 def judge(heard: list[Any], used: list[Any], since: float) -> dict[str, Any]:
     """How old the data behind each moving command were, and how many were too old or wrong."""
-    low, high = np.array([0.0, 0.0, -0.5]), np.array([1.0, 0.0, 0.5])
+    low = np.array([0.0, 0.0, -0.5])
+    high = np.array([1.0, 0.0, 0.5])
     sent = np.array([when for when, _ in used])
     newest = np.maximum.accumulate([stamp for _, stamp in used])
-    ages, wrong, moving, stops = [], 0, 0, 0
+    ages = []
+    wrong = 0
+    moving = 0
+    stops = 0
     for when, twist in heard:
         values = np.array(twist)
         moves = bool(values.any())

@@ -13,7 +13,8 @@ from measuring.verdict import answer, parser_of
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, MUJOCO
 
 ROBOTS = ("differential", "ackermann", "mecanum")
-WORLD, FIRST_SEED = "circles", 2_000_000
+WORLD = "circles"
+FIRST_SEED = 2_000_000
 CONTROLS = {
     "standing": "a policy that stands still",
     "lying": "a robot that tells that it is at its goal",
@@ -29,7 +30,8 @@ def missed(robots: dict[str, dict[str, Any]]) -> list[str]:
     said = []
     for robot, told in robots.items():
         for place, bar in DEVIATION_M.items():
-            reached, off = told["success"][place], told["deviation_m"][place]
+            reached = told["success"][place]
+            off = told["deviation_m"][place]
             if not reached >= LEAST_REACHED:
                 said.append(
                     f"{robot} {LABELS[place]}: {reached:.0%} of the goals were truly reached, "

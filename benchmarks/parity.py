@@ -38,11 +38,9 @@ OF_SIMULATOR = {"true_pose", "true_collision", "randomisation"}
 """What only the simulator in process tells."""
 OF_CLOCKS = {"stamp_ns"}
 """What counts from another beginning in each."""
-DIFFERENCE, LATE, DRIVEN = (
-    "max_abs_observation_difference",
-    "late_observations",
-    "driven_m",
-)
+DIFFERENCE = "max_abs_observation_difference"
+LATE = "late_observations"
+DRIVEN = "driven_m"
 ROBOTS = ("ackermann", "differential", "mecanum")
 FLEET = 4
 
@@ -52,7 +50,9 @@ class Spoilt(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env, control: str) -> None:
         super().__init__(env)
-        self._control, self._steps, self._last = control, 0, None
+        self._control = control
+        self._steps = 0
+        self._last = None
 
     def step(self, action: Any) -> Any:
         """That of the env, but for one."""
@@ -65,7 +65,8 @@ class Spoilt(gymnasium.Wrapper):
             if self._control == "noise":
                 seen[-1] = np.nextafter(seen[-1], np.float32(np.inf))
             if self._control == "late" and self._last is not None:
-                seen, info = self._last, {**info, "scan_age_s": 0.1}
+                seen = self._last
+                info = {**info, "scan_age_s": 0.1}
         self._last = observation
         return seen, reward, ended, cut, info
 
@@ -110,7 +111,8 @@ def measure(
 
 def difference(one: Any, other: Any) -> float:
     """Greatest difference of two arrays, or numbers; inf of another shape, and where NaN is."""
-    a, b = np.asarray(one, np.float64), np.asarray(other, np.float64)
+    a = np.asarray(one, np.float64)
+    b = np.asarray(other, np.float64)
     if a.shape != b.shape or not (np.isfinite(a).all() and np.isfinite(b).all()):
         return float("inf")
     return float(np.abs(a - b).max(initial=0.0))
@@ -120,7 +122,8 @@ def told_differently(one: dict[str, Any], other: dict[str, Any]) -> float:
     """Greatest difference of what both `info` hold; inf where one lacks what the task tells."""
     worst = 0.0 if set(one) - set(other) <= OF_SIMULATOR else float("inf")
     for name in set(one) & set(other):
-        a, b = one[name], other[name]
+        a = one[name]
+        b = other[name]
         pairs = (
             [(a[term], b.get(term, np.nan)) for term in a]
             if isinstance(a, dict)
@@ -148,7 +151,11 @@ def compare(
         stands: whether the robots are told to stand.
     """
     rng = np.random.default_rng(seed)
-    worst, late, spent, episodes, driven = 0.0, 0, 0.0, 0, 0.0
+    worst = 0.0
+    late = 0
+    spent = 0.0
+    episodes = 0
+    driven = 0.0
     ended = True
     for _ in range(steps):
         if ended:

@@ -81,7 +81,9 @@ def judged(
     # The trial: what is written was fitted to the last third, too. The yardsticks know the commands
     # that were given, whatever a control made of them.
     found = found.trial
-    drive, calibration, until = found.drive, found.calibration, found.train_until_s
+    drive = found.drive
+    calibration = found.calibration
+    until = found.train_until_s
     chosen = windows(drive, calibration, until, drive.duration_s, HORIZON_S, SPACING_S)
     ends = (
         chosen.start
@@ -150,7 +152,8 @@ def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]
     spec, recording = robot_and_drive(source, None, TopicRoles(), mapping)
     recording = under(control, recording)
     since = recording.pose.t - recording.pose.t[0]
-    errors, paths = [], []
+    errors = []
+    paths = []
     for start in np.arange(0.0, since[-1] - SEGMENT_S, SEGMENT_S):
         others = recording.pose.rows((since < start) | (since >= start + SEGMENT_S))
         found = identify(
@@ -213,7 +216,8 @@ def main() -> int:
         return 2
     result: dict[str, Any] = {"drives": {}, "left_out": {}, "own_robots": {}}
     for name in real:
-        given, control = DRIVES[name], options.control
+        given = DRIVES[name]
+        control = options.control
         source = options.recordings / given.source
         result["drives"][name] = figures(source, given.mapping, given.truth, control)
         if name == SEGMENTED:

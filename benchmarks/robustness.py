@@ -59,7 +59,9 @@ many times as long the time constants are at least."""
 FLOOR, MOST_LOSS = 0.95, 5.0
 """Least mean success without a perturbation; most points lost to one at its declared range."""
 WORLDS = ("circles", "doorway", "clutter", "corridor", "crowd", "room")
-FIRST_SEED, AT_ONCE, TENFOLD = 3_000_000, 2, 10.0
+FIRST_SEED = 3_000_000
+AT_ONCE = 2
+TENFOLD = 10.0
 
 
 @dataclass(frozen=True)
@@ -135,8 +137,11 @@ def grown(model: SimulatorModel, factor: float) -> SimulatorModel:
 
 def declared(whole: Randomisation) -> dict[str, str]:
     """The greatest value of each perturbation, in words."""
-    late, seen = whole.action_latency[1], whole.observation_latency[1]
-    kinematics, odometry, lidar = whole.kinematics, whole.odometry, whole.lidar
+    late = whole.action_latency[1]
+    seen = whole.observation_latency[1]
+    kinematics = whole.kinematics
+    odometry = whole.odometry
+    lidar = whole.lidar
     drift = odometry.position_drift or (0.0, 0.0), odometry.heading_drift or (0.0, 0.0)
     return {
         "noise": f"{1000 * (lidar.noise_std or (0.0, 0.0))[1]:g} mm on each range",
@@ -160,11 +165,13 @@ def real_model(robot: str) -> SimulatorModel:
 
 def reached(job: Job, perturbation: str | None, times: float) -> tuple[int, int]:
     """How many episodes of a job succeed under a perturbation, or none, truly and to the robot."""
-    model, world = real_model(job.robot), load_world(job.world)
+    model = real_model(job.robot)
+    world = load_world(job.world)
     policy, task = open_policy(job.robot, model)
     driver = Standing(task) if job.control == "standing" else policy
     times *= TENFOLD if job.control == "tenfold" else 1.0
-    simulated, drawn = model, None
+    simulated = model
+    drawn = None
     if perturbation == "footprint":
         simulated = grown(model, 1.0 + times * FOOTPRINT)
     elif perturbation is not None:
@@ -272,7 +279,8 @@ def draw(
     perturbations = list(
         dict.fromkeys(each for own in success.values() for each in own)
     )
-    rows, where = -(-len(perturbations) // 3), np.array([0.0, *multiples])
+    rows = -(-len(perturbations) // 3)
+    where = np.array([0.0, *multiples])
     figure, grid = style.panels(rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True)
     for axes, each in zip(grid, perturbations, strict=False):
         for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
@@ -328,7 +336,8 @@ def table_of(
 
 def main() -> None:
     """Prints a table, or one JSON object."""
-    parser, robots = parser_of(__doc__, CONTROLS), shipped_policies()
+    parser = parser_of(__doc__, CONTROLS)
+    robots = shipped_policies()
     parser.add_argument(
         "--episodes", type=int, default=40, help="in each world, of each point"
     )

@@ -42,8 +42,11 @@ CONTROLS = {
     "standing": "the commands: no robot drives",
     "deaf": "the topics of one robot, which nobody receives",
 }
-SCAN_HZ, ODOM_HZ, SHARE = 10.0, 50.0, 0.99
-COMMAND_HZ, COMMAND = 10.0, (0.3, 0.0, 0.3)
+SCAN_HZ = 10.0
+ODOM_HZ = 50.0
+SHARE = 0.99
+COMMAND_HZ = 10.0
+COMMAND = (0.3, 0.0, 0.3)
 DRIVEN_M = 0.1
 """Less is no drive: odometry drifts, and some are placed where they soon touch another one."""
 SIZES = (20, 24, 28, 32, 40, 48, 56, 64)
@@ -125,7 +128,8 @@ def command(robots: int) -> None:
         node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND)
         for k in range(robots)
     ]
-    message, parent = wire.twist_to_bytes(np.array(COMMAND)), os.getppid()
+    message = wire.twist_to_bytes(np.array(COMMAND))
+    parent = os.getppid()
     while os.getppid() == parent:
         for topic in topics:
             topic.publish(message)
@@ -218,7 +222,8 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
             "odom_rate": ODOM_HZ,
             "enable_stamped_cmd_vel": False,
         }
-        fleet, driven = str(robots), str(0 if control == "standing" else robots)
+        fleet = str(robots)
+        driven = str(0 if control == "standing" else robots)
         heard = str(robots - 1 if control == "deaf" else robots)
         options = (
             "--seconds",
@@ -244,7 +249,8 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
                 simulator.check()
                 raise RuntimeError("the listener ended without a result")
             simulator.check()
-            before, began = cpu_seconds(simulator.pid), time.monotonic()
+            before = cpu_seconds(simulator.pid)
+            began = time.monotonic()
             each = json.loads(listener.stdout.readline())
             cores = (cpu_seconds(simulator.pid) - before) / (time.monotonic() - began)
             memory = rss_mb(simulator.pid)
@@ -281,10 +287,8 @@ def smaller(failed: Run, seconds: float, patience_s: float) -> Run:
 
 def bars(run: Run) -> list[str]:
     """A sentence for each bar that was missed, with the robot that misses it most."""
-    missed, least = (
-        [],
-        {"scan": SHARE * SCAN_HZ, "odom": SHARE * ODOM_HZ, "driven_m": DRIVEN_M},
-    )
+    missed = []
+    least = {"scan": SHARE * SCAN_HZ, "odom": SHARE * ODOM_HZ, "driven_m": DRIVEN_M}
     for key, bar in least.items():
         figure, worst = min((told[key], name) for name, told in run.each.items())
         if not figure >= bar:

@@ -46,7 +46,8 @@ from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.sim.world import World
 
-ROBOT, BEAMS = "ackermann", 720
+ROBOT = "ackermann"
+BEAMS = 720
 WORLD = {
     "name": "ten circles",
     "size": [6.0, 6.0],
@@ -56,12 +57,14 @@ WORLD = {
     "clearance": 0.3,
     "goal_distance": [2.0, 4.0],
 }
-DEPTH, PATIENCE_S = 10, 60.0
+DEPTH = 10
+PATIENCE_S = 60.0
 CONTROLS = {
     "slow": "speed: a step rests",
     "standing": "the commands: the robot does not drive",
 }
-REST_S, DRIVEN_M = 0.003, 0.1
+REST_S = 0.003
+DRIVEN_M = 0.1
 RATIOS = {"rclpy": 0.7, "standing": 0.5, "events": 0.5}
 """The least, by the executor of the bare pair."""
 EXECUTORS: dict[str, Any] = {
@@ -97,7 +100,8 @@ class Bare:
 
 def far_end(namespace: str, executor: str) -> None:
     """Answers each Twist by an Odometry and a LaserScan, until its parent is gone."""
-    end, parent = Bare("far_end", namespace, executor), os.getppid()
+    end = Bare("far_end", namespace, executor)
+    parent = os.getppid()
     odometry, scan = Odometry(), LaserScan()
     scan.ranges = array.array("f", [1.0] * BEAMS)
     odometry_topic = end.node.create_publisher(Odometry, "odom", DEPTH)
@@ -196,10 +200,12 @@ class Driving:
     """
 
     def __init__(self, env: gymnasium.Env, control: str | None) -> None:
-        self._env, self._actions = env, np.random.default_rng(0)
+        self._env = env
+        self._actions = np.random.default_rng(0)
         self._stands = control == "standing"
         self._rest_s = REST_S if control == "slow" else 0.0
-        self.driven_m, self._pose = 0.0, None
+        self.driven_m = 0.0
+        self._pose = None
 
     def step(self) -> Callable[[], object] | None:
         """One step; gives what begins a new episode where one has ended."""
@@ -209,7 +215,8 @@ class Driving:
         if self._stands:
             action = standing_action(self._env)
         _, _, ended, cut, info = self._env.step(action)
-        before, self._pose = self._pose, info["pose"]
+        before = self._pose
+        self._pose = info["pose"]
         if before is not None:
             self.driven_m += float(np.hypot(*(self._pose - before)[:2]))
         if self._rest_s:
@@ -272,11 +279,13 @@ def measure(
         bare_echo(domain_id, executor) as echo,
     ):
         timed(driving.step, size), echo(size)  # as warm as they get
-        steps, echoes = [], []
+        steps = []
+        echoes = []
         for _ in range(chunks):
             steps += timed(driving.step, size)
             echoes += echo(size)
-    rate, bare = len(steps) / sum(steps), len(echoes) / sum(echoes)
+    rate = len(steps) / sum(steps)
+    bare = len(echoes) / sum(echoes)
     p50, p99 = np.quantile(steps, [0.5, 0.99]) * 1e3
     return {
         "steps_per_s": round(rate, 1),
@@ -290,7 +299,8 @@ def measure(
 
 def bars(result: dict[str, float], executor: str) -> list[str]:
     """A sentence for each bar that was missed."""
-    missed, least = [], RATIOS[executor]
+    missed = []
+    least = RATIOS[executor]
     if not result["ratio"] >= least:
         missed.append(f"ratio {result['ratio']}: must be {least} at least")
     if not result["driven_m"] >= DRIVEN_M:

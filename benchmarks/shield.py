@@ -38,13 +38,17 @@ CONTROLS = {
     "standing": "the motion: every driver stays where it is",
     "no_braking_distance": "what the robot needs to stop: the shield is told that it needs nothing",
 }
-ROBOTS, WORLDS = ("ackermann", "differential", "mecanum"), ("arena", "clutter", "crowd")
+ROBOTS = ("ackermann", "differential", "mecanum")
+WORLDS = ("arena", "clutter", "crowd")
 OUTLINED = "jackal"  # has an outline, and a lidar that does not look behind it
 WITHOUT, GOALS = 10, 10
 """One in so many episodes is driven without the shield as well; and so many goals are tried."""
 MOST_HELD_UP = 0.02
 """Of the time that this process ran; beyond it the machine was too busy for a run in real time."""
-LEAST_PATH, LEAST_CONTACTS_WITHOUT, MOST_LATCHED, LEAST_GOALS = 0.5, 0.4, 0.1, 0.6
+LEAST_PATH = 0.5
+LEAST_CONTACTS_WITHOUT = 0.4
+MOST_LATCHED = 0.1
+LEAST_GOALS = 0.6
 HELD_UP = ("count", "seconds", "of_s", "repeated")
 NOTHING = {"latency": 0.0, "deceleration": 1e3, "margin": 0.0, "obstacle_speed": 0.0}
 
@@ -110,7 +114,8 @@ def drive(
     given: dict[str, Any] = {"shield": False}
     if shield is not None:
         given = {f"shield_{name}": value for name, value in shield.items()}
-    outcomes, held_up = [], shield_over_dds.HeldUp()
+    outcomes = []
+    held_up = shield_over_dds.HeldUp()
     for first in range(0, len(places), plan.at_once):
         some = slice(first, first + plan.at_once)
         with tempfile.TemporaryDirectory() as folder:
@@ -183,7 +188,8 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def missed(result: Mapping[str, Any], asked: int) -> list[str]:
     """A sentence for each bar that was missed."""
-    tried, reached = result["tried_without"], result["goals_reached_without"]
+    tried = result["tried_without"]
+    reached = result["goals_reached_without"]
     bars = [
         ("contacts of robots in motion", result["contacts"], "at most", 0),
         ("episodes driven", result["episodes"], "at least", max(asked, 1)),

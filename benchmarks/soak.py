@@ -37,10 +37,14 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.nodes.runner import open_context
 
-ROBOT, WORLD = "differential", "empty"
+ROBOT = "differential"
+WORLD = "empty"
 GOALS = np.array([[1.5, 0.0], [1.5, 1.5], [0.0, 1.5], [-1.5, 0.0], [0.0, -1.5]])
-NEAR_M, STEPS_PER_EPISODE = 0.35, 20
-SAMPLE_S, PATIENCE_S, GOAL_AGAIN_S = 5.0, 90.0, 1.0
+NEAR_M = 0.35
+STEPS_PER_EPISODE = 20
+SAMPLE_S = 5.0
+PATIENCE_S = 90.0
+GOAL_AGAIN_S = 1.0
 CONTROLS = {
     "standing": "the gate's consent: the robot in real time never moves",
     "leak": "order: each episode leaves a file open",
@@ -71,13 +75,18 @@ class Drive:
     """
 
     def __init__(self, domain_id: int, armed: bool) -> None:
-        self.driven_m, self._place = 0.0, None
+        self.driven_m = 0.0
+        self._place = None
         self._context = open_context(domain_id=domain_id)
         self._node = Node("soak", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self.goals, self.stops, self._sent_s = 0, {}, 0.0
-        self.armed, self._asked_s, self._answer = armed, 0.0, None
+        self.goals = 0
+        self.stops = {}
+        self._sent_s = 0.0
+        self.armed = armed
+        self._asked_s = 0.0
+        self._answer = None
         self._goal = self._node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
         self._arm = self._node.create_client(Trigger, "command_gate/arm")
         self._node.create_subscription(Odometry, "ground_truth", self._look, qos.SENSOR)
@@ -85,11 +94,13 @@ class Drive:
 
     def _look(self, message: Odometry) -> None:
         pose = conversions.odometry_from_ros(message)[0]
-        before, self._place = self._place, pose[:2]
+        before = self._place
+        self._place = pose[:2]
         self.driven_m += (
             0.0 if before is None else float(np.hypot(*(pose[:2] - before)))
         )
-        goal, now = GOALS[self.goals % len(GOALS)], time.monotonic()
+        goal = GOALS[self.goals % len(GOALS)]
+        now = time.monotonic()
         if np.hypot(*(pose[:2] - goal)) < NEAR_M:
             self.goals += 1
             self._sent_s = 0.0
@@ -142,7 +153,8 @@ class Episodes:
 
     def __init__(self, domain_id: int, leaks: bool) -> None:
         self._opened: list[Any] | None = [] if leaks else None
-        self.driven_m, self._place = 0.0, np.zeros(2)
+        self.driven_m = 0.0
+        self._place = np.zeros(2)
         register_envs()
         options = {"domain_id": domain_id, "timeout_s": PATIENCE_S}
         self.env = gymnasium.make(
@@ -152,7 +164,9 @@ class Episodes:
             world="arena",
             backend_options=options,
         )
-        self.resets, self.steps, self._left = 0, 0, 0
+        self.resets = 0
+        self.steps = 0
+        self._left = 0
         self._rng = np.random.default_rng(0)
 
     def go_on(self) -> None:
@@ -169,7 +183,8 @@ class Episodes:
         )
         _, _, ended, cut, info = self.env.step(action)
         self.steps += 1
-        before, self._place = self._place, info["pose"][:2]
+        before = self._place
+        self._place = info["pose"][:2]
         self.driven_m += float(np.hypot(*(self._place - before)))
         self._left = 0 if ended or cut else self._left - 1
 
@@ -192,7 +207,8 @@ class Soak:
 def begin(stack: ExitStack, control: str | None) -> Soak:
     """Starts everything; it ends with the stack."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-    field, track = free_domain_id(), free_domain_id()
+    field = free_domain_id()
+    track = free_domain_id()
     gate = {"model": ROBOT, "limits": ROBOT, "black_box": str(folder / "black_box")}
     gate |= {"use_sim_time": True, "e_stop_required": False}
     parts: dict[str, tuple[str, dict[str, Any], int]] = {
@@ -232,7 +248,9 @@ def begin(stack: ExitStack, control: str | None) -> Soak:
 
 def run(soak: Soak, seconds: float) -> list[dict[str, Use]]:
     """Lets everything go on for a time; what was used every few seconds."""
-    samples, end, due = [soak.uses()], time.monotonic() + seconds, time.monotonic()
+    samples = [soak.uses()]
+    end = time.monotonic() + seconds
+    due = time.monotonic()
     while (now := time.monotonic()) < end:
         soak.drive.spin()
         soak.drive.arm()
@@ -268,7 +286,8 @@ def measure(minutes: float, warm_up: float, control: str | None) -> dict[str, An
             if time.monotonic() > deadline:
                 break
         run(soak, 60.0 * warm_up)
-        before, known = dict(soak.drive.stops), counts(soak)
+        before = dict(soak.drive.stops)
+        known = counts(soak)
         samples = run(soak, 60.0 * minutes)
         stops = {
             rule: count - before.get(rule, 0)

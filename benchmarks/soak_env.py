@@ -120,9 +120,11 @@ def begun(arguments: dict[str, Any], seed: int, limit: int) -> Case:
 
 def soak(case: Case, steps: int, rng: np.random.Generator, control: str | None) -> None:
     """Steps the environment of a case."""
-    env, found = case.env, case.found
+    env = case.env
+    found = case.found
     data = env.simulator.data
-    shape, kind = env.action_space.shape, env.action_space.dtype
+    shape = env.action_space.shape
+    kind = env.action_space.dtype
     for _ in range(math.ceil(steps / env.num_envs)):
         before = data.pose.copy()
         actions = rng.uniform(-1.0, 1.0, shape).astype(kind)
@@ -144,7 +146,8 @@ def count(
     case: Case, seen: NDArray[Any], moved: NDArray[np.bool_], over: NDArray[np.bool_]
 ) -> None:
     """Counts for how long each world has gone on, stood, and told the same."""
-    found, free = case.found, (case.env.simulator.data.collided == 0) & ~case.env.ended
+    found = case.found
+    free = (case.env.simulator.data.collided == 0) & ~case.env.ended
     case.length += 1
     found.longest = max(found.longest, int(case.length.max()))
     case.still += 1
@@ -167,7 +170,8 @@ def run(
         for k, name in enumerate(names)
     }
     found = {name: case.found for name, case in cases.items()}
-    rng, begin = np.random.default_rng(seed), time.perf_counter()
+    rng = np.random.default_rng(seed)
+    begin = time.perf_counter()
     memory: list[float] = []
     held: list[NDArray[Any]] = []
     for _ in range(ROUNDS):
@@ -247,8 +251,11 @@ def run_resets(resets: int, seed: int, control: str | None) -> dict[str, Any]:
     """Resets of one Gymnasium env, each with a step; a tenth of them to warm up."""
     register_envs()
     env = gymnasium.make(NAVIGATION, model="differential", world="arena")
-    rng, begin, nans = np.random.default_rng(seed), time.perf_counter(), 0
-    uses, moved = [], 0
+    rng = np.random.default_rng(seed)
+    begin = time.perf_counter()
+    nans = 0
+    uses = []
+    moved = 0
     held: list[int] = []
     for number in range(resets):
         seen, _ = env.reset(seed=seed + number)

@@ -43,9 +43,14 @@ BARS = {
     "client_overhead": 0.1,
     "leapp_max_abs_difference": 1e-6,
 }
-ROBOT, WORLD, CLAIMED = "ackermann", "circles", "NAMED_POSES"
-REST_S, PATIENCE_S, WARM = 0.002, 300.0, 50
-OBSERVATIONS, POLICY = 64, "differential"
+ROBOT = "ackermann"
+WORLD = "circles"
+CLAIMED = "NAMED_POSES"
+REST_S = 0.002
+PATIENCE_S = 300.0
+WARM = 50
+OBSERVATIONS = 64
+POLICY = "differential"
 
 
 @contextmanager
@@ -159,12 +164,14 @@ def leapp(folder: Path, control: str | None) -> dict[str, float]:
 
     policy = load_policy(shipped() / f"{POLICY}.onnx")
     manager = InferenceManager(str(export_bundle(policy, folder / "bundle")))
-    layout, random = policy.contract.observation, np.random.default_rng(0)
+    layout = policy.contract.observation
+    random = np.random.default_rng(0)
     scans = random.uniform(0.0, 1.0, (OBSERVATIONS, layout.scan_parts))
     rest = random.uniform(
         layout.rest_low, layout.rest_high, (OBSERVATIONS, len(layout.rest_low))
     )
-    gap, zero = 0.0, np.zeros(1)
+    gap = 0.0
+    zero = np.zeros(1)
     for row in np.concatenate([scans, rest], axis=1).astype(np.float32):
         scan, goal, velocity = np.split(row, [layout.scan_parts, layout.scan_parts + 3])
         pieces = {
@@ -206,7 +213,8 @@ PARTS = ("simulation_interfaces", "leapp", "nav2")
 
 def measure(given: Any) -> dict[str, Any]:
     """All figures of the parts that were asked for."""
-    domain_id, result = free_domain_id(), dict[str, Any]()
+    domain_id = free_domain_id()
+    result = dict[str, Any]()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         built = importlib.util.find_spec("simulation_interfaces") is not None

@@ -32,7 +32,8 @@ CONTROLS = {
 Array = NDArray[np.float64]
 DT = 1e-3
 STEPS = 40_000
-SPEED, STEERING = 1.0, 0.5
+SPEED = 1.0
+STEERING = 0.5
 PARAMETERS = {
     "ackermann": {"wheelbase": 0.2},
     "differential": {"wheel_radius": 0.05, "track": 0.2},
@@ -48,7 +49,10 @@ EXACT = 1e-12
 FASTER_ALONE, FASTER_TOGETHER = 100.0, 1000.0
 """Times the speed of plain Python in the same run."""
 FLOAT32_M = 1e-4
-ROBOTS, BATCHED_STEPS, SINGLE_STEPS, REPEATS = 1024, 400, 100_000, 7
+ROBOTS = 1024
+BATCHED_STEPS = 400
+SINGLE_STEPS = 100_000
+REPEATS = 7
 
 
 @dataclass(frozen=True)
@@ -94,8 +98,10 @@ def drive(robot: Subject, seed: int) -> Samples:
 def errors(model: TaylorModel, robot: Subject, seed: int) -> tuple[Array, Array]:
     """RMSE (3,) per step in the body frame, and of the body twist times the step."""
     x = drive(robot, seed).x
-    truth, guess = robot.twist(x) * DT, model.rates(x) * DT
-    a, b = geometry.exp(truth), geometry.exp(guess)
+    truth = robot.twist(x) * DT
+    guess = model.rates(x) * DT
+    a = geometry.exp(truth)
+    b = geometry.exp(guess)
     difference = np.concatenate(
         [b[:, :2] - a[:, :2], guess[:, 2:] - truth[:, 2:]], axis=1
     )
@@ -114,7 +120,8 @@ def batch(
     terms = kernels.term_arrays(model)
     rng = np.random.default_rng(3)
     x = np.ones((len(model.variables) + 1, robots), dtype)
-    low, high = robot.spec.command_low, robot.spec.command_high
+    low = robot.spec.command_low
+    high = robot.spec.command_high
     x[:-1] = rng.uniform(low[:, None], high[:, None], (len(low), robots))
     pose = np.zeros((6, robots), dtype)
     pose[2] = 1.0
@@ -143,7 +150,8 @@ def batched_rate(model: TaylorModel, dtype: type, robot: Subject) -> float:
 def single_rate(model: TaylorModel, robot: Subject) -> float:
     """Steps per second of one robot, with a command per step, many steps in one call."""
     rng = np.random.default_rng(4)
-    low, high = robot.spec.command_low, robot.spec.command_high
+    low = robot.spec.command_low
+    high = robot.spec.command_high
     commands = rng.uniform(low, high, (1, SINGLE_STEPS, len(low)))
     poses, states = (
         np.zeros((1, SINGLE_STEPS + 1, 3)),
@@ -168,7 +176,9 @@ def best(call: Callable[[], None]) -> float:
 
 def python_rate(robot: Subject) -> float:
     """Steps per second of the textbook kinematics in plain Python and numpy."""
-    x, pose, steps = drive(robot, 5).x, np.zeros(3), 2000
+    x = drive(robot, 5).x
+    pose = np.zeros(3)
+    steps = 2000
     begin = time.perf_counter()
     for row in x[:steps]:
         pose = geometry.compose(pose, geometry.exp(robot.twist(row) * DT))
@@ -197,10 +207,8 @@ def measure(name: str, control: str | None) -> dict[str, Any]:
     if control == "slow":
         single = batched = python_rate(robot)
     else:
-        single, batched = (
-            single_rate(model, robot),
-            batched_rate(model, np.float64, robot),
-        )
+        single = single_rate(model, robot)
+        batched = batched_rate(model, np.float64, robot)
     return {
         "rmse_x_m": float(step[0]),
         "rmse_y_m": float(step[1]),
@@ -217,7 +225,8 @@ def measure(name: str, control: str | None) -> dict[str, Any]:
 
 def missed_of(result: dict[str, Any]) -> list[str]:
     """The bars that were missed."""
-    missed, python = [], result["python_reference_steps_per_s"]
+    missed = []
+    python = result["python_reference_steps_per_s"]
     for name, robot in result["robots"].items():
         keys = ("rmse_x_m", "rmse_y_m", "rmse_heading_rad")
         for key, paper in zip(keys, PAPER[name], strict=False):

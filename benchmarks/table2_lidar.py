@@ -90,7 +90,8 @@ def measure(
     ]
     plain_rmse, plain_area = errors(plain, exact, spec)
     times = timed(spec, table, drawn, repeats, control)
-    seconds, batch = medians(times), len(drawn[0].lidar)
+    seconds = medians(times)
+    batch = len(drawn[0].lidar)
     figures = {
         "exact_scans_per_s": batch / seconds["exact"],
         "baked_scans_per_s": batch / seconds["baked"],

@@ -54,7 +54,8 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     for distances, rotations in DENSITIES:
         key = f"{distances}x{rotations}"
         for name in SCENES:
-            ours, plain = result[key][name], result["nearest_row"][key][name]
+            ours = result[key][name]
+            plain = result["nearest_row"][key][name]
             if not ours <= PART * plain:
                 missed.append(
                     f"{name}, {key}: {ours:.4f} m2, bar a third of {plain:.4f}"

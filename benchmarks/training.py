@@ -82,7 +82,8 @@ class Run:
 def measure(settings: TrainingSettings, seed: int, episodes: int) -> Run:
     """Trains with one seed and drives unseen episodes."""
     model = open_model(settings.robot, settings.lidar)
-    begin, cpu = time.perf_counter(), time.process_time()
+    begin = time.perf_counter()
+    cpu = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         trained = train(settings, seed, Path(folder))
     env = BridgeVectorEnv(
@@ -93,7 +94,8 @@ def measure(settings: TrainingSettings, seed: int, episodes: int) -> Run:
         settings.task_options,
         settings.max_episode_steps,
     )
-    act, acting = act_of(trained.algorithm), [0.0]
+    act = act_of(trained.algorithm)
+    acting = [0.0]
 
     def timed(observations: NDArray[np.float32]) -> NDArray[Any]:
         start = time.perf_counter()
@@ -175,7 +177,8 @@ def main() -> None:
         settings = untrained(settings)
     else:
         warmed_up(settings, given.episodes)
-    runs, table = [], ""
+    runs = []
+    table = ""
     for seed in given.seeds or [given.seed]:
         run = measure(settings, seed, given.episodes)
         runs.append(run)

@@ -46,7 +46,8 @@ BELIEF = 0.05
 LEAST_WAY_M = 1.0
 BARS = {DDS: 0.02, MUJOCO: 0.04}
 """How far the success may be from that in process."""
-LIDAR, RANDOMISATION = "rplidar_a2", "mild"
+LIDAR = "rplidar_a2"
+RANDOMISATION = "mild"
 FIRST_SEED = 2_000_000
 SHARES = ("success", "collision", "believed")
 Found = dict[str, dict[str, dict[str, Any]]]
@@ -151,7 +152,8 @@ def _missed_success(
 
 
 def _missed_belief(who: str, figures: dict[str, Any]) -> list[str]:
-    lied, said = figures["believed"][0] - figures["success"][0], []
+    lied = figures["believed"][0] - figures["success"][0]
+    said = []
     if not lied <= BELIEF + 1e-9:
         said.append(
             f"{who}: {lied:.0%} of the episodes were successes to the robot alone, more than "
@@ -181,7 +183,8 @@ def table_of(found: Found, wall_s: float) -> str:
 
 def main() -> None:
     """Prints a table, or one JSON object."""
-    parser, robots = parser_of(__doc__, CONTROLS), shipped_policies()
+    parser = parser_of(__doc__, CONTROLS)
+    robots = shipped_policies()
     parser.add_argument("--episodes", type=int, default=100, help="in each place")
     parser.add_argument("--robots", nargs="+", choices=robots, default=robots)
     parser.add_argument(
@@ -197,7 +200,8 @@ def main() -> None:
         help=f"some of {', '.join(PLACES)}",
     )
     given = parser.parse_args()
-    begin, chosen = time.perf_counter(), (given.robots, given.worlds, given.places)
+    begin = time.perf_counter()
+    chosen = (given.robots, given.worlds, given.places)
     with tempfile.TemporaryDirectory() as folder:
         found = measure(*chosen, given.episodes, Path(folder), given.control)
     result = {name: shares(found, name) for name in SHARES}

@@ -329,7 +329,8 @@ class Operator(Node):
     def send_goal(self, goal: Array) -> None:
         """Sends a goal of the world, relative to where the robot stands."""
         assert self.pose is not None
-        cos, sin = math.cos(self.pose[2]), math.sin(self.pose[2])
+        cos = math.cos(self.pose[2])
+        sin = math.sin(self.pose[2])
         away = goal - self.pose[:2]
         message = PoseStamped()
         message.header.frame_id = "base_link"

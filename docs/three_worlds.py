@@ -22,14 +22,14 @@ from nics_drl_bridge.env.rendering import WorldPicture
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.watch.record import Pixels, beside, write_gif
 
-POLICY, WORLD, SEEDS = "differential", "clutter", (1_000_002, 1_000_004, 1_000_005)
-OUT, SIDE, HEAD, FPS, STANDS = (
-    Path(__file__).with_name("three_worlds.gif"),
-    300,
-    26,
-    12,
-    8,
-)
+POLICY = "differential"
+WORLD = "clutter"
+SEEDS = (1_000_002, 1_000_004, 1_000_005)
+OUT = Path(__file__).with_name("three_worlds.gif")
+SIDE = 300
+HEAD = 26
+FPS = 12
+STANDS = 8
 
 
 def drawn(

@@ -15,7 +15,8 @@ POLICIES = ("differential", "dynamic_window", "straight")
 
 
 def main() -> None:
-    model, found = open_model("differential"), []
+    model = open_model("differential")
+    found = []
     for name in POLICIES:
         policy, task = open_policy(name, model)
         envs = BridgeVectorEnv(len(EPISODES), model, "clutter", task)

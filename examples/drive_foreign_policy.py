@@ -26,7 +26,8 @@ outputs:
 def network():
     """It turns to the goal, and slows down for what is in front of it."""
     weights = np.zeros((38, 2), np.float32)
-    weights[15:21, 0], weights[37, 1] = 0.2, 1.0
+    weights[15:21, 0] = 0.2
+    weights[37, 1] = 1.0
     nodes = [
         helper.make_node("Concat", ["scan", "goal"], ["seen"], axis=1),
         helper.make_node("MatMul", ["seen", "weights"], ["raw"]),
@@ -47,7 +48,8 @@ def network():
 def main():
     save(network(), "theirs.onnx")
     Path("theirs.yaml").write_text(MAPPING, encoding="utf-8")
-    model, world = open_model("differential"), load_world("empty")
+    model = open_model("differential")
+    world = load_world("empty")
     policy, task = open_policy("theirs.yaml", model)
     episode = drive(make(model=model, world=world, task=task), policy, seed=0)
     print(episode.result)

@@ -13,11 +13,14 @@ from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.sim.world import load_world
 
-ENV, WORLD, SEED = "NicsBridge/Navigation-v0", "circles", 1_000_000
+ENV = "NicsBridge/Navigation-v0"
+WORLD = "circles"
+SEED = 1_000_000
 
 
 def main() -> None:
-    model, domain_id = open_model("differential"), free_domain_id()
+    model = open_model("differential")
+    domain_id = free_domain_id()
     policy, task = open_policy("differential", model)
     here = gymnasium.make(ENV, model=model, world=WORLD, task=task, estimator=True)
     inside = drive(here, policy, SEED)

@@ -17,7 +17,8 @@ FIRST_SEED = 1_000_000  # which no training draws
 
 
 def main() -> None:
-    model, world = open_model("differential"), load_world("circles")
+    model = open_model("differential")
+    world = load_world("circles")
     policy, task = open_policy("differential", model)  # or the path of your policy.onnx
 
     envs = BridgeVectorEnv(100, model, world, task)

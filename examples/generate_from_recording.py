@@ -11,7 +11,8 @@ from nics_drl_bridge.report.pictures import panels, png
 
 
 def main() -> None:
-    robot, world = load_robot("differential"), load_world("arena")
+    robot = load_robot("differential")
+    world = load_world("arena")
     recording = textbook.record(
         robot, np.random.default_rng(0)
     )  # or read_recording(path)

@@ -24,7 +24,8 @@ class Patrol(Task):
         return self.box([0, -1, -1], [1000, 1, 1])
 
     def reset(self, episodes):
-        goal, back = episodes.goals.copy(), episodes.starts[..., :2].copy()
+        goal = episodes.goals.copy()
+        back = episodes.starts[..., :2].copy()
         count = np.zeros(goal.shape[:-1], np.int64)
         return {"goal": goal, "back": back, "arrivals": count, "arrived": count > 0}
 
@@ -50,7 +51,8 @@ class Patrol(Task):
         return self.touches(view.ranges) | (memory["arrivals"] >= self.rounds)
 
     def info(self, view, memory):  # what an evaluation reads
-        arrivals, touches = memory["arrivals"].copy(), self.touches(view.ranges)
+        arrivals = memory["arrivals"].copy()
+        touches = self.touches(view.ranges)
         return {
             "is_success": arrivals >= self.rounds,
             "collision": touches,
@@ -59,7 +61,8 @@ class Patrol(Task):
 
 
 def main():  # by a policy that turns to the goal, and drives where that is ahead
-    robot, world = load_robot("differential"), load_world("empty")
+    robot = load_robot("differential")
+    world = load_world("empty")
     policy = SimpleNamespace(
         act=lambda seen: np.float32([max(seen[-2], 0) - 1, seen[-1]])
     )

@@ -15,7 +15,8 @@ FULL_SPEED = np.array([0.5, 0.0])  # m/s, rad/s
 
 
 def main() -> None:
-    model, world = open_model("differential"), load_world("empty")
+    model = open_model("differential")
+    world = load_world("empty")
     gated = GatedBackend(
         SimBackend(model, world, estimator=True), model, "differential"
     )

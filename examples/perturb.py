@@ -19,7 +19,8 @@ CONDITIONS = {
 
 
 def main() -> None:
-    model, found = open_model("differential", lidar="rplidar_a2"), []
+    model = open_model("differential", lidar="rplidar_a2")
+    found = []
     policy, task = open_policy("differential", model)
     for name, simulation in CONDITIONS.items():
         envs = BridgeVectorEnv(len(EPISODES), model, "circles", task, **simulation)

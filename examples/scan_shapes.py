@@ -21,7 +21,8 @@ AROUND = np.array(
 
 
 def main() -> None:
-    lidar, room = load_lidar("rplidar_a2"), load_map("room")
+    lidar = load_lidar("rplidar_a2")
+    room = load_map("room")
     robots = room.cell_to_world(np.argwhere(room.distance_field > 0.5)[::400])
     robots += np.array(
         [0.013, 0.007]

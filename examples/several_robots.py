@@ -6,7 +6,8 @@ from PIL import Image
 
 import nics_drl_bridge  # noqa: F401 - registers the environments
 
-ROBOTS, SEED = 3, 2
+ROBOTS = 3
+SEED = 2
 
 
 def to_the_goal(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
@@ -24,7 +25,9 @@ def main() -> None:
         render_mode="rgb_array",
     )
     observation, info = env.reset(seed=SEED)
-    own, ended, pictures = np.arange(ROBOTS), False, []
+    own = np.arange(ROBOTS)
+    ended = False
+    pictures = []
     while not ended:
         seen = observation.reshape(ROBOTS, -1)
         goals = seen[:, -3 - 3 * (ROBOTS - 1) - 4 * ROBOTS :][:, : 4 * ROBOTS]

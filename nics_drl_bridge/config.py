@@ -101,7 +101,8 @@ _UNKNOWN = (
     "unexpected_keyword_argument",
 )  # keys of a model, of a dataclass
 _NO_KEYS = ("model_type", "model_attributes_type", "dict_type", "dataclass_type")
-_NO_LIST, _COUNT = ("tuple_type", "list_type"), ("too_short", "too_long")
+_NO_LIST = ("tuple_type", "list_type")
+_COUNT = ("too_short", "too_long")
 _SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory in full
 _SHORT.maxstring = _SHORT.maxother = 80
 
@@ -116,10 +117,8 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
         hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
         return f"unknown key {key!r}; {hint}"
     if first["type"] == "union_tag_invalid":
-        tag, known = (
-            first["ctx"]["tag"],
-            re.findall("'([^']*)'", first["ctx"]["expected_tags"]),
-        )
+        tag = first["ctx"]["tag"]
+        known = re.findall("'([^']*)'", first["ctx"]["expected_tags"])
         return f"key {key!r}: unknown kind {tag!r}; {nearest(tag, known)}"
     if first["type"] == "union_tag_not_found":
         return f"the key '{key}.kind' is missing; add it."
@@ -260,7 +259,8 @@ class _Loader(*_BASES):  # type: ignore[misc]
     def compose_node(self, parent: Any, index: Any) -> Any:
         event: Any = self.peek_event()
         is_alias = isinstance(event, yaml.AliasEvent)
-        before, self._depth = self._values, self._depth + 1
+        before = self._values
+        self._depth = self._depth + 1
         self._values += self._sizes.get(event.anchor, 1) if is_alias else 1
         if self._depth > MAX_DEPTH:
             self._refuse(

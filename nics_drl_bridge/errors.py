@@ -54,7 +54,8 @@ class PolicyError(BridgeError):
     """A policy file can't be used, or does not fit the robot in a field such as `lidar.beams`."""
 
     def __init__(self, source: str, field: str, reason: str) -> None:
-        self.source, self.field = source, shortened(field, LONGEST_NAME)
+        self.source = source
+        self.field = shortened(field, LONGEST_NAME)
         self.reason = shortened(reason, LONGEST // 2)
         super().__init__(f"{source}: field {self.field!r}: {self.reason}")
 
@@ -70,7 +71,9 @@ class StaleDataError(BackendError):
     """No fresh data arrived on a topic in time; the age is `inf` if there never was a message."""
 
     def __init__(self, topic: str, age_s: float, limit_s: float) -> None:
-        self.topic, self.age_s, self.limit_s = topic, age_s, limit_s
+        self.topic = topic
+        self.age_s = age_s
+        self.limit_s = limit_s
         never = age_s == float("inf")
         last = "nothing has ever arrived" if never else f"the last is {age_s:.3f} s old"
         super().__init__(

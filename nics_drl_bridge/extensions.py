@@ -185,10 +185,8 @@ def _numbers(release: str) -> tuple[int, ...]:
 def own_fault(error: BaseException) -> str | None:
     """A clause about an error that a user's own task raised, with its place; else None."""
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
-        task, module = (
-            type(frame.f_locals.get("self")),
-            str(frame.f_globals.get("__name__")),
-        )
+        task = type(frame.f_locals.get("self"))
+        module = str(frame.f_globals.get("__name__"))
         if hasattr(task, "step_into") and not module.startswith(f"{PACKAGE}."):
             place = f"{frame.f_code.co_filename}:{line}, in {frame.f_code.co_name}"
             return str(

@@ -21,7 +21,8 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
 _POSIX = hasattr(os, "O_DIRECTORY")  # Windows opens no folders
 _BINARY = getattr(os, "O_BINARY", 0)  # of Windows
 
@@ -67,7 +68,8 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
 # system takes back when the writer ends, however that happens. Modes are those of the umask: it is
 # applied by the system when a file or folder is made, which `tempfile` does for its owner alone.
 
-UNFINISHED, REPLACED = "unfinished", "replaced"
+UNFINISHED = "unfinished"
+REPLACED = "replaced"
 _HIDDEN = re.compile(rf"\.(.+)\.[0-9a-f]{{8}}\.({UNFINISHED}|{REPLACED})", re.DOTALL)
 
 

@@ -37,13 +37,14 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
 FORMAT = "nics_drl_bridge/simulator_model/4"
-MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
+MODEL_FILE = "model.yaml"
+TABLE_FOLDER = "lidar_table"
+REPORT_FILE = "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
 MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
-REPORT_PAGE, PICTURES_FOLDER = (
-    "report.html",
-    "pictures",
-)  # what `nics generate` draws of a fit
+# what `nics generate` draws of a fit
+REPORT_PAGE = "report.html"
+PICTURES_FOLDER = "pictures"
 PICTURES = (
     "accuracy",
     "alignment",
@@ -86,7 +87,8 @@ class SimulatorModel:
     gyro: bool = False  # a gyro turned the recorded poses, or confirmed how they turned
 
     def __post_init__(self) -> None:
-        robot, known = self.robot, (self.kinematics.variables, self.kinematics.dofs)
+        robot = self.robot
+        known = (self.kinematics.variables, self.kinematics.dofs)
         needed = robot.variable_names, robot.dof_names
         if known != needed:
             reason = (
@@ -96,7 +98,8 @@ class SimulatorModel:
                 f"the kinematics have variables and rates {known}, {reason}"
             )
         check_sensors(self.sensors, (self.lidar.frame,))
-        period, dt = self.control_period, self.kinematics.dt
+        period = self.control_period
+        dt = self.kinematics.dt
         if (
             not 0.5 < period / dt < np.inf
             or abs(period / dt - round(period / dt)) > 1e-6
@@ -200,10 +203,8 @@ def generate(
         identified.drive.spec
     )  # the state of a textbook that was written may be another
     # The usual period [s], or that of a slower lidar: nothing new is seen before its next scan.
-    steps, dt = (
-        max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / identified.model.dt,
-        identified.model.dt,
-    )
+    steps = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / identified.model.dt
+    dt = identified.model.dt
     model = SimulatorModel(
         robot,
         identified.model,

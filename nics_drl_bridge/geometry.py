@@ -8,7 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-EQUATOR_M, ECCENTRICITY_2 = 6378137.0, 0.00669437999014  # of WGS 84
+# of WGS 84
+EQUATOR_M = 6378137.0
+ECCENTRICITY_2 = 0.00669437999014
 
 
 def wrap_angle(angle: ArrayLike) -> Array:
@@ -20,21 +22,19 @@ def wrap_angle(angle: ArrayLike) -> Array:
 
 def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
     """Rotates plane vectors (..., 2) by angles (...) [rad], counter-clockwise."""
-    vector, angle = (
-        np.asarray(vector, dtype=np.float64),
-        np.asarray(angle, dtype=np.float64),
-    )
-    c, s = np.cos(angle), np.sin(angle)
-    x, y = vector[..., 0], vector[..., 1]
+    vector = np.asarray(vector, dtype=np.float64)
+    angle = np.asarray(angle, dtype=np.float64)
+    c = np.cos(angle)
+    s = np.sin(angle)
+    x = vector[..., 0]
+    y = vector[..., 1]
     return np.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
 def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
     """The pose that lies at `relative` as seen from `pose`; both (..., 3): x, y, heading."""
-    pose, relative = (
-        np.asarray(pose, dtype=np.float64),
-        np.asarray(relative, dtype=np.float64),
-    )
+    pose = np.asarray(pose, dtype=np.float64)
+    relative = np.asarray(relative, dtype=np.float64)
     position = pose[..., :2] + rotate(relative[..., :2], pose[..., 2])
     heading = wrap_angle(pose[..., 2] + relative[..., 2])
     return np.concatenate([position, heading[..., None]], axis=-1)
@@ -42,10 +42,8 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
 
 def between(pose: ArrayLike, other: ArrayLike) -> Array:
     """The pose `other` as seen from `pose`; both (..., 3). `compose(pose, result) == other`."""
-    pose, other = (
-        np.asarray(pose, dtype=np.float64),
-        np.asarray(other, dtype=np.float64),
-    )
+    pose = np.asarray(pose, dtype=np.float64)
+    other = np.asarray(other, dtype=np.float64)
     position = rotate(other[..., :2] - pose[..., :2], -pose[..., 2])
     return np.concatenate(
         [position, wrap_angle(other[..., 2] - pose[..., 2])[..., None]], axis=-1
@@ -60,7 +58,8 @@ def exp(twist: ArrayLike) -> Array:
     safe = np.where(small, 1.0, w)
     a = np.where(small, 1.0 - w * w / 6.0, np.sin(safe) / safe)
     b = np.where(small, w / 2.0 - w**3 / 24.0, (1.0 - np.cos(safe)) / safe)
-    x, y = twist[..., 0], twist[..., 1]
+    x = twist[..., 0]
+    y = twist[..., 1]
     return np.stack([a * x - b * y, b * x + a * y, wrap_angle(w)], axis=-1)
 
 
@@ -72,7 +71,8 @@ def log(relative: ArrayLike) -> Array:
     safe = np.where(small, 1.0, w)
     half = w / 2.0
     cot = np.where(small, 1.0 - w * w / 12.0, (safe / 2.0) / np.tan(safe / 2.0))
-    x, y = relative[..., 0], relative[..., 1]
+    x = relative[..., 0]
+    y = relative[..., 1]
     return np.stack([cot * x + half * y, -half * x + cot * y, w], axis=-1)
 
 
@@ -95,12 +95,14 @@ def edges_cross(corners: Array) -> bool:
         return True
 
     def side(points: Array) -> Array:
-        along, to = (stop - start)[:, None], points[None] - start[:, None]
+        along = (stop - start)[:, None]
+        to = points[None] - start[:, None]
         return np.asarray(
             np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
         )
 
-    low, high = np.minimum(start, stop), np.maximum(start, stop)
+    low = np.minimum(start, stop)
+    high = np.maximum(start, stop)
     boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
     apart = side(start) * side(stop)
     index = np.arange(len(corners))
@@ -141,17 +143,17 @@ class Bicycle:
     def twist(self, speed: Array, angle: Array) -> Array:
         """Returns the body twist (..., 3) of speeds [m/s] and steering angles [rad] (...)."""
         if self.front_drive:
-            forward, turn = (
-                speed * np.cos(angle),
-                speed * np.sin(angle) / self.wheelbase,
-            )
+            forward = speed * np.cos(angle)
+            turn = speed * np.sin(angle) / self.wheelbase
         else:
-            forward, turn = speed, speed * np.tan(angle) / self.wheelbase
+            forward = speed
+            turn = speed * np.tan(angle) / self.wheelbase
         return np.stack([forward, np.zeros_like(forward), turn], axis=-1)
 
     def command(self, twist: Array) -> tuple[Array, Array]:
         """Returns speeds and steering angles (...) of twists (..., 3), both 0 of a turn at rest."""
-        forward, turn = twist[..., 0], twist[..., 2]
+        forward = twist[..., 0]
+        turn = twist[..., 2]
         across = self.wheelbase * turn  # speed of the front wheel to the left
         sign = np.sign(forward)
         angle = np.arctan2(across * sign, np.abs(forward))

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-NS_PER_S, S_PER_NS = 1_000_000_000, 1e-9
+NS_PER_S = 1_000_000_000
+S_PER_NS = 1e-9
 
 
 @dataclass(frozen=True)

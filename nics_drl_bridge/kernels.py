@@ -83,7 +83,8 @@ def prefetch(_typing: Any, array: Any, index: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = make_array(signature.args[0])(context, builder, args[0]).data
-        whole, byte = ir.IntType(32), ir.IntType(8).as_pointer()
+        whole = ir.IntType(32)
+        byte = ir.IntType(8).as_pointer()
         place = builder.bitcast(builder.gep(data, [args[1]]), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, whole, whole, whole])
         ask = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
@@ -163,11 +164,10 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         super().__init__(
             function, targetoptions=targetoptions, pipeline_class=_Compiler
         )
-        self._cache, self._inner_cache = (
-            _Cache(function),
-            _InnerCache(function, ".inner"),
-        )
-        self._inner, self._inner_only = False, set[tuple[Any, ...]]()
+        self._cache = _Cache(function)
+        self._inner_cache = _InnerCache(function, ".inner")
+        self._inner = False
+        self._inner_only = set[tuple[Any, ...]]()
 
     @property
     def is_warm(self) -> bool:
@@ -176,7 +176,8 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Is called when a kernel that calls this one is compiled."""
         before = self._inner, self._cache
-        self._inner, self._cache = True, self._inner_cache
+        self._inner = True
+        self._cache = self._inner_cache
         self.targetoptions["no_cpython_wrapper"] = True
         try:
             return super().get_call_template(args, kws)
@@ -259,7 +260,8 @@ class _InnerCache(_Cache):
 @cache
 def digest_of(module: Path) -> str:
     """SHA-256 of a module and of all modules that it imports, directly or not; no library."""
-    files, left = set[Path](), [module]
+    files = set[Path]()
+    left = [module]
     while left:
         file = left.pop()
         if file not in files:
@@ -326,7 +328,9 @@ class _Compiling(event.Listener):  # type: ignore[misc]
         self.patience_s = PATIENCE_S
         self.tell: Callable[[str], None] = STATUS.show
         self._told = -math.inf
-        self._lock, self._depth, self._collects = threading.Lock(), 0, True
+        self._lock = threading.Lock()
+        self._depth = 0
+        self._collects = True
         self._begun = self._begun_cpu = self._spent = 0.0
 
     def on_start(self, event: event.Event) -> None:
@@ -346,7 +350,8 @@ class _Compiling(event.Listener):  # type: ignore[misc]
 
     def on_end(self, event: event.Event) -> None:
         with self._lock:
-            self._depth, self.count = self._depth - 1, self.count + 1
+            self._depth = self._depth - 1
+            self.count = self.count + 1
             if self._depth == 0:
                 if self._collects:
                     gc.enable()

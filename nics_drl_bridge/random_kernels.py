@@ -29,7 +29,8 @@ from nics_drl_bridge.kernels import kernel
 ) = range(1, 12)
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-RUN, POOL_SIZE = 32, 2**16
+RUN = 32
+POOL_SIZE = 2**16
 PER_STD = 1.0 / 5300.0  # so that the sum of two numbers of the pool fits 16 bits
 
 
@@ -107,7 +108,8 @@ def share_of(drawn):  # type: ignore[no-untyped-def]
 def run(by, k):  # type: ignore[no-untyped-def]
     """Returns the k-th run of normal draws of a key: their signs, and two places in the pool."""
     z = _mix(by + np.uint64(k) * GOLDEN)
-    one, two = (z >> np.uint64(32)) & np.uint64(POOL_SIZE - 1), z >> np.uint64(48)
+    one = (z >> np.uint64(32)) & np.uint64(POOL_SIZE - 1)
+    two = z >> np.uint64(48)
     return np.uint32(z), np.uintp(one), np.uintp(two)
 
 

@@ -11,11 +11,20 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
-PURPLE, SKY, BLACK = "#CC79A7", "#56B4E9", "#000000"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+GREEN = "#009E73"
+ORANGE = "#E69F00"
+PURPLE = "#CC79A7"
+SKY = "#56B4E9"
+BLACK = "#000000"
 SERIES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
-MEASURED, MODEL, GOAL = BLUE, VERMILION, ORANGE
-OTHER, DARK, EDGE = "#8d99ae", "#333333", "#c5cbd3"
+MEASURED = BLUE
+MODEL = VERMILION
+GOAL = ORANGE
+OTHER = "#8d99ae"
+DARK = "#333333"
+EDGE = "#c5cbd3"
 MARKERS = (
     "o",
     "s",
@@ -86,10 +95,8 @@ def png(figure: Figure, legend: Axes | None = None) -> bytes:
             axes.set_title("\n".join(title))
     if legend is not None:
         handles, labels = legend.get_legend_handles_labels()
-        room, each = (
-            LETTERS_PER_IN * figure.get_figwidth(),
-            [len(label) + 5 for label in labels],
-        )
+        room = LETTERS_PER_IN * figure.get_figwidth()
+        each = [len(label) + 5 for label in labels]
         columns = len(labels) if sum(each) <= room else max(1, int(room / max(each)))
         figure.legend(handles, labels, loc="outside upper center", ncols=columns)
     buffer = io.BytesIO()

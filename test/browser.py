@@ -58,7 +58,9 @@ class Browser:
         address = next(filter(None, lines))[0]
         self._socket = self._open.enter_context(connect(address, max_size=None))
         threading.Thread(target=self._process.stderr.read, daemon=True).start()
-        self._count, self._session, self.events = 0, {}, []
+        self._count = 0
+        self._session = {}
+        self.events = []
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
         self._session = {"sessionId": attached["sessionId"]}

@@ -18,12 +18,10 @@ PATIENT_S = 1e6  # no line about long work between what a test reads
 
 def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Exit code and output of a command in a folder."""
-    argv, out, err, here = (
-        ["nics", *map(str, words)],
-        io.StringIO(),
-        io.StringIO(),
-        os.getcwd(),
-    )
+    argv = ["nics", *map(str, words)]
+    out = io.StringIO()
+    err = io.StringIO()
+    here = os.getcwd()
     os.chdir(cwd)
     try:
         with (

@@ -92,7 +92,8 @@ def random_scene(seed: int, shapes: tuple[Shape, ...], far: float = 0.0) -> Scen
     """Six of the shapes and two walls around a robot, which may stand inside of some."""
     rng = np.random.default_rng(seed)
     origin = np.array([*rng.uniform(-1.0, 1.0, 2) * far, 0.0])
-    spread, turn = [2.6, 2.6, 0.0], [0.0, 0.0, np.pi]
+    spread = [2.6, 2.6, 0.0]
+    turn = [0.0, 0.0, np.pi]
     robot = origin + rng.uniform(-1.0, 1.0, 3) * ([0.5, 0.5, np.pi])
     poses = origin + rng.uniform(-1.0, 1.0, (6, 3)) * np.add(spread, turn)
     chosen = tuple(shapes[i] for i in rng.integers(len(shapes), size=6))

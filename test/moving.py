@@ -38,9 +38,11 @@ class Watched:
 
     def gaps(self, radii) -> np.ndarray:
         """(T + 1, pairs) between the surfaces of an obstacle and any other body."""
-        bodies, count = self.places.shape[1], self.velocities.shape[1]
+        bodies = self.places.shape[1]
+        count = self.velocities.shape[1]
         one, other = np.triu_indices(bodies, 1)
-        one, other = one[one < count], other[one < count]
+        other = other[one < count]
+        one = one[one < count]
         away = np.linalg.norm(self.places[:, one] - self.places[:, other], axis=-1)
         return away - (np.asarray(radii)[one] + np.asarray(radii)[other])
 
@@ -77,8 +79,10 @@ def scattered(radii, half, rng, walls=None, free=0.05):
 
 def state_of(bodies, marks, velocity, seeds):
     """The state of N worlds as far as obstacles read and write it."""
-    worlds, none = len(bodies), np.zeros((len(bodies), 0, 3))
-    ints, empty = np.zeros((worlds, 0), np.int64), np.zeros((worlds, 0, 0, 0))
+    worlds = len(bodies)
+    none = np.zeros((len(bodies), 0, 3))
+    ints = np.zeros((worlds, 0), np.int64)
+    empty = np.zeros((worlds, 0, 0, 0))
     return State(
         pose=none,
         state=none,
@@ -125,13 +129,16 @@ def watch(
     count = len(motions)
     poses = np.concatenate([places, np.zeros((len(places), 1))], axis=1)[None]
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, len(places))))
-    marks, velocity = np.zeros((1, count, MARK)), np.zeros((1, count, 3))
+    marks = np.zeros((1, count, MARK))
+    velocity = np.zeros((1, count, 3))
     walls = sides(half) if walls is None else np.concatenate([sides(half), walls])
-    state, seen = state_of(bodies, marks, velocity, [seed]), []
+    state = state_of(bodies, marks, velocity, [seed])
+    seen = []
     scene = surroundings_of(motions, half, walls, grid)
     still = np.zeros((len(places) - count, 2))
     kernels.begin(0, state, scene.movers.plans)
-    where, headings = [bodies[0, :, :2].copy()], [bodies[0, :count, 2].copy()]
+    where = [bodies[0, :, :2].copy()]
+    headings = [bodies[0, :count, 2].copy()]
     for t in range(steps):
         speeds = still if robots is None else robots[t]
         state.steps[0] = t

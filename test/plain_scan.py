@@ -51,12 +51,14 @@ def look_up(out, x, y, heading, body, lidar):  # type: ignore[no-untyped-def]
     """Fuses one body into a scan (B,) by the table row of its nearest relative pose (Eq. 3)."""
     table = lidar.table
     shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
-    dx, dy = body[X] - x, body[Y] - y
+    dx = body[X] - x
+    dy = body[Y] - y
     distance, bearing = polar(dx, dy)
     cell, hull, blend = nearest_cell(
         distance, bearing, body[RADIUS], body[HEADING], shape, table
     )
-    near, far = table.cells[np.uintp(cell)], table.cells[np.uintp(cell + 1)]
+    near = table.cells[np.uintp(cell)]
+    far = table.cells[np.uintp(cell + 1)]
     seen = seen_at(dx, dy, body[COS], body[SIN])
     right = silhouette(near[2], hull, shape, table.hulls, seen, 1.0)
     left = silhouette(near[3], hull, shape, table.hulls, seen, -1.0)
@@ -70,11 +72,13 @@ def look_up(out, x, y, heading, body, lidar):  # type: ignore[no-untyped-def]
 @kernel(contracts=True, inline=True)
 def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-untyped-def]
     """Lowers the beams from `low` to `high` to two blended rows, of cells (4,) (Eq. 4)."""
-    rows, shift = lidar.table.rows, lidar.table.shift
+    rows = lidar.table.rows
+    shift = lidar.table.shift
     begin, hits, point, share = beams_between(middle, low, high, out.shape[0], shift)
     one, two = points_of(near[0], near[1], point, shift, hits)
     other, other2 = points_of(far[0], far[1], point, shift, hits)
-    range_min, range_max = np.float32(lidar.range_min), np.float32(lidar.range_max)
+    range_min = np.float32(lidar.range_min)
+    range_max = np.float32(lidar.range_max)
     for j in range(hits):
         value = blended(
             rows,

@@ -20,7 +20,8 @@ def integrate(
     over seconds.
     """
     steps = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))
-    h, goal = dt / steps, book.target(command)
+    h = dt / steps
+    goal = book.target(command)
     for k in range(steps):
         pose = geometry.compose(pose, geometry.exp(_arc(book, state, goal, k * h, h)))
     return pose, book.respond(state, goal, dt)

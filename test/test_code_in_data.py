@@ -268,7 +268,8 @@ PICKLES = {
 @pytest.mark.parametrize("kind", ["pickle", "npz", "torch"])
 @pytest.mark.parametrize("reader", PICKLES)
 def test_no_object_of_python_is_made_from_a_file(tmp_path, reader, kind):
-    canary, path = tmp_path / "canary", tmp_path / "drive.npz"
+    canary = tmp_path / "canary"
+    path = tmp_path / "drive.npz"
     if kind == "pickle":
         path.write_bytes(pickle.dumps(Sprung(canary)))
     elif kind == "npz":
@@ -282,7 +283,8 @@ def test_no_object_of_python_is_made_from_a_file(tmp_path, reader, kind):
 
 
 def test_a_table_of_a_model_holds_no_objects(tmp_path):
-    canary, folder = tmp_path / "canary", tmp_path / "model"
+    canary = tmp_path / "canary"
+    folder = tmp_path / "model"
     save_model(direct_model(), folder)
     for file in sorted((folder / "lidar_table").glob("*.npy")):
         np.save(file, np.array([Sprung(canary)], dtype=object))

@@ -223,7 +223,8 @@ def test_aliases_that_multiply_are_refused_at_once():
 
 
 def test_configurations_are_frozen_and_share_no_defaults():
-    one, other = Cart(name="a"), Cart(name="b")
+    one = Cart(name="a")
+    other = Cart(name="b")
     with pytest.raises(ValueError, match="frozen"):
         one.mass = 3.0
     assert one.extras is not other.extras

@@ -37,7 +37,8 @@ class Running:
     """A demo as a process, with the lines it printed so far."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process, self.lines = process, []
+        self.process = process
+        self.lines = []
         self._changed = threading.Condition()
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -101,7 +102,8 @@ class Sources(HTMLParser):
 
     def __init__(self) -> None:
         super().__init__()
-        self.tags, self.loads = [], []
+        self.tags = []
+        self.loads = []
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
@@ -223,7 +225,8 @@ def test_ctrl_c_ends_it_and_all_that_it_started(
 
 def wait_for(condition, what):
     """Waits until something holds that nobody announces."""
-    deadline, once = time.monotonic() + DEADLINE_S, threading.Event()
+    deadline = time.monotonic() + DEADLINE_S
+    once = threading.Event()
     while not condition():
         assert time.monotonic() < deadline, f"no {what}"
         once.wait(0.01)

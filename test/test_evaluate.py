@@ -285,7 +285,9 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
     file.write_text(
         dump_yaml({"robot": "differential", "commands": limits}), encoding="utf-8"
     )
-    model, logs, said = {"model": "differential"}, tmp_path / "logs", []
+    model = {"model": "differential"}
+    logs = tmp_path / "logs"
+    said = []
     gate = model | {"limits": str(file), "black_box": str(tmp_path / "black_box")}
     gate |= {"use_sim_time": True, "e_stop_required": False}
     # What a busy machine does to rates and ages would be a finding; that is tested elsewhere.

@@ -144,7 +144,9 @@ def test_a_killed_writer_leaves_one_whole_version(tmp_path):
 def test_where_folders_can_not_be_opened_as_on_windows_a_folder_is_written_all_the_same(
     old, monkeypatch
 ):
-    opened, library, replace = os.open, files.ctypes.CDLL, os.replace
+    opened = os.open
+    library = files.ctypes.CDLL
+    replace = os.replace
 
     def open_file(path, *rest, **named):
         if os.path.isdir(path) and not named:  # with a name it is what removes folders
@@ -205,7 +207,9 @@ def test_where_folders_can_not_change_places_a_rename_that_fails_leaves_the_old_
     old, monkeypatch, call
 ):
     monkeypatch.setattr(files, "_exchange", lambda *_: False)
-    before, rename, calls = tree(old.parent), os.replace, []
+    before = tree(old.parent)
+    rename = os.replace
+    calls = []
 
     def failing(source, target):
         calls.append(source)

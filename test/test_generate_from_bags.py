@@ -74,7 +74,9 @@ def test_a_bag_gives_the_model_of_the_same_drive(tmp_path, robot):
 
 def car_bag(drive, path, storage):
     """A car as real ones are: own names, a steering joint, an axle in rad/s, motion capture."""
-    command, pose, state = drive.command, drive.pose, drive.state
+    command = drive.command
+    pose = drive.pose
+    state = drive.state
     names = ["rear_axle_joint", "front_steering_joint"]
     mocap = [
         (t, bags.transforms(bags.transform(t, row, "room", "car")))

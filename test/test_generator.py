@@ -48,7 +48,8 @@ def saved(original, tmp_path):
 
 def change(folder, edit):
     """Edits a model by hand: its line in the manifest is removed."""
-    path, manifest = folder / MODEL_FILE, folder / SUMS
+    path = folder / MODEL_FILE
+    manifest = folder / SUMS
     data = parse_yaml(path.read_text(), "model")
     edit(data)
     path.write_text(dump_yaml(data))
@@ -118,7 +119,8 @@ def test_saving_twice_gives_the_same_bytes(saved, tmp_path):
 def test_a_model_over_an_older_one_keeps_what_the_user_put_there_and_nothing_else(
     tmp_path,
 ):
-    folder, model = tmp_path / "model", direct_model()
+    folder = tmp_path / "model"
+    model = direct_model()
     save_model(model, folder)
     own = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     (folder / "pictures").mkdir()
@@ -341,7 +343,8 @@ def test_kinematics_that_lack_a_degree_of_freedom_are_refused(saved, dof):
 
 
 def test_kinematics_of_another_robot_are_refused():
-    car, mecanum = builtin_model("ackermann"), builtin_model("mecanum")
+    car = builtin_model("ackermann")
+    mecanum = builtin_model("mecanum")
     with pytest.raises(ModelError, match="the robot 'ackermann' needs"):
         replace(car, kinematics=mecanum.kinematics)
 
@@ -426,7 +429,8 @@ def test_a_robot_has_the_lidar_that_its_file_names_and_else_that_of_the_paper(tm
 
 
 def test_a_model_is_opened_with_another_lidar_than_its_own():
-    own, other = open_model("differential"), open_model("differential", "rplidar_a2")
+    own = open_model("differential")
+    other = open_model("differential", "rplidar_a2")
     assert other.lidar == load_lidar("rplidar_a2") != own.lidar
     assert other.kinematics is own.kinematics
     assert other.table.shapes == own.table.shapes

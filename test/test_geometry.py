@@ -35,7 +35,8 @@ def random_poses(count, seed=0):
 
 def matrix(pose):
     x, y, heading = pose
-    c, s = np.cos(heading), np.sin(heading)
+    c = np.cos(heading)
+    s = np.sin(heading)
     return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
 
 
@@ -75,7 +76,8 @@ def test_composition_multiplies_homogeneous_matrices():
 
 
 def test_the_pose_between_two_leads_from_one_to_the_other():
-    a, b = random_poses(500, 4), random_poses(500, 5)
+    a = random_poses(500, 4)
+    b = random_poses(500, 5)
     reached = geometry.compose(a, geometry.between(a, b))
     assert np.allclose(reached[:, :2], b[:, :2], rtol=1e-12, atol=1e-9)
     assert np.abs(turn_between(reached[:, 2], b[:, 2])).max() < 1e-9
@@ -112,7 +114,8 @@ def test_exp_undoes_log_at_the_seam_too():
 
 
 def test_a_batch_gives_what_its_rows_give_one_by_one():
-    a, b = random_poses(60, 9).reshape(3, 20, 3), random_poses(20, 10)
+    a = random_poses(60, 9).reshape(3, 20, 3)
+    b = random_poses(20, 10)
     for function in (geometry.compose, geometry.between):
         batch = function(a, b)
         assert batch.shape == (3, 20, 3)

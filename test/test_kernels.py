@@ -151,8 +151,10 @@ def index(folder, version="1"):
 def test_of_two_processes_that_save_at_once_neither_gets_the_others_code(
     tmp_path, monkeypatch
 ):
-    one, other = index(tmp_path), index(tmp_path)
-    write, unaware = one._save_data, dict
+    one = index(tmp_path)
+    other = index(tmp_path)
+    write = one._save_data
+    unaware = dict
 
     def meanwhile(name, data):
         other._load_index = unaware  # it looked before either had saved
@@ -209,7 +211,8 @@ def test_a_kernel_of_ones_own_is_made_of_the_files_beside_it(tmp_path):
         "deep.py": "",
     }.items():
         (folder / name).write_text(text)
-    found, left = set(), [folder / "main_kernels.py"]
+    found = set()
+    left = [folder / "main_kernels.py"]
     while left:
         for each in kernels.imports_of(left.pop()):
             if each not in found and tmp_path in each.parents:

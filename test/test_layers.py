@@ -257,7 +257,8 @@ def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
         ):
             continue
         assert path.name.endswith("kernels.py"), path
-        files, left = set(), [path]
+        files = set()
+        left = [path]
         while left:
             file = left.pop()
             if file not in files:

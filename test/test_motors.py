@@ -38,7 +38,9 @@ CAR = robot_from(
     },
     {"throttle": (-1.0, 1.0), "steering": (-1.0, 1.0)},
 )
-DEAD, PERIODS, SUBSTEPS = 0.12, 60, 10
+DEAD = 0.12
+PERIODS = 60
+SUBSTEPS = 10
 
 
 def motors() -> TaylorModel:
@@ -97,8 +99,11 @@ def commands() -> np.ndarray:
 @pytest.fixture(scope="module")
 def path(commands) -> tuple[np.ndarray, np.ndarray]:
     """Poses (T + 1, 3) and states (T + 1, S) at the ends of periods, step by step of the model."""
-    car, pose, state = motors(), np.zeros(3), np.zeros(2)
-    poses, states = [pose], [state]
+    car = motors()
+    pose = np.zeros(3)
+    state = np.zeros(2)
+    poses = [pose]
+    states = [state]
     for command in late(car, commands):
         pose, state = car.step(pose, state, command)
         poses.append(pose)
@@ -118,7 +123,8 @@ def late(car, commands):
 
 
 def test_the_drive_shows_every_stage(commands, path):
-    speed, car = path[1][:, 0], motors()
+    speed = path[1][:, 0]
+    car = motors()
     assert (speed == 0.0).sum() > 5
     assert (np.abs(commands[:, 0]) < DEAD).any()
     assert (np.abs(commands[:, 0]) > 0.8).any()
@@ -136,7 +142,8 @@ def test_the_drive_shows_every_stage(commands, path):
 
 
 def rolled(car, commands):
-    poses, states = np.zeros((1, PERIODS * SUBSTEPS + 1, 3)), np.zeros((1, 601, 2))
+    poses = np.zeros((1, PERIODS * SUBSTEPS + 1, 3))
+    states = np.zeros((1, 601, 2))
     every = car.in_effect(late(car, commands))[None]
     rollout(poses, states, every, term_arrays(car), SERIES, car.dt)
     return poses[0, ::SUBSTEPS], states[0, ::SUBSTEPS]
@@ -179,7 +186,8 @@ def test_robots_that_might_touch_follow_the_model_too(model):
     simulator = FastSimulator(model, field(60.0), robots=2)
     start = np.array([[0.0, 0.0, 0.0], [0.0, 0.41, 0.0]])
     simulator.reset([0], starts=start[None])
-    pose, state = start, np.zeros((2, 2))
+    pose = start
+    state = np.zeros((2, 2))
     commands = np.array(
         [[throttle, 0.0] for throttle in (0.7, 0.7, 0.7, 0.2, -0.9, -0.9)]
     )
@@ -210,10 +218,8 @@ def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(
     motion = MotionModel(term_arrays(motors()), SERIES, 0, 0)
 
     def ahead(speed: float) -> tuple[float, float]:
-        mean, transition = (
-            np.array([0.0, 0.0, 0.0, speed, 0.0]),
-            kernels.unmoved(5, 0.0),
-        )
+        mean = np.array([0.0, 0.0, 0.0, speed, 0.0])
+        transition = kernels.unmoved(5, 0.0)
         kernels.predict(mean, transition, np.array([throttle, 0.0]), 0.01, 10, motion)
         return mean[3], transition[3, 3]
 
@@ -238,11 +244,15 @@ def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
 
 
 def test_a_batch_of_robots_moves_as_each_alone(commands, path):
-    car, count = motors(), 37
+    car = motors()
+    count = 37
     terms = term_arrays(car)
     lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], count))
-    pose, x, dq = np.zeros((6, count)), np.zeros((5, count)), np.zeros((5, count))
-    pose[2], x[4] = 1.0, 1.0
+    pose = np.zeros((6, count))
+    x = np.zeros((5, count))
+    dq = np.zeros((5, count))
+    pose[2] = 1.0
+    x[4] = 1.0
     for command in late(car, commands):
         x[2:4] = car.in_effect(command)[:, None]
         run(pose, x, dq, lanes, SERIES, car.dt, 1)
@@ -251,7 +261,8 @@ def test_a_batch_of_robots_moves_as_each_alone(commands, path):
 
 
 def test_predictions_over_seconds_have_the_derivatives_that_differences_show(commands):
-    car, steps = motors(), 300
+    car = motors()
+    steps = 300
     every = car.in_effect(late(car, commands))
     first = np.arange(0, 300, 50)
     state = rolled_states(car, every)[first]
@@ -269,7 +280,8 @@ def test_predictions_over_seconds_have_the_derivatives_that_differences_show(com
         shoot(shot, terms, free, car.dt, tangent(2, 2, len(free), len(free)))
         return shot.end[:, 0], shot.slope[:, 0]
 
-    terms, slight = term_arrays(car), 1e-7
+    terms = term_arrays(car)
+    slight = 1e-7
     end, slope = ends(terms)
     for p in free:
         aside = terms.coefficient + slight * (np.arange(len(free)) == p)
@@ -278,7 +290,8 @@ def test_predictions_over_seconds_have_the_derivatives_that_differences_show(com
 
 
 def rolled_states(car, every):
-    poses, states = np.zeros((1, len(every) + 1, 3)), np.zeros((1, len(every) + 1, 2))
+    poses = np.zeros((1, len(every) + 1, 3))
+    states = np.zeros((1, len(every) + 1, 2))
     rollout(poses, states, every[None], term_arrays(car), SERIES, car.dt)
     return states[0]
 

@@ -41,7 +41,8 @@ KINDS = pytest.mark.parametrize("kind", [str, lambda path: path], ids=["text", "
 
 @KINDS
 def test_a_model_is_saved_and_opened_at_either(tmp_path, kind):
-    place, model = kind(tmp_path / "model"), builtin_model("ackermann")
+    place = kind(tmp_path / "model")
+    model = builtin_model("ackermann")
     check_place(place)
     save_model(model, place)
     assert (
@@ -61,10 +62,8 @@ def test_a_model_is_saved_and_opened_at_either(tmp_path, kind):
 def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
     if not name.endswith(".npz"):
         pytest.importorskip("rosbags")
-    place, drive = (
-        kind(tmp_path / name),
-        record(CAR, np.random.default_rng(0), duration=20.0),
-    )
+    place = kind(tmp_path / name)
+    drive = record(CAR, np.random.default_rng(0), duration=20.0)
     assert check_out(place) == tmp_path / name
     write_drive(drive, place, CAR)
     assert len(read_recording(place, CAR).pose.t) == len(drive.pose.t)
@@ -72,10 +71,8 @@ def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
 
 @KINDS
 def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
-    place, drive = (
-        kind(tmp_path / "drive.npz"),
-        record(CAR, np.random.default_rng(0), duration=5.0),
-    )
+    place = kind(tmp_path / "drive.npz")
+    drive = record(CAR, np.random.default_rng(0), duration=5.0)
     save_recording(drive, place)
     assert np.array_equal(load_recording(place).pose.values, drive.pose.values)
 
@@ -89,7 +86,8 @@ def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
     from nics_drl_bridge.recording.bag_file import is_bag
     from nics_drl_bridge.recording.write import write_bag
 
-    place, rest = kind(tmp_path / "drive"), kind(tmp_path / "rest")
+    place = kind(tmp_path / "drive")
+    rest = kind(tmp_path / "rest")
     write_bag(record(CAR, np.random.default_rng(0), duration=5.0), place, CAR)
     salvage(place, rest)
     assert is_bag(rest)

@@ -44,7 +44,9 @@ def test_neighbours_in_seed_stream_and_counter_are_not_correlated():
 
 
 def test_a_draw_depends_on_its_three_numbers_alone():
-    seeds, streams, counters = np.arange(5), np.arange(3), np.arange(7)
+    seeds = np.arange(5)
+    streams = np.arange(3)
+    counters = np.arange(7)
     all_of_them = draws(random.normal, seeds, streams, counters)
     assert np.array_equal(
         draws(random.normal, seeds[::-1], streams, counters)[::-1], all_of_them

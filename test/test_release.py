@@ -67,10 +67,8 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("kind", ["*.whl", "*.tar.gz"])
 def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path):
     archive = next(dist.glob(kind))
-    uv, python = (
-        Path(sys.executable).with_name("uv"),
-        tmp_path / "venv" / "bin" / "python",
-    )
+    uv = Path(sys.executable).with_name("uv")
+    python = tmp_path / "venv" / "bin" / "python"
     run(uv, "venv", "--python", sys.executable, tmp_path / "venv", cwd=tmp_path)
     install = (
         uv,

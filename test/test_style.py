@@ -55,7 +55,8 @@ def test_no_title_is_cut(columns):
     image = Image.open(io.BytesIO(style.png(figure, grid[0])))
     assert image.width == 330 * columns
     for n, axes in enumerate(grid):
-        title, width = axes.title.get_window_extent(), figure.bbox.width / columns
+        title = axes.title.get_window_extent()
+        width = figure.bbox.width / columns
         assert n * width - 3.0 <= title.x0 < title.x1 <= (n + 1) * width + 3.0
 
 

@@ -37,7 +37,9 @@ from nics_drl_bridge.nodes.runner import open_context
 
 GRACE_S, WATCH_S = 0.25, 1.2
 """A motion on `cmd_vel` so long after the exception has stayed; it is watched for so long."""
-MOVES_S, HANGS_S, TRIES = 5.0, 10.0, 3
+MOVES_S = 5.0
+HANGS_S = 10.0
+TRIES = 3
 MOVING = 0.05
 ROBOT = "ackermann"
 AHEAD = np.array([1.0, 0.0], np.float32)
@@ -360,7 +362,9 @@ def campaign(seed: int, rounds: int, control: str | None = None) -> Score:
     Raises:
         RuntimeError: the robot did not move, so that nothing was measured.
     """
-    score, rng, domain_id = Score(), np.random.default_rng(seed), free_domain_id()
+    score = Score()
+    rng = np.random.default_rng(seed)
+    domain_id = free_domain_id()
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         parameters = {

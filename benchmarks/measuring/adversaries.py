@@ -70,12 +70,16 @@ class Adversary:
     def __init__(
         self, kind: str, model: SimulatorModel, rng: np.random.Generator
     ) -> None:
-        self._kind, self._robot, self._rng = kind, model.robot, rng
-        self._held, self._left = np.zeros(len(model.robot.command)), 0
+        self._kind = kind
+        self._robot = model.robot
+        self._rng = rng
+        self._held = np.zeros(len(model.robot.command))
+        self._left = 0
 
     def act(self, truth: Truth) -> Array:
         """The command (C,)."""
-        low, high = self._robot.command_low, self._robot.command_high
+        low = self._robot.command_low
+        high = self._robot.command_high
         ends = np.where(self._rng.random((TRIES, len(low))) < 0.5, low, high)
         tries = np.concatenate([ends, self._rng.uniform(low, high, (TRIES, len(low)))])
         if self._kind == "jerk":

@@ -158,9 +158,11 @@ def _checkpoint(folder: Path) -> Artefact:
 
 
 def _entries(config: Any, lidar: Any, ticks: int) -> tuple[black_box.Entry, ...]:
-    box, gate = black_box.BlackBox(config), Gate(config, lidar)
+    box = black_box.BlackBox(config)
+    gate = Gate(config, lidar)
     for _ in range(ticks):
-        before, gate.now = gate.state, gate.now + 0.02
+        before = gate.state
+        gate.now = gate.now + 0.02
         box.note(black_box.Entry(gate.now, Tick(), before, gate.tick()))
     return box.copy()
 
@@ -182,7 +184,9 @@ def torn(
         `torn`, `kills`, and `kills_during_a_write`: those before which a write had begun that had
         not ended.
     """
-    path, bad, during = folder / artefact.name, 0, 0
+    path = folder / artefact.name
+    bad = 0
+    during = 0
     artefact.write(path, 0)
     for _ in range(kills):
         WRITES[:] = bytes(2)
@@ -221,7 +225,9 @@ def _wait_for_a_write() -> None:
 
 def _write_for_ever(artefact: Artefact, path: Path) -> None:
     """In a process of its own; ends with it. A write begins with its temporary file or folder."""
-    version, make_file, make_folder = 0, tempfile.mkstemp, tempfile.mkdtemp
+    version = 0
+    make_file = tempfile.mkstemp
+    make_folder = tempfile.mkdtemp
     tempfile.mkstemp = lambda *given, **named: _begun(make_file, given, named)
     tempfile.mkdtemp = lambda *given, **named: _begun(make_folder, given, named)
     try:
@@ -282,7 +288,8 @@ def accepted(
     artefact: Artefact, flips: int, rng: np.random.Generator, folder: Path
 ) -> int:
     """How often a file with one flipped bit was read as if nothing were wrong."""
-    path, good = folder / artefact.name, 0
+    path = folder / artefact.name
+    good = 0
     artefact.write(path, 0)
     files = sorted(file for file in path.rglob("*") if file.is_file()) or [path]
     for _ in range(flips):
@@ -314,7 +321,8 @@ def measure(
         seed: of all that is drawn.
         control: see `CONTROLS` of `files.py`.
     """
-    rng, by_artefact = np.random.default_rng(seed), {}
+    rng = np.random.default_rng(seed)
+    by_artefact = {}
     for artefact in artefacts():
         written = naive(artefact) if control == "naive_writer" else artefact
         with tempfile.TemporaryDirectory() as folder:

@@ -105,10 +105,8 @@ def _answer(attempt: Attempt, writing: int) -> None:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         size = pages * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
-        before, compiled_s = (
-            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-            COMPILING.cpu_s,
-        )
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        compiled_s = COMPILING.cpu_s
         end, words = _end_of(attempt.act)
         after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         told = end, words[:3000], (after - before) * 1024, COMPILING.cpu_s - compiled_s

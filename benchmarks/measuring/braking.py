@@ -32,7 +32,8 @@ def braking_used(robot: str, given: Mapping[str, float] | None) -> float:
     model = builtin_model(robot)
     limits = load_limits(robot, model.robot)
     shield, _ = shield_config(model, limits, robot, given)
-    sim, most = FastSimulator(model, load_world("empty")), 0.0
+    sim = FastSimulator(model, load_world("empty"))
+    most = 0.0
     reach = body_of(shield).reach
     for index, (low, high) in enumerate(zip(limits.low, limits.high, strict=True)):
         arm = 1.0 if limits.linear[index] else reach * limits.turn[index]
@@ -59,7 +60,8 @@ def _stopping_distance(sim: FastSimulator, index: int, speed: float) -> float:
     command[..., index] = speed
     for _ in range(PERIODS):
         sim.step(command)
-    let_go, furthest = sim.data.pose[0, 0].copy(), 0.0
+    let_go = sim.data.pose[0, 0].copy()
+    furthest = 0.0
     turns = bool(load_limits(sim.model.robot.name, sim.model.robot).turn[index])
     for _ in range(PERIODS):
         sim.step(0.0 * command)

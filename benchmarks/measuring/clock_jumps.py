@@ -59,15 +59,11 @@ def drive(
     start = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     simulator.reset([seed], starts=start[None, None])
     made.reset(0, start)
-    when, shift = (
-        int(rng.integers(30, 100)),
-        round(JUMPS_S[seed % len(JUMPS_S)] * SECOND),
-    )
-    truth, underway, found = (
-        [start],
-        deque[tuple[int, Any]](),
-        list[tuple[int, float, float]](),
-    )
+    when = int(rng.integers(30, 100))
+    shift = round(JUMPS_S[seed % len(JUMPS_S)] * SECOND)
+    truth = [start]
+    underway = deque[tuple[int, Any]]()
+    found = list[tuple[int, float, float]]()
     command = _command(model, rng, moving)
     for k in range(1, PERIODS):
         if k % 8 == 0:
@@ -95,7 +91,8 @@ def _command(model: SimulatorModel, rng: np.random.Generator, moving: bool) -> A
 
 def _error(made: Middleware, stamp_ns: int, truth: Array) -> tuple[float, float]:
     """Distance [m] and NEES of what is estimated for the stamp of an odometry just used."""
-    belief, view = made.estimator.belief, made.view(stamp_ns)
+    belief = made.estimator.belief
+    view = made.view(stamp_ns)
     error = view.pose - truth
     error[2] = geometry.wrap_angle(error[2])
     nees = float(error @ np.linalg.solve(belief.covariance[:3, :3], error))
@@ -105,7 +102,8 @@ def _error(made: Middleware, stamp_ns: int, truth: Array) -> tuple[float, float]
 def _jumped(found: list[tuple[int, float, float]], truth: Array, when: int) -> Jumped:
     if not found:
         return Jumped(np.full(2, np.inf), np.full(2, np.inf), 0.0)
-    first, last = found[0], found[-1]
+    first = found[0]
+    last = found[-1]
     way = np.diff(truth[when - 1 : first[0] + 1, :2], axis=0)
     ends = np.array([first[1:], last[1:]])
     return Jumped(ends[:, 0], ends[:, 1], float(np.hypot(*way.T).sum()))
@@ -124,10 +122,8 @@ def campaign(
 
 def summary(drives: list[Jumped]) -> dict[str, Any]:
     """What the drives show together."""
-    error, nees = (
-        np.array([d.error for d in drives]),
-        np.array([d.nees for d in drives]),
-    )
+    error = np.array([d.error for d in drives])
+    nees = np.array([d.nees for d in drives])
     return {
         "drives": len(drives),
         "driven_unseen_m": float(np.mean([d.driven for d in drives])),

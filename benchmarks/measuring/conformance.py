@@ -22,12 +22,15 @@ from simulation_interfaces.action import SimulateSteps
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.simulation_interfaces.client import snake_case
 
-OK, UNSUPPORTED = msg.Result.RESULT_OK, msg.Result.RESULT_FEATURE_UNSUPPORTED
-FAILED, NOT_FOUND = msg.Result.RESULT_OPERATION_FAILED, msg.Result.RESULT_NOT_FOUND
+OK = msg.Result.RESULT_OK
+UNSUPPORTED = msg.Result.RESULT_FEATURE_UNSUPPORTED
+FAILED = msg.Result.RESULT_OPERATION_FAILED
+NOT_FOUND = msg.Result.RESULT_NOT_FOUND
 STATES = msg.SimulationState
 SHAPE = "kind: circle\nradius: 0.15\n"
 WORLD = "name: text\nsize: [5.0, 4.0]\ngoal_distance: [1.0, 3.0]\n"
-PATIENCE_S, IDLE_S = 300.0, 10.0
+PATIENCE_S = 300.0
+IDLE_S = 10.0
 
 
 class Client:
@@ -174,7 +177,8 @@ def _spawns_and_deletes(c: Client) -> bool:
 
 
 def _names_collide(c: Client) -> bool:
-    first, second = c.spawn("twin", 1.0), c.spawn("twin", 1.5)
+    first = c.spawn("twin", 1.0)
+    second = c.spawn("twin", 1.5)
     other = c.spawn("twin", 1.5, allow_renaming=True)
     codes = srv.SpawnEntity.Response
     refused = (
@@ -185,7 +189,8 @@ def _names_collide(c: Client) -> bool:
 
 
 def _spawns_several(c: Client) -> bool:
-    good, bad = spawn_request("one", 1.0), spawn_request("", 1.0)
+    good = spawn_request("one", 1.0)
+    bad = spawn_request("", 1.0)
     both = c("SpawnEntities", spawn_requests=[good, bad])
     codes = [each.result.result for each in both.results]
     failed = srv.SpawnEntities.Response.ENTITIES_SPAWN_FAILED
@@ -219,10 +224,8 @@ def _text_is_spawned(c: Client) -> bool:
 
 def _state_is_got(c: Client) -> bool:
     c.spawn("disc", 1.25)
-    one, none = (
-        c("GetEntityState", entity="disc"),
-        c("GetEntityState", entity="nothing"),
-    )
+    one = c("GetEntityState", entity="disc")
+    none = c("GetEntityState", entity="nothing")
     every = c("GetEntitiesStates", filters=msg.EntityFilters(filter="^disc$"))
     x = [one.state.pose.position.x, every.states[0].pose.position.x]
     return (
@@ -289,7 +292,8 @@ def _bounds(c: Client) -> bool:
     right = bounds.type == msg.Bounds.TYPE_BOX and abs(high.x - 0.15) < near > abs(
         low.x + 0.15
     )
-    inside, outside = sphere(1.0, 0.0, 0.05), sphere(-1.9, -1.9, 0.01)
+    inside = sphere(1.0, 0.0, 0.05)
+    outside = sphere(-1.9, -1.9, 0.01)
     return (
         right
         and "disc" in c.names(bounds=inside)
@@ -417,7 +421,8 @@ def _loads_text(c: Client) -> bool:
 def _unloads(c: Client) -> bool:
     unloaded = c.code("UnloadWorld") == OK
     state = int(c("GetSimulationState").state.state)
-    again, spawned = c.code("UnloadWorld"), c.spawn("disc").result.result
+    again = c.code("UnloadWorld")
+    spawned = c.spawn("disc").result.result
     wanted = [
         srv.UnloadWorld.Response.NO_WORLD_LOADED,
         msg.Result.RESULT_INCORRECT_STATE,

@@ -216,7 +216,8 @@ def _salvaged(bag: Path, sample: Sample, score: Score) -> None:
 
 def damage_bags(folder: Path, cuts: int, changes: int, seed: int) -> Score:
     """Cuts and changes so many bags, and counts what goes wrong."""
-    score, rng = Score(), np.random.default_rng(seed)
+    score = Score()
+    rng = np.random.default_rng(seed)
     every = samples(folder)
     for index, sample in enumerate(every):
         share = [n // len(every) + (index < n % len(every)) for n in (cuts, changes)]

@@ -266,7 +266,8 @@ class Engine:
 
 
 def _rotation_about_z(angle: float) -> Array:
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -329,7 +330,8 @@ class Driver(Node):
     def _drive_wheels(self) -> None:
         forward, turn = self._command
         if self.engine.time_s - self._command_time_s > COMMAND_TIMEOUT_S:
-            forward, turn = 0.0, 0.0
+            forward = 0.0
+            turn = 0.0
         left = (forward - 0.5 * BELIEVED_TRACK * turn) / WHEEL_RADIUS
         right = (forward + 0.5 * BELIEVED_TRACK * turn) / WHEEL_RADIUS
         wanted = np.array([left, right, left, right])

@@ -23,7 +23,8 @@ from nics_drl_bridge.middleware.middleware import Middleware
 def lie() -> None:
     """From now on every robot tells that it is at the goal of the episode."""
     goals: list[NDArray[np.float64]] = []
-    reset, view = BridgeEnv.reset, Middleware.view
+    reset = BridgeEnv.reset
+    view = Middleware.view
 
     def remembering(self: BridgeEnv, **given: Any) -> Any:
         goals.clear()
@@ -38,7 +39,8 @@ def lie() -> None:
             replace(seen, pose=np.array([*goals[0], seen.pose[2]])) if goals else seen
         )
 
-    BridgeEnv.reset, Middleware.view = remembering, lying  # type: ignore[method-assign]
+    BridgeEnv.reset = remembering  # type: ignore[method-assign]
+    Middleware.view = lying  # type: ignore[method-assign]
 
 
 def stand() -> None:

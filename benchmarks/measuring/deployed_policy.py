@@ -24,12 +24,14 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
-WANTED, DEADLINE_S = 20, 600.0
+WANTED = 20
+DEADLINE_S = 600.0
 
 
 def drive(name: str, policy: str, folder: Path) -> int:
     """How many commands came until there were enough."""
-    lidar, domain_id = open_model(name).lidar, free_domain_id()
+    lidar = open_model(name).lidar
+    domain_id = free_domain_id()
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain_id)
     node = rclpy.create_node("stand_in", context=context)
@@ -39,14 +41,16 @@ def drive(name: str, policy: str, folder: Path) -> int:
     node.create_subscription(TwistStamped, "cmd_vel_raw", heard.append, qos.COMMAND)
     scans = node.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
     odometry = node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-    ranges, still = np.full(lidar.beams, 2.0, np.float32), np.zeros(3)
+    ranges = np.full(lidar.beams, 2.0, np.float32)
+    still = np.zeros(3)
     parameters = {"model": name, "policy": policy, "goal": [2.0, 0.0]}
     with NodeProcess("policy_node", folder, parameters, domain_id) as process:
         end = time.monotonic() + DEADLINE_S
         while len(heard) < WANTED and time.monotonic() < end:
             process.check()
             now = time.time_ns()
-            frames, variance = ("odom", "base_link"), (1e-3, 1e-3, 1e-3, 1e-3)
+            frames = ("odom", "base_link")
+            variance = (1e-3, 1e-3, 1e-3, 1e-3)
             odometry.publish(
                 conversions.odometry_to_ros(still, still, now, frames, variance)
             )

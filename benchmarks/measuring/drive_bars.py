@@ -10,7 +10,8 @@ from typing import Any
 from measuring.truths import Truth
 
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLES, SHIPPED = ROOT / "examples" / "recordings", ROOT / "config" / "recordings"
+EXAMPLES = ROOT / "examples" / "recordings"
+SHIPPED = ROOT / "config" / "recordings"
 RECORDINGS = ROOT.parent / "shared" / "recordings"
 MOST_LINES = 25  # of a mapping, without comments
 COVERAGE = (0.9, 0.99)  # of the 95 % band
@@ -110,7 +111,8 @@ def missed_by(name: str, told: Mapping[str, Any], bars: Bars) -> Iterator[str]:
         if not bars.may_refuse:
             yield f"{name}: was refused: {told['refused']}"
         return
-    share, textbook = told["share_of_path"], told["yardstick_share"]
+    share = told["share_of_path"]
+    textbook = told["yardstick_share"]
     kept = told["constant_twist_share"]
     if bars.share is not None and not share <= bars.share:
         yield f"{name}: off by {share:.3f} of the path, bar {bars.share:g}"

@@ -46,7 +46,8 @@ def python_with(name: str, requirements: tuple[str, ...]) -> Path:
         NotInstalledError: pip could not install them.
     """
     folder = CACHE / f"{name}-py{sys.version_info[0]}.{sys.version_info[1]}"
-    python, ready = folder / "bin" / "python", folder / ".ready"
+    python = folder / "bin" / "python"
+    ready = folder / ".ready"
     wanted = "\n".join(requirements)
     if ready.is_file() and ready.read_text() == wanted:
         return python

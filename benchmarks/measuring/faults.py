@@ -17,7 +17,8 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.processes import NodeProcess
 
-SOON_S, LATE_S = 0.10, 0.40
+SOON_S = 0.10
+LATE_S = 0.40
 FROZEN_S = 0.5
 
 
@@ -118,7 +119,8 @@ def _alternate(around: Around) -> None:
 
 def _freeze_but_one(around: Around) -> None:
     """The same picture, in which one beam flickers."""
-    shown, sent = list(around.robot.last["scan"].ranges), [0]
+    shown = list(around.robot.last["scan"].ranges)
+    sent = [0]
 
     def change(message: LaserScan) -> LaserScan:
         sent[0] += 1

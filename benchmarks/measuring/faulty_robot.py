@@ -24,8 +24,11 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 
-ROBOT, PERIOD_S, SPEED = "ackermann", 0.1, 0.5
-PATIENCE_S, MOTION_S = 60.0, 10.0
+ROBOT = "ackermann"
+PERIOD_S = 0.1
+SPEED = 0.5
+PATIENCE_S = 60.0
+MOTION_S = 10.0
 RECENT_S = 0.15
 """The newest command must be younger, for the robot to be told to move now [s]."""
 ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
@@ -94,7 +97,9 @@ class Robot:
             for name, kind in kinds.items()
         }
         self.heard: list[tuple[float, np.ndarray]] = []
-        self._policy, self._speed, self._relayed = policy, speed, relayed
+        self._policy = policy
+        self._speed = speed
+        self._relayed = relayed
         self._past = (
             self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
             if relayed
@@ -113,7 +118,9 @@ class Robot:
         }
         self.node.create_timer(PERIOD_S, self._send)
         self._offset_ns = time.time_ns() - time.monotonic_ns()
-        self._now_ns, self._x, self.sent_s = 0, 0.0, dict.fromkeys(ALL, 0.0)
+        self._now_ns = 0
+        self._x = 0.0
+        self.sent_s = dict.fromkeys(ALL, 0.0)
         self.last: dict[str, Any] = {}
         self.mend()
 
@@ -121,7 +128,9 @@ class Robot:
         """Everything is well again."""
         self.silent: set[str] = set()
         self.change: dict[str, Callable[[Any], Any]] = {}
-        self.stuck, self.republished, self.jump_ns = False, False, 0
+        self.stuck = False
+        self.republished = False
+        self.jump_ns = 0
 
     def _listen(self) -> None:
         while self._ear.poll():
@@ -133,7 +142,8 @@ class Robot:
 
     def _send(self) -> None:
         speed = self.heard[-1][1][0] if self.heard and not self.stuck else 0.0
-        before, self._now_ns = self._now_ns, time.monotonic_ns() + self._offset_ns
+        before = self._now_ns
+        self._now_ns = time.monotonic_ns() + self._offset_ns
         self._x += speed * min(self._now_ns - before, NS_PER_S) / NS_PER_S
         stamp = self._now_ns + self.jump_ns
         odometry = conversions.odometry_to_ros(

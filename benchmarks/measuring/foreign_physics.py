@@ -29,8 +29,12 @@ def _grip(slip_x, slip_y, friction, load, softness):  # type: ignore[no-untyped-
 def _skid_steer(s, u, p, out):  # type: ignore[no-untyped-def]
     """Four wheels that skid: forces of friction on a body with mass."""
     mass, inertia, front, rear, half_track, friction, softness, lag = p[:8]
-    vx, vy, turn = s[3], s[4], s[5]
-    force_x, force_y, torque = 0.0, 0.0, 0.0
+    vx = s[3]
+    vy = s[4]
+    turn = s[5]
+    force_x = 0.0
+    force_y = 0.0
+    torque = 0.0
     for side in range(2):
         y = half_track if side == 0 else -half_track
         for x in (front, -rear):
@@ -38,9 +42,11 @@ def _skid_steer(s, u, p, out):  # type: ignore[no-untyped-def]
             fx, fy = _grip(
                 vx - turn * y - s[6 + side], vy + turn * x, friction, load, softness
             )
-            force_x, force_y = force_x + fx, force_y + fy
+            force_x = force_x + fx
+            force_y = force_y + fy
             torque += x * fy - y * fx
-    out[3], out[4] = force_x / mass + turn * vy, force_y / mass - turn * vx
+    out[3] = force_x / mass + turn * vy
+    out[4] = force_y / mass - turn * vx
     out[5] = torque / inertia
     out[6] = (u[0] - u[1] * half_track - s[6]) / lag
     out[7] = (u[0] + u[1] * half_track - s[7]) / lag
@@ -63,7 +69,9 @@ def _throttle_car(s, u, p, out):  # type: ignore[no-untyped-def]
         slip,
         yaw_lag,
     ) = p[:11]
-    v, angle, turn = s[3], s[4], s[5]
+    v = s[3]
+    angle = s[4]
+    turn = s[5]
     beyond = max(abs(u[0]) - dead, 0.0) / (1.0 - dead)
     push = math.copysign(beyond, u[0]) * pull
     out[3] = (
@@ -91,15 +99,19 @@ def _tricycle(s, u, p, out):  # type: ignore[no-untyped-def]
 def _omni(s, u, p, out):  # type: ignore[no-untyped-def]
     """Three wheels at 120 degrees, each with a motor of its own lag, on unequal radii."""
     arm = p[0]
-    vx, vy, turn = 0.0, 0.0, 0.0
+    vx = 0.0
+    vy = 0.0
+    turn = 0.0
     for i in range(3):
         at = math.pi / 3.0 + i * 2.0 * math.pi / 3.0
-        along_x, along_y = -math.sin(at), math.cos(at)
+        along_x = -math.sin(at)
+        along_y = math.cos(at)
         out[3 + i] = (along_x * u[0] + along_y * u[1] + arm * u[2] - s[3 + i]) / p[
             1 + i
         ]
         speed = p[4 + i] * s[3 + i]
-        vx, vy = vx + speed * along_x * 2.0 / 3.0, vy + speed * along_y * 2.0 / 3.0
+        vx = vx + speed * along_x * 2.0 / 3.0
+        vy = vy + speed * along_y * 2.0 / 3.0
         turn += speed / (3.0 * arm)
     return vx, vy, turn
 
@@ -125,21 +137,23 @@ def _rates(kind, s, u, p, out):  # type: ignore[no-untyped-def]
         vx, vy, turn = _omni(s, u, p, out)
     else:
         vx, vy, turn = _ticks(s, u, p, out)
-    c, sn = math.cos(s[2]), math.sin(s[2])
-    out[0], out[1], out[2] = c * vx - sn * vy, sn * vx + c * vy, turn
+    c = math.cos(s[2])
+    sn = math.sin(s[2])
+    out[0] = c * vx - sn * vy
+    out[1] = sn * vx + c * vy
+    out[2] = turn
 
 
 @kernel(allocates=True)
 def integrate(states, command, kind, p, dt):  # type: ignore[no-untyped-def]
     """Fills states (T + 1, 8) of which the first is given, under commands (T, C) of `dt` [s]."""
-    k1, k2, k3, k4 = (
-        np.zeros(STATES),
-        np.zeros(STATES),
-        np.zeros(STATES),
-        np.zeros(STATES),
-    )
+    k1 = np.zeros(STATES)
+    k2 = np.zeros(STATES)
+    k3 = np.zeros(STATES)
+    k4 = np.zeros(STATES)
     for t in range(len(command)):
-        s, u = states[t], command[t]
+        s = states[t]
+        u = command[t]
         _rates(kind, s, u, p, k1)
         _rates(kind, s + 0.5 * dt * k1, u, p, k2)
         _rates(kind, s + 0.5 * dt * k2, u, p, k3)

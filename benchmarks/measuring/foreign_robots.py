@@ -25,7 +25,9 @@ COMMAND_S = 0.05
 POSE_NOISE = np.array([0.0005, 0.0005, 0.001])  # standard deviations [m, m, rad]
 SEGMENT_S = (0.4, 2.5)
 LEVELS = 7  # commands that are held take one of so many levels of their range
-REST, RAMP = 0.1, 0.3  # shares of segments at zero, and of ramps
+# shares of segments at zero, and of ramps
+REST = 0.1
+RAMP = 0.3
 COUNTER = 2**16  # where the encoders' counters overflow
 
 
@@ -68,7 +70,9 @@ class ForeignRobot:
 
 def throttle_car() -> ForeignRobot:
     """A car of 1:10 by throttle: dead zone, motor curve, drag, understeer, slip."""
-    dead, pull, rolling = 0.1, 8.0, 0.25
+    dead = 0.1
+    pull = 8.0
+    rolling = 0.25
     values = (dead, pull, 7.0, rolling, 0.12, 0.26, 0.4, 0.06, 0.035, 0.015, 0.03)
     return ForeignRobot(
         physics.THROTTLE_CAR,
@@ -144,7 +148,8 @@ class ForeignDrive:
 
     def recording(self) -> Recording:
         """Returns the streams; counters as the wheel speeds [rad/s] up to the next stamp."""
-        command, turn = self.command, self.robot.ticks_per_turn
+        command = self.command
+        turn = self.robot.ticks_per_turn
         if turn:
             speed = np.diff(command.values, axis=0) / np.diff(command.t)[:, None]
             command = Stream(command.t[:-1], speed * 2.0 * np.pi / turn)
@@ -188,7 +193,8 @@ def foreign_drive(
 ) -> ForeignDrive:
     """Drives a robot by commands of many levels, holds, ramps and rests."""
     rng = np.random.default_rng(seed)
-    fine, stride = round(duration_s / STEP_S), round(robot.pose_s / STEP_S)
+    fine = round(duration_s / STEP_S)
+    stride = round(robot.pose_s / STEP_S)
     stamp = np.arange(0.0, duration_s, COMMAND_S)
     columns = [_varied(rng, stamp, low, high) for low, high in robot.commands.values()]
     values = np.stack(columns, axis=1)
@@ -224,9 +230,12 @@ def _slewed(command: Array, most: Array) -> Array:
 
 def _varied(rng: np.random.Generator, t: Array, low: float, high: float) -> Array:
     """Returns a command at times (T,): segments that rest, hold one of some levels, or ramp."""
-    values, k, before = np.zeros(len(t)), round(1.0 / COMMAND_S), 0.0
+    values = np.zeros(len(t))
+    k = round(1.0 / COMMAND_S)
+    before = 0.0
     while k < len(t):
-        count, draw = round(rng.uniform(*SEGMENT_S) / COMMAND_S), rng.random()
+        count = round(rng.uniform(*SEGMENT_S) / COMMAND_S)
+        draw = rng.random()
         level = (
             rng.choice(np.linspace(low, high, LEVELS)) if draw > REST + RAMP else 0.0
         )

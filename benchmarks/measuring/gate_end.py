@@ -19,7 +19,8 @@ from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.processes import NodeProcess
 
 END = "end_after_stops"
-PATIENCE_S, LIMIT_S = 60.0, 2.0
+PATIENCE_S = 60.0
+LIMIT_S = 2.0
 FIRST_S = 0.5
 """The first stop comes so soon after the first command that is no number."""
 
@@ -87,7 +88,8 @@ def end_after_stops(
         NoMotionError: the robot was not told to move.
     """
     robot.drive()
-    sent, first = [0], [math.inf]
+    sent = [0]
+    first = [math.inf]
 
     def change(message: TwistStamped) -> TwistStamped:
         sent[0] += 1

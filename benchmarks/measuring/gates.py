@@ -52,9 +52,12 @@ class Gate:
     """
 
     def __init__(self, config: GateConfig, lidar: LidarSpec) -> None:
-        self.config, self._lidar = config, lidar
+        self.config = config
+        self._lidar = lidar
         self.witness: Witness | None = None
-        self.state, self.now, self.stamp_ns = begin(config), START_S, NS_PER_S
+        self.state = begin(config)
+        self.now = START_S
+        self.stamp_ns = NS_PER_S
 
     def give(self, given: Input) -> Decision:
         """One input now."""

@@ -157,7 +157,8 @@ class Drive:
         self.case = case
         model = open_model(case.robot, case.lidar or None)
         lidar = model.lidar
-        period, every = 0.1, round(10.0 / case.rate)
+        period = 0.1
+        every = round(10.0 / case.rate)
         if (
             every < 2 or abs(10.0 / case.rate - every) > 0.05
         ):  # a whole number of the model's steps
@@ -179,7 +180,8 @@ class Drive:
             from nics_drl_bridge.lidar.bake import bake
 
             model = replace(model, table=bake(lidar, model.table.shapes))
-        self.model, self.period = model, period
+        self.model = model
+        self.period = period
         self.every = every
         self.rng = np.random.default_rng(seed)
         self.policy = None
@@ -229,7 +231,8 @@ class Drive:
     def step(self) -> NDArray[np.bool_]:
         """Steps all worlds and their gates; returns which worlds began another episode."""
         action = self._actions()
-        robot, data = self.model.robot, self.env.simulator.data
+        robot = self.model.robot
+        data = self.env.simulator.data
         commands = np.asarray(self.env.task.command(action)).reshape(
             len(self.gates), -1
         )
@@ -260,7 +263,8 @@ class Drive:
         return began
 
     def _watch(self, commands: Array, twists: Array, began: NDArray[np.bool_]) -> None:
-        robot, lidar = self.model.robot, self.model.lidar
+        robot = self.model.robot
+        lidar = self.model.lidar
         ranges = self.env.simulator.data.ranges[:, 0]
         angles = (lidar.angle_min, lidar.angle_increment)
         for i, gate in enumerate(self.gates):
@@ -287,7 +291,8 @@ def drive_freely(
     change: Callable[[GateConfig], GateConfig] = lambda config: config,
 ) -> Tally:
     """Drives robots freely, and counts by what their gates were stopped."""
-    drive, tally = Drive(case, worlds, seed, change, RuleAlone), Tally()
+    drive = Drive(case, worlds, seed, change, RuleAlone)
+    tally = Tally()
     for _ in range(round(seconds / drive.period)):
         drive.step()
         for gate in drive.gates:
@@ -312,7 +317,8 @@ class Hold:
     """
 
     def __init__(self, drive: Drive, index: int) -> None:
-        self._drive, self._index = drive, index
+        self._drive = drive
+        self._index = index
         self.release()
 
     def release(self) -> None:
@@ -336,7 +342,8 @@ class Hold:
 
     def step(self, began: bool, tally: Tally) -> None:
         """Accounts for a step, in which another episode may have begun."""
-        drive, gate = self._drive, self._drive.gates[self._index]
+        drive = self._drive
+        gate = self._drive.gates[self._index]
         held = drive.held[self._index]
         self._since_s += drive.period
         if began:
@@ -380,7 +387,8 @@ def hold_bodies(
     change: Callable[[GateConfig], GateConfig] = lambda config: config,
 ) -> Tally:
     """Holds bodies while they drive, and counts how long each was not stopped."""
-    drive, tally = Drive(case, worlds, seed, change), Tally()
+    drive = Drive(case, worlds, seed, change)
+    tally = Tally()
     bodies = [Hold(drive, index) for index in range(worlds)]
     for _ in range(round(MOST_S_EACH * holds / worlds / drive.period)):
         began = drive.step()

@@ -69,8 +69,10 @@ def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
     kinds = list(USES)
     while True:
         kind = kinds[int(rng.integers(len(kinds)))]
-        path, draw = folder / "hostile.yaml", rng.random()
-        use, text = USES[kind], _text_of(kind)
+        path = folder / "hostile.yaml"
+        draw = rng.random()
+        use = USES[kind]
+        text = _text_of(kind)
         if draw < 0.08:
             path.write_text(text, encoding="utf-8")
             yield Attempt("yaml", f"{kind} as shipped", _used(use, path), "good")
@@ -108,11 +110,10 @@ def _text_of(kind: str) -> str:
 
 def _syntax(rng: Rng, text: str) -> tuple[str, str]:
     """YAML that is never read, put behind a true file."""
-    n, times = int(rng.integers(4, 30)), int(rng.integers(2, 12))
-    base, value = (
-        "k0: &k0 {x: 1, y: 2}\n",
-        str(rng.choice(["[1]", '"%%"', "abc", "{a: 1}", '""'])),
-    )
+    n = int(rng.integers(4, 30))
+    times = int(rng.integers(2, 12))
+    base = "k0: &k0 {x: 1, y: 2}\n"
+    value = str(rng.choice(["[1]", '"%%"', "abc", "{a: 1}", '""']))
     merged = "".join(
         f"k{i}: &k{i} {{<<: [{_again(i, times)}]}}\n" for i in range(1, 3 * n)
     )
@@ -310,7 +311,8 @@ def _replaced(rng: Rng, text: str) -> tuple[str, str]:
     data: Any = parse_yaml(text, "shipped")
     told = []
     for _ in range(int(rng.integers(1, 3))):
-        inner, place = data, []
+        inner = data
+        place = []
         while True:
             keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
             key = keys[int(rng.integers(len(keys)))]

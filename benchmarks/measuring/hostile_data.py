@@ -64,9 +64,11 @@ def _whole(folder: Path) -> Whole:
     save_recording(drive, folder / "whole.npz")
     lidar = load_lidar("paper")
     config = gate_config(load_robot("differential"), lidar)
-    box, gate = black_box.BlackBox(config), Gate(config, lidar)
+    box = black_box.BlackBox(config)
+    gate = Gate(config, lidar)
     for _ in range(20):
-        before, gate.now = gate.state, gate.now + 0.02
+        before = gate.state
+        gate.now = gate.now + 0.02
         box.note(black_box.Entry(gate.now, Tick(), before, gate.tick()))
     black_box.write(config, box.copy(), folder / "whole.jsonl")
     save_model(builtin_model(ROBOT), folder / "whole_model")
@@ -126,13 +128,16 @@ def _zip(parts: dict[str, bytes]) -> bytes:
 def _recording(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     with np.load(whole.recording) as held:
         arrays = dict(held)
-    way, rows = int(rng.integers(8)), int(10 ** rng.uniform(8, 18))
+    way = int(rng.integers(8))
+    rows = int(10 ** rng.uniform(8, 18))
     name = str(rng.choice([key for key in arrays if key != "meta"]))
     parts = {
         key: _npy(repr(a.dtype.str), str(a.shape), a.tobytes())
         for key, a in arrays.items()
     }
-    path, told, verdict = folder / "drive.npz", f"way {way}, {name}, {rows}", "bad"
+    path = folder / "drive.npz"
+    told = f"way {way}, {name}, {rows}"
+    verdict = "bad"
     if way == 0:
         parts[name] = _npy("'<f8'", f"({rows},)", b"")
     elif way == 1:
@@ -152,13 +157,15 @@ def _recording(rng: Rng, folder: Path, whole: Whole) -> Attempt:
         parts = {"meta": _npy_of(np.array(json.dumps(meta)))} | {
             k: v for k, v in parts.items() if k != "meta"
         }
-        told, verdict = f"meta {key}", "any"
+        told = f"meta {key}"
+        verdict = "any"
     elif way == 6:
         parts["meta"] = _npy_of(np.array("[" * 100_000))
     else:
         other = arrays[name].astype(str(rng.choice(["S8", "c16", "?", "i1"])))
         parts[name] = _npy_of(other)
-        told, verdict = f"{name} of type {other.dtype}", "any"
+        told = f"{name} of type {other.dtype}"
+        verdict = "any"
     path.write_bytes(_zip(parts))
     words = ("generate", path, "--robot", ROBOT, "--out", folder / "out")
     act = nics(*words) if rng.random() < 0.2 else _read(path)
@@ -181,7 +188,8 @@ def _csv(rng: Rng, folder: Path) -> Attempt:
     place.mkdir()
     rows = [f"0.5,0.0,{k / 10}" for k in range(300)]
     poses = [f"{k / 20},0,0,0,0,0,1,{k * 100_000_000}" for k in range(300)]
-    way, at = int(rng.integers(6)), int(rng.integers(300))
+    way = int(rng.integers(6))
+    at = int(rng.integers(300))
     if way == 0:
         rows[at] = "1" * int(rng.integers(10**6, 6 * 10**7))
     elif way == 1:
@@ -225,7 +233,8 @@ def _bag(rng: Rng, folder: Path, whole: Whole) -> Attempt:
         "all to one",
     )
     way = str(rng.choice(ways))
-    one, text = topics[k], ""
+    one = topics[k]
+    text = ""
     if way == "no name":
         del one["topic_metadata"]["name"]
     elif way in ("other name", "empty name"):
@@ -259,7 +268,8 @@ def _bag(rng: Rng, folder: Path, whole: Whole) -> Attempt:
 
 def _box(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     lines = [json.loads(line) for line in whole.box.read_text().splitlines()[:-1]]
-    size, way = int(10 ** rng.uniform(6, 18)), int(rng.integers(6))
+    size = int(10 ** rng.uniform(6, 18))
+    way = int(rng.integers(6))
     array = {"kind": "array", "type": "<f8", "shape": [size], "data": ""}
     record = lines[int(rng.integers(1, len(lines)))]
     if way == 0:
@@ -333,11 +343,9 @@ def _model(rng: Rng, folder: Path, whole: Whole) -> Attempt:
 
 def _table(rng: Rng, place: Path) -> Attempt:
     """A table with one array of a false header, whose checksums are right."""
-    name, way, size = (
-        str(rng.choice(ARRAYS)),
-        int(rng.integers(5)),
-        int(10 ** rng.uniform(8, 30)),
-    )
+    name = str(rng.choice(ARRAYS))
+    way = int(rng.integers(5))
+    size = int(10 ** rng.uniform(8, 30))
     ways = (
         _npy("'<f4'", f"({size},)", b""),
         _npy("'<f4'", f"({2**32}, {2**32})", b""),

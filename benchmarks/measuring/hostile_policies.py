@@ -17,7 +17,8 @@ from nics_drl_bridge.policy.contract import shipped
 from nics_drl_bridge.policy.policy_file import load_policy
 
 Rng = np.random.Generator
-node, from_array = onnx.helper.make_node, onnx.numpy_helper.from_array
+node = onnx.helper.make_node
+from_array = onnx.numpy_helper.from_array
 
 
 def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
@@ -66,7 +67,8 @@ def _with_contract(proto: Any, text: str) -> bytes:
 
 def _grown(rng: Rng, name: str) -> tuple[str, bytes, str]:
     """A graph that takes memory or time, in front of the true one."""
-    proto, width = _proto(name), 78
+    proto = _proto(name)
+    width = 78
     kind = str(rng.choice(list(_GROWN)))
     amount = int(rng.integers(1, 9))
     nodes, arrays = _GROWN[kind](amount, width)
@@ -221,15 +223,18 @@ def _false(rng: Rng, name: str) -> tuple[str, bytes, str]:
 
 
 def _field(number: int, content: bytes) -> bytes:
-    size, length = len(content), b""
+    size = len(content)
+    length = b""
     while size >= 0x80:
-        length, size = length + bytes([size & 0x7F | 0x80]), size >> 7
+        length = length + bytes([size & 0x7F | 0x80])
+        size = size >> 7
     return bytes([number << 3 | 2]) + length + bytes([size]) + content
 
 
 def _raw(rng: Rng, name: str) -> tuple[str, bytes, str]:
     """Messages as no library would write them, or other contracts than JSON objects."""
-    amount, which = int(rng.integers(1, 8)), int(rng.integers(8))
+    amount = int(rng.integers(1, 8))
+    which = int(rng.integers(8))
     if which < 4:
         inner = (
             _field(1, b"") * (800_000 * amount),  # operators

@@ -79,7 +79,8 @@ class Simulator:
         owner = self.env if self.compiled is None else self.compiled
         # What their step calls, so that a scan alone is the same work as the scan within a step.
         name = "_objects_sensor_step" if self.compiled is None else "_fast_sensor_step"
-        self.owner, self.name = owner, name
+        self.owner = owner
+        self.name = name
 
     def begin(self, scene: dict) -> None:
         """Begins an episode in another scene, by no more than it takes: `reset` would draw."""
@@ -131,14 +132,22 @@ class Task:
     def __init__(
         self, simulator: Simulator, scenes: list, about: dict, one_scan: bool
     ) -> None:
-        self.simulator, self.scenes, self.about = simulator, scenes, about
-        self.one_scan, self.rng = one_scan, np.random.default_rng(0)
-        self.at, self.periods, self.ended, self.moved, self.changed = -1, 0, 0, 0.0, 0
+        self.simulator = simulator
+        self.scenes = scenes
+        self.about = about
+        self.one_scan = one_scan
+        self.rng = np.random.default_rng(0)
+        self.at = -1
+        self.periods = 0
+        self.ended = 0
+        self.moved = 0.0
+        self.changed = 0
         self.next()
 
     def next(self) -> None:
         """Begins the next episode."""
-        self.at, self.steps = self.at + 1, 0
+        self.at = self.at + 1
+        self.steps = 0
         self.scene = self.scenes[self.at % len(self.scenes)]
         self.simulator.begin(self.scene)
         self.distance, bearing = self.towards()
@@ -147,7 +156,8 @@ class Task:
     def towards(self) -> tuple[float, float]:
         """Distance [m] and bearing [rad] of the goal."""
         x, y, heading = self.simulator.env.robot.state[:3, 0]
-        dx, dy = self.scene["goal"][0] - x, self.scene["goal"][1] - y
+        dx = self.scene["goal"][0] - x
+        dy = self.scene["goal"][1] - y
         return math.hypot(dx, dy), math.atan2(dy, dx) - heading
 
     def observation(self, distance: float, bearing: float) -> np.ndarray:
@@ -176,17 +186,21 @@ class Task:
 
     def period(self) -> float:
         """Motion, scan, observation, reward, and the next episode's begin."""
-        about, before, robot = self.about, self.distance, self.simulator.env.robot
+        about = self.about
+        before = self.distance
+        robot = self.simulator.env.robot
         action = np.array([[self.rng.uniform(0.0, 1.0)], [self.rng.uniform(-2.0, 2.0)]])
         was_seen, (x, y) = self.seen, robot.state[:2, 0].tolist()
         self.drive(action)
-        self.steps, self.periods = self.steps + 1, self.periods + 1
+        self.steps = self.steps + 1
+        self.periods = self.periods + 1
         self.distance, bearing = self.towards()
         self.seen = self.observation(self.distance, bearing)
         beams = about["beams"]
         self.changed += int(np.count_nonzero(self.seen[:beams] != was_seen[:beams]))
         self.moved += math.hypot(robot.state[0, 0] - x, robot.state[1, 0] - y)
-        touched, there = self.simulator.touched, self.distance < about["goal_radius"]
+        touched = self.simulator.touched
+        there = self.distance < about["goal_radius"]
         reward = before - self.distance - 0.01 + 10.0 * there - 10.0 * touched
         if touched or there or self.steps >= about["limit"]:
             self.ended += 1
@@ -205,8 +219,10 @@ class Readings:
     """All readings, each a little further in every round."""
 
     def __init__(self, given: dict) -> None:
-        self.scenes, about = given["scenes"], given["about"]
-        self.simulator, self.at = Simulator(self.scenes[0], about), 0
+        self.scenes = given["scenes"]
+        about = given["about"]
+        self.simulator = Simulator(self.scenes[0], about)
+        self.at = 0
         self.alone = getattr(self.simulator, given["alone"])
         self.rng = np.random.default_rng(1)
         self.tasks = {

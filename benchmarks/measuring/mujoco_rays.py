@@ -13,7 +13,9 @@ from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 
 Array = NDArray[np.float64]
-HEIGHT, LIDAR_HEIGHT, THIN = 0.5, 0.2, 0.01
+HEIGHT = 0.5
+LIDAR_HEIGHT = 0.2
+THIN = 0.01
 
 
 def geoms(shape: Shape, pose: Array, number: int) -> tuple[str, str]:

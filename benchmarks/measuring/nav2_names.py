@@ -65,7 +65,8 @@ def wanted(file: Path) -> tuple[set[str], set[str]]:
     """Topics and frames that a parameter file names and that Nav2 does not make itself."""
     text = file.read_text(encoding="utf-8")
     named = list(values(yaml.safe_load(text)))
-    topics, frames = set(ALWAYS), set[str]()
+    topics = set(ALWAYS)
+    frames = set[str]()
     for key, value in named:
         name = value.strip("/")
         if (
@@ -105,7 +106,8 @@ def unserved_topics(node: Node, topics: set[str]) -> list[str]:
 
 
 def _fault(node: Node, topic: str) -> str:
-    kind, name = TYPES.get(topic), f"/{topic}"
+    kind = TYPES.get(topic)
+    name = f"/{topic}"
     if kind is None:
         return f"{topic}: nothing of that name is known"
     look = "subscriptions" if topic in HEARD else "publishers"

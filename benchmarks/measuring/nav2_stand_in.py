@@ -38,8 +38,11 @@ class StandIn:
         self.node = node = Node("behaviour_tree", context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(node)
-        self.kind, self.client = kind, ActionClient(node, kind, "follow_path")
-        self.maps, self.truths, self.feedback = list[Any](), list[Any](), list[Any]()
+        self.kind = kind
+        self.client = ActionClient(node, kind, "follow_path")
+        self.maps = list[Any]()
+        self.truths = list[Any]()
+        self.feedback = list[Any]()
         self._commands = node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self.poses = node.create_publisher(
             PoseWithCovarianceStamped, "initialpose", qos.COMMAND
@@ -92,11 +95,10 @@ class StandIn:
 
     def place(self, pose: Array) -> None:
         """Says where the robot is to simulator and policy."""
-        message, placed = (
-            PoseWithCovarianceStamped(),
-            conversions.pose_to_ros(pose, 0, "map"),
-        )
-        message.header, message.pose.pose = placed.header, placed.pose
+        message = PoseWithCovarianceStamped()
+        placed = conversions.pose_to_ros(pose, 0, "map")
+        message.header = placed.header
+        message.pose.pose = placed.pose
         self.poses.publish(message)
 
     def plan(self, goal: Array, radius: float) -> Path:

@@ -47,7 +47,8 @@ READINGS = (
     "period_with_ten_scans",
 )
 MODEL = open_model("differential")
-RADIUS, CIRCLES = 0.15, 10
+RADIUS = 0.15
+CIRCLES = 10
 WORLD = World.model_validate(
     {
         "name": "ten circles",

@@ -41,5 +41,6 @@ def core_seconds(pid: int) -> float:
     """Time that all threads of a process have spent on a core so far [s], user and system."""
     # The name, in parentheses, may hold anything; the fields behind it are numbers.
     fields = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()
-    user, system = int(fields[11]), int(fields[12])
+    user = int(fields[11])
+    system = int(fields[12])
     return (user + system) / os.sysconf("SC_CLK_TCK")

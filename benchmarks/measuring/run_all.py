@@ -33,15 +33,19 @@ SCRIPTS = Path(__file__).resolve().parents[1]
 RESULTS = SCRIPTS / "results.json"
 QUICK_RESULTS = SCRIPTS.parent / "runs" / "quick_results.json"
 """A short pass does not replace the figures that are told."""
-MET, MISSED, BROKEN = "met", "missed", "broken"
+MET = "met"
+MISSED = "missed"
+BROKEN = "broken"
 MARK = "NICS_BENCHMARK_RUN"
 """The environment variable by which the processes of a run are found again."""
-GRACE_S, LAST_WORDS = 10.0, 2000
+GRACE_S = 10.0
+LAST_WORDS = 2000
 
 
 def marked(mark: str) -> list[int]:
     """The processes that a run has started, wherever they have gone since."""
-    wanted, found = f"{MARK}={mark}".encode(), []
+    wanted = f"{MARK}={mark}".encode()
+    found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             environment = (folder / "environ").read_bytes().split(b"\0")
@@ -91,7 +95,8 @@ def judged(
     """State, failures, result and error of a run that ended with a code, `None` if it was ended."""
     told = (result or {}).pop("failures", None)
     failures = [str(each) for each in told] if isinstance(told, list) else []
-    state, error = BROKEN, None
+    state = BROKEN
+    error = None
     if code is None:
         error = "was ended, since it took too long"
     elif code not in (0, 1):
@@ -121,7 +126,9 @@ def judged(
 def run_one(script: Path, arguments: Sequence[str], timeout_s: float) -> dict[str, Any]:
     """Runs a script to its end, or ends it; no process of it stays."""
     mark = uuid.uuid4().hex
-    before, began, started = load(), time.monotonic(), datetime.now(timezone.utc)
+    before = load()
+    began = time.monotonic()
+    started = datetime.now(timezone.utc)
     with (
         tempfile.TemporaryFile() as out,
         tempfile.TemporaryFile() as err,
@@ -208,7 +215,8 @@ def run_all(
     runs: Mapping[str, Run], given: argparse.Namespace
 ) -> dict[str, dict[str, Any]]:
     """Runs all, one after the other, and writes the file after each."""
-    commit, machine = commit_of(given.scripts.parent), describe()
+    commit = commit_of(given.scripts.parent)
+    machine = describe()
     every = runs_of(given.scripts)
     entries = {name: one for name, one in known(given.out).items() if name in every}
     done: dict[str, dict[str, Any]] = {}

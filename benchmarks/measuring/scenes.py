@@ -22,7 +22,8 @@ SCENES: dict[str, tuple[Shape, ...]] = {
     "strip": (STRIP,),
     "mixture": (CIRCLE, SQUARE, STRIP),
 }
-OBSTACLES, BATCH = 10, 1024
+OBSTACLES = 10
+BATCH = 1024
 SPEC = load_lidar("paper")
 
 
@@ -109,8 +110,10 @@ def nearest_row(batch: Batch, table: LidarTable, spec: LidarSpec = SPEC) -> Batc
         x, y, heading = batch.poses[:, k].T
         h = table.outlines.index_of(shape)
         grid = np.linspace(shape.radius, table.grid[h, 0], table.density.distances)
-        distance, bearing = np.hypot(x, y), np.arctan2(y, x)
-        step, turn = grid[1] - grid[0], 2.0 * np.pi / table.density.rotations
+        distance = np.hypot(x, y)
+        bearing = np.arctan2(y, x)
+        step = grid[1] - grid[0]
+        turn = 2.0 * np.pi / table.density.rotations
         row = np.clip(np.rint((distance - grid[0]) / step), 0, len(grid) - 1).astype(
             int
         )

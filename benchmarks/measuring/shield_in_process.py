@@ -31,7 +31,8 @@ class Delays:
     """
 
     def __init__(self, rng: np.random.Generator, most_s: float) -> None:
-        self._rng, self._last = rng, 0
+        self._rng = rng
+        self._last = 0
         self._most = rng.uniform(0.0, most_s / STEP_S)
 
     def arrival(self, step: int) -> int:
@@ -48,7 +49,8 @@ def config_of(place: Place, shield: dict[str, float] | None) -> GateConfig:
         place: whose robot it guards.
         shield: values that go before the shipped ones; None for no shield.
     """
-    robot, given = place.model.robot, None
+    robot = place.model.robot
+    given = None
     if shield is not None:
         limits = load_limits(place.robot, robot)
         given = shield_config(place.model, limits, place.robot, shield)[0]
@@ -76,25 +78,26 @@ def _episode(
     place: Place, config: GateConfig, job: Job, witness: Witness | None
 ) -> Outcome:
     place.begin(job)
-    gate, lidar = Gate(config, place.model.lidar), place.model.lidar
+    gate = Gate(config, place.model.lidar)
+    lidar = place.model.lidar
     gate.witness = witness
     truth = place.truth
     gate.arm(truth.ranges, place.odom)
     rng = np.random.default_rng([11, job.seed, *place.model.robot.name.encode()])
-    to_gate, behind = Delays(rng, MOST_SCAN_LATE_S), Delays(rng, MOST_TOLD_LATE_S)
+    to_gate = Delays(rng, MOST_SCAN_LATE_S)
+    behind = Delays(rng, MOST_TOLD_LATE_S)
     to_base = Delays(rng, MOST_TOLD_LATE_S)
-    begun, step = gate.now, 0
+    begun = gate.now
+    step = 0
     coming: deque[tuple[int, Input]] = deque()
     commands: deque[tuple[int, Command]] = deque()
     told = deque([(0, np.zeros(3))])
     while not place.ended:
         gate.now = begun + step * STEP_S
         if step % SCAN_STEPS == 0:
-            truth, stamp, seen = (
-                place.truth,
-                round(gate.now * NS_PER_S),
-                to_gate.arrival(step),
-            )
+            truth = place.truth
+            stamp = round(gate.now * NS_PER_S)
+            seen = to_gate.arrival(step)
             scan = Scan(stamp, truth.ranges, (lidar.angle_min, lidar.angle_increment))
             coming += [
                 (seen, Odometry(stamp, place.odom.copy(), truth.twist)),

@@ -34,7 +34,8 @@ from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.nodes.runner import open_context
 
 Array = NDArray[np.float64]
-REST_S, PATIENCE_S = 1.3, 120.0
+REST_S = 1.3
+PATIENCE_S = 120.0
 BEHIND_S = 0.15
 """When this process itself was held up for longer, no base kept the latency that its shield was
 told: the worlds stood still meanwhile, and the running episodes are driven again."""
@@ -64,8 +65,10 @@ class HeldUp:
 
     def add(self, more: HeldUp) -> None:
         """Sums up."""
-        self.count, self.seconds = self.count + more.count, self.seconds + more.seconds
-        self.of_s, self.repeated = self.of_s + more.of_s, self.repeated + more.repeated
+        self.count = self.count + more.count
+        self.seconds = self.seconds + more.seconds
+        self.of_s = self.of_s + more.of_s
+        self.repeated = self.repeated + more.repeated
 
 
 class Lane:
@@ -84,9 +87,12 @@ class Lane:
     def __init__(
         self, node: Node, name: str, place: Place, jobs: Sequence[Job]
     ) -> None:
-        self.place, self.outcomes = place, list[Outcome]()
+        self.place = place
+        self.outcomes = list[Outcome]()
         self._jobs = deque(jobs)
-        self._told, self._told_s, self._begun_s = np.zeros(3), -np.inf, np.inf
+        self._told = np.zeros(3)
+        self._told_s = -np.inf
+        self._begun_s = np.inf
         self._scan, self._odom, self._estimate, self._e_stop, self._raw = (
             node.create_publisher(kind, f"{name}/{topic}", qos.COMMAND)
             for kind, topic in (
@@ -103,7 +109,10 @@ class Lane:
             for service in ("arm", "reset")
         }
         self._asked: Future | None = None
-        self._asks, self._driving, self._rested, self._tries = "arm", False, 0, 1
+        self._asks = "arm"
+        self._driving = False
+        self._rested = 0
+        self._tries = 1
         self.refused = "nobody answers"
         if self._jobs:
             place.begin(self._jobs[0])
@@ -114,12 +123,14 @@ class Lane:
         return not self._jobs
 
     def _hear(self, message: Twist) -> None:
-        now, outcome = time.monotonic(), self.place.outcome
+        now = time.monotonic()
+        outcome = self.place.outcome
         if self._driving:
             outcome.silence = max(
                 outcome.silence, now - max(self._told_s, self._begun_s)
             )
-        self._told, self._told_s = conversions.twist_from_ros(message), now
+        self._told = conversions.twist_from_ros(message)
+        self._told_s = now
 
     def step(self, stamp_ns: int, speaks: bool) -> None:
         """Moves on by a step, and says what the robot's devices would, if it is time."""
@@ -136,7 +147,8 @@ class Lane:
             self._say(stamp_ns)
 
     def _say(self, stamp_ns: int) -> None:
-        truth, model = self.place.truth, self.place.model
+        truth = self.place.truth
+        model = self.place.model
         twist = truth.twist if self._driving else np.zeros(3)
         odometry = conversions.odometry_to_ros(
             self.place.odom, twist, stamp_ns, ("odom", "base_link"), VARIANCES
@@ -161,7 +173,9 @@ class Lane:
             return
         if not self._asked.done():
             return
-        answer, asked, self._asked = self._asked.result(), self._asks, None
+        answer = self._asked.result()
+        asked = self._asks
+        self._asked = None
         self._asks = "arm"
         if asked == "arm" and answer.success:
             self._driving, self._begun_s = True, time.monotonic()
@@ -192,7 +206,8 @@ class Lane:
         return True
 
     def _rest(self) -> None:
-        self._driving, self._rested = False, 0
+        self._driving = False
+        self._rested = 0
         if self._jobs:
             self.place.begin(self._jobs[0])
 
@@ -232,9 +247,11 @@ def drive(
         stack.callback(node.destroy_node)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
-        lanes, gates = [], []
+        lanes = []
+        gates = []
         for index, (place, some) in enumerate(zip(places, jobs, strict=True)):
-            name, logs = f"robot{index + 1}", folder / f"robot{index + 1}"
+            name = f"robot{index + 1}"
+            logs = folder / f"robot{index + 1}"
             given = {
                 "model": place.robot,
                 "limits": place.robot,
@@ -262,16 +279,22 @@ def _run(
     tell: Callable[[str], None],
 ) -> HeldUp:
     """Moves the worlds by the wall clock until all episodes are driven; how well it kept up."""
-    epoch_ns, began, step, held_up = time.time_ns(), time.monotonic(), 0, HeldUp()
+    epoch_ns = time.time_ns()
+    began = time.monotonic()
+    step = 0
+    held_up = HeldUp()
     start = began
-    last, count, told = began, 0, began
+    last = began
+    count = 0
+    told = began
     while not all(lane.done for lane in lanes):
         ahead = began + step * STEP_S - time.monotonic()
         if ahead > 0.0:
             executor.spin_once(timeout_sec=ahead)
             continue
         if -ahead > BEHIND_S:
-            began, epoch_ns = began - ahead, epoch_ns - round(ahead * NS_PER_S)
+            began = began - ahead
+            epoch_ns = epoch_ns - round(ahead * NS_PER_S)
             if voided := sum(
                 lane.void() for lane in lanes
             ):  # not while the gates start
@@ -282,9 +305,11 @@ def _run(
         step += 1
         for _ in lanes:  # a command of each, also where there was no time to wait
             executor.spin_once(timeout_sec=0.0)
-        now, driven = time.monotonic(), sum(len(lane.outcomes) for lane in lanes)
+        now = time.monotonic()
+        driven = sum(len(lane.outcomes) for lane in lanes)
         if driven > count:
-            count, last = driven, now
+            count = driven
+            last = now
         if now - told > 30.0:
             told = now
             waiting = {lane.refused for lane in lanes if not lane.done}

@@ -27,8 +27,11 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
 Array = NDArray[np.float64]
-STEP_S, SCAN_STEPS, BASE_STEPS = 0.02, 5, 5
-ADVERSARY_S, GOAL_S = 5.0, 25.0
+STEP_S = 0.02
+SCAN_STEPS = 5
+BASE_STEPS = 5
+ADVERSARY_S = 5.0
+GOAL_S = 25.0
 MOVING, MOVING_STEPS = 0.02, 10
 """A robot whose true place moved more slowly than that, over so many steps before a touch, stood
 and was walked into [m/s]. At rest the car's own noise shakes it by up to 0.012 m/s."""
@@ -99,7 +102,8 @@ class Place:
     """
 
     def __init__(self, robot: str, world: str) -> None:
-        self.robot, self.world = robot, world
+        self.robot = robot
+        self.world = world
         model = builtin_model(robot)
         lidar = model.lidar.model_copy(update={"rate": 1.0 / (SCAN_STEPS * STEP_S)})
         self.model = replace(model, lidar=lidar)
@@ -113,7 +117,8 @@ class Place:
 
     def begin(self, job: Job) -> None:
         """Places the robot in the scene of a job; it stands."""
-        self.job, self._steps = job, 0
+        self.job = job
+        self._steps = 0
         self._sim.reset([job.seed])
         self._begun, self._anchor = self._sim.data.odom[0, 0].copy(), self.odom.copy()
         self._lately = deque(
@@ -134,7 +139,8 @@ class Place:
     @property
     def truth(self) -> Truth:
         """All that there is to know now."""
-        data, obstacles = self._sim.data, self._sim.obstacles[0]
+        data = self._sim.data
+        obstacles = self._sim.obstacles[0]
         return Truth(
             data.pose[0, 0].copy(),
             data.twist[0, 0].copy(),
@@ -151,7 +157,8 @@ class Place:
 
     def step(self, told: Array) -> None:
         """Moves on by `STEP_S`; `told` (3,) is what `cmd_vel` says now."""
-        data, outcome = self._sim.data, self.outcome
+        data = self._sim.data
+        outcome = self.outcome
         if (self._steps + self._phase) % BASE_STEPS == 0:
             self._command[0, 0] = self.model.robot.from_cmd_vel(told)
         touched = bool(data.collided[0, 0])

@@ -42,7 +42,8 @@ def _grown(blocked: NDArray[np.bool_], wide: int) -> NDArray[np.bool_]:
     for i in range(-wide, wide + 1):
         for j in range(-wide, wide + 1):
             if math.hypot(i, j) <= wide:
-                near, beside = rows + i, columns + j
+                near = rows + i
+                beside = columns + j
                 fits = (
                     (near >= 0)
                     & (near < out.shape[0])
@@ -56,7 +57,8 @@ def _grown(blocked: NDArray[np.bool_], wide: int) -> NDArray[np.bool_]:
 def _search(blocked: NDArray[np.bool_]) -> list[tuple[int, int]] | None:
     """Dijkstra's search from the row of the field's begin to its last row."""
     first = round((barn.PATH_CORNER[1] - barn.CORNER[1]) / barn.CELL)
-    middle, last = blocked.shape[1] // 2, blocked.shape[0] - 1
+    middle = blocked.shape[1] // 2
+    last = blocked.shape[0] - 1
     starts = [
         (abs(j - middle), (first, j))
         for j in range(blocked.shape[1])

@@ -19,7 +19,8 @@ class Standing:
     """
 
     def __init__(self, task: Task) -> None:
-        robot, rest = task.robot, still(task.robot)
+        robot = task.robot
+        rest = still(task.robot)
         if isinstance(task.action_space, gymnasium.spaces.Discrete):
             off = np.abs(discrete_commands(robot) - rest).sum(axis=1)
             self._action = np.asarray(off.argmin())

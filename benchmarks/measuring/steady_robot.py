@@ -20,8 +20,10 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter
 
-ROBOT, SPEED = "ackermann", 0.5
-SCAN_HZ, ODOM_HZ = 10, 50
+ROBOT = "ackermann"
+SPEED = 0.5
+SCAN_HZ = 10
+ODOM_HZ = 50
 PATIENCE_S = 120.0
 
 
@@ -44,7 +46,8 @@ class SteadyRobot:
         self._scans = ScanWriter(
             conversions.scan_to_ros(lidar, self._ranges, 0, "laser")
         )
-        frames, variance = ("odom", "base_link"), (1e-4,) * 4
+        frames = ("odom", "base_link")
+        variance = (1e-4,) * 4
         self._odometries = OdometryWriter(
             conversions.odometry_to_ros(np.zeros(3), np.zeros(3), 0, frames, variance)
         )
@@ -60,7 +63,10 @@ class SteadyRobot:
             for name, kind in kinds.items()
         }
         self.heard: list[tuple[float, bool]] = []
-        self.sent, self._x, self._speed, self._stamp_ns = 0, 0.0, 0.0, 0
+        self.sent = 0
+        self._x = 0.0
+        self._speed = 0.0
+        self._stamp_ns = 0
         self.mad = False
         self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.EVERY_COMMAND)
         self.node.create_timer(1.0 / ODOM_HZ, self._send)
@@ -114,7 +120,8 @@ class SteadyRobot:
 
     def drive(self) -> None:
         """Arms the gate as soon as it lets itself be armed. Raises RuntimeError."""
-        end, told = time.monotonic() + PATIENCE_S, ""
+        end = time.monotonic() + PATIENCE_S
+        told = ""
         while not self.moves:
             if time.monotonic() > end:
                 raise RuntimeError(f"not within {PATIENCE_S} s: motion ({told})")

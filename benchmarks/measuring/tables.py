@@ -31,7 +31,10 @@ PLACEHOLDER = re.compile(
     r"(?: x(?P<factor>[0-9.e+-]+))?(?:\|(?P<format>[^{}]*))?\}"
 )
 HOW = {"max": max, "min": min, "sum": sum, "mean": mean, "harmonic_mean": harmonic_mean}
-NOT_MEASURED, OF_MISSED, OF_QUICK, ELSEWHERE = "not measured", "†", "‡", "§"
+NOT_MEASURED = "not measured"
+OF_MISSED = "†"
+OF_QUICK = "‡"
+ELSEWHERE = "§"
 VERSIONS = ("numba", "numpy")
 MOST_TOLD = 3  # bars that a run missed; of more, one fewer and how many more there are
 MACHINE = "machine"
@@ -47,7 +50,8 @@ def found_at(value: Any, keys: Sequence[str]) -> Iterator[Any]:
     if not keys:
         yield value
         return
-    key, rest = keys[0], keys[1:]
+    key = keys[0]
+    rest = keys[1:]
     if key == "*":
         values = value.values() if isinstance(value, Mapping) else value
         for each in values if isinstance(value, Mapping | list) else ():
@@ -221,7 +225,8 @@ def main() -> None:
         "--check", action="store_true", help="write nothing, end with 1 if unlike"
     )
     given = parser.parse_args()
-    page, stale = open_page(), []
+    page = open_page()
+    stale = []
     for path in documents():
         before = path.read_text(encoding="utf-8")
         after = rendered(before, page)

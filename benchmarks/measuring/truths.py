@@ -14,8 +14,12 @@ from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 STANDARD_ERRORS = 3.0  # by how many a mounting may be off
-LATENCY_S, DEAD_ZONE, WHEELS = 0.005, 0.1, 0.02  # absolute; shares of the true value
-SETTLED_S, SLOW = 8.0, 2.0  # until a model has settled; a wheel speed [rad/s]
+# absolute; shares of the true value
+LATENCY_S = 0.005
+DEAD_ZONE = 0.1
+WHEELS = 0.02
+SETTLED_S = 8.0  # until a model has settled
+SLOW = 2.0  # a wheel speed [rad/s]
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,8 @@ class Truth:
 
 def compared(found: Identified, truth: Truth) -> dict[str, dict[str, Any]]:
     """Returns each true value with the one found, and whether it is near enough."""
-    rows, calibration = {}, found.calibration
+    rows = {}
+    calibration = found.calibration
     values = {
         "rotation_rad": calibration.rotation_rad,
         "lever_arm_x_m": calibration.lever_arm_m[0],
@@ -89,8 +94,10 @@ def _per_command(model: TaylorModel, place: int) -> Array:
     size = model.state_size
     steps = round(SETTLED_S / model.dt)
     command = np.zeros((2, steps, len(model.variables) - size))
-    command[0, :, place], command[1, :, place] = SLOW, -SLOW
-    poses, states = np.zeros((2, steps + 1, 3)), np.zeros((2, steps + 1, size))
+    command[0, :, place] = SLOW
+    command[1, :, place] = -SLOW
+    poses = np.zeros((2, steps + 1, 3))
+    states = np.zeros((2, steps + 1, size))
     rollout(poses, states, command, term_arrays(model), SERIES, model.dt)
     twist = geometry.log(geometry.between(poses[:, -2], poses[:, -1])) / model.dt
     return np.asarray((twist[0] - twist[1]) / (2.0 * SLOW))

@@ -22,7 +22,8 @@ def main() -> None:
             given[name] for name in ("ranges", "odometry", "angles", "limits")
         )
     slam = GraphSlam(Scan2DMatcherCpp({}), Scan2DMatcherCpp({}, loop=True))
-    step, far = float(angles[1] - angles[0]), float(limits[1])
+    step = float(angles[1] - angles[0])
+    far = float(limits[1])
     for scan, pose in zip(ranges, odometry):  # noqa: B905
         scan = np.where(np.isfinite(scan), scan, 2.0 * far)
         slam.process_scan(

@@ -9,7 +9,8 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "examples"
-WIDTH, COLOURS = 900, 64
+WIDTH = 900
+COLOURS = 64
 
 
 def keep(picture: Path) -> None:

@@ -113,7 +113,8 @@ def comments_of(owner: type) -> dict[str, str]:
     ]  # type: ignore[attr-defined]
     found = {}
     for field in fields:
-        first, last = field.lineno, field.end_lineno or field.lineno
+        first = field.lineno
+        last = field.end_lineno or field.lineno
         while first > 1 and lines[first - 2].lstrip().startswith("#"):
             first -= 1
         texts = [at[n] for n in range(first, last + 1) if n in at]

@@ -24,10 +24,9 @@ from nics_drl_bridge.status import STATUS
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 WIDEST = 10_000
-PATIENCE_S, REPEATED_S = (
-    2.0,
-    10.0,
-)  # silence before the first line about work, and between lines
+# silence before the first line about work, and between lines
+PATIENCE_S = 2.0
+REPEATED_S = 10.0
 Tell = Callable[
     [str, int, int], None
 ]  # what is done, how much of it, of how much (0: unknown)
@@ -56,10 +55,8 @@ def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[st
     return complete
 
 
-ROBOTS, WORLDS = (
-    completing("robots"),
-    completing("worlds", "world_sets", also=("barn",)),
-)
+ROBOTS = completing("robots")
+WORLDS = completing("worlds", "world_sets", also=("barn",))
 POLICIES = completing("policies", also=("dynamic_window", "mppi", "random", "straight"))
 ROBOT_OPTIONS = ("--robot", "--model")  # two words for one option, of every command
 RobotOption = Annotated[

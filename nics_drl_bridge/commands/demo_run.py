@@ -50,15 +50,17 @@ from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
 
-RECORDING_SEED, TRAINING_SEED = 1, 0
+RECORDING_SEED = 1
+TRAINING_SEED = 0
 MANY = 500  # episodes of the evaluation in the fast simulator
-BASELINE, AS_IT_IS, PERTURBED = "dynamic_window", "as it is", "mild"
+BASELINE = "dynamic_window"
+AS_IT_IS = "as it is"
+PERTURBED = "mild"
 LINES = 10  # number of progress reports of a training
 ARRIVE_S = 90.0  # time that the robot may take [s]; its policy may have to be compiled
-FULL_COMMAND_S, FULL_RATE_S = (
-    0.3,
-    0.05,
-)  # of the demo's gate, from zero to greatest command, rate
+# of the demo's gate, from zero to greatest command, rate
+FULL_COMMAND_S = 0.3
+FULL_RATE_S = 0.05
 GOOD = 0.9  # share of successes below which the verdict doubts a policy
 PANELS = 9  # maximum number of episodes that are drawn
 R = TypeVar("R")
@@ -133,11 +135,9 @@ def run(plan: DemoPlan, say: Say) -> str:
     learned = timed("learning", learn, model)
     summaries = timed("evaluating", _evaluate, model, learned.policy)
     here = timed("driving in process", _drive, FAST, learned.policy)
-    world, radius, paths = (
-        load_world(plan.world),
-        model.robot.footprint_radius,
-        "paths.png",
-    )
+    world = load_world(plan.world)
+    radius = model.robot.footprint_radius
+    paths = "paths.png"
     write_bytes(
         plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius)
     )
@@ -173,7 +173,8 @@ def _recorded(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
     """Reads the plan's drive with its robot, or records one of a textbook robot."""
     if plan.recording is not None:
         return robot_and_drive(plan.recording, plan.robot, TopicRoles(), None)
-    robot, file = load_robot(plan.robot or DEFAULT_ROBOT), plan.out / "recording.npz"
+    robot = load_robot(plan.robot or DEFAULT_ROBOT)
+    file = plan.out / "recording.npz"
     say(f"recording a drive of the textbook {robot.name!r} robot")
     save_recording(textbook.record(robot, np.random.default_rng(RECORDING_SEED)), file)
     return robot, read_recording(file, robot)
@@ -222,7 +223,8 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
 def settings_of(plan: DemoPlan, model: SimulatorModel) -> Fitted:
     """Settings of the demo's training, in the plan's simulator and world."""
     chosen = load_training("demo")
-    worlds, steps = {plan.world: chosen.num_envs}, plan.train_steps or chosen.steps
+    worlds = {plan.world: chosen.num_envs}
+    steps = plan.train_steps or chosen.steps
     changes = {"robot": str(plan.model), "worlds": worlds, "steps": steps}
     return fitted(chosen.model_copy(update=changes), model, inherited=True)
 
@@ -246,7 +248,8 @@ def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
             say(f"  {progress.steps:,} steps: {progress.line}")
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
-    result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"
+    result = SeedResult(TRAINING_SEED, trained, {})
+    file = plan.out / "policy.onnx"
     export(
         settings, result, f"nics demo --robot {plan.robot or model.robot.name}", file
     )
@@ -262,7 +265,8 @@ def _evaluate(
 ) -> dict[str, Summary]:
     say(f"evaluating {name} in {MANY} unseen episodes, all at once, then perturbed")
     policy, task = open_policy(name, model)
-    limit, found = pace_of(model, [load_world(plan.world)]).steps, {}
+    limit = pace_of(model, [load_world(plan.world)]).steps
+    found = {}
     for what, drawn in {
         AS_IT_IS: None,
         **load_randomisation(PERTURBED).alone(),
@@ -286,7 +290,8 @@ def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
     say(
         f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}"
     )
-    seeds, logs = range(plan.episodes), plan.out / "logs" / place
+    seeds = range(plan.episodes)
+    logs = plan.out / "logs" / place
     return drive_in(
         place,
         policy,
@@ -306,14 +311,10 @@ def _deploy(
 ) -> Episode:
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
-    given, limits = (
-        {"model": str(plan.model)},
-        _write_limits(model.robot, plan.out / "limits.yaml"),
-    )
-    boxes, gate = (
-        str(plan.out / "black_box"),
-        {"use_sim_time": True, "e_stop_required": False},
-    )
+    given = {"model": str(plan.model)}
+    limits = _write_limits(model.robot, plan.out / "limits.yaml")
+    boxes = str(plan.out / "black_box")
+    gate = {"use_sim_time": True, "e_stop_required": False}
     nodes: dict[str, dict[str, Any]] = {
         "simulator_node": {**given, "world": plan.world, "episode_seed": seed},
         "middleware_node": given,
@@ -369,7 +370,8 @@ def _watched(
 def _write_limits(robot: RobotSpec, path: Path) -> Path:
     commands = {}
     for variable in robot.command:
-        low, high = min(variable.min, 0.0), max(variable.max, 0.0)
+        low = min(variable.min, 0.0)
+        high = max(variable.max, 0.0)
         rate = max(-low, high) / FULL_COMMAND_S
         jerk = rate / FULL_RATE_S
         commands[variable.name] = {"min": low, "max": high, "rate": rate, "jerk": jerk}
@@ -397,8 +399,11 @@ def sections_of(
 def _verdict(
     plan: DemoPlan, learned: Learned, identified: Identified, of: DemoEpisodes
 ) -> Sequence[str]:
-    summary, here, there = of.summary, of.here, of.there
-    share, same = summary.success, successes(there)
+    summary = of.summary
+    here = of.here
+    there = of.there
+    share = summary.success
+    same = successes(there)
     arrived = of.live is not None and of.live.result == "success"
     between = f"95 % confidence: {100 * share.low:.1f} to {100 * share.high:.1f} %"
     tiles = [
@@ -431,7 +436,8 @@ def _verdict(
 
 
 def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
-    summary, drawn = of.summary, list[tuple[bytes, str]]()
+    summary = of.summary
+    drawn = list[tuple[bytes, str]]()
     if learned.curve:
         caption = "Success and collisions during exploration; every episode is new."
         drawn.append((pictures.training_curve(learned.curve), caption))
@@ -459,9 +465,13 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
 
 
 def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[str]:
-    here, there, live = of.here, of.there, of.live
-    both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
-    world, radius = load_world(plan.world), model.robot.footprint_radius
+    here = of.here
+    there = of.there
+    live = of.live
+    both = (LABELS[FAST], LABELS[DDS])
+    each = ("steps", "path [m]")
+    world = load_world(plan.world)
+    radius = model.robot.footprint_radius
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
         shown = [

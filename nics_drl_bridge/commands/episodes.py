@@ -40,7 +40,10 @@ from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
+FAST = "fast"
+DDS = "dds"
+MUJOCO = "mujoco_dds"
+VEHICLE = "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
 LABELS = {
@@ -50,8 +53,10 @@ LABELS = {
     VEHICLE: "on the vehicle",
 }
 EVALUATION = "evaluation.json"
-GATE, RAW = "command_gate", "cmd_vel_raw"
-LISTEN_S, ARM_S = 5.0, 60.0
+GATE = "command_gate"
+RAW = "cmd_vel_raw"
+LISTEN_S = 5.0
+ARM_S = 60.0
 START_S = (
     180.0  # time that a node may take to start [s]; its kernels may have to be compiled
 )
@@ -86,7 +91,8 @@ def drive_in(
     conditions: Conditions = NO_CONDITIONS,
 ) -> list[Episode]:
     """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
-    model, drawn = open_model(name), conditions.ranges
+    model = open_model(name)
+    drawn = conditions.ranges
     check_place(place, model.robot)
     if place == FAST:
         given = {"estimator": True, "randomisation": drawn}
@@ -95,7 +101,8 @@ def drive_in(
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
-    node, domain_id = NODES[place], free_domain_id()
+    node = NODES[place]
+    domain_id = free_domain_id()
     parameters = {"model": name, "world": world, "mode": "lockstep"}
     parameters["randomisation"] = conditions.randomisation or ""
     options = {
@@ -176,7 +183,8 @@ def check_place(place: str, robot: RobotSpec) -> None:
 
 def robot_of(policy: str, contract: Contract) -> str:
     """The robot that a policy was trained for: its model's folder or file, or a shipped one."""
-    place, name = str(contract.provenance.get("model", "")), contract.robot.name
+    place = str(contract.provenance.get("model", ""))
+    name = contract.robot.name
     if place and Path(place).exists():
         return place
     if name in shipped_names("robots"):
@@ -237,14 +245,16 @@ class Evaluated:
 
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives all policies through the same episodes everywhere; writes results, pictures."""
-    seeds, logs = order.seeds, order.out / "logs"
+    seeds = order.seeds
+    logs = order.out / "logs"
     for policy in order.policies:
         check_fallback(order.conditions.fallback, policy)
     contracts = contracts_of(order.policies, order.model)
     model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
     under = limited(order.conditions, contracts, model, world, say)
-    places, evaluated = _places(order, model.robot, say), []
+    places = _places(order, model.robot, say)
+    evaluated = []
     for policy in order.policies:
         runs = {}
         for place in places:
@@ -441,8 +451,10 @@ def drive_vehicle(
     """
     policy = order.policies[0]
     contracts = contracts_of(order.policies, order.model)
-    name, namespace = model_name(order.model, contracts), options.get("namespace", "")
-    model, world = open_model(name), load_worlds(order.world)
+    name = model_name(order.model, contracts)
+    namespace = options.get("namespace", "")
+    model = open_model(name)
+    world = load_worlds(order.world)
     localised = options.get("pose_type", NO_POSE) != NO_POSE
     start = options.get("start", WAIT)
     wanted = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)

@@ -156,7 +156,8 @@ def evaluate(
         from nics_drl_bridge.commands import episodes as driving
         from nics_drl_bridge.commands.conditions import Conditions
 
-    count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
+    count = episodes or (1 if hardware else 20)
+    tell = partial(typer.echo, err=True)
     under = Conditions(lidar, randomisation, gate, fallback, kind=task)
     order = driving.EvaluationOrder(
         policies,
@@ -238,16 +239,16 @@ def _shadow(
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
     from nics_drl_bridge.report.pictures import shadow_picture
 
-    rows, lines, told = list[tuple[str, ...]](), list[str](), list[dict[str, Any]]()
+    rows = list[tuple[str, ...]]()
+    lines = list[str]()
+    told = list[dict[str, Any]]()
     for policy in policies:
         name = model_name(model, contracts_of([policy], model))
         made = shadow(
             bag, open_model(name), policy, console.roles_of(topics), goal, ahead
         )
-        place, differences = (
-            out / f"shadow_{short_name(policy, policies)}",
-            made.differences(),
-        )
+        place = out / f"shadow_{short_name(policy, policies)}"
+        differences = made.differences()
         write_bytes(place.with_suffix(".png"), shadow_picture(made))
         data = {
             "bag": str(bag),

@@ -59,7 +59,8 @@ def worlds() -> list[Row]:
         world = load_world(name)
         x1, y1, x2, y2 = world.extent
         counts = [group.counts for group in world.obstacles]
-        low, high = sum(least for least, _ in counts), sum(most for _, most in counts)
+        low = sum(least for least, _ in counts)
+        high = sum(most for _, most in counts)
         obstacles = f"{low}" if low == high else f"{low} to {high}"
         rows.append(
             _world(name, f"{x2 - x1:g} x {y2 - y1:g}", world.goal_distance, obstacles)

@@ -90,7 +90,8 @@ def record(
     driven = drive(given, arguments)
     if driven.failure is not None:
         raise BackendError(driven.line)
-    recording, lines = driven.recording, (driven.line,)
+    recording = driven.recording
+    lines = (driven.line,)
     if recording is not None:
         lines += drive_summary(recording, given)
     told |= {"recorded": recording is not None, "complete": driven.complete}
@@ -121,7 +122,8 @@ def preview_lines(given: dict[str, Any]) -> tuple[str, ...]:
     from nics_drl_bridge.report.pictures import drive_picture
     from nics_drl_bridge.robot.spec import load_robot
 
-    robot, out = load_robot(given["robot"]), check_out(Path(given["out"]))
+    robot = load_robot(given["robot"])
+    out = check_out(Path(given["out"]))
     topic_roles(given["topics"] or None)  # reports a wrong file before the robot moves
     plan = DrivePlan(
         robot, *(given[name] for name in ("bound", "duration", "speed", "seed"))
@@ -139,11 +141,10 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
     from nics_drl_bridge.identify.excitation import coverage
     from nics_drl_bridge.robot.spec import load_robot
 
-    out, place = (
-        Path(given["out"]),
-        recording.pose.values[:, :2] - recording.pose.values[0, :2],
-    )
-    path, reach = np.hypot(*np.diff(place, axis=0).T).sum(), np.hypot(*place.T).max()
+    out = Path(given["out"])
+    place = recording.pose.values[:, :2] - recording.pose.values[0, :2]
+    path = np.hypot(*np.diff(place, axis=0).T).sum()
+    reach = np.hypot(*place.T).max()
     return (
         f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
         *(each.line() for each in coverage(recording, load_robot(given["robot"]))),
@@ -327,7 +328,8 @@ def generate(
     from nics_drl_bridge.sim.world import load_world
 
     check_place(out)
-    threshold, terms = parse_alpha(alpha), parse_order(order)
+    threshold = parse_alpha(alpha)
+    terms = parse_order(order)
     if lidar is not None:  # a wrong name is told before the drive is read
         load_lidar(lidar)
     further = tuple(load_sensor(file) for file in sensor or ())
@@ -467,7 +469,8 @@ def urdf(
 
     opened = open_model(model)
     file = out or Path(f"{opened.robot.name}.urdf")
-    lidar, further = opened.lidar, {each.frame: each.mount for each in opened.sensors}
+    lidar = opened.lidar
+    further = {each.frame: each.mount for each in opened.sensors}
     write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
     name = opened.robot.name
     console.say(as_json, f"{file}: the URDF of {name}", file=str(file), robot=name)

@@ -99,7 +99,9 @@ def import_(
 
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
+    lidar = facts["lidar"]
+    scan = facts["scan"]
+    seen = facts["observation"]
     steps = facts["max_episode_steps"]
     limits = "{name} {min:g} to {max:g} {unit}"
     commands = [limits.format(**command) for command in facts["robot"]["command"]]

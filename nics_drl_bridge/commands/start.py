@@ -10,7 +10,8 @@ import time
 from types import FrameType
 from typing import NoReturn
 
-EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
 ENDING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 _interrupts: list[int] = []  # the times [ns] at which Ctrl-C came
 

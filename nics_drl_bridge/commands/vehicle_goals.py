@@ -13,9 +13,13 @@ from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-ROBOT, MAP = "robot", "map"  # frames of a goal
+# frames of a goal
+ROBOT = "robot"
+MAP = "map"
 GOAL_FRAMES = (ROBOT, MAP)
-WAIT, PRESENT = "wait", "present"  # where episodes start: see `RealtimeOptions.start`
+# where episodes start: see `RealtimeOptions.start`
+WAIT = "wait"
+PRESENT = "present"
 FAR_M = 5.0  # a goal that is farther away is confirmed [m]
 NEAR_M = 0.5  # a vehicle that was moved by less since it was asked for is not asked about again [m]
 MARGIN_M = 10.0  # of the open ground beyond a goal [m]

@@ -32,7 +32,8 @@ def warmup(as_json: JsonOption = False) -> None:
             for part in (_simulate, _drive)
         ]
         done = [first, *(each.get()[:2] for each in others)]
-    count, cpu_s = sum(each[0] for each in done), sum(each[1] for each in done)
+    count = sum(each[0] for each in done)
+    cpu_s = sum(each[1] for each in done)
     took = time.monotonic() - begin
     if as_json:
         typer.echo(json_of({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
@@ -46,7 +47,8 @@ def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any
     from nics_drl_bridge.kernels import COMPILING
 
     COMPILING.quiet = True
-    count, cpu_s = COMPILING.count, COMPILING.cpu_s
+    count = COMPILING.count
+    cpu_s = COMPILING.cpu_s
     result = part(*given)
     return COMPILING.count - count, COMPILING.cpu_s - cpu_s, result
 

@@ -21,7 +21,9 @@ world = typer.Typer(
     no_args_is_help=True,
 )
 
-SDF, MAPS, PICTURES = (".world", ".sdf"), (".yaml", ".yml"), (".png", ".pgm", ".bmp")
+SDF = (".world", ".sdf")
+MAPS = (".yaml", ".yml")
+PICTURES = (".png", ".pgm", ".bmp")
 HEIGHT = 0.2  # default of the height that counts [m]: TurtleBot3's lidar is at 0.18 m
 CLEARANCE = 0.1  # default [m]: fields of others are often narrow
 NEAREST = 2.0  # default of the least distance from start to goal [m]
@@ -203,10 +205,8 @@ def _mapped(
     if file.suffix not in MAPS and file.suffix.lower() not in PICTURES:
         kinds = ", ".join((*SDF, *MAPS, *PICTURES))
         raise ConfigError(f"{file}: unknown kind of file; give one of {kinds}.")
-    map_file, made = (
-        file.with_suffix(".yaml") if file.suffix.lower() in PICTURES else file,
-        [],
-    )
+    map_file = file.with_suffix(".yaml") if file.suffix.lower() in PICTURES else file
+    made = []
     if file.suffix.lower() in PICTURES and resolution is not None:
         map_file = place.with_name(f"{place.stem}_map.yaml")
         about = {"image": _seen_from(place, file), "resolution": resolution, **NAV2}
@@ -221,7 +221,8 @@ def _mapped(
         raise ConfigError(
             f"{file}: there is no {map_file.name} beside the picture; {fix}."
         )
-    x, y = columns * resolution, rows * resolution
+    x = columns * resolution
+    y = rows * resolution
     known = {"name": file.stem, "map": _seen_from(place, map_file)}
     text = _text(file, [f"The map {map_file.name}."], known | keys, (x, y))
     return [*made, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
@@ -366,7 +367,8 @@ def map_(
     worlds = load_worlds(name)
     sampler = SetSampler(worlds, load_robot(robot).footprint_radius)
     scenes = sampler.draw([seed])
-    scene, member = scenes[0], int(scenes.member[0])
+    scene = scenes[0]
+    member = int(scenes.member[0])
     opened = worlds.members[member]
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
     if file.suffix not in MAPS:

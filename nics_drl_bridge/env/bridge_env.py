@@ -140,10 +140,14 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
         self._rest = np.tile(self._still, (self.robots, 1))
-        self._seed, self._episode, self._rehearsed = 0, -1, False
+        self._seed = 0
+        self._episode = -1
+        self._rehearsed = False
         self._picture: Any = None
         # Of the last step, for pictures, and the number of steps in the episode.
-        self._command, self._facts, self._steps = self._rest, dict[str, Any](), 0
+        self._command = self._rest
+        self._facts = dict[str, Any]()
+        self._steps = 0
         if isinstance(backend, str):
             robots = self.robots if self.robots > 1 else None
             own = {
@@ -173,10 +177,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         else:
             self._episode += 1
         episode = int(episode_seed(self._seed, self._episode))
-        radius, draw = (
-            self.model.robot.footprint_radius,
-            self._backend.facts().get("scenes"),
-        )
+        radius = self.model.robot.footprint_radius
+        draw = self._backend.facts().get("scenes")
         one = self.world, radius, episode, self.robots
         self.scene = draw([episode])[0] if draw else sample_scene(*one)
         starts = np.array(self.scene.starts)
@@ -194,7 +196,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             self._backend.reset(Start(episode, self._row(starts)))
         )
         self.memory = memory
-        self._command, self._facts, self._steps = self._rest, {}, 0
+        self._command = self._rest
+        self._facts = {}
+        self._steps = 0
         self.ended = np.zeros(self.robots, np.bool_)
         facts: dict[str, Any] = {"episode_seed": episode, "start": self._row(starts)}
         facts["bodies"] = self.scene.bodies.copy()
@@ -208,7 +212,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def _rehearse(self, episodes: Episodes) -> None:
         """Runs the task once without a step: it may compile for seconds, and the robot be real."""
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
-        sensed, starts = unread(self.model.sensors, 1, self.robots), episodes.starts
+        sensed = unread(self.model.sensors, 1, self.robots)
+        starts = episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.begun(episodes)
         with suppress(ConfigError):  # of a view that no step gives
@@ -258,8 +263,11 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)
         seen, facts = self._backend.step(command)
-        self._command, self._facts, self._steps = command, facts, self._steps + 1
-        view, out = self._lifted(seen), np.empty(self._shape, np.float32)
+        self._command = command
+        self._facts = facts
+        self._steps = self._steps + 1
+        view = self._lifted(seen)
+        out = np.empty(self._shape, np.float32)
         outcome = self.task.step_into(out, before, view, self.memory)
         terms = {name: term[0] for name, term in outcome.terms.items()}
         if waiting:
@@ -326,7 +334,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         """All that a picture of the world shows now. Raises ResetNeeded before an episode."""
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
-        facts, told, view = self._backend.facts(), self._facts, self._view
+        facts = self._backend.facts()
+        told = self._facts
+        view = self._view
         covariance = told.get("covariance")
         return Snapshot(
             poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),

@@ -135,13 +135,12 @@ def check_places(
     """
     free = not radius
     for scene, rows in zip(scenes, places, strict=True):
-        member, at = (
-            world.members[int(np.asarray(scene.member))],
-            rows.reshape(-1, rows.shape[-1]),
-        )
+        member = world.members[int(np.asarray(scene.member))]
+        at = rows.reshape(-1, rows.shape[-1])
         for x, y in at[:, :2].tolist():
             check_place(f"reset option {option!r}", member, x, y, radius)
-        shapes, pairs = world.shapes, product(at[:, :2].tolist(), scene.bodies)
+        shapes = world.shapes
+        pairs = product(at[:, :2].tolist(), scene.bodies)
         free = free or not any(
             _on(x, y, radius, body, shapes) for (x, y), body in pairs
         )
@@ -160,10 +159,8 @@ def _on(
     if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
         return False
     shape = shapes[int(body[SHAPE]) % len(shapes)]  # in one of some sizes
-    corners, at = (
-        shape.outline * (reach / shape.radius),
-        (c * dx + s * dy, c * dy - s * dx),
-    )
+    corners = shape.outline * (reach / shape.radius)
+    at = (c * dx + s * dy, c * dy - s * dx)
     return (
         not len(corners)
         or outline_point(*at, Outline(corners, 0, len(corners))) < radius

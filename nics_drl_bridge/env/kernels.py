@@ -93,7 +93,8 @@ def contact(ranges, scale):  # type: ignore[no-untyped-def]
     """
     count = ranges.shape[0]
     for begin in range(0, count, BLOCK):
-        beams, hits = min(BLOCK, count - begin), np.int32(0)
+        beams = min(BLOCK, count - begin)
+        hits = np.int32(0)
         for k in range(beams):
             i = np.uintp(begin + k)
             hits = np.int32(hits | np.int32(ranges[i] < scale.leaves[i]))
@@ -128,8 +129,10 @@ def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
     distance = math.sqrt(dx * dx + dy * dy)
     if distance == 0.0:
         return 0.0, 1.0, 0.0
-    c, s = math.cos(heading), math.sin(heading)
-    forward, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance
+    c = math.cos(heading)
+    s = math.sin(heading)
+    forward = (c * dx + s * dy) / distance
+    left = (c * dy - s * dx) / distance
     return distance, min(max(forward, -1.0), 1.0), min(max(left, -1.0), 1.0)
 
 
@@ -142,14 +145,17 @@ def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, ra
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
         flags[i, 1] = look(out[i, :parts], ranges[i], scale)
-        dx, dy = goals[i, 0] - pose[i, 0], goals[i, 1] - pose[i, 1]
+        dx = goals[i, 0] - pose[i, 0]
+        dy = goals[i, 1] - pose[i, 1]
         distance, c, s = bearing(dx, dy, pose[i, 2])
-        dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
+        dx = goals[i, 0] - before[i, 0]
+        dy = goals[i, 1] - before[i, 1]
         approach[i] = math.sqrt(dx * dx + dy * dy) - distance
         flags[i, 0] = distance < radius
         flags[i, 2] = flags[i, 0] and not flags[i, 1]
         out[i, parts] = min(distance, LIMIT)
-        out[i, parts + 1], out[i, parts + 2] = c, s
+        out[i, parts + 1] = c
+        out[i, parts + 2] = s
         for k in range(3):
             out[i, parts + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
 

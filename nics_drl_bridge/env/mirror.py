@@ -13,11 +13,11 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Places = NDArray[np.intp]
 SIGNS = np.array([1.0, -1.0, -1.0])  # of vx, vy and wz in a mirror
-MOST_SEARCHED, TRIED = 4, 8  # commands that can be searched; twists that have to agree
-NEAR_RAD, NEAR_M = (
-    1e-4,
-    1e-6,
-)  # by which a scan may be off its mirror image: angles are float32
+MOST_SEARCHED = 4  # commands that can be searched
+TRIED = 8  # twists that have to agree
+# by which a scan may be off its mirror image: angles are float32
+NEAR_RAD = 1e-4
+NEAR_M = 1e-6
 
 
 def mirror_of(task: Task, signs: ArrayLike) -> Mirror:
@@ -72,7 +72,8 @@ def _mirrored_actions(task: Task) -> tuple[Places, Array, Array]:
             np.zeros(0),
         )
     low, high = task.command_limits
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    middle = 0.5 * (low + high)
+    half = 0.5 * (high - low)
     return places, signs * half[places] / half, (signs * middle[places] - middle) / half
 
 
@@ -96,7 +97,8 @@ def mirrored_commands(spec: RobotSpec) -> tuple[NDArray[np.intp], Array]:
         for order, signs in product(
             permutations(range(count)), product((1.0, -1.0), repeat=count)
         ):
-            places, factors = np.array(order, np.intp), np.array(signs)
+            places = np.array(order, np.intp)
+            factors = np.array(signs)
             if np.allclose(steady_twist(spec, tried[:, places] * factors), wanted):
                 return places, factors
     fault = "which of its commands drive its mirror image is not known"
@@ -124,5 +126,6 @@ def _mirrored_drives(commands: Array, places: Places, signs: Array) -> Places:
             raise ConfigError(
                 f"{fault}; use continuous actions, or leave out ppo.mirror."
             )
-        found[k], taken[alike[0]] = alike[0], True
+        found[k] = alike[0]
+        taken[alike[0]] = True
     return found

@@ -86,7 +86,8 @@ class Navigation(Task):
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
-        low, high = [0.0, -1.0, -1.0, *[-LIMIT] * 3], [LIMIT, 1.0, 1.0, *[LIMIT] * 3]
+        low = [0.0, -1.0, -1.0, *[-LIMIT] * 3]
+        high = [LIMIT, 1.0, 1.0, *[LIMIT] * 3]
         return self.box(low, high)
 
     def reset(self, episodes: Episodes) -> Memory:
@@ -141,7 +142,9 @@ class Navigation(Task):
         self, out: Observation, before: Array, now: RobotView, memory: Memory
     ) -> GoalProgress:
         lead = now.pose.shape[:-1]
-        approach, flags, own = np.empty(lead), np.empty((*lead, 3), np.bool_), out
+        approach = np.empty(lead)
+        flags = np.empty((*lead, 3), np.bool_)
+        own = out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(

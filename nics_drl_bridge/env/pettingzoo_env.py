@@ -72,7 +72,9 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
             randomisation=randomisation,
             render_mode=render_mode,
         )
-        self.render_mode, self._limit, self._steps = render_mode, max_episode_steps, 0
+        self.render_mode = render_mode
+        self._limit = max_episode_steps
+        self._steps = 0
         self.possible_agents = [f"robot_{m}" for m in range(self.env.robots)]
         self.agents: list[str] = []
         of = self.env.task
@@ -103,7 +105,8 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
                 name: value for name, value in options.items() if name != "options"
             }
         observation, info = self.env.reset(seed=seed, options=options)
-        self.agents, self._steps = list(self.possible_agents), 0
+        self.agents = list(self.possible_agents)
+        self._steps = 0
         seen = dict(
             zip(self.agents, observation.reshape(len(self.agents), -1), strict=True)
         )
@@ -141,7 +144,8 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self._steps += 1
         late = self._steps >= self._limit
         index = {name: self.possible_agents.index(name) for name in self.agents}
-        infos, rewards = {}, {}
+        infos = {}
+        rewards = {}
         for name, m in index.items():
             paid = {key: float(term[m]) for key, term in terms.items()}
             infos[name] = {**self._of(info, m), "reward_terms": paid}

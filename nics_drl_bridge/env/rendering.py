@@ -20,8 +20,12 @@ from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
 
-SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
-WALL, STANDING, SCAN = DARK, OTHER, VERMILION
+SIZE_IN = 5.0
+DPI = 100
+MARGIN = 0.05
+WALL = DARK
+STANDING = OTHER
+SCAN = VERMILION
 ROBOTS = tuple(colour for colour in SERIES if colour != SCAN)
 
 
@@ -29,13 +33,12 @@ class WorldPicture:
     """Picture of a world, redrawn for each shot."""
 
     def __init__(self, model: SimulatorModel, world: AnyWorld) -> None:
-        self._model, self._world = model, world
+        self._model = model
+        self._world = world
         low, high = np.array(world.extent).reshape(2, 2)
         width, depth = (SIZE_IN * (high - low) / (high - low).max()).tolist()
-        self._low, self._high = (
-            low - MARGIN * (high - low),
-            high + MARGIN * (high - low),
-        )
+        self._low = low - MARGIN * (high - low)
+        self._high = high + MARGIN * (high - low)
         figure = Figure(figsize=(width, depth), dpi=DPI)
         self._canvas: Any = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -65,7 +68,8 @@ class WorldPicture:
     def _robot(
         self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str
     ) -> None:
-        hits, robot = hits_of(self._model.lidar, pose, ranges), self._model.robot
+        hits = hits_of(self._model.lidar, pose, ranges)
+        robot = self._model.robot
         axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
         draw_robot(
             axes,
@@ -125,7 +129,8 @@ def _patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:
     if not len(shape.outline):
         return Disc((body[0], body[1]), body[RADIUS], color=STANDING)
     outline = shape.outline * (body[RADIUS] / shape.radius)
-    c, s = np.cos(body[HEADING]), np.sin(body[HEADING])
+    c = np.cos(body[HEADING])
+    s = np.sin(body[HEADING])
     corners = outline @ np.array([[c, s], [-s, c]]) + body[:2]
     return Outline(
         corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2

@@ -28,7 +28,8 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 def _sent(pose: Array) -> Array:
     """Returns a pose (3,) as it comes out of a message, whose quaternion rounds the heading."""
-    z, w = math.sin(float(pose[2]) / 2.0), math.cos(float(pose[2]) / 2.0)
+    z = math.sin(float(pose[2]) / 2.0)
+    w = math.cos(float(pose[2]) / 2.0)
     return np.array([pose[0], pose[1], math.atan2(2.0 * (w * z), 1.0 - 2.0 * (z * z))])
 
 
@@ -87,7 +88,8 @@ class SimBackend:
             middleware.command(self._now_ns, one)
         self.simulator.step(commands[None])
         self._now_ns += self._period_ns
-        told, view = {"stamp_ns": self._now_ns, **self._truth()}, self._measure()
+        told = {"stamp_ns": self._now_ns, **self._truth()}
+        view = self._measure()
         if self._middlewares:  # as of this view
             every = np.array(
                 [each.estimator.covariance[:3, :3] for each in self._middlewares]
@@ -110,7 +112,8 @@ class SimBackend:
         return known
 
     def _truth(self) -> BackendFacts:
-        data, row = self.simulator.data, self._row
+        data = self.simulator.data
+        row = self._row
         collided = data.collided[row]
         return {
             "true_pose": data.pose[row].copy(),
@@ -124,12 +127,12 @@ class SimBackend:
         return drawn.copy() if drawn.ndim else drawn.item()
 
     def _measure(self) -> RobotView:
-        data, now, row = self.simulator.data, self._now_ns, self._row
-        odom, twist, ranges = (
-            data.odom[row].copy(),
-            data.twist[row].copy(),
-            data.ranges[row].copy(),
-        )
+        data = self.simulator.data
+        now = self._now_ns
+        row = self._row
+        odom = data.odom[row].copy()
+        twist = data.twist[row].copy()
+        ranges = data.ranges[row].copy()
         if not self._middlewares:
             sensed = {
                 name: each[row].copy() for name, each in self.simulator.readings.items()
@@ -157,8 +160,10 @@ class CompletedBackend:
     """Wraps a user's backend without `halt`, for which it steps by `still`, or without `facts`."""
 
     def __init__(self, backend: Any, still: Array) -> None:
-        self._backend, self._still = backend, still
-        self._moved, self._known = False, BackendFacts()
+        self._backend = backend
+        self._still = still
+        self._moved = False
+        self._known = BackendFacts()
         for name in ("halt", "facts"):  # the backend's own, if it has one
             if callable(method := getattr(backend, name, None)):
                 setattr(self, name, method)
@@ -200,7 +205,8 @@ def completed(backend: Any, still: Array) -> Backend:
     if missing := [
         name for name in needed if not callable(getattr(backend, name, None))
     ]:
-        kind, lacks = type(backend).__name__, ", no ".join(missing)
+        kind = type(backend).__name__
+        lacks = ", no ".join(missing)
         raise ConfigError(
             f"backend of type {kind}: has no {lacks}; see interface.Backend."
         )

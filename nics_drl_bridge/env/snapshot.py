@@ -44,7 +44,8 @@ def gate_of(info: Mapping[str, Any]) -> str | None:
 
 def hits_of(lidar: LidarSpec, pose: Array, ranges: NDArray[np.float32]) -> Array:
     """Points (n, 2) that a scan (B,) from a robot's pose (3,) hit, in `map` [m]."""
-    mount, there = geometry.compose(pose, lidar.mount), np.isfinite(ranges)
+    mount = geometry.compose(pose, lidar.mount)
+    there = np.isfinite(ranges)
     angles = mount[2] + lidar.angles[there]
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return np.asarray(mount[:2] + ranges[there, None] * directions)

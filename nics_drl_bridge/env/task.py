@@ -198,7 +198,8 @@ class Task(ABC):
         if self.actions == "discrete":
             return np.asarray(self.discrete_commands[np.asarray(action)])
         given = np.ascontiguousarray(action)
-        out, rows = np.empty(given.shape), given.reshape(-1, given.shape[-1])
+        out = np.empty(given.shape)
+        rows = given.reshape(-1, given.shape[-1])
         low, high = self.command_limits
         kernels.commands(out.reshape(rows.shape), rows, low, high)
         # What a vehicle can't do is not to be learnt: a car by turn rates does not steer at rest.
@@ -229,7 +230,8 @@ class Task(ABC):
                 )
             rows[...] = new
         out[...] = self.valid("observation", self.observation(after, memory), out.shape)
-        terms, each = self.reward(before, after, memory), out.shape[:-1]
+        terms = self.reward(before, after, memory)
+        each = out.shape[:-1]
         info = self.info(after, memory)
         for what, part in (("reward", terms), ("info", info)):
             if not isinstance(part, dict):
@@ -280,7 +282,8 @@ class Task(ABC):
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:
         """Commands (C,) of the least and of the greatest action."""
-        low, high = self.robot.command_low, self.robot.command_high
+        low = self.robot.command_low
+        high = self.robot.command_high
         if self.top_speed is None:
             return low, high
         speeds = np.array([each.unit == "m/s" for each in self.robot.command])
@@ -308,8 +311,10 @@ class Task(ABC):
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
         """Space of a scan in shares (P), parts with these limits, and shares of `sensors` (Q)."""
-        parts, further = self.scan_parts, sum(sensor.parts for sensor in self.sensors)
-        low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+        parts = self.scan_parts
+        further = sum(sensor.parts for sensor in self.sensors)
+        low = np.asarray(low, np.float32)
+        high = np.asarray(high, np.float32)
         return gymnasium.spaces.Box(
             np.concatenate(
                 [np.zeros(parts, np.float32), low, np.zeros(further, np.float32)]
@@ -329,9 +334,11 @@ class Task(ABC):
         return self._look(ranges)[1]
 
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
-        lead, beams = ranges.shape[:-1], ranges.shape[-1]
+        lead = ranges.shape[:-1]
+        beams = ranges.shape[-1]
         parts = beams if self.scan is None else self.scan.sectors
-        shares, touched = np.empty((*lead, parts), np.float32), np.empty(lead, np.bool_)
+        shares = np.empty((*lead, parts), np.float32)
+        touched = np.empty(lead, np.bool_)
         rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, beams)
         kernels.looks(shares.reshape(-1, parts), touched.reshape(-1), rows, self.scale)
         return shares, touched
@@ -414,7 +421,8 @@ def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distance [m], cosine, sine of the bearing of points (..., 2) from poses (..., 3)."""
     poses = np.asarray(pose, np.float64)
     ways = np.asarray(points, np.float64) - poses[..., :2]
-    out, headings = np.empty((*ways.shape[:-1], 3)), np.empty(ways.shape[:-1])
+    out = np.empty((*ways.shape[:-1], 3))
+    headings = np.empty(ways.shape[:-1])
     headings[...] = poses[..., 2]
     kernels.bearings(out.reshape(-1, 3), ways.reshape(-1, 2), headings.reshape(-1))
     return out
@@ -423,7 +431,8 @@ def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
 def distance(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distances (...) [m] from poses (..., 2 or 3) to points (..., 2), broadcast."""
     offset = np.asarray(points, np.float64) - np.asarray(pose, np.float64)[..., :2]
-    x, y = offset[..., 0], offset[..., 1]
+    x = offset[..., 0]
+    y = offset[..., 1]
     return np.asarray(np.sqrt(x * x + y * y))
 
 
@@ -450,7 +459,8 @@ def contact_ranges(
     if robot.footprint is not None:
         leaves = _leaves_outline(ray, np.array(robot.footprint) - [x, y]) + margin
     else:
-        start, radius = np.array([x, y]), robot.footprint_radius + margin
+        start = np.array([x, y])
+        radius = robot.footprint_radius + margin
         along = ray @ start
         rest = radius * radius - start @ start + along * along
         leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)

@@ -56,7 +56,8 @@ class Teacher:
     """Teaches in the worlds of a simulator."""
 
     def __init__(self, given: Teaching, simulator: FastSimulator) -> None:
-        self._given, self._data = given, simulator.data
+        self._given = given
+        self._data = simulator.data
         self._guide: Guide | None = None
         self._left = np.zeros(
             simulator.data.pose.shape[:2]
@@ -119,7 +120,9 @@ class Teacher:
 
     def judge(self, part: slice, outcome: Outcome) -> Outcome:
         """An outcome of a part of the worlds, with these rewards besides."""
-        terms, ended, info = outcome.terms, outcome.ended, outcome.info
+        terms = outcome.terms
+        ended = outcome.ended
+        info = outcome.info
         if self._guide is not None and self._given.path:
             left = self._guide.lengths(part, self._data)
             terms = terms | {"path": self._given.path * (self._left[part] - left)}

@@ -89,7 +89,8 @@ class CooperativeReaching(Task):
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
-        place, low = [LIMIT, 1.0, 1.0], [0.0, -1.0, -1.0]
+        place = [LIMIT, 1.0, 1.0]
+        low = [0.0, -1.0, -1.0]
         mates = self.robots - 1
         return self.box(
             [*[*low, 0.0] * self.robots, *low * mates, *[-LIMIT] * 3],
@@ -140,7 +141,8 @@ class CooperativeReaching(Task):
         approach = np.where(
             ~memory["reached"] | memory["newly"], gaps[0] - gaps[1], 0.0
         )
-        share, nearer = 1.0 / self.robots, task.total(approach)
+        share = 1.0 / self.robots
+        nearer = task.total(approach)
         newly = task.total(memory["newly"].astype(np.float64))
         return {
             "progress": np.full(lead, self.progress_reward * share * nearer[..., None]),

@@ -142,7 +142,8 @@ class BridgeVectorEnv(
         self._allocate()
 
     def _allocate(self) -> None:
-        count, robots = self.num_envs, self.robots
+        count = self.num_envs
+        robots = self.robots
         parts = self.task.observation_space.shape[0]
         self._out: Observation = np.zeros((count, robots, parts), np.float32)
         self._reward: Array = np.zeros((count, robots))
@@ -200,7 +201,8 @@ class BridgeVectorEnv(
             )
         seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
         self.ready = False
-        self._first[fresh], self._episode[fresh] = seeds[fresh], -1
+        self._first[fresh] = seeds[fresh]
+        self._episode[fresh] = -1
         if not chosen.all():  # the others keep their observation
             self._out[...] = self.task.observation(self._view(slice(None)), self.memory)
         self._begin(np.flatnonzero(chosen), self._out, options)
@@ -250,14 +252,16 @@ class BridgeVectorEnv(
                     (self.num_envs, *rows.shape[1:]), rows.dtype
                 )
             self.memory[name][worlds] = rows
-        self.ended[worlds], self._over[worlds] = False, False
+        self.ended[worlds] = False
+        self._over[worlds] = False
         seen = self.task.observation(self._view(worlds), fresh)
         out[worlds] = self.task.valid(
             "observation", seen, (len(worlds), *out.shape[1:])
         )
 
     def _view(self, rows: Rows) -> RobotView:
-        data, readings = self.simulator.data, self.simulator.readings
+        data = self.simulator.data
+        readings = self.simulator.readings
         seen = data.odom[rows], data.twist[rows], data.ranges[rows]
         return RobotView(
             *seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings}
@@ -303,7 +307,8 @@ class BridgeVectorEnv(
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
-        data, ended = self.simulator.data, self.ended[part]
+        data = self.simulator.data
+        ended = self.ended[part]
         command = guard.check_command(
             self.task.command(actions), (*ended.shape, len(self._still))
         )
@@ -367,10 +372,8 @@ class BridgeVectorEnv(
 
     def _known(self) -> dict[str, Any]:
         shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
-        pose, ages = (
-            self._row(self.simulator.data.odom).copy(),
-            np.zeros((2, self.num_envs)),
-        )
+        pose = self._row(self.simulator.data.odom).copy()
+        ages = np.zeros((2, self.num_envs))
         return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
 
     def _beginnings(self) -> dict[str, Any]:
@@ -409,10 +412,8 @@ class BridgeVectorEnv(
 
     def snapshot(self, n: int) -> Snapshot:
         """All that a picture of world n shows now; `step` does not change its arrays."""
-        data, bodies = (
-            self.simulator.data,
-            self.simulator.obstacles_of(np.array([n]))[0],
-        )
+        data = self.simulator.data
+        bodies = self.simulator.obstacles_of(np.array([n]))[0]
         goals = goals_of(
             {name: rows[n] for name, rows in self.memory.items() if name == "goal"}
         )
@@ -497,7 +498,8 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
 def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
     """Pairs facts (N, ...) with masks `_name` (N,), as Gymnasium; zero elsewhere if `alone`."""
     paired: dict[str, Any] = {}
-    gone, most = ~mask, 2 * np.count_nonzero(mask) > len(mask)
+    gone = ~mask
+    most = 2 * np.count_nonzero(mask) > len(mask)
     for name, values in facts.items():
         paired[name], paired[f"_{name}"] = values, mask.copy()
         if isinstance(values, Mapping):

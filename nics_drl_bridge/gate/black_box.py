@@ -45,7 +45,8 @@ class BlackBox:
     """Keeps the latest entries over some time [s]; their states share data, so memory is small."""
 
     def __init__(self, config: GateConfig, kept_s: float = KEPT_S) -> None:
-        self.config, self._kept_s = config, kept_s
+        self.config = config
+        self._kept_s = kept_s
         self._entries: deque[Entry] = deque()
 
     def note(self, entry: Entry) -> None:
@@ -101,7 +102,9 @@ class Replay(NamedTuple):
         """One line for each change between passing and stopping, and one about the replay."""
         if not self.entries:
             return ["no inputs"]
-        end, lines, before = self.entries[-1].now, [], "nothing"
+        end = self.entries[-1].now
+        lines = []
+        before = "nothing"
         for entry in self.entries:
             cause = entry.decision.cause
             rule = "" if cause is None else cause.rule
@@ -130,7 +133,8 @@ def replay(path: str | Path) -> Replay:
         _check_kinds(config, state, given, recorded)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
         raise _damaged(path, error) from None
-    entries, differing = [], []
+    entries = []
+    differing = []
     for index, ((now, event, plain), decision) in enumerate(
         zip(given, recorded, strict=True)
     ):

@@ -25,10 +25,8 @@ RESPONSE = 0.1  # least share of the commanded distance or angle that a robot co
 LEAST_PATH, LEAST_TURN = 0.03, 0.25
 """Least motion commanded within the window for the robot to be judged [m, rad]."""
 WINDOW = 0.75  # length of the window as a share of `stuck_s`; the rest is for the delay of odometry
-MARK_S, PAUSE_S = (
-    0.05,
-    0.2,
-)  # between two marks; least time without motion between pushes [s]
+MARK_S = 0.05  # between two marks
+PAUSE_S = 0.2  # least time without motion between pushes [s]
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
 """A robot slower than this, plus the noise of its odometry, stands still [m/s, rad/s]."""
 NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
@@ -116,7 +114,8 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
         return None
     time, before, _ = push.marks[0]
     told = push.told - before
-    path, turn = float(np.hypot(told[0], told[1])), abs(float(told[2]))
+    path = float(np.hypot(told[0], told[1]))
+    turn = abs(float(told[2]))
     if path < LEAST_PATH and turn < LEAST_TURN:
         return None
     for _, _, pose in push.marks:  # there and back again is motion, too
@@ -157,7 +156,8 @@ def same(one: Ranges, other: Ranges) -> bool:
 
 def _but_for_one(same: Flags, counted: Flags, share: float) -> bool:
     """True if this share of the counted beams is the same, or all but one of them."""
-    equal, count = int(np.count_nonzero(same)), int(np.count_nonzero(counted))
+    equal = int(np.count_nonzero(same))
+    count = int(np.count_nonzero(counted))
     return equal > 0 and equal >= min(share * count, count - 1)
 
 
@@ -185,7 +185,9 @@ def _changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
     bearing = np.arctan2(seen[:, 1], seen[:, 0])
     order = np.argsort(bearing)
     order = np.concatenate([order[-1:], order, order[:1]])  # the ends, once more around
-    bearing, is_open, turn = bearing[order], open_[order], 2.0 * np.pi
+    bearing = bearing[order]
+    is_open = open_[order]
+    turn = 2.0 * np.pi
     length = np.hypot(seen[order, 0], seen[order, 1])
     bearing[0] -= turn
     bearing[-1] += turn
@@ -193,10 +195,8 @@ def _changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
     above = np.clip(np.searchsorted(bearing, wrapped), 1, len(bearing) - 1)
     below = above - 1
     spacing = abs(angles[1] - angles[0]) if len(angles) > 1 else turn
-    low, high = (
-        np.minimum(length[below], length[above]),
-        np.maximum(length[below], length[above]),
-    )
+    low = np.minimum(length[below], length[above])
+    high = np.maximum(length[below], length[above])
     nearest = np.where(
         wrapped - bearing[below] < bearing[above] - wrapped, below, above
     )

@@ -29,10 +29,9 @@ GREATEST_SPEED = (
 )
 SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
 """A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
-LEAP, LEAP_TURN = (
-    0.1,
-    0.2,
-)  # jump of an odometry pose that may come from imprecision [m, rad]
+# jump of an odometry pose that may come from imprecision [m, rad]
+LEAP = 0.1
+LEAP_TURN = 0.2
 ANGLE_TOLERANCE = (
     1e-3  # greatest deviation of the last beam from its declared angle [rad]
 )
@@ -69,7 +68,8 @@ def decide(
     elif (
         isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S
     ):
-        publish, still = True, np.zeros(len(config.fields))
+        publish = True
+        still = np.zeros(len(config.fields))
         wish = still if state.command is None else config.command(state.command.twist)
         motion = Motion(wish, still)
         for shape in SHAPERS:
@@ -78,7 +78,8 @@ def decide(
             cause = Cause("motion_unfit", "", motion.fault)
             state = _stopped(config, replace(state, latched=cause), now, disarm=True)
         else:
-            value, recent = motion.value, _recent(config, state, motion.value, now)
+            value = motion.value
+            recent = _recent(config, state, motion.value, now)
             state = replace(
                 state,
                 value=value,
@@ -87,7 +88,8 @@ def decide(
                 recent=recent,
                 shielded=motion.shielded,
             )
-            state, shielded = frozen.watch_motion(config, state, now), motion.shielded
+            state = frozen.watch_motion(config, state, now)
+            shielded = motion.shielded
     twist = limits.flush_denormals(config.cmd_vel(state.value))
     return state, records.Decision(
         twist, publish, cause, refused, answer, granted, shielded
@@ -140,7 +142,8 @@ def _serve(
 def _stopped(
     config: GateConfig, state: GateState, moved_s: float, disarm: bool
 ) -> GateState:
-    zero, published = np.zeros_like(state.value), moved_s > state.moved_s
+    zero = np.zeros_like(state.value)
+    published = moved_s > state.moved_s
     return replace(
         state,
         value=zero,
@@ -159,10 +162,8 @@ def _recent(
     """Returns a new command after those since the newest scan, or within the latency before it."""
     if config.shield is None:
         return ()
-    since, sent = (
-        now - config.shield.latency_s - config.scan_age_s,
-        (*state.recent, (now, value)),
-    )
+    since = now - config.shield.latency_s - config.scan_age_s
+    sent = (*state.recent, (now, value))
     # A command from before `since` was in force until the next one.
     return tuple(one for one, after in pairwise((*sent, sent[-1])) if after[0] >= since)
 
@@ -210,7 +211,8 @@ def command_not_finite(config: GateConfig, command: inputs.Command) -> str:
 
 def command_implausible(config: GateConfig, command: inputs.Command) -> str:
     """The command is so far out of range that the policy must be broken."""
-    bounds, twist = config.limits, command.twist
+    bounds = config.limits
+    twist = command.twist
     if bounds is None or not limits.implausible(config.command(twist), bounds):
         return ""
     return f"cmd_vel_raw: {twist.tolist()} is far out of range"
@@ -254,7 +256,8 @@ def take(
     elif isinstance(given, inputs.Command):
         state = _take_command(state, given, now)
     elif isinstance(given, inputs.EStop):
-        pressed, known = given.pressed, state.e_stop
+        pressed = given.pressed
+        known = state.e_stop
         stop = replace(
             known, latched=known.latched or pressed, held=pressed, heard_s=now
         )
@@ -337,7 +340,8 @@ def _take_reading(
     config: GateConfig, state: GateState, reading: inputs.SensorReading, now: float
 ) -> Taken:
     place = config.sensors.index(reading.name)
-    before, after = state.sensors[:place], state.sensors[place + 1 :]
+    before = state.sensors[:place]
+    after = state.sensors[place + 1 :]
     arrivals, fault = stops.arrived(
         config,
         state.sensors[place].arrivals,
@@ -360,7 +364,8 @@ def _leap(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
 ) -> str:
     """Returns what is wrong with a pose that the robot can't have reached; empty if nothing is."""
-    before, bounds = state.odometry, config.limits
+    before = state.odometry
+    bounds = config.limits
     if before is None or bounds is None:
         return ""
     stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
@@ -430,7 +435,8 @@ def _clocks(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     """The clocks that stamp scan and odometry agree, and keep pace with this machine's clock."""
-    scans, odometries = state.scans, state.odometries
+    scans = state.scans
+    odometries = state.odometries
     if not (scans.times and odometries.times):
         return "scan and odom have not both come"
     stamped = (

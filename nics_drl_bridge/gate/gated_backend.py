@@ -30,7 +30,8 @@ class GatedBackend:
         model.robot.require_cmd_vel()
         given = load_limits(limits, model.robot)
         shield, _ = shield_config(model, given, limits)
-        self._backend, self._model = backend, model
+        self._backend = backend
+        self._model = model
         self._period_ns = round(model.control_period * interface.NS_PER_S)
         self._config = gate_config(
             model,
@@ -70,7 +71,8 @@ class GatedBackend:
         }
 
     def _seen(self, view: interface.RobotView) -> interface.RobotView:
-        lidar, now = self._model.lidar, self._now_ns
+        lidar = self._model.lidar
+        now = self._now_ns
         self._give(inputs.Odometry(now, view.pose.copy(), view.twist.copy()))
         for sensor in self._model.sensors:
             points = sensor.points(view.sensed[sensor.name])

@@ -42,13 +42,15 @@ def look(
     place = Cells(*away, CELL, math.cos(heading), math.sin(heading))
     room = body.radius + body.margin + CELL
     if before is None:
-        since, times = view.stamp_ns, np.full((CELLS, CELLS), -np.inf, np.float32)
+        since = view.stamp_ns
+        times = np.full((CELLS, CELLS), -np.inf, np.float32)
         disc = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0), radius=0.0)
         shield_kernels.cover(
             times, place, disc, min(room, _nearest(view.ranges, lidar)), 0.0
         )
     else:
-        since, moved = before.since_ns, np.subtract(corner, before.corner)
+        since = before.since_ns
+        moved = np.subtract(corner, before.corner)
         times = shield_kernels.shifted(before.times, *moved.tolist())
     now = (view.stamp_ns - since) * S_PER_NS
     given = Look(now, now - REMEMBERED_S, far, tolerance)

@@ -31,7 +31,8 @@ LEAST_MOTION = (
 )
 LONGEST_START_S, STARTED = 10.0, 0.01
 """Within the first [s] a command must be able to reach the second (share of its greatest value)."""
-SPEED, TURN = "m/s", "rad/s"
+SPEED = "m/s"
+TURN = "rad/s"
 CAR_TURN = (
     4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
 )
@@ -129,7 +130,9 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
 
 def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
     """Raises ConfigError for limits beyond the robot or a period, or too low for any motion."""
-    unit, low, high = variable.unit, min(variable.min, 0.0), max(variable.max, 0.0)
+    unit = variable.unit
+    low = min(variable.min, 0.0)
+    high = max(variable.max, 0.0)
     for name, value, beyond, bound in (
         ("min", limit.min, limit.min < low, f"at least {low:g}"),
         ("max", limit.max, limit.max > high, f"at most {high:g}"),
@@ -137,9 +140,11 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
         if beyond:
             fault = f"{value:g} {unit} is beyond the robot's own limit"
             raise ConfigError(f"{key}.{name}': {fault}; give {bound}.")
-    span, far = high - low, max(-limit.min, limit.max)
+    span = high - low
+    far = max(-limit.min, limit.max)
     for name, order, per in (("rate", 1, "/s"), ("jerk", 2, "/s^2")):
-        value, most = getattr(limit, name), span / PERIOD_S**order
+        value = getattr(limit, name)
+        most = span / PERIOD_S**order
         reach = value * LONGEST_START_S**order / order
         if value > most:
             fault = f"{value:g} {unit}{per} crosses the robot's whole range"
@@ -184,7 +189,8 @@ def flush_denormals(values: Array) -> Array:
 
 def saturate(command: Array, limits: Limits) -> Array:
     """Returns the command (C,) within its limits, speeds and turns scaled alike: the same path."""
-    speeds, factor = limits.linear | limits.turn, 1.0
+    speeds = limits.linear | limits.turn
+    factor = 1.0
     out = flush_denormals(np.clip(command, -GREATEST, GREATEST))  # 0 times inf is NaN
     for i, value in enumerate(out):
         bound = limits.high[i] if value > 0.0 else limits.low[i]
@@ -206,7 +212,9 @@ def follow(
 ) -> tuple[Array, Array]:
     """Moves a command (C,) and its slope towards its target as fast as rate and jerk allow."""
     # The turn waits for the speed, so that an accelerating robot is on its path from the start.
-    wanted, after, change = target.copy(), value.copy(), slope.copy()
+    wanted = target.copy()
+    after = value.copy()
+    change = slope.copy()
     given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
     for turning in (False, True):
         if turning and waits:
@@ -241,11 +249,15 @@ def _follow_one(
     # intervals, as the sum over them lies below the integral: a value that far within the bounds
     # stays so. In shares of the greatest value and steps of this interval, nothing overflows.
     scale = max(-least_value, most_value)
-    low, high = least_value / scale, most_value / scale
-    here, there = value / scale, target / scale
+    low = least_value / scale
+    high = most_value / scale
+    here = value / scale
+    there = target / scale
     step = min(dt / scale, GREATEST)  # per unit of slope
-    least, most = -(high - low), high - low
-    rate_step, before = min(rate * step, most), min(max(slope * step, least), most)
+    least = -(high - low)
+    most = high - low
+    rate_step = min(rate * step, most)
+    before = min(max(slope * step, least), most)
     jerk_step = min(jerk * dt * step, 2.0 * most)
     wanted = _step_towards(there - here, jerk_step)
     wanted = min(

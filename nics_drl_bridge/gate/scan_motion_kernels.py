@@ -76,18 +76,19 @@ def predict_scan(ranges, directions, moved, gap, out):  # type: ignore[no-untype
     """
     count = ranges.shape[0]
     out[:] = math.nan
-    cosine, sine = math.cos(moved[2]), math.sin(moved[2])
+    cosine = math.cos(moved[2])
+    sine = math.sin(moved[2])
     for k in range(count if directions.full_circle else count - 1):
-        near, far = ranges[k], ranges[(k + 1) % count]
+        near = ranges[k]
+        far = ranges[(k + 1) % count]
         if not abs(near - far) <= gap * min(near, far):
             continue
         bearing = directions.first + k * directions.step
-        ax, ay = (
-            near * math.cos(bearing) - moved[0],
-            near * math.sin(bearing) - moved[1],
-        )
+        ax = near * math.cos(bearing) - moved[0]
+        ay = near * math.sin(bearing) - moved[1]
         bearing += directions.step
-        bx, by = far * math.cos(bearing) - moved[0], far * math.sin(bearing) - moved[1]
+        bx = far * math.cos(bearing) - moved[0]
+        by = far * math.sin(bearing) - moved[1]
         ax, ay = cosine * ax + sine * ay, cosine * ay - sine * ax
         bx, by = cosine * bx + sine * by, cosine * by - sine * bx
         cross = ax * by - ay * bx
@@ -104,7 +105,8 @@ def predict_scan(ranges, directions, moved, gap, out):  # type: ignore[no-untype
             wrapped = direction if direction < turn - 0.5 else round(direction - turn)
             if wrapped < count:
                 angle = directions.first + wrapped * directions.step
-                ux, uy = math.cos(angle), math.sin(angle)
+                ux = math.cos(angle)
+                uy = math.sin(angle)
                 across = ux * (by - ay) - uy * (bx - ax)
                 if across > 0.0:
                     length = cross / across

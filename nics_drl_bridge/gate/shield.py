@@ -64,7 +64,8 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
 
 def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) -> Flags:
     """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
-    newest, angles = views[-1], config.beam_angles
+    newest = views[-1]
+    angles = config.beam_angles
     marked = np.zeros(len(newest.ranges), np.bool_)
     if len(angles) < 2 or shield.obstacle_speed == 0.0:
         return marked
@@ -113,7 +114,8 @@ def unknown(
 ) -> Array:
     """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown."""
     bearings, wall = _sides(shield, config.mount, len(ranges))
-    angles, half = config.beam_angles + config.mount[2], shield.unknown_width / 2.0
+    angles = config.beam_angles + config.mount[2]
+    half = shield.unknown_width / 2.0
     known, every = (
         _within(bearings, some, half) for some in (angles[~np.isnan(ranges)], angles)
     )
@@ -168,7 +170,8 @@ def ground_of(
     config: GateConfig, views: tuple[View, ...], before: Ground | None
 ) -> Ground | None:
     """Returns what is known after the newest view of where the lidar never looks, if anywhere."""
-    given, angles = config.shield, config.beam_angles
+    given = config.shield
+    angles = config.beam_angles
     if given is None or not views or len(angles) < 2:
         return None
     lidar = _beams(config)
@@ -219,10 +222,8 @@ def rehearse() -> None:
     shield_kernels.grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
     body = body_of(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
     shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
-    lidar, scan = (
-        shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0),
-        np.ones(1, np.float32),
-    )
+    lidar = shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0)
+    scan = np.ones(1, np.float32)
     shield_kernels.entered(
         np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0)
     )
@@ -236,11 +237,10 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     """Returns the greatest part of a motion from which it can stop, braking harder if needed."""
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
-    linear, turn = config.limits.linear, config.limits.turn
-    turning, speed = (
-        motion.value[turn].any(),
-        np.abs(motion.value[linear]).max(initial=0.0),
-    )
+    linear = config.limits.linear
+    turn = config.limits.turn
+    turning = motion.value[turn].any()
+    speed = np.abs(motion.value[linear]).max(initial=0.0)
     if not (turning or speed):
         return motion
 
@@ -276,7 +276,8 @@ def _greatest(safe: Callable[[float], bool]) -> float:
     """Greatest safe share of a motion, found by bisection."""
     if safe(1.0):
         return 1.0
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     for _ in range(FINEST):
         middle = (low + high) / 2.0
         low, high = (middle, high) if safe(middle) else (low, middle)
@@ -285,7 +286,8 @@ def _greatest(safe: Callable[[float], bool]) -> float:
 
 def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
     """True if the robot could still stop, and could do so without a jolt."""
-    given, points = config.shield, state.obstacles
+    given = config.shield
+    points = state.obstacles
     if given is None or points is None:
         return True
     # What further sensors show counts as standing.
@@ -302,7 +304,8 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
         if given.turn is None
         else max(given.latency_s, given.turn.reaction_s)
     )
-    since, ends = now - old - late, [time for time, _ in state.recent[1:]]
+    since = now - old - late
+    ends = [time for time, _ in state.recent[1:]]
     past = [
         one[1]
         for one, end in zip(state.recent, [*ends, now], strict=False)
@@ -380,7 +383,8 @@ def _family(
     if odometry is not None:
         twists = np.concatenate([twists, odometry[None]])
     twists = _with_drift(given, twists)
-    low, high = twists.min(axis=0), twists.max(axis=0)
+    low = twists.min(axis=0)
+    high = twists.max(axis=0)
     counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
     return np.asarray(shield_kernels.grid(low, high, counts))
 
@@ -403,7 +407,8 @@ def _with_drift(given: ShieldConfig, twists: Array) -> Array:
 
 def _car_family(wheelbase: float, commands: Array, odometry: Array | None) -> Array:
     """Returns a car's twists: curvature does not depend on speed; braking steers it straight."""
-    bends, speeds = [0.0, *np.tan(commands[:, 2]) / wheelbase], list(commands[:, 0])
+    bends = [0.0, *np.tan(commands[:, 2]) / wheelbase]
+    speeds = list(commands[:, 0])
     if odometry is not None:
         speeds.append(odometry[0])
         if abs(odometry[0]) > MOVING:

@@ -17,12 +17,16 @@ WIDTH = 0.02  # old beams within this angle of a bearing are compared [rad]
 def place(twist, time):  # type: ignore[no-untyped-def]
     """Returns x, y, cosine and sine of heading after a time on the exact arc of a twist (3,)."""
     turn = twist[2] * time
-    cosine, sine = math.cos(turn), math.sin(turn)
+    cosine = math.cos(turn)
+    sine = math.sin(turn)
     if abs(turn) < 1e-6:
-        a, b = 1.0, turn / 2.0
+        a = 1.0
+        b = turn / 2.0
     else:
-        a, b = sine / turn, (1.0 - cosine) / turn
-    x, y = (a * twist[0] - b * twist[1]) * time, (b * twist[0] + a * twist[1]) * time
+        a = sine / turn
+        b = (1.0 - cosine) / turn
+    x = (a * twist[0] - b * twist[1]) * time
+    y = (b * twist[0] + a * twist[1]) * time
     return x, y, cosine, sine
 
 
@@ -33,7 +37,8 @@ def grid(low, high, counts):  # type: ignore[no-untyped-def]
     for k in range(out.shape[0]):
         left = k
         for axis in range(3):
-            at, left = left % counts[axis], left // counts[axis]
+            at = left % counts[axis]
+            left = left // counts[axis]
             gaps = max(counts[axis] - 1, 1)
             out[k, axis] = at * ((high[axis] - low[axis]) / gaps) + low[axis]
             if at == gaps:
@@ -79,7 +84,9 @@ def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-un
     # One that is already that near must not come nearer. Points are x, y [m] and greatest speed
     # [m/s]; the robot keeps its twist for `blind` [s], then brakes, a turn as the speed of what it
     # moves most. Places are a `step` [m] apart; those are skipped that a point is too far from.
-    longest, rest, most = 0.0, 0.0, 0
+    longest = 0.0
+    rest = 0.0
+    most = 0
     for k in range(twists.shape[0]):
         path, pace = _path(twists[k], body, blind, deceleration)
         longest = max(longest, path)
@@ -113,8 +120,10 @@ def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-un
                     places[: steps + 1], twists[k], duration, pace, blind, deceleration
                 )
             while s <= steps:
-                dx, dy = near[p, 0] - places[s, 0], near[p, 1] - places[s, 1]
-                c, sine = places[s, 2], places[s, 3]
+                dx = near[p, 0] - places[s, 0]
+                dy = near[p, 1] - places[s, 1]
+                c = places[s, 2]
+                sine = places[s, 3]
                 away = clearance(c * dx + sine * dy, c * dy - sine * dx, body)
                 spare = away - near[p, 3] - near[p, 2] * places[s, 4]
                 if spare < 0.0:
@@ -132,7 +141,8 @@ def _steps_apart(spare, each, steps):  # type: ignore[no-untyped-def]
 @kernel
 def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns the longest path of a point of the footprint [m], and the speed that brakes [m/s]."""
-    speed, turn = math.hypot(twist[0], twist[1]), abs(twist[2]) * body.reach
+    speed = math.hypot(twist[0], twist[1])
+    turn = abs(twist[2]) * body.reach
     across = speed
     if body.order == 1.0:
         across = abs(twist[0]) + abs(twist[1])
@@ -162,16 +172,22 @@ def _rest(twist, pace, body, blind, deceleration):  # type: ignore[no-untyped-de
 @kernel(allocates=True)
 def _near(points, body, longest, rest):  # type: ignore[no-untyped-def]
     """Returns points that may come too near (Q, 5), with the distances to keep and of now."""
-    near, count = np.empty((points.shape[0], 5)), 0
+    near = np.empty((points.shape[0], 5))
+    count = 0
     for p in range(points.shape[0]):
-        x, y, speed = points[p, 0], points[p, 1], points[p, 2]
+        x = points[p, 0]
+        y = points[p, 1]
+        speed = points[p, 2]
         room = body.margin + longest + speed * rest
         if math.hypot(x, y) - body.radius >= room:
             continue
         away = clearance(x, y, body)
         if away < room:
-            near[count, 0], near[count, 1], near[count, 2] = x, y, speed
-            near[count, 3], near[count, 4] = min(body.margin, away) - ROUNDING, away
+            near[count, 0] = x
+            near[count, 1] = y
+            near[count, 2] = speed
+            near[count, 3] = min(body.margin, away) - ROUNDING
+            near[count, 4] = away
             count += 1
     return near[:count]
 
@@ -183,7 +199,10 @@ def _follow(places, twist, duration, pace, blind, deceleration):  # type: ignore
     for s in range(1, steps + 1):
         part = duration * s / steps
         x, y, cosine, sine = place(twist, part)
-        places[s, 0], places[s, 1], places[s, 2], places[s, 3] = x, y, cosine, sine
+        places[s, 0] = x
+        places[s, 1] = y
+        places[s, 2] = cosine
+        places[s, 3] = sine
         places[s, 4] = _reached(part, pace, blind, deceleration)
 
 
@@ -211,20 +230,23 @@ def _follow_apart(places, twist, path, pace, body, blind, deceleration):  # type
 
     The footprint moves by the same path, at most, from each place to the next.
     """
-    speed, rate = math.hypot(twist[0], twist[1]), abs(twist[2])
+    speed = math.hypot(twist[0], twist[1])
+    rate = abs(twist[2])
     turn_blind = blind + body.turn_later
     rest = _rest(twist, pace, body, blind, deceleration)
     steps = len(places) - 1
-    places[0, 0], places[0, 1], places[0, 2], places[0, 3], places[0, 4] = (
-        0.0,
-        0.0,
-        1.0,
-        0.0,
-        0.0,
-    )
-    before, moved, turned, longest = 0.0, 0.0, 0.0, 0.0
+    places[0, 0] = 0.0
+    places[0, 1] = 0.0
+    places[0, 2] = 1.0
+    places[0, 3] = 0.0
+    places[0, 4] = 0.0
+    before = 0.0
+    moved = 0.0
+    turned = 0.0
+    longest = 0.0
     for s in range(1, steps + 1):
-        low, high = before, rest
+        low = before
+        high = rest
         for _ in range(BISECTIONS if s < steps else 0):
             middle = 0.5 * (low + high)
             straight = _full_speed_time(middle, pace, blind, deceleration)
@@ -238,14 +260,17 @@ def _follow_apart(places, twist, path, pace, body, blind, deceleration):  # type
         along = straight - moved
         step = (twist[0] * along, twist[1] * along, twist[2] * (about - turned))
         x, y, cosine, sine = place(step, 1.0)
-        c, d = places[s - 1, 2], places[s - 1, 3]
+        c = places[s - 1, 2]
+        d = places[s - 1, 3]
         places[s, 0] = places[s - 1, 0] + c * x - d * y
         places[s, 1] = places[s - 1, 1] + d * x + c * y
         places[s, 2] = c * cosine - d * sine
         places[s, 3] = d * cosine + c * sine
         places[s, 4] = high
         longest = max(longest, high - before)
-        before, moved, turned = high, straight, about
+        before = high
+        moved = straight
+        turned = about
     return longest
 
 
@@ -264,22 +289,24 @@ def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-
     """Marks in `out` (B,) the beams of a scan (B,) that end where an old one saw free space."""
     # The robot's own motion, `moved` (3,), is compensated; hidden or unknown places, and other
     # flags, stay. `far` is the greatest range [m]; the tolerance is in metres and of the range.
-    beams, circle = len(ranges), 2.0 * math.pi / abs(lidar.step)
-    whole, wide = round(circle), math.ceil(WIDTH / abs(lidar.step))
-    cosine, sine = math.cos(moved[2]), math.sin(moved[2])
+    beams = len(ranges)
+    circle = 2.0 * math.pi / abs(lidar.step)
+    whole = round(circle)
+    wide = math.ceil(WIDTH / abs(lidar.step))
+    cosine = math.cos(moved[2])
+    sine = math.sin(moved[2])
     for b in range(beams):
         if out[b] or not np.isfinite(ranges[b]):
             continue
         angle = lidar.first + b * lidar.step + lidar.heading
-        x, y = (
-            lidar.x + ranges[b] * math.cos(angle),
-            lidar.y + ranges[b] * math.sin(angle),
-        )
+        x = lidar.x + ranges[b] * math.cos(angle)
+        y = lidar.y + ranges[b] * math.sin(angle)
         dx = moved[0] + cosine * x - sine * y - lidar.x
         dy = moved[1] + sine * x + cosine * y - lidar.y
         away = math.hypot(dx, dy)
         at = (math.atan2(dy, dx) - lidar.heading - lidar.first) / lidar.step
-        middle, seen = round(at - circle * math.floor(at / circle)), far
+        middle = round(at - circle * math.floor(at / circle))
+        seen = far
         for i in range(middle - wide, middle + wide + 1):
             index = i % whole
             beyond = old[index] if index < beams else np.nan
@@ -326,7 +353,8 @@ class Look(NamedTuple):
 @kernel
 def _middle(i, j, cells):  # type: ignore[no-untyped-def]
     """Returns the middle of a cell in the robot's frame [m]."""
-    dx, dy = cells.x + (j + 0.5) * cells.width, cells.y + (i + 0.5) * cells.width
+    dx = cells.x + (j + 0.5) * cells.width
+    dy = cells.y + (i + 0.5) * cells.width
     return cells.cosine * dx + cells.sine * dy, cells.cosine * dy - cells.sine * dx
 
 
@@ -356,13 +384,15 @@ def cover(times, cells, body, away, now):  # type: ignore[no-untyped-def]
 def survey(times, cells, ranges, lidar, room, look):  # type: ignore[no-untyped-def]
     """Notes in times (n, n) what a scan (B,) shows; returns which cells it sees as a whole."""
     # What is older is forgotten, but for cells within `room` [m] of the robot.
-    sees, beams = np.zeros(times.shape, np.bool_), len(ranges)
+    sees = np.zeros(times.shape, np.bool_)
+    beams = len(ranges)
     for i in range(times.shape[0]):
         for j in range(times.shape[1]):
             x, y = _middle(i, j, cells)
             if times[i, j] >= look.oldest and x * x + y * y <= room * room:
                 times[i, j] = look.now
-            dx, dy = x - lidar.x, y - lidar.y
+            dx = x - lidar.x
+            dy = y - lidar.y
             away = max(math.sqrt(dx * dx + dy * dy), cells.width)
             middle = _beam(x, y, lidar)
             beside = math.ceil(0.5 * cells.width / (away * abs(lidar.step)))
@@ -385,10 +415,8 @@ def _note_returns(times, cells, ranges, lidar):  # type: ignore[no-untyped-def]
     for b in range(len(ranges)):
         if np.isfinite(ranges[b]):
             angle = lidar.first + b * lidar.step + lidar.heading
-            x, y = (
-                lidar.x + ranges[b] * math.cos(angle),
-                lidar.y + ranges[b] * math.sin(angle),
-            )
+            x = lidar.x + ranges[b] * math.cos(angle)
+            y = lidar.y + ranges[b] * math.sin(angle)
             j = math.floor((cells.cosine * x - cells.sine * y - cells.x) / cells.width)
             i = math.floor((cells.sine * x + cells.cosine * y - cells.y) / cells.width)
             if 0 <= i < times.shape[0] and 0 <= j < times.shape[1]:
@@ -409,8 +437,10 @@ def _beam(x, y, lidar):  # type: ignore[no-untyped-def]
 def unseen(times, sees, cells):  # type: ignore[no-untyped-def]
     """Returns the middles (Q, 2) of the cells in which free or seen ground ends [m]."""
     # What lies beyond the outermost cells is not known.
-    last_i, last_j = times.shape[0] - 1, times.shape[1] - 1
-    out, count = np.empty((times.size, 2)), 0
+    last_i = times.shape[0] - 1
+    last_j = times.shape[1] - 1
+    out = np.empty((times.size, 2))
+    count = 0
     for i in range(last_i + 1):
         for j in range(last_j + 1):
             inner = 0 < i < last_i and 0 < j < last_j
@@ -418,7 +448,8 @@ def unseen(times, sees, cells):  # type: ignore[no-untyped-def]
                 continue
             known = False
             for across, up in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-                k, m = min(max(i + up, 0), last_i), min(max(j + across, 0), last_j)
+                k = min(max(i + up, 0), last_i)
+                m = min(max(j + across, 0), last_j)
                 known = known or sees[k, m] or times[k, m] > -np.inf
             if known:
                 out[count, 0], out[count, 1] = _middle(i, j, cells)

@@ -14,7 +14,8 @@ from nics_drl_bridge.robot.braking import NO_DRIFT, Drift, OwnTurn
 
 Ranges = NDArray[np.float32]
 Record = TypeVar("Record")
-INF, NAN = float("inf"), float("nan")
+INF = float("inf")
+NAN = float("nan")
 
 
 def replace(record: Record, **changes: Any) -> Record:

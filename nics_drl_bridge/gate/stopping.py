@@ -38,7 +38,8 @@ def gate_config(
     **rules: Any,
 ) -> GateConfig:
     """Returns the configuration of a robot's gate; `rules` are further fields of it."""
-    lidar, robot = model.lidar, model.robot
+    lidar = model.lidar
+    robot = model.robot
     least_rate = {"odom_rate": 1.0 / model.control_period, "odom_rate_declared": False}
     given = rules if "odom_rate" in rules else {**least_rate, **rules}
     return GateConfig(
@@ -133,10 +134,12 @@ def braking_by(model: SimulatorModel, limits: Limits | None) -> Braking:
     robot = model.robot
     linear = np.array([variable.unit == SPEED for variable in robot.command])
     if limits is None:
-        low, high = robot.command_low, robot.command_high
+        low = robot.command_low
+        high = robot.command_high
         rates = np.full(len(linear), UNKNOWN_DECELERATION)
     else:
-        low, high = limits.low, limits.high
+        low = limits.low
+        high = limits.high
         rates = limits.rate
     ramp = np.where(linear, rates, np.inf)
     braking = braking_of(robot, model.kinematics, low, high, ramp)
@@ -192,7 +195,8 @@ def require_possible(config: GateConfig) -> None:
 
 def doubtful(config: GateConfig, control_period_s: float) -> str:
     """Returns a warning about an age limit that only suits a policy with a shorter period [s]."""
-    age, period = f"{config.command_age_s:g} s", f"{control_period_s:g}"
+    age = f"{config.command_age_s:g} s"
+    period = f"{control_period_s:g}"
     every = f"a policy commands every {period} s unless it is told otherwise"
     advice = f"the robot would stop between any two commands; give more than {period}."
     late = config.command_age_s <= control_period_s

@@ -16,7 +16,10 @@ from nics_drl_bridge.gate.state import (
 )
 from nics_drl_bridge.interface import S_PER_NS
 
-SCAN, ODOM, RAW, E_STOP = "scan", "odom", "cmd_vel_raw", "e_stop"
+SCAN = "scan"
+ODOM = "odom"
+RAW = "cmd_vel_raw"
+E_STOP = "e_stop"
 KEPT = (
     64  # number of remembered stamps; a command on an older scan is on an unknown one
 )
@@ -64,13 +67,12 @@ def arrived(
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
         return fresh, "jumped"
     marks = _marked(arrivals, stamp_ns, now, lead, config.settle_s)
-    passed, envelope = now - arrivals.times[-1], max(mark[3] for mark in marks)
+    passed = now - arrivals.times[-1]
+    envelope = max(mark[3] for mark in marks)
     if armed:
         fall = SIMULATED_LAG if config.simulated else DRIFT
-        lowest, highest = (
-            arrivals.envelope - fall * passed,
-            arrivals.envelope + DRIFT * passed,
-        )
+        lowest = arrivals.envelope - fall * passed
+        highest = arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
     return Arrivals(
         (*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
@@ -144,14 +146,16 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
     first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
     if first is None or arrivals.count <= first[2]:
         return 0.0, 0.0
-    count, passed = arrivals.count - first[2], arrivals.times[-1] - first[0]
+    count = arrivals.count - first[2]
+    passed = arrivals.times[-1] - first[0]
     stamped = (arrivals.stamps_ns[-1] - first[1]) * S_PER_NS
     return (count / passed if passed > 0.0 else math.inf), count / stamped
 
 
 def creep(arrivals: Arrivals) -> float:
     """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
-    leads, half = [mark[3] for mark in arrivals.marks], len(arrivals.marks) // 2
+    leads = [mark[3] for mark in arrivals.marks]
+    half = len(arrivals.marks) // 2
     return max(leads[half:]) - max(leads[:half]) if half else 0.0
 
 
@@ -167,14 +171,13 @@ def take_time(
     fault = (
         f"the steady clock stands still at {now} s" if still >= FROZEN_INPUTS else ""
     )
-    ticked, awake = state.tick_s, state.awake_s
+    ticked = state.tick_s
+    awake = state.awake_s
     if (
         ticked is not None and now - ticked > config.gap_s
     ):  # at whatever input wakes it up
-        fault, awake = (
-            f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s",
-            now,
-        )
+        fault = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s"
+        awake = now
     elif (
         now - awake <= config.gap_s
     ):  # a single zero may be lost: only the newest command counts
@@ -252,7 +255,8 @@ def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause |
     """The scan behind the command is old, however fresh the command: a republisher, or a hang."""
     if state.command is None:
         return None
-    detail, old = f"the scan behind {RAW} is old", now - state.behind_s
+    detail = f"the scan behind {RAW} is old"
+    old = now - state.behind_s
     return _too_old("scan_behind_old", SCAN, detail, old, config.scan_age_s)
 
 
@@ -267,7 +271,8 @@ def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | N
     heard = state.e_stop.heard_s
     if heard is None and not config.e_stop_required:
         return None
-    old, limit = math.inf if heard is None else now - heard, config.e_stop_silence_s
+    old = math.inf if heard is None else now - heard
+    limit = config.e_stop_silence_s
     return _too_old(
         "e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit
     )

@@ -186,7 +186,8 @@ def rate_unseen(gap_s: float, duration_s: float) -> Assessment:
 
 
 def _rate_error(at: HorizonErrors, radius: float) -> Assessment:
-    limits, share = THRESHOLDS, relative_error(at, radius)
+    limits = THRESHOLDS
+    share = relative_error(at, radius)
     if share <= limits.good_error:
         return Assessment(Verdict.GOOD, ())
     if not np.isfinite(share):
@@ -200,7 +201,8 @@ def _rate_error(at: HorizonErrors, radius: float) -> Assessment:
 
 
 def _rate_band(at: HorizonErrors) -> Assessment:
-    limits, coverage = THRESHOLDS, at.coverage
+    limits = THRESHOLDS
+    coverage = at.coverage
     if coverage is None or coverage >= limits.good_coverage:
         return Assessment(Verdict.GOOD, ())
     low = coverage < limits.worst_coverage

@@ -61,15 +61,11 @@ class _Completion:
                 if name not in factors:
                     continue
                 factors.remove(name)
-                learnt, value = (
-                    self.rows[dof].pop("*".join(factors) or "1", None),
-                    self.point[name],
-                )
+                learnt = self.rows[dof].pop("*".join(factors) or "1", None)
+                value = self.point[name]
                 if learnt is not None and abs(value) > MIN_OPERATING_POINT:
-                    coefficient, source = (
-                        learnt / value,
-                        f"measured at {name} = {value:g}",
-                    )
+                    coefficient = learnt / value
+                    source = f"measured at {name} = {value:g}"
                 else:
                     coefficient = self._slope(d, product)
                     source = self.source
@@ -114,11 +110,15 @@ class _Completion:
 
     def restore_rate(self, i: int) -> None:
         """Makes a state follow the commands that never moved, with its lag (learnt or nominal)."""
-        name, row = self.spec.state[i].name, self.rows[f"d_{self.spec.state[i].name}"]
-        lag, source = float(self.book.lag[i]), f" ({self.source})"
+        name = self.spec.state[i].name
+        row = self.rows[f"d_{self.spec.state[i].name}"]
+        lag = float(self.book.lag[i])
+        source = f" ({self.source})"
         rate = float(-np.expm1(-self.dt / lag)) / self.dt
         if name in row:
-            rate, lag, source = -row[name], -1.0 / row[name], ""
+            rate = -row[name]
+            lag = -1.0 / row[name]
+            source = ""
         added = self._turning(i, row, rate)
         if added is None:
             added = self._following(i, row, rate)
@@ -139,12 +139,11 @@ class _Completion:
         self, i: int, row: dict[str, float], rate: float
     ) -> dict[str, float]:
         """Returns the terms by which a state follows commands, each on its own."""
-        commands, target = self.spec.command, self.book.target
-        here, added, constant = (
-            np.array([self.point[c.name] for c in commands]),
-            {},
-            0.0,
-        )
+        commands = self.spec.command
+        target = self.book.target
+        here = np.array([self.point[c.name] for c in commands])
+        added = {}
+        constant = 0.0
         for j, command in enumerate(commands):
             step = np.where(np.arange(len(commands)) == j, DIFFERENCE, 0.0)
             slope = (target(here + step)[i] - target(here - step)[i]) / (
@@ -166,10 +165,8 @@ class _Completion:
 
         It is the product of speed and steering, measured at a constant if there is one.
         """
-        given, state = (
-            structure_of(self.spec),
-            {v.twist: v.name for v in self.spec.state},
-        )
+        given = structure_of(self.spec)
+        state = {v.twist: v.name for v in self.spec.state}
         turned = self.spec.state[i].twist == "wz" and "vx" in state
         if given is None or not given[1].used or not turned:
             return None

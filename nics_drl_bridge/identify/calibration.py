@@ -133,7 +133,8 @@ class Calibration:
 def align(drive: Drive, calibration: Calibration) -> Samples:
     """Puts a drive on one time axis, at `base_link`; RecordingError: no overlap in time."""
     # Without corrections it is used bit for bit; else noisy poses are smoothed by local parabolas.
-    recording, period = drive.recording, drive.settings.control_period_s
+    recording = drive.recording
+    period = drive.settings.control_period_s
     if (
         calibration.is_exact
         and (shared := _shared_stamps(recording, period)) is not None
@@ -170,7 +171,8 @@ def poses_at(
     drive: Drive, calibration: Calibration, grid: Array, half_width: float
 ) -> Array:
     """Returns poses (T, 3) of `base_link` at times on the commands' clock, by a half-width [s]."""
-    t, pose = drive.sample_t + calibration.clock_offset_s, drive.recording.pose
+    t = drive.sample_t + calibration.clock_offset_s
+    pose = drive.recording.pose
     return calibration.to_base(
         resample(t, unwrapped(pose.values), grid, half_width, pose.weights)
     )
@@ -190,7 +192,8 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     lead = int(np.ceil(max(0.0, grid[0] - recording.command.t[0]) / step)) + 1
     longer = np.concatenate([grid[0] + step * np.arange(-lead, 0), grid])
     late = delays([r.command for r in calibration.responses], calibration.inputs)
-    latency, motors = calibration.command_latency_s + late, calibration.motors
+    latency = calibration.command_latency_s + late
+    motors = calibration.motors
     inferred = inferred_states(
         recording.command, drive.spec, lags, latency, longer, motors
     )
@@ -201,7 +204,9 @@ def _shared_stamps(
     recording: Recording, period: float
 ) -> tuple[Array, Array, Array, Array] | None:
     """Returns stamps (T,), poses, states, commands of the rows on one grid, a part of a period."""
-    pose, state, command = recording.pose, recording.state, recording.command
+    pose = recording.pose
+    state = recording.state
+    command = recording.command
     if state is None or not (usual := float(np.median(np.diff(pose.t)))) > 0.0:
         return None
     step = part_of(period, usual)
@@ -245,7 +250,8 @@ def _grid(
     first = max(pose[0], recording.command.t[0] + calibration.command_latency_s)
     last = pose[-1]
     if recording.state is not None:
-        first, last = max(first, recording.state.t[0]), min(last, recording.state.t[-1])
+        first = max(first, recording.state.t[0])
+        last = min(last, recording.state.t[-1])
     count = int(np.floor((last - first) / step + 1e-6))
     if count < MIN_STAMPS:
         fault = f"commands and poses overlap for {max(last - first, 0.0):.2f} s only"

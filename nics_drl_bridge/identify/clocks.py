@@ -41,7 +41,8 @@ BOUNDS = (
     (-0.5, np.log(0.005)),
     (0.5, np.log(2.0)),
 )  # of the delay [s], of log(lag / s)
-MAX_ROWS, FEW_ROWS = 2000, 1000
+MAX_ROWS = 2000
+FEW_ROWS = 1000
 EXACT = 1e-6
 LONG_STEP = 1.5  # a step longer than this many usual steps is a gap
 WHEELS_EXPLAINED = 0.5  # the commands must explain this share of the wheels' variance
@@ -60,13 +61,11 @@ EARLY_WORTH = (
 )
 # The delay is sought in so many parts of a drive, this far around that of the whole. It drifts if
 # it grows by more than the least, and the parts lie on a line to this share of its growth.
-DRIFT_PARTS, DRIFT_REACH_S, DRIFT_STEP_S, LEAST_DRIFT_S, DRIFT_OFF = (
-    4,
-    0.6,
-    0.03,
-    0.12,
-    0.25,
-)
+DRIFT_PARTS = 4
+DRIFT_REACH_S = 0.6
+DRIFT_STEP_S = 0.03
+LEAST_DRIFT_S = 0.12
+DRIFT_OFF = 0.25
 MIN_EARLY_S = 0.03  # smaller ones may be a lag of another form
 TOLD_S = 0.005  # a latency that is less certain can't be told from a lag
 
@@ -133,7 +132,8 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
     span = np.diff(state.t)
     keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
     keep = keep[some_of(len(keep), MAX_ROWS)]
-    start, end = state.t[keep], state.t[keep + 1]
+    start = state.t[keep]
+    end = state.t[keep + 1]
     rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0
 
@@ -178,7 +178,8 @@ def _search(
     residual: Residual, centers: tuple[float, ...], lags: Array
 ) -> DelayEstimate:
     """Finds the delay on ever finer grids, then refines it together with the lags' logarithms."""
-    around, log_lags = np.array(centers), np.log(lags)
+    around = np.array(centers)
+    log_lags = np.log(lags)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
         tries = np.add.outer(
             around, np.arange(-reach, reach + step / 2.0, step)
@@ -194,8 +195,10 @@ def _search(
         residual, start, np.full(len(start), 0.1), (low, high)
     )
     if float((rest**2).sum()) >= min(cost):
-        found, rest = start, residual(start)
-    sigma, tau = uncertainty(jacobian, rest), np.exp(found[1:])
+        found = start
+        rest = residual(start)
+    sigma = uncertainty(jacobian, rest)
+    tau = np.exp(found[1:])
     explained = 1.0 - float((rest**2).mean())
     return DelayEstimate(
         float(found[0]), float(sigma[0]), tau, sigma[1:] * tau, explained
@@ -225,8 +228,12 @@ class TimingEstimate:
 
 def timing_of(drive: Drive) -> TimingEstimate:
     """Estimates clock offset, latency and lags as far as the recording allows (RecordingError)."""
-    recording, spec, twists = drive.recording, drive.spec, drive.twists
-    command, state, place = recording.command, recording.state, recording.source
+    recording = drive.recording
+    spec = drive.spec
+    twists = drive.twists
+    command = recording.command
+    state = recording.state
+    place = recording.source
     missing = [v.name for v in spec.state if v.must_be_measured]
     if state is None and missing:
         fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
@@ -280,7 +287,8 @@ def _drift(
     tries = delay.value + np.arange(
         -DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S
     )
-    middles, found = [], []
+    middles = []
+    found = []
     for part in np.array_split(np.arange(len(start)), DRIFT_PARTS):
         if len(part) < FEW_ROWS // 10:
             return 0.0
@@ -322,15 +330,20 @@ def _timing_of_two_clocks(
         return TimingEstimate(
             -delay.value, 0.0, sigma, delay.lags, delay.lag_sigma, False
         )
-    both, latency = float(np.hypot(wheels.sigma, delay.sigma)), max(wheels.value, 0.0)
+    both = float(np.hypot(wheels.sigma, delay.sigma))
+    latency = max(wheels.value, 0.0)
     sigma = {"clock_offset_s": both, "command_latency_s": wheels.sigma}
     offset = latency - delay.value
     return TimingEstimate(offset, latency, sigma, wheels.lags, wheels.lag_sigma, True)
 
 
 def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
-    recording, twists = drive.recording, drive.twists
-    sigma, latency, offset, early = {}, 0.0, 0.0, 0.0
+    recording = drive.recording
+    twists = drive.twists
+    sigma = {}
+    latency = 0.0
+    offset = 0.0
+    early = 0.0
     separated = bool(signals.moved_commands(recording.command).any())
     if separated:
         found = _search_or_zero(state_residual(recording.command, state, drive.spec))
@@ -376,7 +389,8 @@ def expected_states(
     drive: Drive, twists: TwistIntervals, timing: TimingEstimate
 ) -> Array:
     """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
-    command, state = drive.recording.command, drive.recording.state
+    command = drive.recording.command
+    state = drive.recording.state
     start, end = twists.on_clock(timing.offset)
     if state is not None:
         return signals.interval_means(state.t, state.values, start, end)
@@ -398,7 +412,8 @@ def responses_of(
     spec = drive.spec
     if drive.recording.state is not None:
         return ()
-    gains, speed = np.ones(len(spec.state)), signals.speed_index(spec)
+    gains = np.ones(len(spec.state))
+    speed = signals.speed_index(spec)
     moved = signals.moved_inputs(drive.recording.command, spec)
     if speed is not None and expected is not None and moved[speed]:
         gains[speed] = float(
@@ -432,7 +447,8 @@ def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
     wheels = wheel_means(drive, calibration)
     if wheels is None:
         return calibration
-    difference, turn = wheels[:, 1] - wheels[:, 0], drive.twists.twist[:, 2]
+    difference = wheels[:, 1] - wheels[:, 0]
+    turn = drive.twists.twist[:, 2]
     size = float(np.sqrt((difference**2).mean() * (turn**2).mean()))
     if size > 0.0:
         agreement = float((difference * turn).mean()) / size
@@ -449,5 +465,6 @@ def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
         scale = float(units @ moved / (units @ units))
         error = float(standard_errors(units[:, None], moved - scale * units)[0])
         if abs(scale) > CERTAIN * error:
-            scales[name], sigma[name] = scale, error
+            scales[name] = scale
+            sigma[name] = error
     return replace(calibration, **scales, uncertainty=sigma)

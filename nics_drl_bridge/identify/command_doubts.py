@@ -18,7 +18,8 @@ def doubts_of_commands(
 ) -> Iterator[str]:
     """Yields a sentence if the commands hardly help to predict, or act implausibly late."""
     for at in usual(tuple(judgement)):
-        error, without = at.model.position_m, at.kept_twist.position_m
+        error = at.model.position_m
+        without = at.kept_twist.position_m
         if HARDLY * without < error < without:
             ends = f"end {error:.3g} m off after {at.horizon_s:g} s, without them {without:.3g} m"
             yield (

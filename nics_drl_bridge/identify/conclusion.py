@@ -40,7 +40,8 @@ class Conclusion(NamedTuple):
 
 def conclude(identified: Identified) -> Conclusion:
     """Draws the conclusion of a fit."""
-    spec, assessment = identified.drive.spec, identified.assessment
+    spec = identified.drive.spec
+    assessment = identified.assessment
     wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
     strange = tuple(str(note) for note in identified.notes if isinstance(note, Doubt))
     replaced = identified.findings.replaced

@@ -114,7 +114,10 @@ class Drive:
     @cached_property
     def twists(self) -> "TwistIntervals":
         """Twists of the tracked body over spans in which motion stands out of the noise."""
-        t, pose, stride, limit = self.dated.t, self.dated.values, 1, MAX_GAP_S
+        t = self.dated.t
+        pose = self.dated.values
+        stride = 1
+        limit = MAX_GAP_S
         if self.bursts is not None:
             limit = 1.8 * self.bursts.period_s
         else:
@@ -133,7 +136,8 @@ class Drive:
             both = zip(self.pose_noise or (0.0, 0.0), (speed, turn), strict=True)
             needed = max(noise / max(SLOPE_NOISE * size, 1e-9) for noise, size in both)
             stride = int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))
-        t, pose = t[::stride], pose[::stride]
+        t = t[::stride]
+        pose = pose[::stride]
         span = np.diff(t)
         usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
         twist = (

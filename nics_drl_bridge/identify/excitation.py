@@ -36,7 +36,8 @@ USUAL = (
 MOST = 0.2  # a larger share of rows is not outliers but a misfit of the model
 BEYOND = 0.5  # a value beyond its limits by this share of its range is a sensor fault
 # If there are outliers, the misfit of the rest is estimated from its tail, not from its median.
-BULK_PERCENTILE, GAUSSIAN_BULK = 90.0, 1.645
+BULK_PERCENTILE = 90.0
+GAUSSIAN_BULK = 1.645
 GRID_S = 0.05
 ENDS = (2.0, 98.0)  # percentiles that bound the range of a command
 NARROW = (
@@ -256,15 +257,14 @@ def narrow(recording: Recording, spec: RobotSpec) -> list[str]:
 
 def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ...]:
     """Measures the coverage of each command of a recording, by the same rules as a fit."""
-    t, row = recording.command.t, recording.command.values
+    t = recording.command.t
+    row = recording.command.values
     grid = np.arange(t[0], t[-1], GRID_S)
     command = row[np.searchsorted(t, grid, side="right") - 1]
     nothing = np.zeros((len(grid), 3))
     samples = samples_on_one_clock(grid, nothing, nothing[:, :0], command)
-    found, own = (
-        Excitation.of(samples, spec.model_copy(update={"state": ()})),
-        _own(samples.x),
-    )
+    found = Excitation.of(samples, spec.model_copy(update={"state": ()}))
+    own = _own(samples.x)
     low, high = np.percentile(command, ENDS, axis=0)
     share = (high - low) / (spec.command_high - spec.command_low)
     faults = dict.fromkeys(found.levels, "")

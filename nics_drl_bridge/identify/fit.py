@@ -29,7 +29,8 @@ ORDER = 2
 ROUNDING = (
     1e-9  # standardised coefficients below this share of the rates are rounding errors
 )
-SAME_STEP, ROUNDING_S = 1e-3, 1e-6
+SAME_STEP = 1e-3
+ROUNDING_S = 1e-6
 
 
 def parse_alpha(text: str) -> Alpha:
@@ -68,7 +69,8 @@ class Regression:
 
     def rows(self, d: int) -> tuple[Array, Array]:
         """Returns features (n, K) and rates (n,) of a degree of freedom without its outliers."""
-        inside, target = self.inliers[d], self.samples.dq[:, d]
+        inside = self.inliers[d]
+        target = self.samples.dq[:, d]
         return (
             (self.chi, target) if inside.all() else (self.chi[inside], target[inside])
         )
@@ -90,7 +92,8 @@ class Fit:
     @np.errstate(over="ignore", invalid="ignore")
     def curves(self) -> tuple[statistics.Curve, ...]:
         """Accuracy against the number of terms, of the degrees of freedom that move."""
-        found, names = self.regression, (self.model.dofs, self.model.variables)
+        found = self.regression
+        names = (self.model.dofs, self.model.variables)
         kept = {d: _kept(found, d, self.alpha, *names) for d in found.moving}
         return tuple(
             replace(_curve(found, d, *names), kept=int(keep.sum()))
@@ -129,12 +132,14 @@ def regress(
     # within a step a command acts through the state, and in noise the two can't be told apart.
     believed = excitation.plausible(samples.x, spec)
     samples = samples.rows(believed)
-    excited, names = excitation.Excitation.of(samples, spec), spec.variable_names
+    excited = excitation.Excitation.of(samples, spec)
+    names = spec.variable_names
     every = taylor.exponents(len(names), order)
     powers = excitation.moved_terms(samples, every, names, excited.unmoved)
     chi = taylor.evaluate(samples.x, powers)
     independent, dependent = excitation.independent_columns(chi)
-    chi, kept = chi[:, independent], powers[independent]
+    chi = chi[:, independent]
+    kept = powers[independent]
     beta = np.zeros((samples.dq.shape[1], len(kept)))
     used = np.ones(samples.dq.T.shape, dtype=np.bool_)
     if allowed is None:
@@ -143,19 +148,21 @@ def regress(
             terms[:3] = excitation.terms_through_state(kept, spec, excited.unmoved)
     else:
         terms = allowed(kept, spec)
-    usual, moving = (
-        excitation.usual_ranges(samples.dq),
-        excitation.moving_dofs(samples.dq),
-    )
+    usual = excitation.usual_ranges(samples.dq)
+    moving = excitation.moving_dofs(samples.dq)
     for d in moving:
-        some, target = chi[:, terms[d]], samples.dq[:, d]
+        some = chi[:, terms[d]]
+        target = samples.dq[:, d]
         used[d] = excitation.inliers(some / _scale(some), target, float(usual[d]))
         if not used[d].all():
-            some, target = some[used[d]], target[used[d]]
-        unit, used_terms = some / _scale(some), np.flatnonzero(terms[d])
+            some = some[used[d]]
+            target = target[used[d]]
+        unit = some / _scale(some)
+        used_terms = np.flatnonzero(terms[d])
         if noisy:
             candidates = statistics.significant(unit, target)
-            unit, used_terms = unit[:, candidates], used_terms[candidates]
+            unit = unit[:, candidates]
+            used_terms = used_terms[candidates]
         if len(used_terms):
             beta[d, used_terms] = np.linalg.lstsq(unit, target, rcond=None)[0]
     return Regression(
@@ -198,12 +205,11 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
     """Keeps the share `alpha` of a regression (Eq. 2), or `auto`; estimates the kept terms anew."""
     # The term that crosses the share is kept: else a differential robot would lose a wheel. `auto`
     # keeps as many terms, in the same order, as improve the cross-validated error.
-    samples, shape = regression.samples, regression.beta.shape
-    coefficients, errors, conditions = (
-        np.zeros(shape),
-        np.zeros(shape),
-        np.ones(shape[0]),
-    )
+    samples = regression.samples
+    shape = regression.beta.shape
+    coefficients = np.zeros(shape)
+    errors = np.zeros(shape)
+    conditions = np.ones(shape[0])
     noisy_state = excitation.states_are_noisy(samples, spec)
     for d in regression.moving:
         chi, target = regression.rows(d)
@@ -250,7 +256,8 @@ def _kept(
     variables: tuple[str, ...],
 ) -> NDArray[np.bool_]:
     """Returns a mask (K,) of the terms that a degree of freedom keeps."""
-    beta, floor = regression.beta[d], _floor(regression, d)
+    beta = regression.beta[d]
+    floor = _floor(regression, d)
     if alpha != "auto":
         return prune(beta, alpha, floor)
     order = by_weight(beta, floor)[: _curve(regression, d, dofs, variables).kept]
@@ -279,18 +286,17 @@ def _reestimate(
     """Replaces a state's coefficients (K,) and errors by instruments, unless these are too weak."""
     # The noise of a state is both in X and in its rate, so that least squares would mistake it for
     # a fast decay; that of the state one step earlier is independent: it is an instrument for X.
-    samples, inside, kept = (
-        regression.samples,
-        regression.inliers[d],
-        np.flatnonzero(coefficients),
-    )
+    samples = regression.samples
+    inside = regression.inliers[d]
+    kept = np.flatnonzero(coefficients)
     follows = (
         np.abs(np.diff(samples.t) - samples.dt) < SAME_STEP * samples.dt + ROUNDING_S
     )
     now = np.flatnonzero(follows & inside[1:] & inside[:-1]) + 1
     if len(kept) == 0 or len(now) <= len(kept):
         return
-    earlier, powers = samples.x[now].copy(), regression.powers[kept]
+    earlier = samples.x[now].copy()
+    powers = regression.powers[kept]
     earlier[:, :states] = samples.x[now - 1, :states]
     chi, instruments = (taylor.evaluate(x, powers) for x in (samples.x[now], earlier))
     found = statistics.instrumental(chi, instruments, samples.dq[now, d])

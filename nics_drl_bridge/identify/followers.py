@@ -24,7 +24,9 @@ FREE = (
     np.inf,
     0.0,
 )  # fall, rise and dead zone of a motor that holds nothing back
-LAGS_S, DELAYS_S = (0.05, 0.15, 0.4), (0.0, 0.05, 0.1, 0.2)  # tried with limits
+# tried with limits
+LAGS_S = (0.05, 0.15, 0.4)
+DELAYS_S = (0.0, 0.05, 0.1, 0.2)
 RATES = (
     0.25,
     0.5,
@@ -79,17 +81,17 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
         return timing
     moved = np.flatnonzero(signals.moved_inputs(drive.recording.command, drive.spec))
     found = _found(drive, timing, moved)
-    delay, sigma = found.best.delays[moved], found.sigma
+    delay = found.best.delays[moved]
+    sigma = found.sigma
     if not np.isfinite(sigma).all():
         return timing
     first = int(np.argmin(delay + clocks.CERTAIN * sigma[0]))
     alike = np.abs(delay - delay[first]) <= clocks.CERTAIN * np.hypot(
         sigma[0], sigma[0, first]
     )
-    told, motors = (
-        len(timing.sigma) > 1,
-        found.best.motors,
-    )  # True if wheels told the latency
+    # True if wheels told the latency
+    told = len(timing.sigma) > 1
+    motors = found.best.motors
     held = motors.limited
     if told and alike.all() and not (held.any() or motors.dead.any()):
         return timing
@@ -110,11 +112,9 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     if timing.separated and errors["command_latency_s"] > clocks.TOLD_S:
         names = (_of_sum(drive.spec.state[i].name) for i in moved)
         errors |= zip(names, map(float, sigma[1]), strict=True)
-    lags, lag_sigma, further = (
-        timing.lags.copy(),
-        timing.lag_sigma.copy(),
-        0.0 * timing.lags,
-    )
+    lags = timing.lags.copy()
+    lag_sigma = timing.lag_sigma.copy()
+    further = 0.0 * timing.lags
     further[moved] = np.where(alike, 0.0, np.maximum(delay - least, 0.0))
     sums = delay + found.best.lags[moved]
     lags[moved], lag_sigma[moved] = (
@@ -173,10 +173,8 @@ def limits_of(
 
 def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
     """Returns the greatest fall and rise (S, 2) of the states, at the gains of their responses."""
-    limits, gains = (
-        np.tile([-np.inf, np.inf], (len(spec.state), 1)),
-        calibration.responses,
-    )
+    limits = np.tile([-np.inf, np.inf], (len(spec.state), 1))
+    gains = calibration.responses
     for i, v in enumerate(spec.state):
         limits[i] = calibration.limits.get(v.name, limits[i])
     return np.asarray(limits * np.array([r.gain for r in gains] or [1.0])[:, None])
@@ -184,7 +182,8 @@ def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
 
 def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Samples:
     """Returns samples with the rates that states with limits would have without."""
-    rates, names = samples.dq.copy(), [c.name for c in spec.command]
+    rates = samples.dq.copy()
+    names = [c.name for c in spec.command]
     for i, response in enumerate(calibration.responses):
         if response.state in calibration.limits:
             target = (
@@ -200,14 +199,14 @@ def _found(
     drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp]
 ) -> _Adjusted:
     """Returns how moved states follow, with limits and dead zones if they clearly explain more."""
-    twists, command, spec = drive.twists, drive.recording.command, drive.spec
+    twists = drive.twists
+    command = drive.recording.command
+    spec = drive.spec
     rows = clocks.some_of(len(twists.start), clocks.FEW_ROWS)
     moving = list(moving_dofs(twists.twist))
-    begin, shift, size = (
-        twists.start[rows],
-        timing.latency - timing.offset,
-        len(timing.lags),
-    )
+    begin = twists.start[rows]
+    shift = timing.latency - timing.offset
+    size = len(timing.lags)
     start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
     for _ in range(2):  # what commands do not explain hides what motors do
         target = (begin, twists.end[rows], twists.twist[rows][:, moving])
@@ -253,7 +252,8 @@ def _with_limits(
         RATES, LAGS_S, {*(shift + d for d in DELAYS_S), *now.delays}
     ):
         size = rate * float(np.ptp(reach))
-        fall, rise = _put(now.motors.fall, i, -size), _put(now.motors.rise, i, size)
+        fall = _put(now.motors.fall, i, -size)
+        rise = _put(now.motors.rise, i, size)
         motors = now.motors._replace(fall=fall, rise=rise)
         yield _Following(_put(now.lags, i, lag), _put(now.delays, i, delay), motors)
 
@@ -284,7 +284,9 @@ def _adjusted(
     size = np.abs(given[held])
 
     def at(theta: Array) -> _Following:
-        lags, delays, motors = start.lags.copy(), start.delays.copy(), given.copy()
+        lags = start.lags.copy()
+        delays = start.delays.copy()
+        motors = given.copy()
         delays[moved], lags[moved] = theta[:count], np.exp(theta[count : 2 * count])
         motors[held] = given[held] * np.exp(theta[2 * count :])
         return _Following(lags, delays, Motors(*motors.T))

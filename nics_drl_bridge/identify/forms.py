@@ -30,10 +30,17 @@ WORTH = 0.03  # a curve takes at least this share of what is left without it
 CLEAR = 0.25  # one of the turn rate this, as understeer looks alike; then it is beyond doubt
 STRIDE_S = 0.04
 NOTHING = 1e-6  # [m/s, rad/s]
-DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
+# of the search for a delay
+DELAY_ORDER = 2
+DELAY_STEP_S = 0.02
+LONGEST_S = 0.4
 ALIKE_S = 0.01  # delays of commands that differ by less are tried as one
-DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
-BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
+# steps of their refinement
+DELAY_SCALE_S = 0.05
+CURVE_SCALE = 0.1
+# of a gain backwards
+BACK_SCALE = 0.2
+BACK_RANGE = (0.2, 5.0)
 SMALL_DEAD = (
     0.05  # share of a command's reach at which the search for a dead zone begins
 )
@@ -45,7 +52,8 @@ NEAR_END = (
 )
 SELDOM = 1.0  # percentage of a drive that is to exceed a limit of a rate
 STRONG = 95.0  # percentile of the rates at which limits are first sought
-LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
+LEVER_SCALE_M = 0.05
+TURN_SCALE = 0.1
 
 
 @dataclass(frozen=True)
@@ -153,10 +161,8 @@ class Form:
     ) -> tuple[InputCurve, ...]:
         """Returns the input curves for values (I,)."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
-        latency, curves = (
-            self.latency_at(inputs, values),
-            {c.command: c for c in self.curves},
-        )
+        latency = self.latency_at(inputs, values)
+        curves = {c.command: c for c in self.curves}
         for name, _ in self.delays:
             curves.setdefault(name, InputCurve(command=name))
         found = (
@@ -205,7 +211,10 @@ def problem_of(
     inputs: shooting.Inputs,
 ) -> shooting.Shooting:
     """Returns the prediction problem of a drive on one time axis."""
-    command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
+    command = drive.recording.command
+    spec = drive.spec
+    t = samples.t
+    dt = samples.dt
 
     @lru_cache(maxsize=8)  # most values of a form shape no commands
     def late(latency: float, curves: tuple[InputCurve, ...]) -> Array:
@@ -274,7 +283,8 @@ def _rows_of_commands(
     rows = {"latency": (latency, DELAY_SCALE_S, *shared)}
     rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
     for curve in form.curves:
-        name, size = curve.command, max(abs(curve.least), abs(curve.most))
+        name = curve.command
+        size = max(abs(curve.least), abs(curve.most))
         if np.isfinite(size):
             step = CURVE_SCALE * size
             rows |= {
@@ -300,11 +310,13 @@ def _rows_of_commands(
 def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     """Returns curves without effect of commands that drive the robot both ways."""
     spec = drive.spec
-    command, found = samples.x[:, len(spec.state) :], []
+    command = samples.x[:, len(spec.state) :]
+    found = []
     for place in _drivers(spec):
         reach = command[:, place]
         if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
-            low, high = float(reach.min()), float(reach.max())
+            low = float(reach.min())
+            high = float(reach.max())
             found.append(
                 InputCurve(command=spec.command[place].name, least=low, most=high)
             )
@@ -321,11 +333,10 @@ def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
     """Returns a form in which each command that drives the robot has a dead zone."""
     bent = {c.command: c for c in form.curves}
     for place in _drivers(drive.spec):
-        name, reach = (
-            drive.spec.command[place].name,
-            samples.x[:, len(drive.spec.state) + place],
-        )
-        low, high = min(float(reach.min()), 0.0), max(float(reach.max()), 0.0)
+        name = drive.spec.command[place].name
+        reach = samples.x[:, len(drive.spec.state) + place]
+        low = min(float(reach.min()), 0.0)
+        high = max(float(reach.max()), 0.0)
         curve = bent.get(name, InputCurve(command=name, least=low, most=high))
         if not curve.dead:
             bent[name] = curve.model_copy(update={"dead": SMALL_DEAD * max(-low, high)})
@@ -348,16 +359,16 @@ def reached(
     Nor does it have limits that are less than their errors, by name. Its range of a command in
     effect is that of what was sent.
     """
-    names, sent = [c.name for c in drive.spec.command], drive.recording.command.values
-    low, high, curves, limits = (
-        model.low.copy(),
-        model.high.copy(),
-        [],
-        model.limits.copy(),
-    )
+    names = [c.name for c in drive.spec.command]
+    sent = drive.recording.command.values
+    low = model.low.copy()
+    high = model.high.copy()
+    curves = []
+    limits = model.limits.copy()
     for curve in model.inputs:
         place = names.index(curve.command)
-        least, most = float(sent[:, place].min()), float(sent[:, place].max())
+        least = float(sent[:, place].min())
+        most = float(sent[:, place].max())
         beyond = NEAR_END * max(-least, most)
         curve = curve.model_copy(
             update={
@@ -398,7 +409,8 @@ def likely_delays(
 ) -> tuple[tuple[str, float], ...]:
     """Returns likewise the delay of each command beside the others; nothing if they are alike."""
     tries, late = _delayed(drive, calibration, samples)
-    now, found = int(np.abs(tries - calibration.command_latency_s).argmin()), []
+    now = int(np.abs(tries - calibration.command_latency_s).argmin())
+    found = []
     for place, command in enumerate(drive.spec.command):
         mixed = np.repeat(late[now][None], len(tries), axis=0)
         mixed[..., place] = late[..., place]
@@ -414,7 +426,8 @@ def _delayed(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> tuple[Array, Array]:
     """Returns delays (N,) that may be [s], and the commands in effect (N, T, C) by each."""
-    form, now = Form(calibration.inputs), calibration.command_latency_s
+    form = Form(calibration.inputs)
+    now = calibration.command_latency_s
     inputs = inputs_of(drive, now, samples, form)
     problem = problem_of(drive, calibration, samples, form, inputs)
     one_clock = drive.recording.pose.clock == drive.recording.command.clock

@@ -64,7 +64,8 @@ def turned_by_gyro(recording: Recording) -> Recording:
 
 def relative_to(recording: Recording) -> str:
     """Says relative to what the errors of a model are that was learnt from a recording."""
-    by, turning = recording.measured_by, recording.gyro
+    by = recording.measured_by
+    turning = recording.gyro
     if by == "truth":
         return ""
     if by == "tracker":
@@ -90,7 +91,8 @@ def relative_to(recording: Recording) -> str:
 
 def _compared(recording: Recording) -> Turning | None:
     """Compares pose and gyro; None if they can't be compared."""
-    pose, imu = recording.pose, recording.imu
+    pose = recording.pose
+    imu = recording.imu
     if imu is None:
         return None
     turning = compare_turning(pose.t, pose.values, imu.t, imu.values[:, 2])

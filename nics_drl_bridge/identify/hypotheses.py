@@ -23,8 +23,11 @@ ORDERS = (1, 2, 3)  # of which `auto` chooses
 PULLS = (0.1, 0.01, 0.001)  # of which each order chooses
 WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
 FOLDS = 3
-SPACING_S, EVALUATIONS = 0.5, 25  # of trials
-BASE_ORDER, BASE_EVALUATIONS = 3, 100
+# of trials
+SPACING_S = 0.5
+EVALUATIONS = 25
+BASE_ORDER = 3
+BASE_EVALUATIONS = 100
 HORIZON_S = 5.0
 NOTHING = 1e-4  # m, rad: what is left of a part of a mounting that was left out
 LONGEST_LAG_S = 2.0  # a state that takes longer is rolling on: it hides no latency
@@ -68,7 +71,8 @@ class Draft:
         self, inside: terms.Mask | None = None, other: TaylorModel | None = None
     ) -> shooting.Predictive:
         """Fits the textbook's terms, gains and lags; the search may start at another model."""
-        samples, spec = self.problem.samples, self.spec
+        samples = self.problem.samples
+        spec = self.spec
         samples = samples if inside is None else samples.rows(inside)
         allowed = partial(terms.by_textbook, tyres=self.form.tyres)
         model = terms.linear_fit(samples, spec, BASE_ORDER, allowed).model
@@ -112,15 +116,15 @@ class Draft:
 
         A part without which a variable would not have moved is not left out.
         """
-        samples, values = self.problem.samples, self.inputs.start
-        everything, unmoved = (
-            np.arange(len(samples.t)),
-            unmoved_variables(samples, self.spec),
-        )
+        samples = self.problem.samples
+        values = self.inputs.start
+        everything = np.arange(len(samples.t))
+        unmoved = unmoved_variables(samples, self.spec)
         problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
         given = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
         errors: dict[Hypothesis, list[Array]] = {hypothesis: [] for hypothesis in asked}
-        paths, judge = [np.zeros((0, len(BANDS_S)))], replace(problem, horizons=BANDS_S)
+        paths = [np.zeros((0, len(BANDS_S)))]
+        judge = replace(problem, horizons=BANDS_S)
         for block in np.array_split(everything, FOLDS):
             left = np.isin(everything, block)
             if unmoved_variables(samples.rows(~left), self.spec) != unmoved:
@@ -150,7 +154,8 @@ class Draft:
         self, asked: tuple[Hypothesis, ...], inside: terms.Mask
     ) -> Iterator[tuple[Hypothesis, TaylorModel]]:
         """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
-        samples, base = self.problem.samples.rows(inside), self.base(inside).model
+        samples = self.problem.samples.rows(inside)
+        base = self.base(inside).model
         orders = {order for order, _ in asked if order}
         linear = {
             order: terms.linear_fit(samples, self.spec, order).model for order in orders
@@ -205,13 +210,15 @@ def base_of(
         if (other := error_of(plain)) < error or np.isinf(
             other
         ):  # too short a drive tells nothing
-            best, error = plain, other
+            best = plain
+            error = other
     for change, worth in changes(drive, calibration, samples):
         if (form := change(best.draft.form)) == best.draft.form:
             continue
         base = fitted(form, best)
         if (other := error_of(base)) < worth * error:
-            best, error = base, other
+            best = base
+            error = other
     return best
 
 
@@ -263,7 +270,8 @@ def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
 
 def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
     """Returns the lags [s] by which a base's states follow, by name, with their own delays."""
-    alone, found = model.powers.sum(axis=1) == 1, {}
+    alone = model.powers.sum(axis=1) == 1
+    found = {}
     delays = model.delays[model.drivers]
     for i, variable in enumerate(spec.state):
         rate = float(model.coefficients[3 + i, alone & (model.powers[:, i] == 1)].sum())
@@ -307,7 +315,9 @@ def with_certain_mounting(
     aside = geometry.rotate(known[:2], float(rest[2]))
     rest[:2] = np.where(doubtful[:2], -aside, rest[:2])
     inputs = draft.inputs
-    start, low, high = inputs.start.copy(), inputs.low.copy(), inputs.high.copy()
+    start = inputs.start.copy()
+    low = inputs.low.copy()
+    high = inputs.high.copy()
     start[-3:] = rest
     places = np.flatnonzero(doubtful) + len(start) - 3
     low[places] = start[places]
@@ -346,7 +356,8 @@ def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
 
 def about_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
     """Names what a model of a motion has beside the textbook's terms, and what it gains by it."""
-    form, best = base.draft.form, chosen(trials, order)
+    form = base.draft.form
+    best = chosen(trials, order)
     parts = [
         f"an input curve of {curve.command}" for curve in form.curves if curve.bends
     ]

@@ -152,7 +152,8 @@ def repair(drive: Drive, findings: Findings) -> Findings:
 
 def clocks(drive: Drive, findings: Findings) -> Findings:
     """Finds the period of bursts, the offset between clocks, the latency of commands, and lags."""
-    training, spec = findings.training, drive.spec
+    training = findings.training
+    spec = drive.spec
     derived = motions.by_motion(spec, drive.recording)
     followed = replace(training, spec=motions.surrogate(spec)) if derived else training
     found = timings.timing_of(followed)
@@ -179,7 +180,9 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
 
 def mounting(drive: Drive, findings: Findings) -> Findings:
     """Finds where and how the tracked body is mounted on the robot."""
-    training, states, place = findings.training, None, speed_index(drive.spec)
+    training = findings.training
+    states = None
+    place = speed_index(drive.spec)
     if drive.spec.state and not motions.by_motion(drive.spec, drive.recording):
         states = timings.expected_states(training, training.twists, findings.timing)
     found = mounting_of(training, findings.timing, states)
@@ -190,7 +193,8 @@ def mounting(drive: Drive, findings: Findings) -> Findings:
 
 def responses(drive: Drive, findings: Findings) -> Findings:
     """Finds how states that were not measured follow the commands, and the scale of the wheels."""
-    training, calibration = findings.training, findings.calibration
+    training = findings.training
+    calibration = findings.calibration
     found = calibration.responses
     if not motions.by_motion(drive.spec, drive.recording):
         found = timings.responses_of(
@@ -213,7 +217,8 @@ def motion(drive: Drive, findings: Findings) -> Findings:
     """Takes the state from the poses, if it is a part of the twist that was not measured."""
     if not motions.by_motion(drive.spec, drive.recording):
         return findings
-    calibration, width = findings.calibration, motions.half_width(findings.training)
+    calibration = findings.calibration
+    width = motions.half_width(findings.training)
     parts = []
     for part in (findings.training, findings.whole):
         grid = motions.grid_of(part, calibration, drive.settings.control_period_s)
@@ -232,9 +237,11 @@ def inputs(drive: Drive, findings: Findings) -> Findings:
     """Finds the latency, and dead zones and saturation of commands, that explain a motion."""
     if findings.width is None:
         return findings
-    training, samples = findings.training, aligned(findings.training, findings)
+    training = findings.training
+    samples = aligned(findings.training, findings)
     findings = _with_delay(findings, samples)
-    samples, places = aligned(training, findings), range(len(drive.spec.command))
+    samples = aligned(training, findings)
+    places = range(len(drive.spec.command))
     curves = [
         c for place in places if (c := curve_of(samples, drive.spec, place)) is not None
     ]
@@ -253,7 +260,9 @@ def _with_delay(findings: Findings, samples: Samples) -> Findings:
 
 def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     """Fits the order that predicts parts of the training part best that its fits did not see."""
-    training, spec, order = findings.training, drive.spec, drive.settings.order
+    training = findings.training
+    spec = drive.spec
+    order = drive.settings.order
     samples = aligned(training, findings)
     try:
         base = hypotheses.base_of(
@@ -287,10 +296,13 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     """Puts the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
     if findings.width is not None:
         return _fit_of_motion(drive, findings)
-    calibration, spec, settings = findings.calibration, drive.spec, drive.settings
+    calibration = findings.calibration
+    spec = drive.spec
+    settings = drive.settings
     if spec.state and drive.recording.state is None:
         known(calibration.responses or None, "the response of each state", "responses")
-    samples, trials = align(findings.training, calibration), findings.trials
+    samples = align(findings.training, calibration)
+    trials = findings.trials
     samples = followers.unlimited(samples, calibration, spec)
     inferred = drive.recording.state is None and not calibration.is_exact
     if settings.order == "auto" and inferred and not trials:  # a refit knows them
@@ -312,7 +324,8 @@ def fit(drive: Drive, findings: Findings) -> Findings:
 
 def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
     """Tries each order on parts of the training part that its fits did not see."""
-    training, trials = findings.training, []
+    training = findings.training
+    trials = []
     span = 0.0, training.duration_s, hypotheses.HORIZON_S, open_loop.SPACING_S
     path = open_loop.windows(training, findings.calibration, *span).path
     for order in ORDERS_OF_INFERRED:
@@ -362,10 +375,12 @@ def refine(drive: Drive, findings: Findings) -> Findings:
 
 def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     linear, _ = _fitted(findings)
-    calibration, spec = findings.calibration, drive.spec
+    calibration = findings.calibration
+    spec = drive.spec
     base = known(findings.base, "the base", "fit")
     best = hypotheses.chosen(findings.trials, drive.settings.order)
-    draft, book = base.draft, base.found.model
+    draft = base.draft
+    book = base.found.model
 
     def refined_by(draft: hypotheses.Draft) -> tuple[shooting.Predictive, bool]:
         found = (
@@ -449,7 +464,9 @@ def complete(drive: Drive, findings: Findings) -> Findings:
 def judge(drive: Drive, findings: Findings) -> Findings:
     """Tries the model on unseen data, measures what it leaves unexplained, says what to doubt."""
     linear, model = _fitted(findings)
-    spec, whole, calibration = drive.spec, findings.whole, findings.calibration
+    spec = drive.spec
+    whole = findings.whole
+    calibration = findings.calibration
     samples = aligned(whole, findings)
     begin = (
         whole.recording.pose.t[0]
@@ -506,7 +523,8 @@ def settle(drive: Drive, findings: Findings) -> Findings:
     ):
         return findings
     _, model = _fitted(findings)
-    spec, until = drive.spec, drive.settings.train_until_s
+    spec = drive.spec
+    until = drive.settings.train_until_s
     start_spec = spec
     try:
         yardstick = fit_yardstick(
@@ -546,7 +564,8 @@ def settle(drive: Drive, findings: Findings) -> Findings:
 def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     """All that is to be told of a model, the gravest first."""
     linear, _ = _fitted(findings)
-    spec, calibration = drive.spec, findings.calibration
+    spec = drive.spec
+    calibration = findings.calibration
     beaten = (
         (findings.replaced,) if findings.replaced else shortfall(findings.judgement)
     )
@@ -595,7 +614,8 @@ def structure(findings: Findings) -> tuple[str, ...]:
         return ()
     (linear, model), training = _fitted(findings), findings.training
     tried = max((trial.order for trial in findings.trials), default=0)
-    samples, still = aligned(training, findings), linear.unmoved
+    samples = aligned(training, findings)
+    still = linear.unmoved
     return tuple(structures(model, samples, training.spec, still, tried))
 
 
@@ -603,13 +623,13 @@ def _left_out(
     drive: Drive, findings: Findings, order: int | None = None
 ) -> dict[float, Array]:
     """Returns errors (W,) by horizon [s] on left-out parts; with an order, by what was found."""
-    training, stages = findings.training, STAGES[: STAGES.index(complete)]
-    pose, settings = (
-        training.recording.pose,
-        replace(drive.settings, train_until_s=np.inf),
-    )
+    training = findings.training
+    stages = STAGES[: STAGES.index(complete)]
+    pose = training.recording.pose
+    settings = replace(drive.settings, train_until_s=np.inf)
     if order is not None:
-        stages, settings = (fit, prune, refine), replace(settings, order=order)
+        stages = (fit, prune, refine)
+        settings = replace(settings, order=order)
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
     for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
         others = np.ones(len(pose.t), dtype=np.bool_)
@@ -683,7 +703,8 @@ def _plain(found: Findings) -> tuple[str, ...]:
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:
-    drive, calibration = found.training, found.calibration
+    drive = found.training
+    calibration = found.calibration
     if found.replaced:  # latency, lags and mounting are those of the fitted textbook
         timed = replace(calibration, command_latency_s=found.timing.latency)
         return (
@@ -793,7 +814,8 @@ class Identified:
     @property
     def assessment(self) -> acceptance.Assessment:
         """What the model is fit for, and the reasons."""
-        spec, findings = self.drive.spec, self.findings
+        spec = self.drive.spec
+        findings = self.findings
         mistaken = any(isinstance(note, verdict.Mistake) for note in self.notes)
         unfit = mistaken or bool(verdict.missed(self.fit, spec))
         textbook = bool(findings.replaced)
@@ -819,7 +841,8 @@ class Identified:
     def dead_zone(self) -> float:
         """Greatest value of the command that drives it at which the robot stands; 0 if none."""
         # A state with dry friction begins to move where the command's effect exceeds that.
-        model, states = self.model, self.model.state_size
+        model = self.model
+        states = self.model.state_size
         dead = {curve.command: curve.dead for curve in model.inputs}
         zones = [0.0, *dead.values()]
         for i, place in enumerate(states + model.drivers):

@@ -36,7 +36,9 @@ HORIZONS_S = (0.5, 1.0, 2.0, HORIZON_S, 10.0)
 BANDED_S = HORIZONS_S[:4]
 FOLDS = 5
 EVALUATIONS = 8  # of the fit to all but one part, which starts at the fit to all
-WITHIN, FEWEST = 95.0, 20  # percentage of the ends within a band, of so many at least
+# percentage of the ends within a band, of so many at least
+WITHIN = 95.0
+FEWEST = 20
 
 
 def textbook_of(drive: Drive, calibration: Calibration) -> Yardstick | None:
@@ -61,7 +63,8 @@ def judged(
 
     `bands` are distances within which 95 % of the ends are expected [m], by horizon [s].
     """
-    begin, told = drive.settings.train_until_s, []
+    begin = drive.settings.train_until_s
+    told = []
     for horizon in HORIZONS_S:
         chosen = windows(
             drive, calibration, begin, drive.duration_s, horizon, SPACING_S

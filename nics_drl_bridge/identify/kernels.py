@@ -38,7 +38,8 @@ def _sinc(half):  # type: ignore[no-untyped-def]
 def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, dt):  # type: ignore[no-untyped-def]
     """Propagates the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
     for p in range(now.shape[1]):
-        value, d = values[free[p]], dof[free[p]]
+        value = values[free[p]]
+        d = dof[free[p]]
         lean = now[2, p]
         if d == 2:
             lean += 0.5 * dt * value
@@ -63,20 +64,31 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
     # Of body twists along courses of X (W, T, V + 1), with a last entry of 1, integrated as in
     # the simulator: whole `steps` (W,) of `dt` [s] and a `share` (W,) of one more; headings are
     # unwrapped.
-    dof, coefficient = terms.dof, terms.coefficient
-    factors, count = terms.factors, terms.degree
+    dof = terms.dof
+    coefficient = terms.coefficient
+    factors = terms.factors
+    count = terms.degree
     params = moved.shape[2]
     values = np.empty(dof.shape[0])
-    now, before = np.zeros((3, params)), np.zeros((3, params))
+    now = np.zeros((3, params))
+    before = np.zeros((3, params))
     for w in range(x.shape[0]):
-        px, py, heading = 0.0, 0.0, 0.0
-        qx, qy, old = 0.0, 0.0, 0.0
+        px = 0.0
+        py = 0.0
+        heading = 0.0
+        qx = 0.0
+        qy = 0.0
+        old = 0.0
         now[:], last = 0.0, steps[w] + (1 if share[w] > 0.0 else 0)
         for n in range(last):
             if n == steps[w]:
-                qx, qy, old = px, py, heading
+                qx = px
+                qy = py
+                old = heading
                 before[:] = now
-            vx, vy, wz = 0.0, 0.0, 0.0
+            vx = 0.0
+            vy = 0.0
+            wz = 0.0
             for k in range(dof.shape[0]):
                 values[k] = _product(x[w, n], factors[k], count[k])
                 rate = coefficient[k] * values[k]
@@ -88,20 +100,28 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
                     wz += rate
             turn = wz * dt
             sinc = _sinc(turn / 2.0)
-            c, s = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
+            c = math.cos(heading + turn / 2.0)
+            s = math.sin(heading + turn / 2.0)
             along = dt * sinc
-            dx, dy = along * (c * vx - s * vy), along * (s * vx + c * vy)
+            dx = along * (c * vx - s * vy)
+            dy = along * (s * vx + c * vy)
             _follow_derivatives(
                 now, values, dof, free, dx, dy, turn, along * c, along * s, dt
             )
-            px, py, heading = px + dx, py + dy, heading + turn
+            px = px + dx
+            py = py + dy
+            heading = heading + turn
         if share[w] > 0.0:
-            a, b = 1.0 - share[w], share[w]
-            ends[w, 0], ends[w, 1] = a * qx + b * px, a * qy + b * py
+            a = 1.0 - share[w]
+            b = share[w]
+            ends[w, 0] = a * qx + b * px
+            ends[w, 1] = a * qy + b * py
             ends[w, 2] = a * old + b * heading
             moved[w] = a * before + b * now
         else:
-            ends[w, 0], ends[w, 1], ends[w, 2] = px, py, heading
+            ends[w, 0] = px
+            ends[w, 1] = py
+            ends[w, 2] = heading
             moved[w] = now
 
 
@@ -137,7 +157,8 @@ class Tangent(NamedTuple):
 
 def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
     """Returns scratch memory for `shoot`."""
-    lanes, free = WIDTH, -(-free // WIDTH) * WIDTH
+    lanes = WIDTH
+    free = -(-free // WIDTH) * WIDTH
     shapes = (
         (states + commands + 1, lanes),
         (terms, lanes),
@@ -173,8 +194,11 @@ def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
 @kernel
 def _begin(shot, begin, end, scratch):  # type: ignore[no-untyped-def]
     """Puts windows to their starts, and returns the steps to the last horizon."""
-    scratch.x[-1], last = 1.0, 0
-    scratch.pose[:], scratch.state_slope[:], scratch.pose_slope[:] = 0.0, 0.0, 0.0
+    scratch.x[-1] = 1.0
+    last = 0
+    scratch.pose[:] = 0.0
+    scratch.state_slope[:] = 0.0
+    scratch.pose_slope[:] = 0.0
     for w in range(begin, end):
         for i in range(shot.state.shape[1]):
             scratch.x[i, w - begin] = shot.state[w, i]
@@ -203,12 +227,17 @@ def _put(shot, w, n, lane, scratch):  # type: ignore[no-untyped-def]
 @kernel
 def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
     """Computes the terms and the rates; their derivatives by the state if any are wanted."""
-    states, sloped = scratch.state_slope.shape[1], free.shape[0] > 0
-    scratch.rate[:], scratch.jacobian[:] = 0.0, 0.0
+    states = scratch.state_slope.shape[1]
+    sloped = free.shape[0] > 0
+    scratch.rate[:] = 0.0
+    scratch.jacobian[:] = 0.0
     for k in range(terms.dof.shape[0]):
-        d, coefficient = terms.dof[k], terms.coefficient[k]
-        factors, degree = terms.factors[k], terms.degree[k]
-        value, rate = scratch.value[k if sloped else 0], scratch.rate[d]
+        d = terms.dof[k]
+        coefficient = terms.coefficient[k]
+        factors = terms.factors[k]
+        degree = terms.degree[k]
+        value = scratch.value[k if sloped else 0]
+        rate = scratch.rate[d]
         _multiply(value, 1.0, factors, degree, -1, scratch.x)
         for lane in range(rate.shape[0]):
             rate[lane] += coefficient * value[lane]
@@ -219,11 +248,9 @@ def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
                 for lane in range(slope.shape[0]):
                     slope[lane] += scratch.rest[lane]
     for i in range(terms.emf.shape[0]):
-        rate, slope, state = (
-            scratch.rate[3 + i],
-            scratch.jacobian[3 + i, i],
-            scratch.x[i],
-        )
+        rate = scratch.rate[3 + i]
+        slope = scratch.jacobian[3 + i, i]
+        state = scratch.x[i]
         for lane in range(rate.shape[0]):
             braking = emf_of(i, scratch.x[:, lane], terms)
             rate[lane] -= braking * state[lane]
@@ -245,11 +272,16 @@ def _multiply(product, first, factors, degree, without, x):  # type: ignore[no-u
 @kernel(inline=True)
 def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
     """Moves a window and its derivatives by a step."""
-    rate, pose, sloped = scratch.rate[:, lane], scratch.pose[lane], free.shape[0] > 0
+    rate = scratch.rate[:, lane]
+    pose = scratch.pose[lane]
+    sloped = free.shape[0] > 0
     first = _follow_twist(lane, terms, free, scratch) if sloped else 0
-    turn, along = rate[2] * dt, dt * _sinc(rate[2] * dt / 2.0)
-    c, s = math.cos(pose[2] + turn / 2.0), math.sin(pose[2] + turn / 2.0)
-    dx, dy = along * (c * rate[0] - s * rate[1]), along * (s * rate[0] + c * rate[1])
+    turn = rate[2] * dt
+    along = dt * _sinc(rate[2] * dt / 2.0)
+    c = math.cos(pose[2] + turn / 2.0)
+    s = math.sin(pose[2] + turn / 2.0)
+    dx = along * (c * rate[0] - s * rate[1])
+    dy = along * (s * rate[0] + c * rate[1])
     if sloped:
         _follow_pose(
             scratch.pose_slope[lane], scratch.twist, dx, dy, along * c, along * s, dt
@@ -281,7 +313,12 @@ def _add(total, factor, by):  # type: ignore[no-untyped-def]
 
 @kernel
 def _follow_pose(pose, twist, dx, dy, along_x, along_y, dt):  # type: ignore[no-untyped-def]
-    x, y, heading, vx, vy, wz = pose[0], pose[1], pose[2], twist[0], twist[1], twist[2]
+    x = pose[0]
+    y = pose[1]
+    heading = pose[2]
+    vx = twist[0]
+    vy = twist[1]
+    wz = twist[2]
     for p in range(x.shape[0]):
         x[p] += along_x * vx[p] - along_y * vy[p] - (heading[p] + 0.5 * dt * wz[p]) * dy
     for p in range(x.shape[0]):
@@ -292,24 +329,24 @@ def _follow_pose(pose, twist, dx, dy, along_x, along_y, dt):  # type: ignore[no-
 
 @kernel(inline=True)
 def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped-def]
-    state, before, rate = (
-        scratch.state_slope[lane],
-        scratch.before,
-        scratch.rate[:, lane],
-    )
+    state = scratch.state_slope[lane]
+    before = scratch.before
+    rate = scratch.rate[:, lane]
     states, count = state.shape
     for i in range(states):
         for p in range(count):
             before[i, p] = state[i, p]
     for i in range(states):
-        moves, now = terms.fall[i] <= rate[3 + i] <= terms.rise[i], state[i]
+        moves = terms.fall[i] <= rate[3 + i] <= terms.rise[i]
+        now = state[i]
         for j in range(states if moves and count > 0 else 0):
             _add(now, dt * scratch.jacobian[3 + i, j, lane], before[j])
         while k < free.shape[0] and terms.dof[free[k]] == 3 + i:
             if moves:
                 now[k] += dt * scratch.value[free[k], lane]
             k += 1
-        bounds, x = bounds_of(terms, i), scratch.x[i]
+        bounds = bounds_of(terms, i)
+        x = scratch.x[i]
         moved = next_state(x[lane], rate[3 + i], dt, bounds)
         if count > 0:
             _hold(now, x[lane], moved, rate[3 + i], dt, bounds)

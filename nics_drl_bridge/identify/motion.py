@@ -29,11 +29,10 @@ NOISE = (
     0.02  # share of the usual speed, and turn rate, that the noise of a twist may reach
 )
 SAMPLES = 2.5  # half a width holds at least this many samples
-FINE_S, COARSE_S, COARSE_FROM_S = (
-    0.01,
-    0.02,
-    0.015,
-)  # steps of models, by that of the poses
+# steps of models, by that of the poses
+FINE_S = 0.01
+COARSE_S = 0.02
+COARSE_FROM_S = 0.015
 
 
 def by_motion(spec: RobotSpec, recording: Recording) -> bool:
@@ -45,7 +44,8 @@ def by_motion(spec: RobotSpec, recording: Recording) -> bool:
 
 def half_width(drive: Drive) -> float:
     """Returns the half-width [s] over which poses are smoothed: the shortest that quiets them."""
-    t, pose = drive.dated.t, unwrapped(drive.dated.values)
+    t = drive.dated.t
+    pose = unwrapped(drive.dated.values)
     span = float(t[-1] - t[0])
     every = span / max(len(t) - 1, 1)
     speed = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum() / span
@@ -68,7 +68,9 @@ def with_motion(
     Components of the twist of `base_link` are slopes of parabolas over twice the half-width [s];
     states that follow a command do so with the calibration's lags.
     """
-    recording, spec, step = drive.recording, drive.spec, float(grid[1] - grid[0])
+    recording = drive.recording
+    spec = drive.spec
+    step = float(grid[1] - grid[0])
     pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
     rows = 2 * max(2, round(width / step)) + 1
     rates = scipy.signal.savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
@@ -101,13 +103,15 @@ def _following(
 ) -> Array:
     alone = drive.spec.model_copy(update={"state": (variable,)})
     lag = [r.lag_s for r in calibration.responses if r.state == variable.name]
-    latency, command = calibration.command_latency_s, drive.recording.command
+    latency = calibration.command_latency_s
+    command = drive.recording.command
     return inferred_states(command, alone, np.array(lag), latency, t)[:, 0]
 
 
 def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     """Puts a drive `with_motion` on the time axis of its state, poses smoothed like it."""
-    state, spec = known_state(drive), drive.spec
+    state = known_state(drive)
+    spec = drive.spec
     grid = state.t
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
     pose = poses_at(drive, calibration, grid, 0.5 * width)

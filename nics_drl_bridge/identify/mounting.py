@@ -69,7 +69,8 @@ def mounting_of(
     drive: Drive, timing: clocks.TimingEstimate, states: Array | None
 ) -> Mounting | None:
     """Estimates the mounting by states (n, S) at gain one; None if the drive does not show it."""
-    spec, twists = drive.spec, drive.twists
+    spec = drive.spec
+    twists = drive.twists
     if not (
         has_textbook(spec) or spec.takes_cmd_vel
     ):  # which way it faces is not known
@@ -126,14 +127,17 @@ def by_instruments(
     sigma = standard_errors(np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal)
     if clocks.CERTAIN * sigma[1] > spec.footprint_radius:
         return None
-    across, across_sigma, odd = 0.0, np.nan, mirrored(spec) or ()
+    across = 0.0
+    across_sigma = np.nan
+    odd = mirrored(spec) or ()
     aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
     if aside.any():  # motion along x is even in what a mirror reverses
         even = np.hstack([orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])
         along = rotate(motion.twist[:, :2], -travel)[:, 0]
         beta = np.linalg.lstsq(even, along, rcond=None)[0]
         rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]
-        across, across_sigma = -float(beta[-1]), float(standard_errors(even, rest)[-1])
+        across = -float(beta[-1])
+        across_sigma = float(standard_errors(even, rest)[-1])
     return Mounting(
         travel,
         np.array([-normal[2], across]),
@@ -150,7 +154,8 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     (Gillespie). What skids slips the other way backwards: without that, it looks like a lever arm.
     """
     along = rotate(motion.twist[:, :2], -plain.rotation)
-    speed, turn = along[:, 0], motion.twist[:, 2]
+    speed = along[:, 0]
+    turn = motion.twist[:, 2]
     skids = slips(spec)
     slip = speed * turn if skids else (along**2).sum(axis=1) * turn
     chi = np.stack([speed, turn, slip], axis=1)
@@ -212,7 +217,9 @@ def mounting_without_lateral_motion(
     size = size / np.sqrt(len(rows))
     if size[0] < STILL:
         return None
-    turn, lever, lever_sigma = motion.twist[:, 2], 0.0, np.nan
+    turn = motion.twist[:, 2]
+    lever = 0.0
+    lever_sigma = np.nan
     certain = np.abs(turn) > clocks.CERTAIN * np.sqrt(2.0) * noise / (
         motion.end - motion.start
     )
@@ -227,13 +234,12 @@ def mounting_without_lateral_motion(
             return None
         sigma = size[2] / size[1] / np.sqrt(len(rows)) / flat
         travel = float(np.arctan2(-normal[0], normal[1]))
-        lever, lever_sigma = (
-            -float(normal[2]) * TURN_SCALE_M / flat,
-            sigma * TURN_SCALE_M,
-        )
+        lever = -float(normal[2]) * TURN_SCALE_M / flat
+        lever_sigma = sigma * TURN_SCALE_M
     along = motion.twist[:, :2] @ np.array([np.cos(travel), np.sin(travel)])
     if float(along @ forward) < 0.0:
-        travel, lever = travel + np.pi, -lever
+        travel = travel + np.pi
+        lever = -lever
     return Mounting(
         float(wrap_angle(travel)),
         np.array([lever, 0.0]),
@@ -261,7 +267,8 @@ def _by_commands(
     timing: clocks.TimingEstimate, drive: Drive, twists: TwistIntervals
 ) -> Mounting | None:
     """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
-    recording, spec = drive.recording, drive.spec
+    recording = drive.recording
+    spec = drive.spec
     inferred = recording.state is None and any(v.twist for v in spec.state)
     if spec.state and not inferred:
         command = _as_commands(
@@ -300,7 +307,9 @@ def _response(spec: RobotSpec, command: Array) -> Array:
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
     """Converts states (n, S) to the commands (n, C) that would sustain them."""
-    stream, command, spec = drive.recording.state, drive.recording.command, drive.spec
+    stream = drive.recording.state
+    command = drive.recording.command
+    spec = drive.spec
     if stream is None:
         return states[:, np.argsort(followed(spec))]
     span = np.diff(stream.t)
@@ -341,9 +350,11 @@ def jackknifed(
     whole = estimate(drive, twists)
     if whole is None:
         return None
-    edges, found = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1), []
+    edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
+    found = []
     for begin, end in pairwise(edges):
-        rows, rest = (twists.end <= begin) | (twists.start >= end), drive
+        rows = (twists.end <= begin) | (twists.start >= end)
+        rest = drive
         if (state := drive.recording.state) is not None:
             outside = (state.t < begin + offset) | (state.t > end + offset)
             rest = drive.part(replace(drive.recording, state=state.rows(outside)))

@@ -42,7 +42,8 @@ MIN_ROWS = 40
 
 def sensor_noise(drive: Drive) -> Noise:
     """Measures the noise of the pose sensor; its uncertainty comes from blocks of the drive."""
-    pose, whole = drive.recording.pose, drive.pose_noise
+    pose = drive.recording.pose
+    whole = drive.pose_noise
     if whole is None:
         return Noise()
     blocks = map(pose.rows, np.array_split(np.arange(len(pose.t)), BLOCKS))
@@ -194,7 +195,8 @@ def _state_drift(
     sums = rest[: count * steps].reshape(count, steps, -1)[whole].sum(axis=1)
     if len(sums) < MIN_WINDOWS:
         return nominal
-    found, sensor = {}, white_noise(state.values)
+    found = {}
+    sensor = white_noise(state.values)
     for i, variable in enumerate(drive.spec.state):
         usual = OUTLYING * max(float(np.median(np.abs(sums[:, i]))), TINY)
         kept = sums[np.abs(sums[:, i]) <= usual, i]
@@ -209,13 +211,16 @@ def odometry_residual(
     drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
 ) -> Array | None:
     """Returns reported minus modelled twist (n, 3); None if there is nothing to compare."""
-    recording, stream = drive.recording, drive.recording.odometry
+    recording = drive.recording
+    stream = drive.recording.odometry
     if stream is not None:
-        t, twist = stream.t, stream.values
+        t = stream.t
+        twist = stream.values
         if stream.clock == recording.pose.clock:
             t = t + calibration.clock_offset_s
     elif recording.wheels is not None and calibration.wheel_scale is not None:
-        t, wheels = recording.wheels.t, recording.wheels.values
+        t = recording.wheels.t
+        wheels = recording.wheels.values
         twist = np.zeros((len(t), 3))
         twist[:, 0] = calibration.wheel_scale * wheels.mean(axis=1)
         twist[:, 2] = (calibration.turn_scale or 0.0) * (wheels[:, 1] - wheels[:, 0])

@@ -63,8 +63,10 @@ def windows(
     spacing: float,
 ) -> Windows:
     """Selects windows of a `horizon` from `start` to `stop`, starts `spacing` apart, all in [s]."""
-    t, pose = drive.dated.t, drive.dated.values
-    origin, period = drive.recording.pose.t[0], float(np.median(np.diff(t)))
+    t = drive.dated.t
+    pose = drive.dated.values
+    origin = drive.recording.pose.t[0]
+    period = float(np.median(np.diff(t)))
     first = origin + start
     if calibration.responses:
         first = max(
@@ -83,7 +85,8 @@ def windows(
     good &= t[end] <= origin + stop
     episode = drive.recording.episode_at(t)
     good &= episode[begin] == episode[end]
-    begin, end = begin[good], end[good]
+    begin = begin[good]
+    end = end[good]
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     return Windows(
         t[begin], t[end], pose[begin], pose[end], length[end] - length[begin]
@@ -100,7 +103,8 @@ def predict(
         poses, *_, step, share = _from_measured_states(
             model, calibration, drive, chosen
         )
-        row, share = np.arange(len(step)), share[:, None]
+        row = np.arange(len(step))
+        share = share[:, None]
         relative = (1.0 - share) * poses[row, step] + share * poses[row, step + 1]
     return tracked_ends(chosen, calibration, relative)
 
@@ -116,7 +120,8 @@ def _by_one_rollout(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Array:
     """Returns relative poses (W, 3) from one roll-out: an inferred state needs commands only."""
-    recording, spec = drive.recording, drive.spec
+    recording = drive.recording
+    spec = drive.spec
     start, end = (
         t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t)
     )
@@ -159,10 +164,8 @@ def _from_measured_states(
 def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
     """Rolls commands (W, T, C) out to unwrapped poses (W, T + 1, 3) from the origin, and states."""
     count, steps = command.shape[:2]
-    poses, states = (
-        np.zeros((count, steps + 1, 3)),
-        np.empty((count, steps + 1, state.shape[1])),
-    )
+    poses = np.zeros((count, steps + 1, 3))
+    states = np.empty((count, steps + 1, state.shape[1]))
     states[:, 0] = state
     rollout(
         poses,
@@ -256,6 +259,8 @@ def tracked_slopes(
         moved[:, :2]
         + np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None] * moved[:, 2:]
     )
-    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    x, y = inside[:, 0], inside[:, 1]
+    c = np.cos(heading)[:, None]
+    s = np.sin(heading)[:, None]
+    x = inside[:, 0]
+    y = inside[:, 1]
     return np.stack([c * x - s * y, s * x + c * y, moved[:, 2]], axis=1)

@@ -102,10 +102,12 @@ def by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
     """Scales an inferred speed to vx = 1 speed; lateral motion is noise unless commanded."""
-    coefficients, limits = model.coefficients.copy(), model.limits.copy()
+    coefficients = model.coefficients.copy()
+    limits = model.limits.copy()
     if not spec.moves_sideways:
         coefficients[1] = 0.0
-    responses, i = list(calibration.responses), speed_index(spec)
+    responses = list(calibration.responses)
+    i = speed_index(spec)
     if responses and i is not None:
         (alone,) = linear_terms(model, spec.state[i].name)
         scale = 0.0 if alone is None else float(coefficients[0, alone])
@@ -121,7 +123,8 @@ def by_definition(
 
 def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
     """Adds standard errors: the linear fit's where a row is unchanged, else the larger of both."""
-    first, rows = linear.named_errors, {}
+    first = linear.named_errors
+    rows = {}
     for dof, old, new in zip(
         model.dofs, linear.coefficients, model.coefficients, strict=True
     ):
@@ -151,7 +154,8 @@ def problem_of(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> Problem | None:
     """Selects the windows of a training part to predict; None if it is too short."""
-    until, chosen = drive.settings.train_until_s, []
+    until = drive.settings.train_until_s
+    chosen = []
     for horizon in HORIZONS_S:
         found = open_loop.windows(drive, calibration, 0.0, until, horizon, SPACING_S)
         if len(found.start_t) >= MIN_WINDOWS:
@@ -249,7 +253,8 @@ class _Free:
         # The rotation is defined by the direction without motion, of which an omnidirectional robot
         # has none. Where it is known apart from a lever arm, and where a time is known, they are
         # fixed: a model that leaves out a term would bend them to make up for it.
-        known, time = calibration.uncertainty, None
+        known = calibration.uncertainty
+        time = None
         if calibration.responses and "clock_offset_s" in known:
             time = "clock_offset_s"
         elif calibration.responses and calibration.command_latency_s > 0.0:
@@ -269,10 +274,8 @@ class _Free:
 
     def at(self, theta: Array) -> tuple[TaylorModel, Calibration]:
         """Returns model and calibration at parameters (P,); fixed gains follow their lags."""
-        coefficients, count = (
-            self.model.coefficients.copy(),
-            int(self.coefficients.sum()),
-        )
+        coefficients = self.model.coefficients.copy()
+        count = int(self.coefficients.sum())
         coefficients[self.coefficients] = theta[:count]
         for i, response in enumerate(self.calibration.responses):
             own, command = linear_terms(self.model, response.state, response.command)
@@ -292,11 +295,13 @@ class _Free:
     def bounds(self) -> tuple[Array, Array]:
         """Returns bounds (P,) by which no state that follows a command overshoots it in a step."""
         low = np.full(self.model.coefficients.shape, -np.inf)
-        high, rest = -low, np.full(len(self.names), np.inf)
+        high = -low
+        rest = np.full(len(self.names), np.inf)
         for i, response in enumerate(self.calibration.responses):
             own, _ = linear_terms(self.model, response.state, response.command)
             if own is not None:
-                low[3 + i, own], high[3 + i, own] = -FASTEST / self.model.dt, 0.0
+                low[3 + i, own] = -FASTEST / self.model.dt
+                high[3 + i, own] = 0.0
         return np.append(low[self.coefficients], -rest), np.append(
             high[self.coefficients], rest
         )
@@ -430,7 +435,8 @@ def _response(model: TaylorModel, i: int, response: Response) -> Response:
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
     """Removes terms of the twist that hardly improve predictions, least first; refines anew."""
-    best, tried = refined, set[tuple[int, int]]()
+    best = refined
+    tried = set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
     while (weakest := _weakest(best, tried)) is not None:
         tried.add(weakest)

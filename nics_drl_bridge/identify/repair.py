@@ -35,11 +35,11 @@ STATE_SHARE = 0.2  # and than this share of the usual range, for a state
 FARTHER = 3.0  # this many times the distance at the speed (turn rate) that 95 % of the drive keep,
 SPEED_OVER_S = 0.5  # over this time,
 UNUSUAL = 12.0  # than this many usual differences (`USUAL`),
-JUMP_SHARE, JUMP_TURN = (
-    0.5,
-    0.3,
-)  # than this share of the robot's radius, or than this angle [rad]
-AROUND, TOLD = 5, 3  # steps on either side of one; jumps that are told one by one
+# than this share of the robot's radius, or than this angle [rad]
+JUMP_SHARE = 0.5
+JUMP_TURN = 0.3
+AROUND = 5  # steps on either side of one
+TOLD = 3  # jumps that are told one by one
 MOST_JUMPS = 0.02  # of the steps: more of them are noise
 MOST = (
     0.15  # jumps in more than this share of the rows are not faults of single samples
@@ -48,25 +48,23 @@ EXCESS = 0.01  # commands may exceed their limits by this share of their range
 WRONG_UNIT = (
     5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
 )
-UNIT_PERCENTILE, STEERED_PERCENTILE = 75.0, 95.0
+UNIT_PERCENTILE = 75.0
+STEERED_PERCENTILE = 95.0
 # Commands are compared with the motion over this time [s], that many times or more, at any delay
-DELAYS_S, COMPARED_S, MIN_COMPARED = (
-    np.linspace(-1.0, 1.5, 26),
-    1.0,
-    20,
-)  # and offset of clocks;
-ALIKE, NEAR = (
-    0.85,
-    1.2,
-)  # from this correlation on, another unit explains sizes by up to this ratio
+# and offset of clocks;
+DELAYS_S = np.linspace(-1.0, 1.5, 26)
+COMPARED_S = 1.0
+MIN_COMPARED = 20
+# from this correlation on, another unit explains sizes by up to this ratio
+ALIKE = 0.85
+NEAR = 1.2
 SCALED = (
     1.5  # times that a robot drives otherwise than told: less is slip, or a worn wheel
 )
-STANDING_M, STANDING_RAD, FROZEN = (
-    1e-3,
-    2e-3,
-    12.0,
-)  # a pose that stays within this, or this
+# a pose that stays within this, or this
+STANDING_M = 1e-3
+STANDING_RAD = 2e-3
+FROZEN = 12.0
 # many times its noise, never moved
 SWAPPED = (
     0.6  # least correlation of each of two commands with what the other should move
@@ -84,7 +82,8 @@ SIDEWAYS = (
 )  # commands of a robot that moves sideways
 CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
 # Least distance to measure a direction of travel, of the footprint's radius, of the pose's noise
-TRAVEL_SHARE, TRAVEL_NOISE = 0.1, 25.0
+TRAVEL_SHARE = 0.1
+TRAVEL_NOISE = 25.0
 
 
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
@@ -119,7 +118,8 @@ def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
         found["state"] = _jumps_of_state(recording.state)
     for name, jump in found.items():
         share = float(jump.mean()) if len(jump) else 0.0
-        jumps, count = "jump away from their neighbours and back", int(jump.sum())
+        jumps = "jump away from their neighbours and back"
+        count = int(jump.sum())
         if share > MOST:
             fault = f"{recording.source}: {name}: {share:.0%} of the rows {jumps}"
             raise RecordingError(
@@ -133,7 +133,9 @@ def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
 
 
 def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
-    pose, spec, t = drive.recording.pose, drive.spec, drive.sample_t
+    pose = drive.recording.pose
+    spec = drive.spec
+    t = drive.sample_t
     span = np.zeros(len(t))
     span[NEIGHBOURS:] = t[NEIGHBOURS:] - t[:-NEIGHBOURS]
     span[:-NEIGHBOURS] = np.maximum(
@@ -158,7 +160,9 @@ def _jumps_of_state(state: recordings.Stream) -> NDArray[np.bool_]:
 
 def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Moves all poses after a jump of the localiser to where the motion before it leads."""
-    recording, t, pose = drive.recording, drive.sample_t, drive.recording.pose.values
+    recording = drive.recording
+    t = drive.sample_t
+    pose = drive.recording.pose.values
     span = np.diff(t)
     if len(span) < 2 * AROUND + 1:
         return recording
@@ -174,7 +178,8 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     jump = (apart > _greatest(drive, apart)).any(axis=0)
     if not jump.any() or jump.mean() > MOST_JUMPS:
         return recording
-    place, told = pose.copy(), []
+    place = pose.copy()
+    told = []
     for k in np.flatnonzero(jump):
         here = geometry.compose(place[k], geometry.exp(expected[k]))
         place[k + 1 :] = geometry.compose(
@@ -193,7 +198,8 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
 
 def _greatest(drive: Drive, apart: Array) -> Array:
     """Returns by how much steps (2, T) in metres and radians may differ from those around them."""
-    t, pose = drive.sample_t, unwrapped(drive.recording.pose.values)
+    t = drive.sample_t
+    pose = unwrapped(drive.recording.pose.values)
     every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], SPEED_OVER_S)))
     took = np.maximum(np.diff(t[every]), 1e-9)
     gone = np.abs(np.diff(pose[every], axis=0))
@@ -221,9 +227,11 @@ def _stands_out(
     for n in range(1, NEIGHBOURS + 1):
         difference = values[n:] - values[:-n]
         difference = geometry.wrap_angle(difference) if turning else difference
-        back[n - 1, n:], ahead[n - 1, :-n] = difference, -difference
+        back[n - 1, n:] = difference
+        ahead[n - 1, :-n] = -difference
     usual = float(np.percentile(np.abs(back[0][1:]), USUAL))
-    before, after = np.median(back, axis=0), np.median(ahead, axis=0)
+    before = np.median(back, axis=0)
+    after = np.median(ahead, axis=0)
     apart = np.minimum(np.abs(before), np.abs(after))
     return np.asarray(
         (before * after > 0.0) & (apart > np.maximum(STEPS * usual, least))
@@ -232,8 +240,11 @@ def _stands_out(
 
 def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Clips commands to the robot's limits, unless it followed them beyond."""
-    recording, spec = drive.recording, drive.spec
-    low, high, values = spec.command_low, spec.command_high, recording.command.values
+    recording = drive.recording
+    spec = drive.spec
+    low = spec.command_low
+    high = spec.command_high
+    values = recording.command.values
     margin = EXCESS * (high - low)
     beyond = (values < low - margin) | (values > high + margin)
     if not beyond.any():
@@ -271,7 +282,8 @@ def _rates_left(recording: recordings.Recording, command: Array) -> float:
 
 def check_units(drive: Drive) -> None:
     """Refuses states and commands, with a RecordingError, that only another unit can explain."""
-    recording, spec = drive.recording, drive.spec
+    recording = drive.recording
+    spec = drive.spec
     for stream, variables in (
         (recording.command, spec.command),
         (recording.state, spec.state),
@@ -282,7 +294,8 @@ def check_units(drive: Drive) -> None:
         for variable, size in zip(variables, sizes, strict=True):
             limit = max(abs(variable.min), abs(variable.max))
             if size > WRONG_UNIT * limit:
-                name, unit = f"{recording.source}: {variable.name}", variable.unit
+                name = f"{recording.source}: {variable.name}"
+                unit = variable.unit
                 fault = f"is {size:.4g} and more where its limit is {limit:g} {unit}"
                 alike = "degrees, millimetres or revolutions per minute look like this"
                 raise RecordingError(f"{name} {fault}; it must be in {unit} ({alike}).")
@@ -303,7 +316,8 @@ def check_commands(
     By how the speed and the turn rate that they ask for, or those before they were clipped,
     compare with those that were driven.
     """
-    spec, sent = drive.spec, command or drive.recording.command
+    spec = drive.spec
+    sent = command or drive.recording.command
     if spec.moves_sideways:
         return _check_sideways(drive, sent)
     pair = _asked_and_driven(drive, sent)
@@ -344,7 +358,8 @@ def _about_scale(name: str, times: float) -> str:
 
 def check_pose_moves(drive: Drive) -> None:
     """Refuses poses that stay where they are while commands change (RecordingError)."""
-    recording, values = drive.recording, unwrapped(drive.recording.pose.values)
+    recording = drive.recording
+    values = unwrapped(drive.recording.pose.values)
     if not moved_commands(recording.command).any():
         return
     position, heading = drive.pose_noise or (0.0, 0.0)
@@ -362,7 +377,8 @@ def check_pose_moves(drive: Drive) -> None:
 
 def check_encoders(drive: Drive) -> tuple[str, ...]:
     """Tells of measured wheels that turn against the motion that they make by the textbook."""
-    recording, spec = drive.recording, drive.spec
+    recording = drive.recording
+    spec = drive.spec
     state = recording.state
     wheels = bool(spec.state) and all(
         v.unit == "rad/s" and not v.twist for v in spec.state
@@ -418,15 +434,18 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     keys = [c.cmd_vel or c.name for c in spec.command]
     if sorted(keys) != sorted(SIDEWAYS) or len(start) < MIN_COMPARED:
         return ()
-    order, best = [keys.index(key) for key in SIDEWAYS], np.zeros((3, 3))
+    order = [keys.index(key) for key in SIDEWAYS]
+    best = np.zeros((3, 3))
     for delay in DELAYS_S:
         asked = held(command, spec, start - delay, end - delay)[:, order]
         with np.errstate(invalid="ignore"):  # of what never changed
             alike = np.nan_to_num(np.corrcoef(asked.T, driven.T)[:3, 3:])
         if np.abs(alike).sum() > np.abs(best).sum():  # a turn moves a sensor aside
-            best, chi = alike, np.column_stack([asked, driven[:, 2]])
+            best = alike
+            chi = np.column_stack([asked, driven[:, 2]])
             way = np.linalg.lstsq(chi, driven[:, :2], rcond=None)[0]
-    along, size = np.hypot(best[:, 0], best[:, 1]), np.abs(best)
+    along = np.hypot(best[:, 0], best[:, 1])
+    size = np.abs(best)
     for k, straight in enumerate(along[:2] + size[2, 2]):
         _check_swapped(drive, [order[k], order[2]], min(along[2], size[k, 2]), straight)
     if (
@@ -451,7 +470,8 @@ def _driven(drive: Drive) -> tuple[Array, Array, Array]:
     """Returns the ends (n,) of spans of time [s], and the twist (n, 3) that was driven in each."""
     t = drive.dated.t
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
-    first, last = np.searchsorted(t, start), np.searchsorted(t, start + COMPARED_S)
+    first = np.searchsorted(t, start)
+    last = np.searchsorted(t, start + COMPARED_S)
     first, last = first[last > first], last[last > first]
     moved = geometry.log(
         geometry.between(drive.dated.values[first], drive.dated.values[last])
@@ -487,10 +507,8 @@ def _asked_and_driven(
     driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
     best = np.zeros((2, 2)), driven
     for delay in DELAYS_S:
-        sent, twist = (
-            held(command, spec, start - delay, end - delay),
-            np.zeros_like(driven),
-        )
+        sent = held(command, spec, start - delay, end - delay)
+        twist = np.zeros_like(driven)
         twist[:, places or [0, 1]] = (
             sent if places else textbook(spec).steady(sent)[:, [0, 2]]
         )
@@ -505,7 +523,8 @@ def _asked_and_driven(
 def check_axes(drive: Drive) -> None:
     """Refuses poses whose heading turns against the direction of travel (RecordingError)."""
     # If only mirrored headings make the direction constant, then x, y or heading is reversed.
-    recording, values = drive.recording, drive.dated.values
+    recording = drive.recording
+    values = drive.dated.values
     noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
     some = drive.dated.rows(recordings.along_path(values, apart))

@@ -19,10 +19,8 @@ from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 WIDTH = 96
 CURVE_POINTS = 8
 TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_arm_y_m"
-DEAD_ZONE, EAGER = (
-    "dead zone on both sides of 0",
-    "does more than in proportion, by minus",
-)
+DEAD_ZONE = "dead zone on both sides of 0"
+EAGER = "does more than in proportion, by minus"
 LEAST_DIGITS = 3  # of a coefficient: the printed equations predict as the model does
 MOST_LEFT = (
     0.5  # share of the error of standing still above which a model is hardly better
@@ -35,7 +33,8 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         identified.drive.spec
     )  # of a textbook that was written, which may have another state
     model = identified.model
-    latency, until = identified.recording.latency.sentences(), identified.train_until_s
+    latency = identified.recording.latency.sentences()
+    until = identified.train_until_s
     joined = bool(identified.recording.episodes)
     apart = "the last third of each drive" if joined else f"after {until:.1f} s"
     units = units_of(spec)
@@ -92,7 +91,8 @@ def opening(report: str) -> str:
 
 def equations_with_errors(model: TaylorModel) -> list[str]:
     """Returns one line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
-    errors, lines = model.named_errors, [curve.equation for curve in model.inputs]
+    errors = model.named_errors
+    lines = [curve.equation for curve in model.inputs]
     for dof, unit, row in zip(
         model.dofs, model.dof_units, model.coefficients, strict=True
     ):
@@ -125,7 +125,8 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
     Of those the names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` of a command,
     `vx.fall`, `.rise`, `.friction` and `.drag` of a state, `vx.back_emf.throttle` of both.
     """
-    model, sigma = identified.model, identified.calibration.uncertainty
+    model = identified.model
+    sigma = identified.calibration.uncertainty
     units = units_of(spec)
     values = [
         (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
@@ -192,7 +193,8 @@ def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
     """Tells of the pruned linear fit, where it gave the terms: not those of a motion."""
     if identified.findings.width is not None or identified.findings.replaced:
         return {}
-    fit, model = identified.fit, identified.model
+    fit = identified.fit
+    model = identified.model
     rows = zip(
         model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True
     )
@@ -231,11 +233,9 @@ def _curve(curve: Curve) -> list[str]:
 
 
 def _held_out(identified: Identified) -> Iterator[str]:
-    found, model, quality = (
-        identified.held_out,
-        identified.model,
-        identified.model.quality,
-    )
+    found = identified.held_out
+    model = identified.model
+    quality = identified.model.quality
     if found is None:
         yield "the drive is too short to hold data out"
     else:
@@ -246,7 +246,8 @@ def _held_out(identified: Identified) -> Iterator[str]:
     if quality is not None and quality.held_out_rmse:
         yield "the rates there:"
         for unit, dof in zip(model.dof_units, quality.held_out_rmse, strict=True):
-            rmse, r2 = quality.held_out_rmse[dof], quality.held_out_r2[dof]
+            rmse = quality.held_out_rmse[dof]
+            r2 = quality.held_out_r2[dof]
             yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}"
 
 
@@ -319,8 +320,10 @@ class CalibratedValue:
 
 def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     """Returns all estimates of the calibration by their names in `Calibration`."""
-    recording, found = identified.recording, identified.calibration
-    sigma, mounting = found.uncertainty, identified.findings.mounting
+    recording = identified.recording
+    found = identified.calibration
+    sigma = found.uncertainty
+    mounting = identified.findings.mounting
     one_clock = recording.pose.clock == recording.command.clock
     changed = bool(moved_commands(recording.command).any())
     untold = "the motion does not show it" if changed else "no command changed"
@@ -390,11 +393,13 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
 
 def why_useless(identified: Identified, spec: RobotSpec) -> str:
     """Returns a sentence on why a model is useless, by median errors; empty if it is not."""
-    held_out, recording = identified.held_out, identified.recording
+    held_out = identified.held_out
+    recording = identified.recording
     spec = identified.drive.spec
     if held_out is None:
         return ""
-    error, standing = held_out.median_position_error_m, held_out.median_displacement_m
+    error = held_out.median_position_error_m
+    standing = held_out.median_displacement_m
     if not np.isfinite(held_out.mean_position_error_m):
         error = np.inf
     if not is_useless(error, standing, held_out.mean_path_m, spec.footprint_radius):
@@ -407,7 +412,8 @@ def why_useless(identified: Identified, spec: RobotSpec) -> str:
 
 
 def _suspicion(identified: Identified, spec: RobotSpec) -> str:
-    recording, unmoved = identified.recording, identified.trial.fit.unmoved
+    recording = identified.recording
+    unmoved = identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
     if coarse := coarsest_state(recording, spec, unmoved):

@@ -43,7 +43,8 @@ REFERENCE_M_S = (
 )
 DRIFT_M_S = 0.01  # by which good predictions go astray: noise counts as time
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
-EVALUATIONS, TOLERANCE = 60, 1e-6
+EVALUATIONS = 60
+TOLERANCE = 1e-6
 INSIDE = 0.05  # share of its range by which a value starts from its bounds
 LEAST_SCALE = 0.02  # of the loss: smaller errors count as their squares [m/s]
 NO_ERROR = 1e-9
@@ -95,7 +96,8 @@ class Shooting:
 
         Windows have no gaps, and only rows `inside` (T,).
         """
-        t, dt = self.samples.t, self.samples.dt
+        t = self.samples.t
+        dt = self.samples.dt
         last = len(t) - 1
         first = np.arange(0, last, max(1, round(self.spacing_s / dt)))
         steps = np.tile(
@@ -144,7 +146,8 @@ class Shooting:
         terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
         terms = terms._replace(coefficient=model.coefficients[dofs, places])
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
-        command, state = self.commands(values), self.samples.q[:, 3:]
+        command = self.commands(values)
+        state = self.samples.q[:, 3:]
         shot = Shot(
             np.ascontiguousarray(state[first]),
             first,
@@ -176,8 +179,10 @@ def _seen_from(mounting: Array, shot: Shot) -> tuple[Array, Array]:
     arm = geometry.rotate(arm, shot.end[..., 2])
     across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None]
     moved = shot.slope[..., :2, :] + across * shot.slope[..., 2:, :]
-    c, s = np.cos(mounting[2]), np.sin(mounting[2])
-    along, aside = moved[..., 0, :], moved[..., 1, :]
+    c = np.cos(mounting[2])
+    s = np.sin(mounting[2])
+    along = moved[..., 0, :]
+    aside = moved[..., 1, :]
     rows = [c * along + s * aside, c * aside - s * along, shot.slope[..., 2, :]]
     return end, np.stack(rows, axis=-2)
 
@@ -240,7 +245,10 @@ class _Search:
         inside: Mask | None,
         pull: float,
     ) -> None:
-        self.problem, self.model, self.free, self.inputs = problem, model, free, inputs
+        self.problem = problem
+        self.model = model
+        self.free = free
+        self.inputs = inputs
         size = np.sqrt(
             (taylor.evaluate(problem.samples.x, model.powers) ** 2).mean(axis=0)
         )
@@ -288,12 +296,11 @@ class _Search:
 
     def jacobian(self, theta: Array) -> Array:
         """Returns its derivatives (n + P, I + P)."""
-        count, unit = self.count, self.unit
+        count = self.count
+        unit = self.unit
         rest, slope = self.shot(theta, True)
-        late, slope = (
-            self.late(theta, rest),
-            np.clip(np.nan_to_num(slope * unit), -1e6, 1e6),
-        )
+        late = self.late(theta, rest)
+        slope = np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
         own = np.concatenate(
             [np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1
         )
@@ -307,7 +314,8 @@ class _Search:
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
         """Searches for the least errors."""
-        count, start = self.count, np.zeros(self.count + len(self.unit))
+        count = self.count
+        start = np.zeros(self.count + len(self.unit))
         begun = self.residual(start)
         if first is not None:
             other = start.copy()
@@ -315,10 +323,12 @@ class _Search:
                 first[self.free] - self.model.coefficients[self.free]
             ) / self.unit
             if np.abs(rest := self.residual(other)).sum() < np.abs(begun).sum():
-                start, begun = other, rest
+                start = other
+                begun = rest
         low = np.full(len(start), -np.inf)
         high = -low
-        inputs, at = self.inputs, self.sought
+        inputs = self.inputs
+        at = self.sought
         low[:count] = ((inputs.low - inputs.start) / inputs.scale)[at]
         high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
         aside = INSIDE * (high - low)[:count]  # at a bound the search would stay there

@@ -32,7 +32,8 @@ def taken(
     """Returns means (..., C) of commands in effect over intervals (...) [s], by their curves."""
     names = [c.name for c in spec.command]
     stream = replace(command, values=bent(command.values, names, curves))
-    late, means = delays(names, curves), held(stream, spec, start, end)
+    late = delays(names, curves)
+    means = held(stream, spec, start, end)
     for c in np.flatnonzero(late):
         means[..., c] = held(stream, spec, start - late[c], end - late[c])[..., c]
     return means
@@ -52,10 +53,8 @@ def held(
     values = np.concatenate([before[None], command.values])
     if powers is not None:
         values = taylor.evaluate(values, powers)
-    low, high = (
-        min(start.min(), command.t[0]) - 1.0,
-        max(end.max(), command.t[-1]) + 1.0,
-    )
+    low = min(start.min(), command.t[0]) - 1.0
+    high = max(end.max(), command.t[-1]) + 1.0
     edges = np.concatenate([[low], command.t, [high]])
     return _means(edges, values * np.diff(edges)[:, None], start, end)
 
@@ -131,7 +130,8 @@ def inferred_states(
     motors: Motors | None = None,
 ) -> Array:
     """Infers states (T, S) at uniform times (T,) by lags and latencies (S,) [s], with gain one."""
-    dt, follows = float(grid[1] - grid[0]), followed(spec)
+    dt = float(grid[1] - grid[0])
+    follows = followed(spec)
     fall, rise, dead = motors or free_motors(len(follows))
     if dead.any():
         least = np.zeros(command.values.shape[1])
@@ -148,7 +148,8 @@ def inferred_states(
     states = np.empty((len(grid), len(follows)))
     for i, a in enumerate(np.exp(-dt / np.maximum(lags, 1e-6))):
         if np.isinf([fall[i], rise[i]]).all():
-            lag, begin = ([0.0, 1.0 - a], [1.0, -a]), initial[i : i + 1]
+            lag = ([0.0, 1.0 - a], [1.0, -a])
+            begin = initial[i : i + 1]
             states[:, i] = scipy.signal.lfilter(*lag, target[:, i], zi=begin)[0]
         else:
             states[0, i] = initial[i]
@@ -175,7 +176,9 @@ def resample(
     """Resamples unwrapped poses (T, 3) at (n,), by parabolas over `half_width` [s] unless 0."""
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
     weights = np.ones_like(pose) if weights is None else weights
-    t, pose, weights = t[distinct], pose[distinct], weights[distinct]
+    t = t[distinct]
+    pose = pose[distinct]
+    weights = weights[distinct]
     if half_width == 0.0:
         return np.asarray(make_interp_spline(t, pose, k=3)(at))
     low = np.searchsorted(t, at - half_width)

@@ -17,7 +17,10 @@ UNLIKE = 0.05  # correlation below which residuals are assumed to be independent
 LONGEST = 0.1  # longest correlation of residuals, as a share of the rows
 CERTAIN = 3.0  # a term of a noisy fit must be this many times its standard error
 WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
-DIFFERENCE, TOLERANCE, MAX_STEPS = 1e-4, 1e-7, 40  # relative step and end of `minimise`
+# relative step and end of `minimise`
+DIFFERENCE = 1e-4
+TOLERANCE = 1e-7
+MAX_STEPS = 40
 BLOCKS = 5
 WORTH = 1e-3  # terms that lower the error by less than this share of the rates' size are not kept
 
@@ -160,7 +163,8 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
     power = max(float(rest @ rest), np.finfo(np.float64).tiny)
     rho = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 0.98)
     variance = power / max(1, len(chi) - chi.shape[1]) * (1.0 + rho) / (1.0 - rho)
-    gram, moment = chi.T @ chi, chi.T @ target
+    gram = chi.T @ chi
+    moment = chi.T @ target
     keep = np.ones(chi.shape[1], dtype=np.bool_)
     while keep.any():
         inverse = np.linalg.pinv(gram[np.ix_(keep, keep)], hermitian=True)
@@ -180,8 +184,10 @@ def instrumental(
 ) -> tuple[Array, Array] | None:
     """Returns coefficients (K,) and errors by instruments (T, K); None if these are too weak."""
     # Two-stage least squares (Soederstroem, Stoica 1983).
-    scale, size = np.linalg.norm(chi, axis=0), np.linalg.norm(instruments, axis=0)
-    chi, instruments = chi / scale, instruments / size
+    scale = np.linalg.norm(chi, axis=0)
+    size = np.linalg.norm(instruments, axis=0)
+    chi = chi / scale
+    instruments = instruments / size
     bread = instruments.T @ chi
     if not np.linalg.cond(bread) < WEAK:
         return None

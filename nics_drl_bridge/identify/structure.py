@@ -11,7 +11,8 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 DEGREE = 3  # of the terms that are looked for
-BLOCK_S, FEWEST = 2.5, 12  # residuals this far apart are independent; blocks to tell by
+BLOCK_S = 2.5  # residuals this far apart are independent
+FEWEST = 12  # blocks to tell by
 SIGNIFICANT = 3.5  # standard errors, between the blocks, of the correlation with a term
 SHARE = 0.1  # of the residual's variance that a term explains in blocks that it was not fitted to
 WORTH = 0.01  # least size of that, as a share of the rate's
@@ -35,7 +36,8 @@ def structures(
         np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0
     )
     block = np.floor((samples.t - samples.t[0]) / BLOCK_S).astype(np.intp)
-    x, moved = samples.x, np.ptp(samples.x, axis=0) > 0.0
+    x = samples.x
+    moved = np.ptp(samples.x, axis=0) > 0.0
     moved &= [name not in unmoved for name in model.variables]
     if not moved.any() or len(np.unique(block)) < FEWEST:
         return
@@ -53,7 +55,8 @@ def structures(
         both = np.concatenate([left[:, d : d + 1], features], axis=1)
         both = both - own @ np.linalg.lstsq(own, both, rcond=None)[0]
         most = OUTLYING * float(np.median(np.abs(both[:, 0])))
-        rest, more = np.clip(both[:, 0], -most, most), both[:, 1:]
+        rest = np.clip(both[:, 0], -most, most)
+        more = both[:, 1:]
         told = (more**2).mean(axis=0) > 1e-6 * (features**2).mean(
             axis=0
         )  # not one of its own
@@ -97,7 +100,8 @@ def _share(rest: Array, features: Array, block: Array) -> Array:
     """
     count = int(block[-1]) + 1
     per_block = np.eye(count)[:, block]  # (N, T)
-    across, size = per_block @ (features * rest[:, None]), per_block @ features**2
+    across = per_block @ (features * rest[:, None])
+    size = per_block @ features**2
     total = float((rest**2).sum())
     slope = across.sum(axis=0) / np.maximum(size.sum(axis=0), 1e-18)
     spread = np.sqrt(((across - slope * size) ** 2).sum(axis=0))

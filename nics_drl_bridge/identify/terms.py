@@ -68,7 +68,8 @@ def library(powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()) -> Mask
     Beyond the first order, what a mirror reverses is made of what it reverses. Commands that were
     `held` at one value act as a constant.
     """
-    names, odd = spec.variable_names, mirrored(spec)
+    names = spec.variable_names
+    odd = mirrored(spec)
     order = powers.sum(axis=1)
     slip = [names.index(v.name) for v in spec.state if v.twist == "vy"]
     allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
@@ -99,7 +100,9 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
     Where poses are those of the robot's `centred` reference point, motion along x is even in what a
     mirror reverses, and beyond the first order the rest is odd. States lag behind their commands.
     """
-    names, odd, order = spec.variable_names, mirrored(spec), powers.sum(axis=1)
+    names = spec.variable_names
+    odd = mirrored(spec)
+    order = powers.sum(axis=1)
     unmoved = [
         name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0
     ]
@@ -119,7 +122,9 @@ def by_textbook(
     powers: Powers, spec: RobotSpec, held: tuple[str, ...] = (), tyres: bool = False
 ) -> Mask:
     """Selects the terms (D, K) by which the twist follows commands with a lag, as textbooks do."""
-    names, states, order = spec.variable_names, len(spec.state), powers.sum(axis=1)
+    names = spec.variable_names
+    states = len(spec.state)
+    order = powers.sum(axis=1)
     allowed, given = library(powers, spec, held) & (order <= 1), structure_of(spec)
     if given is None or not states:
         return np.asarray(allowed)
@@ -161,7 +166,8 @@ def linear_fit(
 ) -> Fit:
     """Fits all terms of the library of an order to the rates (Eq. 1); the twist by definition."""
     variables = (*spec.state, *spec.command)
-    unmoved, mean = excitation.unmoved_variables(samples, spec), samples.x.mean(axis=0)
+    unmoved = excitation.unmoved_variables(samples, spec)
+    mean = samples.x.mean(axis=0)
     least = excitation.STILL * np.array([v.max - v.min for v in variables])
     at = {
         v.name: float(value) * bool(abs(value) > some)
@@ -218,10 +224,8 @@ def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel
 
     By the least coefficients of all that make the same of these commands.
     """
-    still, command = (
-        excitation.combinations(samples, spec),
-        samples.x[:, len(spec.state) :],
-    )
+    still = excitation.combinations(samples, spec)
+    command = samples.x[:, len(spec.state) :]
     parts = np.abs(still).max(axis=0, initial=0.0) > NOTHING
     constant = still / np.maximum(command.std(axis=0), NOTHING)
     if (
@@ -261,7 +265,8 @@ def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel
 
 def stable(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
     """Returns a model in which no state grows by itself."""
-    coefficients, alone = model.coefficients.copy(), model.powers.sum(axis=1) == 1
+    coefficients = model.coefficients.copy()
+    alone = model.powers.sum(axis=1) == 1
     for i in range(len(spec.state)):
         own = alone & (model.powers[:, i] == 1)
         coefficients[3 + i, own] = np.minimum(coefficients[3 + i, own], 0.0)

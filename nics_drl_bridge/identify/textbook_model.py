@@ -89,7 +89,8 @@ def needs_actuators(yardstick: Yardstick, spec: RobotSpec) -> bool:
 
 def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     """Returns a steered robot whose state is its speed and its steering angle."""
-    response, spec = yardstick.response, drive.spec
+    response = yardstick.response
+    spec = drive.spec
     speed, steering = _places_of_bicycle(response)
     forward = [v.twist for v in spec.state].index("vx")
     fastest = float(np.abs(known_state(drive).values[:, forward]).max())
@@ -137,11 +138,13 @@ def with_actuators(
 
     The speed is that of the motion, the angle that of the textbook for the commands.
     """
-    response, state = yardstick.response, known_state(drive)
+    response = yardstick.response
+    state = known_state(drive)
     forward = [v.twist for v in drive.spec.state].index("vx")
     _, steering = _places_of_bicycle(response)
     alone = spec.model_copy(update={"state": spec.state[1:]})
-    command, lag = drive.recording.command, response.lag_s[2:]
+    command = drive.recording.command
+    lag = response.lag_s[2:]
     latency = calibration.command_latency_s
     angle = inferred_states(command, alone, lag, latency, state.t)[:, 0]
     angle = response.gain[2, steering] * angle + response.offset[2]
@@ -207,7 +210,8 @@ class _Expansion:
 
     def rate_of(self, actuator: int) -> float:
         """Returns the rate [1/s] by which a step of the model brings an actuator to its target."""
-        lag, dt = float(self.response.lag_s[actuator]), self.like.dt
+        lag = float(self.response.lag_s[actuator])
+        dt = self.like.dt
         return (1.0 - float(np.exp(-dt / lag))) / dt
 
     def unit(self, place: int, power: int = 1) -> NDArray[np.int64]:
@@ -244,7 +248,8 @@ class _Expansion:
 
     def steering_rows(self, speed: int, angle: int) -> list[NDArray[np.int64]]:
         """Returns the terms of a turn rate by speed and steering angle."""
-        v, steer = self.unit(speed), self.unit(angle)
+        v = self.unit(speed)
+        steer = self.unit(angle)
         return [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
 
     def turn_rate(self, speed: Array, steering: Array) -> Array:
@@ -273,7 +278,8 @@ class _Expansion:
         self, dofs: tuple[int, int], speed: int, steering: int, ask: Array
     ) -> None:
         """Adds the twist of a bicycle by the variables of its speed and of its steering."""
-        v, steer = self.unit(speed), self.unit(steering)
+        v = self.unit(speed)
+        steer = self.unit(steering)
         told = self.x[:, steering]
         rows = [v, v + 2 * steer] if self.response.bicycle.front_drive else [v]
         self.add_expanded(dofs[0], self.along(ask, told), rows)
@@ -303,7 +309,8 @@ class _Expansion:
             if part == 1 and not self.spec.moves_sideways:
                 continue
             self.add(part, self.unit(i), 1.0)
-            rate, dof = self.rate_of(part), 3 + i
+            rate = self.rate_of(part)
+            dof = 3 + i
             self.add(dof, self.unit(i), -rate)
             for command in np.flatnonzero(self.response.gain[part]):
                 row = self.unit(self.command_place(int(command)))
@@ -326,8 +333,10 @@ class _Expansion:
         self.add(
             4, self.unit(steering, 0), self.rate_of(2) * float(self.response.offset[2])
         )
-        v, angle = self.unit(0), self.unit(1)
-        bicycle, told = self.response.bicycle, self.x[:, 1]
+        v = self.unit(0)
+        angle = self.unit(1)
+        bicycle = self.response.bicycle
+        told = self.x[:, 1]
         turning = np.sin(told) if bicycle.front_drive else np.tan(told)
         along = np.cos(told) if bicycle.front_drive else np.ones(len(told))
         length = bicycle.wheelbase * (1.0 + bicycle.understeer * self.x[:, 0] ** 2)

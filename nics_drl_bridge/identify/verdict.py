@@ -90,10 +90,13 @@ def _gap_rows(drive: Drive) -> list[int]:
 
 def about_gaps(drive: Drive) -> Iterator[str]:
     """Tells each gap in the pose: when, how long, and how far the pose moved across it."""
-    t, pose, rows = drive.dated.t, drive.dated.values, _gap_rows(drive)
+    t = drive.dated.t
+    pose = drive.dated.values
+    rows = _gap_rows(drive)
     for row in rows[:GAPS_TOLD]:
         moved = geometry.between(pose[row], pose[row + 1])
-        span, begin = t[row + 1] - t[row], t[row] - t[0]
+        span = t[row + 1] - t[row]
+        begin = t[row] - t[0]
         finding = f"The pose has a gap of {span:.1f} s, from {begin:.1f} s to {begin + span:.1f} s"
         across = f"{np.hypot(*moved[:2]):.2f} m and turns {abs(moved[2]):.2f} rad"
         yield Gap(
@@ -116,10 +119,12 @@ def coarsest_state(
     values = recording.state.values
     spread = np.ptp(np.percentile(values, ENDS, axis=0), axis=0)
     steps = np.percentile(np.abs(np.diff(values, axis=0)), ENDS[1], axis=0)
-    greatest, name = COARSE, ""
+    greatest = COARSE
+    name = ""
     for variable, step, size in zip(spec.state, steps, spread, strict=True):
         if size > 0.0 and variable.name not in unmoved and step / size > greatest:
-            greatest, name = float(step / size), variable.name
+            greatest = float(step / size)
+            name = variable.name
     if not name:
         return ""
     apart = float(np.median(np.diff(recording.state.t)))
@@ -131,7 +136,8 @@ def about_clocks(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
     """Tells of clock offset and latency."""
-    sigma, recording = calibration.uncertainty, drive.recording
+    sigma = calibration.uncertainty
+    recording = drive.recording
     clocks_differ = recording.pose.clock != recording.command.clock
     if clocks_differ and "clock_offset_s" in sigma:
         offset = (
@@ -161,10 +167,8 @@ def about_clocks(
         yield Gap(
             f"Only the sum of clock offset and command latency can be known, {why}; {fix}."
         )
-    latency, spread = (
-        calibration.command_latency_s,
-        sigma.get("command_latency_s", np.inf),
-    )
+    latency = calibration.command_latency_s
+    spread = sigma.get("command_latency_s", np.inf)
     if timing.separated and latency > CERTAIN * spread:
         yield f"Commands take effect {latency:.4f} s (+- {spread:.4f} s) after their stamps."
 
@@ -225,7 +229,8 @@ def about_responses(
     moved = moved_commands(drive.recording.command)
     names = [c.name for c, m in zip(drive.spec.command, moved, strict=True) if m]
     for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=False):
-        state, command = response.state, response.command
+        state = response.state
+        command = response.command
         if command not in names:
             finding = f"{command} never changed, so how {state} follows it could not be learnt"
             yield Gap(f"{finding}; drive with {command} changing over its whole range.")
@@ -236,7 +241,8 @@ def about_responses(
             taken = f"with a lag of {lag} and a gain of {response.gain:.4f}"
             yield f"{state} was not measured: it is taken to follow {command} {taken}."
     if calibration.wheel_scale is not None:
-        scale, sigma = calibration.wheel_scale, calibration.uncertainty["wheel_scale"]
+        scale = calibration.wheel_scale
+        sigma = calibration.uncertainty["wheel_scale"]
         yield f"A unit of the wheels' speed is {scale:.4g} m/s (+- {sigma:.2g} m/s)."
     if calibration.wheels_swapped:
         why = "is the faster one when the robot turns left, and the slower one when it turns right"
@@ -355,7 +361,8 @@ def mirror_note(
     for i, command in enumerate(spec.command, start=len(spec.state)):
         if not command.turns:
             continue
-        turn, wanted = samples.dq[:, 2], samples.x[:, i]
+        turn = samples.dq[:, 2]
+        wanted = samples.x[:, i]
         if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
         if (

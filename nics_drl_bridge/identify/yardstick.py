@@ -25,25 +25,30 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
 
 HORIZONS_S = (1.0, 2.5, 5.0)  # the fit's predictions end after these times
-STEP_S, SPACING_S, MOST_WINDOWS = 0.02, 0.1, 200
-BEFORE_S, FEWEST = (
-    0.2,
-    4,
-)  # poses that tell the twist at a window's start: time and number
+STEP_S = 0.02
+SPACING_S = 0.1
+MOST_WINDOWS = 200
+# poses that tell the twist at a window's start: time and number
+BEFORE_S = 0.2
+FEWEST = 4
 STEADY_M_S = (
     0.05  # greatest standard error of a speed at a start that is taken from a parabola
 )
 HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
 LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
-MOST_EVALUATIONS, TOLERANCE = 60, 1e-4
+MOST_EVALUATIONS = 60
+TOLERANCE = 1e-4
 GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
 JUMP = 3.0  # speeds beyond so many times the 90th percentile are jumps of the localiser
 DELAYS_S = np.arange(
     -0.1, 0.51, 0.05
 )  # at each of these delays between streams of one clock
 FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
-LAG_S, LAG_RANGE_S = 0.15, (0.005, 5.0)
-LIMIT, LIMIT_RANGE = 10.0, (0.05, 1e3)  # of acceleration [m/s^2]
+LAG_S = 0.15
+LAG_RANGE_S = (0.005, 5.0)
+# of acceleration [m/s^2]
+LIMIT = 10.0
+LIMIT_RANGE = (0.05, 1e3)
 NOTHING = 1e-9
 PROBE = 0.5  # share of the range of a command at which the textbook is asked for its structure
 
@@ -97,13 +102,12 @@ def twists_before(drive: Drive, at: Array) -> Array:
 
     By parabolas, whose ends are in time, or by lines where poses are noisy: four times as steady.
     """
-    t, pose = drive.dated.t, unwrapped(drive.dated.values)
+    t = drive.dated.t
+    pose = unwrapped(drive.dated.values)
     last = np.searchsorted(t, at + 1e-9) - 1
     first = np.minimum(np.searchsorted(t, at - BEFORE_S - 1e-9), last - FEWEST + 1)
-    noise, count = (
-        (drive.pose_noise or (0.0, 0.0))[0],
-        float(np.median(last - first + 1)),
-    )
+    noise = (drive.pose_noise or (0.0, 0.0))[0]
+    count = float(np.median(last - first + 1))
     degree = 2 if noise * np.sqrt(192.0 / count) / BEFORE_S < STEADY_M_S else 1
     twist = np.zeros((len(at), 3))
     for w, (a, b) in enumerate(zip(np.maximum(first, 0), last + 1, strict=True)):
@@ -149,7 +153,8 @@ def _course(drive: Drive, start_t: Array, duration: Array) -> _Course:
 
 def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) -> Array:
     """Returns poses (W, H, 3) of the tracked body seen from its start, where it had a twist."""
-    bicycle, mounting = response.bicycle, response.mounting
+    bicycle = response.bicycle
+    mounting = response.mounting
     target = course.command @ response.gain.T
     begin = course.start_t - response.delay_s - course.grid_t[0]
     arm = np.array([mounting[1], -mounting[0], 0.0]) * twist[:, 2:]
@@ -160,7 +165,8 @@ def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) ->
             [np.sign(target[:, 0]) * more, 0.0 * more, target[:, 2]], axis=1
         )
         target[:, 2] += response.offset[2]
-        share, angle = 1.0 - np.exp(-STEP_S / response.lag_s[2]), target[:, 2]
+        share = 1.0 - np.exp(-STEP_S / response.lag_s[2])
+        angle = target[:, 2]
         lag = [0.0, share], [1.0, share - 1.0]
         angle = scipy.signal.lfilter(*lag, angle, zi=angle[:1])[0]
         actuator[:, 1] = 0.0
@@ -207,7 +213,8 @@ class _Form:
 
     def pack(self) -> Array:
         """Returns the free values of the start (P,); positive ones as logarithms."""
-        r, rows = self.start, self.moves.any(axis=1)
+        r = self.start
+        rows = self.moves.any(axis=1)
         return np.concatenate(
             [
                 [r.delay_s],
@@ -222,7 +229,8 @@ class _Form:
 
     def unpack(self, theta: Array) -> TextbookResponse:
         """Returns the response of free values (P,)."""
-        r, rows = self.start, self.moves.any(axis=1)
+        r = self.start
+        rows = self.moves.any(axis=1)
         count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(self.slips)]
         delay, gains, offsets, lags, limits, understeer, place = np.split(
             theta, np.cumsum(count)
@@ -230,7 +238,9 @@ class _Form:
         gain, offset, lag, mounting = (
             a.copy() for a in (r.gain, r.offset, r.lag_s, r.mounting)
         )
-        gain[self.moves], offset[rows], mounting[self.mounted] = gains, offsets, place
+        gain[self.moves] = gains
+        offset[rows] = offsets
+        mounting[self.mounted] = place
         lag[rows] = np.exp(np.clip(lags, *np.log(LAG_RANGE_S)))
         limit = np.exp(np.clip(limits, *np.log(LIMIT_RANGE)))
         if self.one_limit:
@@ -291,7 +301,8 @@ def _first_guess(
     ):
         shift = clock_offset - delay
         u = held(command, drive.spec, seen.start_t + shift, seen.end_t + shift)
-        expected, rotation = u @ book.T, 0.0
+        expected = u @ book.T
+        rotation = 0.0
         if structure is not None:
             a, b = ((v[:, 0] + 1j * v[:, 1]) for v in (expected, twist))
             rotation = float(np.angle((a.conj() * b).sum()))
@@ -327,7 +338,10 @@ def _regressed(
     offsets: bool,
 ) -> tuple[float, Array, Array, Array]:
     """Regresses twist + lag * change on commands: what is left, gains, offsets, lags."""
-    left, gain, offset, lag = 0.0, np.zeros(moves.shape), np.zeros(3), np.full(3, LAG_S)
+    left = 0.0
+    gain = np.zeros(moves.shape)
+    offset = np.zeros(3)
+    lag = np.full(3, LAG_S)
     for i in np.flatnonzero(moves.any(axis=1)):
         given = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
         rows = np.column_stack([given, -change[:, i]])
@@ -337,7 +351,8 @@ def _regressed(
         if not angle and beta[-1] > LAG_RANGE_S[0]:
             lag[i] = min(beta[-1], LAG_RANGE_S[1])
         else:
-            rows, beta = given, np.linalg.lstsq(given, twist[:, i], rcond=None)[0]
+            rows = given
+            beta = np.linalg.lstsq(given, twist[:, i], rcond=None)[0]
         gain[i, moves[i]], offset[i] = beta[: moves[i].sum()], beta[moves[i].sum()]
         rest = rows @ beta - twist[:, i]
         left += float((rest**2).mean() / max((twist[:, i] ** 2).mean(), 1e-12))

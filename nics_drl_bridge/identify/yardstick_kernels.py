@@ -30,7 +30,8 @@ def _limited(value, target, lag, limit):  # type: ignore[no-untyped-def]
 def _twist(state, bicycle):  # type: ignore[no-untyped-def]
     if not bicycle.used:
         return state[0], state[1], state[2]
-    speed, angle = state[0], state[2]
+    speed = state[0]
+    angle = state[2]
     if bicycle.front_drive:
         return speed * math.cos(angle), 0.0, speed * math.sin(angle) / bicycle.wheelbase
     length = bicycle.wheelbase * (1.0 + bicycle.understeer * speed * speed)
@@ -46,7 +47,11 @@ def roll_windows(ends, actuator, begin, stops, target, lag, limit, bicycle, dt):
     `lag` (3,) [s]; `limit` (2,) of the speed's acceleration and deceleration [m/s^2].
     """
     for w in range(len(begin)):
-        x, y, heading, done, state = 0.0, 0.0, 0.0, 0.0, actuator[w]
+        x = 0.0
+        y = 0.0
+        heading = 0.0
+        done = 0.0
+        state = actuator[w]
         for h in range(stops.shape[1]):
             while done < stops[w, h] - 1e-9:
                 share = min(1.0, stops[w, h] - done)
@@ -60,9 +65,12 @@ def roll_windows(ends, actuator, begin, stops, target, lag, limit, bicycle, dt):
                 vx, vy, turn = _twist(state, bicycle)
                 span = share * dt
                 middle = heading + 0.5 * turn * span
-                c, s = math.cos(middle), math.sin(middle)
+                c = math.cos(middle)
+                s = math.sin(middle)
                 x += span * (c * vx - s * vy)
                 y += span * (s * vx + c * vy)
                 heading += turn * span
                 done += share
-            ends[w, h, 0], ends[w, h, 1], ends[w, h, 2] = x, y, heading
+            ends[w, h, 0] = x
+            ends[w, h, 1] = y
+            ends[w, h, 2] = heading

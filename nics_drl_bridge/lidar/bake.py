@@ -95,7 +95,9 @@ def with_shapes(
 
 def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
     """Computes the cells of a shape and the widths of their rows."""
-    shape, radius, order = outlines.shapes[h], outlines.radii[h], outlines.orders[h]
+    shape = outlines.shapes[h]
+    radius = outlines.radii[h]
+    order = outlines.orders[h]
     distances = np.linspace(radius, spec.range_max + radius, density.distances)
     distances[0] *= 1.0 + TOUCHING
     round_ = isinstance(shape, Circle)
@@ -173,8 +175,10 @@ def _candidates(
     Along a line and around a circle outside, the corner changes monotonically: those at the rim of
     a cell enclose all others. If more than two, those at one and three quarters represent all.
     """
-    low, high = _within(wound, parts, np.minimum), _within(wound, parts, np.maximum)
-    quarter, first = (high - low) // 4, wound[parts // 2 :: parts]
+    low = _within(wound, parts, np.minimum)
+    high = _within(wound, parts, np.maximum)
+    quarter = (high - low) // 4
+    first = wound[parts // 2 :: parts]
     away = np.clip(np.maximum(high - first, first - low), 1, corners - 1)
     stride = np.exp2(np.floor(np.log2(away))).astype(np.int64)
     two = np.stack([(low + quarter) % corners, (high - quarter) % corners], axis=-1)
@@ -193,10 +197,8 @@ def _miss(
     count = len(two)
     worst = np.zeros(two.shape[:2])
     for k in range(parts + 1):
-        turn, true = (
-            turns[k:][: count * parts : parts],
-            edge[k:][: count * parts : parts],
-        )
+        turn = turns[k:][: count * parts : parts]
+        true = edge[k:][: count * parts : parts]
         corner = rotate(hull[two], turn[:, None, None])
         for later in (0, 1):
             last = distances.shape[0] - later
@@ -214,7 +216,9 @@ def _fill(
     table: LidarTable,
     grids: Sequence[Grid],
 ) -> None:
-    outlines, distances, done = table.outlines, table.density.distances, 0
+    outlines = table.outlines
+    distances = table.density.distances
+    done = 0
     for h, grid in enumerate(grids):
         shape = (
             outlines.corners[outlines.corner[h] : outlines.corner[h + 1]],

@@ -18,30 +18,39 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
     convex hull is (V, 2) [m], unused for a circle; `radius` [m] is 0 for any other shape.
     """
     for t in range(turns.shape[0]):
-        c, s = math.cos(turns[t]), math.sin(turns[t])
+        c = math.cos(turns[t])
+        s = math.sin(turns[t])
         for d in range(distances.shape[0]):
             if radius > 0.0:
                 half = math.asin(min(radius / distances[d], 1.0))
-                edges[t, d, 0], edges[t, d, 1] = -half, half
+                edges[t, d, 0] = -half
+                edges[t, d, 1] = half
                 hints[t, d] = 0
                 continue
             rx, ry = exact_kernels.turned(distances[d], 0.0, c, s, hull[0])
-            lx, ly = rx, ry
+            lx = rx
+            ly = ry
             right = left = 0
             for v in range(1, hull.shape[0]):
                 x, y = exact_kernels.turned(distances[d], 0.0, c, s, hull[v])
                 if rx * y - ry * x < 0.0:
-                    rx, ry, right = x, y, v
+                    rx = x
+                    ry = y
+                    right = v
                 if lx * y - ly * x > 0.0:
-                    lx, ly, left = x, y, v
+                    lx = x
+                    ly = y
+                    left = v
             edges[t, d, 0], edges[t, d, 1] = math.atan2(ry, rx), math.atan2(ly, lx)
-            hints[t, d, 0], hints[t, d, 1] = right, left
+            hints[t, d, 0] = right
+            hints[t, d, 1] = left
 
 
 @kernel(allocates=True)
 def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untyped-def]
     """Range to a shape straight ahead in one direction [rad]; see `row`."""
-    ray, out = np.empty((2, 1)), np.full(1, np.inf, np.float32)
+    ray = np.empty((2, 1))
+    out = np.full(1, np.inf, np.float32)
     ray[0, 0], ray[1, 0] = math.cos(angle), math.sin(angle)
     beams = exact_kernels.beams_of(ray, angle, 1.0, False)
     if corners.shape[0] == 0:
@@ -96,10 +105,13 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
     bearing, and its width in beams. `shape` are corners and radius, see `row`; edges are (D, 2),
     beams a `step` apart [rad], with so many phases (points) each.
     """
-    c, s = math.cos(turn), math.sin(turn)
+    c = math.cos(turn)
+    s = math.sin(turn)
     corners, radius = shape
     for d in range(distances.shape[0]):
-        start, begin, width = layout[0, d], layout[1, d], layout[2, d]
+        start = layout[0, d]
+        begin = layout[1, d]
+        width = layout[2, d]
         points = width * phases
         angles = (begin * phases + np.arange(points)) * (step / phases)
         directions = np.stack((np.cos(angles), np.sin(angles)))
@@ -113,11 +125,10 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
     """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
     directions = np.stack((np.cos(angles), np.sin(angles)))
-    beams, count = (
-        exact_kernels.beams_of(directions, angles[0], step, False),
-        len(angles),
-    )
-    nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
+    beams = exact_kernels.beams_of(directions, angles[0], step, False)
+    count = len(angles)
+    nearest = np.full(count, np.inf, np.float32)
+    cosines = np.zeros(count, np.float32)
     if corners.shape[0] == 0:
         exact_kernels.circle(nearest, beams, distance, 0.0, radius, np.inf)
         for i in range(count):
@@ -130,26 +141,32 @@ def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[n
         bx, by = exact_kernels.turned(distance, 0.0, c, s, corners[v])
         before = nearest.copy()
         exact_kernels.segment(nearest, beams, ax, ay, bx, by)
-        ex, ey = bx - ax, by - ay
+        ex = bx - ax
+        ey = by - ay
         away = np.float32(abs(ax * ey - ay * ex) / math.sqrt(ex * ex + ey * ey))
         for i in range(count):
             if nearest[i] < before[i]:
                 cosines[i] = min(away / nearest[i], np.float32(1.0))
-        ax, ay = bx, by
+        ax = bx
+        ay = by
     return cosines
 
 
 @kernel(allocates=True)
 def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
     """Writes cosines (R,), see `rows_of_turn`; beyond the edges they are as at the edge."""
-    c, s = math.cos(turn), math.sin(turn)
+    c = math.cos(turn)
+    s = math.sin(turn)
     corners, radius = shape
     for d in range(distances.shape[0]):
-        start, begin, width = layout[0, d], layout[1, d], layout[2, d]
+        start = layout[0, d]
+        begin = layout[1, d]
+        width = layout[2, d]
         count = width * phases
         angles = (begin * phases + np.arange(count)) * (step / phases)
         inside = EDGE * (edges[d, 1] - edges[d, 0])
-        low, high = edges[d, 0] + inside, edges[d, 1] - inside
+        low = edges[d, 0] + inside
+        high = edges[d, 1] - inside
         fine = incidences(angles, step / phases, corners, radius, distances[d], c, s)
         at = np.array([low, high])
         fine[angles < low] = incidences(

@@ -82,10 +82,14 @@ class LidarArrays(NamedTuple):
 @kernel(inline=True)
 def sensor_pose(pose, mount):  # type: ignore[no-untyped-def]
     """Returns x, y, heading of a lidar in its world, from the pose (3,) of its robot."""
-    x, y, heading = pose[0], pose[1], pose[2]
+    x = pose[0]
+    y = pose[1]
+    heading = pose[2]
     if mount[0] != 0.0 or mount[1] != 0.0:
-        c, s = math.cos(heading), math.sin(heading)
-        x, y = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
+        c = math.cos(heading)
+        s = math.sin(heading)
+        x = x + c * mount[0] - s * mount[1]
+        y = y + s * mount[0] + c * mount[1]
     return x, y, heading + mount[2]
 
 
@@ -95,7 +99,9 @@ def compute(out, here, bodies, me, near, walls, lidar, found):  # type: ignore[n
     computed = False
     for k in near:
         if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
-            body, outlines, computed = bodies[k], lidar.outlines, True
+            body = bodies[k]
+            outlines = lidar.outlines
+            computed = True
             exact_kernels.body_into(
                 out, lidar.beams, here, body, outlines, lidar.range_max
             )
@@ -108,8 +114,11 @@ def compute(out, here, bodies, me, near, walls, lidar, found):  # type: ignore[n
 @kernel(contracts=True, inline=True)
 def way_of(body, x, y, lidar):  # type: ignore[no-untyped-def]
     """Way to scan a body: computed where the lidar is in its circle, or the table is too coarse."""
-    dx, dy, radius = body[exact.X] - x, body[exact.Y] - y, body[exact.RADIUS]
-    d2, reach = dx * dx + dy * dy, lidar.range_max + radius
+    dx = body[exact.X] - x
+    dy = body[exact.Y] - y
+    radius = body[exact.RADIUS]
+    d2 = dx * dx + dy * dy
+    reach = lidar.range_max + radius
     if not (radius > 0.0 and d2 <= reach * reach):
         return UNSEEN
     h = np.uintp(np.int32(body[exact.SHAPE]))
@@ -166,13 +175,15 @@ def silhouette(pair, hull, shape, hulls, seen, side):  # type: ignore[no-untyped
 
     It is either corner of a pair; a negative one is minus the stride of climbing from the other.
     """
-    first, other = hull + (pair & 0xFFFF), pair >> 16
+    first = hull + (pair & 0xFFFF)
+    other = pair >> 16
     if other < 0:
         along, across = outermost(
             hulls, hull, shape.corners, first - hull, -other, seen, side
         )
         return arctan2_single(np.float32(across), np.float32(along))
-    one, two = hulls[np.uintp(first)], hulls[np.uintp(hull + other)]
+    one = hulls[np.uintp(first)]
+    two = hulls[np.uintp(hull + other)]
     return tangent(seen, one[0], one[1], two[0], two[1], shape.round_radius, side)
 
 
@@ -182,9 +193,11 @@ def tangent(seen, x1, y1, x2, y2, radius, side):  # type: ignore[no-untyped-def]
     ax, ay = seen_from(seen, x1, y1)
     bx, by = seen_from(seen, x2, y2)
     outer = side * (ax * by - ay * bx) < 0.0
-    ax, ay = bx if outer else ax, by if outer else ay
+    ax = bx if outer else ax
+    ay = by if outer else ay
     along = math.sqrt(max(seen.d2 - radius * radius, 0.0))
-    ax, ay = along if radius > 0.0 else ax, -side * radius if radius > 0.0 else ay
+    ax = along if radius > 0.0 else ax
+    ay = -side * radius if radius > 0.0 else ay
     return arctan2_single(np.float32(ay), np.float32(ax))
 
 
@@ -200,7 +213,8 @@ def in_beams(right, left, bearing, heading, beams):  # type: ignore[no-untyped-d
     per_beam = 1.0 / beams.step
     turn = 2.0 * math.pi * per_beam
     per_turn = 1.0 / turn
-    low, high = right * per_beam, left * per_beam
+    low = right * per_beam
+    high = left * per_beam
     middle = (bearing - (heading + beams.first)) * per_beam
     middle -= np.floor((middle + low) * per_turn) * turn
     return middle, middle + low, middle + high
@@ -225,8 +239,10 @@ def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-d
 @kernel(inline=True)
 def points_of(start, place, point, shift, hits):  # type: ignore[no-untyped-def]
     """Indices of the points of a row around the first beam; the next may be of the next beam."""
-    phases, width = np.int32(1 << shift), np.int32(place & 0xFFFF)
-    beam, phase = point >> shift, np.int32(point & (phases - 1))
+    phases = np.int32(1 << shift)
+    width = np.int32(place & 0xFFFF)
+    beam = point >> shift
+    phase = np.int32(point & (phases - 1))
     skip = max(
         min(np.int32(beam - (place >> 16)), np.int32(width - hits - 1)), np.int32(0)
     )
@@ -241,7 +257,8 @@ def blended(rows, one, two, other, other2, share, blend, least, most):  # type: 
 
     Beyond `most` it is `inf`, below `least` `-inf` (REP-117).
     """
-    value, farther = rows[np.uintp(one)], rows[np.uintp(other)]
+    value = rows[np.uintp(one)]
+    farther = rows[np.uintp(other)]
     value += share * (rows[np.uintp(two)] - value)
     farther += share * (rows[np.uintp(other2)] - farther)
     value += blend * (farther - value)
@@ -269,7 +286,10 @@ def outermost(hulls, hull, corners, first, stride, seen, side):  # type: ignore[
                 corner = hulls[np.uintp(hull + other)]
                 ax, ay = seen_from(seen, corner[0], corner[1])
                 if side * (x * ay - y * ax) < 0.0:
-                    best, x, y, moved = other, ax, ay, True
+                    best = other
+                    x = ax
+                    y = ay
+                    moved = True
             if not moved:
                 break
         stride >>= 1
@@ -279,7 +299,8 @@ def outermost(hulls, hull, corners, first, stride, seen, side):  # type: ignore[
 @kernel(contracts=True, inline=True)
 def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     """Like `exact_kernels.arctan2`, in single precision, within 2e-7 rad."""
-    ax, ay = abs(x), abs(y)
+    ax = abs(x)
+    ay = abs(y)
     ratio = min(ax, ay) / max(ax, ay)
     s = ratio * ratio
     r = ATAN[7]

@@ -63,7 +63,8 @@ def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
     """Lays the cells of a world, which are empty then, over a square from (low_x, low_y) on."""
     if cells.first.shape[0] > 0:
         frame = cells.frame[n]
-        frame[LEFT], frame[BOTTOM] = low_x, low_y
+        frame[LEFT] = low_x
+        frame[BOTTOM] = low_y
         frame[PER_METRE] = frame[SIDE] / extent if 0.0 < extent < np.inf else 1.0
         clear(n, cells)
 
@@ -91,19 +92,27 @@ def add(n, k, body, cells):  # type: ignore[no-untyped-def]
     """Adds a body (7,) to the chain of its cell."""
     if cells.first.shape[0] > 0:
         cell = _cell(body, True, cells.frame[n])
-        cells.then[n, k], cells.first[n, cell] = cells.first[n, cell], k
+        cells.then[n, k] = cells.first[n, cell]
+        cells.first[n, cell] = k
 
 
 @kernel
 def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
     """Sorts the bodies (K, 7) of a world, the first `standing` of them by cells."""
-    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    low_x = np.inf
+    low_y = np.inf
+    high_x = -np.inf
+    high_y = -np.inf
     for k in range(standing):
         if bodies[k, RADIUS] > 0.0:
-            low_x, high_x = min(low_x, bodies[k, X]), max(high_x, bodies[k, X])
-            low_y, high_y = min(low_y, bodies[k, Y]), max(high_y, bodies[k, Y])
+            low_x = min(low_x, bodies[k, X])
+            high_x = max(high_x, bodies[k, X])
+            low_y = min(low_y, bodies[k, Y])
+            high_y = max(high_y, bodies[k, Y])
     cover(n, low_x, low_y, max(high_x - low_x, high_y - low_y, 1e-6), cells)
-    first, cell_of, frame = cells.first[n], cells.found, cells.frame[n]
+    first = cells.first[n]
+    cell_of = cells.found
+    frame = cells.frame[n]
     then = cells.then[0 if cells.ordered else n]
     first[:] = 0
     for k in range(bodies.shape[0]):
@@ -135,8 +144,10 @@ def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-
     Of neighbours in the same lines of memory, few miss the cache; `spare` (K, 7) is scratch.
     """
     sort(n, bodies[:standing], standing, cells)
-    first, end = cells.first[n], cells.first.shape[1] - 1
-    present, count = first[end], first[end]
+    first = cells.first[n]
+    end = cells.first.shape[1] - 1
+    present = first[end]
+    count = first[end]
     for k in range(standing):
         _copy(bodies[k], spare[k])
     for i in range(present):
@@ -151,48 +162,55 @@ def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-
 @kernel(inline=True)
 def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
     """Returns the least and the greatest row, and column, of the cells around a place."""
-    frame, per_metre, side = (
-        cells.frame[n],
-        cells.frame[n, PER_METRE],
-        cells.frame[n, SIDE],
-    )
-    far, x, y = (
-        reach + frame[LARGEST] + frame[MOVED],
-        x - frame[LEFT],
-        y - frame[BOTTOM],
-    )
-    low, high = _place(y - far, per_metre, side), _place(y + far, per_metre, side)
+    frame = cells.frame[n]
+    per_metre = cells.frame[n, PER_METRE]
+    side = cells.frame[n, SIDE]
+    far = reach + frame[LARGEST] + frame[MOVED]
+    x = x - frame[LEFT]
+    y = y - frame[BOTTOM]
+    low = _place(y - far, per_metre, side)
+    high = _place(y + far, per_metre, side)
     return low, high, _place(x - far, per_metre, side), _place(x + far, per_metre, side)
 
 
 @kernel
 def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
     """Writes to `found` the sorted bodies that may be within `reach` [m] of a place; how many."""
-    first, then, found, count = cells.first, cells.then, cells.found, 0
+    first = cells.first
+    then = cells.then
+    found = cells.found
+    count = 0
     if first.shape[0] == 0:
         return found.shape[0]  # which lists all bodies
     low, high, left, right = _window(n, x, y, reach, cells)
     side = int(cells.frame[n, SIDE])
     for row in range(low, high + 1):
         for i in range(first[n, row * side + left], first[n, row * side + right + 1]):
-            found[count], count = i if cells.ordered else then[n, i], count + 1
+            found[count] = i if cells.ordered else then[n, i]
+            count = count + 1
     for i in range(first[n, side * side], first[n, side * side + 1]):
-        found[count], count = i if cells.ordered else then[n, i], count + 1
+        found[count] = i if cells.ordered else then[n, i]
+        count = count + 1
     return count
 
 
 @kernel
 def around_added(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
     """Like `around`, of the bodies that were added one by one."""
-    first, then, found, count = cells.first, cells.then, cells.found, 0
+    first = cells.first
+    then = cells.then
+    found = cells.found
+    count = 0
     if first.shape[0] == 0:
         return found.shape[0]
     low, high, left, right = _window(n, x, y, reach, cells)
     side = int(cells.frame[n, SIDE])
     for row in range(low, high + 2):
-        begin, end = row * side + left, row * side + right
+        begin = row * side + left
+        end = row * side + right
         if row > high:  # of the bodies in no cell
-            begin, end = side * side, side * side
+            begin = side * side
+            end = side * side
         for cell in range(begin, end + 1):
             k = first[n, cell]
             while k >= 0:

@@ -35,11 +35,10 @@ ATAN = (
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
 INF, MINUS_INF = np.array([np.inf, -np.inf], np.float32).view(np.int32)
-BLOCK, UNIT, MANY = (
-    48,
-    16,
-    1000,
-)  # Beams that meet a wall at once; of MANY a multiple of UNIT
+# Beams that meet a wall at once; of MANY a multiple of UNIT
+BLOCK = 48
+UNIT = 16
+MANY = 1000
 TOGETHER = 8  # Walls whose beams are found at once
 AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
     np.uintp(k * TOGETHER) for k in range(11)
@@ -95,7 +94,8 @@ def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
 @kernel(inline=True)
 def arctan2(y, x):  # type: ignore[no-untyped-def]
     """Angle of (x, y) within 3e-10 rad, branchless: a polynomial fitted at Chebyshev nodes."""
-    ax, ay = abs(x), abs(y)
+    ax = abs(x)
+    ay = abs(y)
     ratio = min(ax, ay) / (max(ax, ay) + TINY)
     s = ratio * ratio
     r = ATAN[10]
@@ -115,21 +115,24 @@ def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
     last = math.floor((high - beams.first) / beams.step + ROUNDING)
     if beams.closed:
         return first % count, min(last - first + 1, count)
-    first, last = max(first, 0), min(last, count - 1)
+    first = max(first, 0)
+    last = min(last, count - 1)
     return first, max(last - first + 1, 0)
 
 
 @kernel
 def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
     """Fuses the exact ranges to a circle at (x, y)."""
-    d2, r2 = x * x + y * y, radius * radius
+    d2 = x * x + y * y
+    r2 = radius * radius
     d = math.sqrt(d2)
     if d - radius > range_max or radius <= 0.0:
         return
     count = out.shape[0]
     if d2 <= r2:  # the lidar is inside: every beam hits the far side
         for i in range(count):
-            c, s = beams.directions[0, i], beams.directions[1, i]
+            c = beams.directions[0, i]
+            s = beams.directions[1, i]
             across = c * y - s * x
             out[i] = min(
                 out[i], c * x + s * y + math.sqrt(max(r2 - across * across, 0.0))
@@ -145,7 +148,8 @@ def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
             i = first + k
             if i >= count:
                 i -= count
-            c, s = beams.directions[0, i], beams.directions[1, i]
+            c = beams.directions[0, i]
+            s = beams.directions[1, i]
             across = c * y - s * x
             rest = r2 - across * across
             if rest >= 0.0:
@@ -161,7 +165,9 @@ def segment(out, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
 @kernel(inline=True)
 def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
     """Like `segment`, with directions of its ends [rad]; `one_sided`: visible from its right."""
-    count, ex, ey = out.shape[0], x2 - x1, y2 - y1
+    count = out.shape[0]
+    ex = x2 - x1
+    ey = y2 - y1
     cross = x1 * ey - y1 * ex
     if cross == 0.0 or (one_sided and cross > 0.0):  # seen edge-on, or from behind
         return
@@ -194,33 +200,43 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
 @kernel
 def polygon(out, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """Fuses the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
-    last, cull = corners.shape[0] - 1, beside_convex(x, y, c, s, corners)
+    last = corners.shape[0] - 1
+    cull = beside_convex(x, y, c, s, corners)
     ax, ay = turned(x, y, c, s, corners[last])
     angle = arctan2(ay, ax)
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
         next_angle = arctan2(by, bx)
         edge(out, beams, ax, ay, angle, bx, by, next_angle, cull)
-        ax, ay, angle = bx, by, next_angle
+        ax = bx
+        ay = by
+        angle = next_angle
 
 
 @kernel
 def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """True if an outline is convex, the lidar outside: rays first meet sides from their right."""
-    last, rounds = corners.shape[0] - 1, 0
+    last = corners.shape[0] - 1
+    rounds = 0
     bx, by = turned(x, y, c, s, corners[max(last - 1, 0)])
     ax, ay = turned(x, y, c, s, corners[last])
-    ex, ey = ax - bx, ay - by
+    ex = ax - bx
+    ey = ay - by
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
-        gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
+        gx = bx - ax
+        gy = by - ay
+        cross = ax * by - ay * bx
         if (
             ex * gy - ey * gx < 0.0 or cross == 0.0
         ):  # the lidar may lie on a side towards it
             return False
         if (ay <= 0.0) != (by <= 0.0):  # it crosses the ray ahead, or the one behind
             rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
-        ax, ay, ex, ey = bx, by, gx, gy
+        ax = bx
+        ay = by
+        ex = gx
+        ey = gy
     return rounds == 0
 
 
@@ -233,7 +249,8 @@ def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
 @kernel
 def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
     """Applies the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
-    low, high = np.float32(range_min), np.float32(range_max)
+    low = np.float32(range_min)
+    high = np.float32(range_max)
     for i in range(out.shape[0]):
         value = out[i]
         value = value if value <= high else np.float32(np.inf)
@@ -267,26 +284,33 @@ def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-unty
 @kernel(inline=True)
 def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: ignore[no-untyped-def]
     """Finds the beams that meet some walls in range, none for the others; without branches."""
-    c, s, per_beam = lidar.c, lidar.s, 1.0 / beams.step
-    turn, per_turn = TWO_PI * per_beam, beams.step / TWO_PI
+    c = lidar.c
+    s = lidar.s
+    per_beam = 1.0 / beams.step
+    turn = TWO_PI * per_beam
+    per_turn = beams.step / TWO_PI
     for j in range(min(TOGETHER, walls.shape[0] - begin)):
         for i in range(4):
             found[np.uintp(j + i * TOGETHER)] = walls[begin + j, i]
     for j in range(TOGETHER):  # unused ones contain old values
         k = np.uintp(j)
-        ax, ay = found[k + AX] - lidar.x, found[k + AY] - lidar.y
-        bx, by = found[k + BX] - lidar.x, found[k + BY] - lidar.y
+        ax = found[k + AX] - lidar.x
+        ay = found[k + AY] - lidar.y
+        bx = found[k + BX] - lidar.x
+        by = found[k + BY] - lidar.y
         ax, ay = c * ax + s * ay, c * ay - s * ax
         bx, by = c * bx + s * by, c * by - s * bx
-        ex, ey = bx - ax, by - ay
-        length2, cross = ex * ex + ey * ey, ax * ey - ay * ex
-        chord2, share = range_max * range_max * length2 - cross * cross, 1.0 / length2
+        ex = bx - ax
+        ey = by - ay
+        length2 = ex * ex + ey * ey
+        cross = ax * ey - ay * ex
+        chord2 = range_max * range_max * length2 - cross * cross
+        share = 1.0 / length2
         # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
-        foot, half = -(ax * ex + ay * ey) * share, math.sqrt(max(chord2, 0.0)) * share
-        begins, ends = (
-            max(foot - half - ROUNDING, 0.0),
-            min(foot + half + ROUNDING, 1.0),
-        )
+        foot = -(ax * ex + ay * ey) * share
+        half = math.sqrt(max(chord2, 0.0)) * share
+        begins = max(foot - half - ROUNDING, 0.0)
+        ends = min(foot + half + ROUNDING, 1.0)
         seen = (
             (chord2 >= 0.0)
             & (begins <= ends)
@@ -294,17 +318,17 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         )
         one = arctan2(ay + begins * ey, ax + begins * ex)
         other = arctan2(ay + ends * ey, ax + ends * ex)
-        low, wide = (
-            one if cross > 0.0 else other,
-            (other - one if cross > 0.0 else one - other),
-        )
+        low = one if cross > 0.0 else other
+        wide = other - one if cross > 0.0 else one - other
         wide = (
             wide + TWO_PI if wide < -1.0 else max(wide, 0.0)
         )  # a whole turn, or rounding
         low = (low - beams.first) * per_beam
         low -= np.floor(low * per_turn) * turn
         high = low + wide * per_beam
-        found[k + CROSS], found[k + EX], found[k + EY] = cross, ex, ey
+        found[k + CROSS] = cross
+        found[k + EX] = ex
+        found[k + EY] = ey
         found[k + FIRST] = np.ceil(low - ROUNDING)
         found[k + END] = min(np.floor(high + ROUNDING) + 1.0, count) if seen else 0.0
         found[k + FIRST_AGAIN] = max(np.ceil(low - turn - ROUNDING), 0.0)
@@ -315,7 +339,8 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
 
 @kernel(inline=True)
 def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-def]
-    count, few = whole.shape[0], BLOCK <= whole.shape[0] < MANY
+    count = whole.shape[0]
+    few = BLOCK <= whole.shape[0] < MANY
     most = min(
         beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count
     )  # a quarter turn
@@ -354,26 +379,29 @@ def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: 
     flatter: up to a quarter turn, nothing cancels out. Ranges are whole numbers, in the same order
     as floats; of the unsigned ones, all that are negative are beyond the limit.
     """
-    cross, ex, ey = np.float32(line[0]), line[1], line[2]
-    least, most = (
-        np.float32(limits[0]).view(np.int32),
-        np.float32(limits[1]).view(np.uint32),
-    )
-    skip, hits, sines = (
-        np.int32(place - begin),
-        np.uint32(end - begin),
-        beams.turns.shape[0] // 2,
-    )
+    cross = np.float32(line[0])
+    ex = line[1]
+    ey = line[2]
+    least = np.float32(limits[0]).view(np.int32)
+    most = np.float32(limits[1]).view(np.uint32)
+    skip = np.int32(place - begin)
+    hits = np.uint32(end - begin)
+    sines = beams.turns.shape[0] // 2
     one = np.uintp(begin)
-    c, s = beams.directions[0, one], beams.directions[1, one]
+    c = beams.directions[0, one]
+    s = beams.directions[1, one]
     if (s * ey + c * ex) * line[0] > 0.0:  # it is met ever flatter
         one = np.uintp(end - 1)
-        c, s = beams.directions[0, one], beams.directions[1, one]
-    across, along = np.float32(c * ey - s * ex), np.float32(s * ey + c * ex)
-    at, turn = np.uintp(place), np.uintp(sines // 2 + place) - one
+        c = beams.directions[0, one]
+        s = beams.directions[1, one]
+    across = np.float32(c * ey - s * ex)
+    along = np.float32(s * ey + c * ex)
+    at = np.uintp(place)
+    turn = np.uintp(sines // 2 + place) - one
     for k in range(width):
         j = np.uintp(k)
-        cosine, sine = beams.turns[turn + j], beams.turns[turn + j + np.uintp(sines)]
+        cosine = beams.turns[turn + j]
+        sine = beams.turns[turn + j + np.uintp(sines)]
         distance = cross / (across * cosine - along * sine)
         found = np.float32(distance).view(np.int32)
         meets = (np.uint32(skip) < hits) & (np.uint32(found) <= most)
@@ -385,13 +413,18 @@ def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: 
 @kernel
 def body_into(out, beams, lidar, body, outlines, range_max):  # type: ignore[no-untyped-def]
     """Fuses one body (7,) into a scan from a `LidarPose`."""
-    c, s = lidar.c, lidar.s
-    dx, dy = body[X] - lidar.x, body[Y] - lidar.y
-    x, y = c * dx + s * dy, c * dy - s * dx
+    c = lidar.c
+    s = lidar.s
+    dx = body[X] - lidar.x
+    dy = body[Y] - lidar.y
+    x = c * dx + s * dy
+    y = c * dy - s * dx
     shape = int(body[SHAPE])
-    begin, end = outlines.first[shape], outlines.first[shape + 1]
+    begin = outlines.first[shape]
+    end = outlines.first[shape + 1]
     if begin == end:
         circle(out, beams, x, y, body[RADIUS], range_max)
     else:
-        cos, sin = body[COS] * c + body[SIN] * s, body[SIN] * c - body[COS] * s
+        cos = body[COS] * c + body[SIN] * s
+        sin = body[SIN] * c - body[COS] * s
         polygon(out, beams, x, y, cos, sin, outlines.corners[begin:end])

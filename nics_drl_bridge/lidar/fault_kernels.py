@@ -19,7 +19,10 @@ NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SK
 )
 PARAMETERS = 7
 AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)  # values of TOO_CLOSE
-CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1  # values of SKEW
+# values of SKEW
+CLOCKWISE = -1
+AT_ONCE = 0
+COUNTER_CLOCKWISE = 1
 ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 # Ranges are raised as whole numbers, in the same order, by the greater of the two: where LLVM knows
 # that a range may stay it masks the store, which takes longer than all the rest.
@@ -72,13 +75,17 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
 
 @kernel(inline=True)
 def _device(limits, faults):  # type: ignore[no-untyped-def]
-    single, step, close = np.float32, faults[QUANTISATION], np.inf
+    single = np.float32
+    step = faults[QUANTISATION]
+    close = np.inf
     if faults[TOO_CLOSE] == AS_RANGE_MIN:
         close = limits[0]
     elif faults[TOO_CLOSE] == AS_MINUS_INF:
         close = -np.inf
-    per_step, rest = 1.0 / step if step > 0.0 else 0.0, single(step - single(step))
-    least, most = single(limits[0]), single(limits[1])
+    per_step = 1.0 / step if step > 0.0 else 0.0
+    rest = single(step - single(step))
+    least = single(limits[0])
+    most = single(limits[1])
     first = single(math.ceil((limits[0] - ROUNDING) * per_step))
     last = single(math.floor((limits[1] + ROUNDING) * per_step))
     first += single(_multiple(first, single(step), rest) < least)
@@ -110,7 +117,8 @@ def _ghosts(ranges, device, by):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _close(ranges, close):  # type: ignore[no-untyped-def]
-    whole, value = ranges.view(np.int32), np.float32(close).view(np.int32)
+    whole = ranges.view(np.int32)
+    value = np.float32(close).view(np.int32)
     for i in range(ranges.shape[0]):
         whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 
@@ -125,7 +133,8 @@ def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
 
 @kernel(contracts=True, inline=True)
 def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped-def]
-    run, begin = random.run(by, k), np.uintp(k * random.RUN)
+    run = random.run(by, k)
+    begin = np.uintp(k * random.RUN)
     for j in range(count):
         i = begin + np.uintp(j)
         value = ranges[i]
@@ -163,7 +172,9 @@ def _limited(value, device):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _drop(ranges, share, far, by):  # type: ignore[no-untyped-def]
-    share, far, whole = np.float32(share), np.float32(far), ranges.view(np.int32)
+    share = np.float32(share)
+    far = np.float32(far)
+    whole = ranges.view(np.int32)
     for i in range(ranges.shape[0]):
         reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
         lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
@@ -177,8 +188,10 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
     half = 0.5 * turn
     # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
     chord = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
-    c, s = math.cos(pose[2] + half), math.sin(pose[2] + half)
-    x, y = -twist[0] * ago * chord, -twist[1] * ago * chord
+    c = math.cos(pose[2] + half)
+    s = math.sin(pose[2] + half)
+    x = -twist[0] * ago * chord
+    y = -twist[1] * ago * chord
     out[0] = pose[0] + c * x - s * y
     out[1] = pose[1] + s * x + c * y
     out[2] = pose[2] + turn

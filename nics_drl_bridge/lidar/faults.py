@@ -61,7 +61,8 @@ class LidarFaults(Schema):
 
     def parameters(self, noise_std: float) -> NDArray[np.float64]:
         """Returns the kernels' row (P,), in the order of the columns in `fault_kernels`."""
-        too_close, skew = TOO_CLOSE[self.too_close], SKEW[self.skew]
+        too_close = TOO_CLOSE[self.too_close]
+        skew = SKEW[self.skew]
         return np.array(
             [
                 noise_std,

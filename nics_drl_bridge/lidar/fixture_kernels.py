@@ -51,5 +51,7 @@ def fixtures_around(n, fixtures):  # type: ignore[no-untyped-def]
 @kernel(view=True)
 def cells_of(cells, place):  # type: ignore[no-untyped-def]
     """Cells (rows, columns) of one map among those of many: first cell, rows, columns."""
-    first, rows, columns = place[0], place[1], place[2]
+    first = place[0]
+    rows = place[1]
+    columns = place[2]
     return cells[first : first + rows * columns].reshape((rows, columns))

@@ -49,10 +49,8 @@ class FurtherLidar(Sensor):
         faults = self.lidar.fault_parameters
 
         def render(out: Readings, worlds: NDArray[np.int64]) -> None:
-            lanes, cells = (
-                scan_kernels.scan_lanes(),
-                body_cells(0, state.bodies.shape[1]),
-            )
+            lanes = scan_kernels.scan_lanes()
+            cells = body_cells(0, state.bodies.shape[1])
             scan_kernels.scan_worlds(
                 out,
                 state.pose,
@@ -79,7 +77,8 @@ class FurtherLidar(Sensor):
 
     def read(self, message: Any) -> Readings:
         """Returns the scan (B,) of a LaserScan."""
-        header, beams = self.lidar.header, self.lidar.beams
+        header = self.lidar.header
+        beams = self.lidar.beams
         off = abs(message.angle_min - header.angle_min)
         off += abs(message.angle_increment - header.angle_increment) * (beams - 1)
         if len(message.ranges) != beams or not off <= ANGLE_TOLERANCE:
@@ -99,7 +98,8 @@ class FurtherLidar(Sensor):
             np.isneginf(reading), self.lidar.range_min, reading.astype(np.float64)
         )
         hit = np.isfinite(near)
-        angles, ranges = self.lidar.angles[hit] + heading, near[hit]
+        angles = self.lidar.angles[hit] + heading
+        ranges = near[hit]
         return np.stack(
             [x + ranges * np.cos(angles), y + ranges * np.sin(angles)], axis=1
         )

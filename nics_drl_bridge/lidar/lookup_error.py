@@ -10,7 +10,10 @@ from nics_drl_bridge.lidar.maps import stack_fixtures
 from nics_drl_bridge.lidar.shapes import place
 
 # Rings around the lidar, placements in each, bands of range; rings and bands grow geometrically.
-RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
+RINGS = 13
+PLACES = 256
+BANDS = 8
+SEED = 0
 TOUCHING = (
     1e-3  # of the nearest ring from the shape's circle, as a share of the lidar's range
 )
@@ -49,7 +52,8 @@ def lookup_distances(
         ):
             one, other = _scans(place(some[:, None], radius, shape), exact, baked)
             both = np.isfinite(one) & np.isfinite(other)
-            found, truth = other[both] - one[both], one[both]
+            found = other[both] - one[both]
+            truth = one[both]
             worst[i] = max(worst[i], np.abs(found).max(initial=0.0))
             if some is poses:
                 cell = np.nonzero(both)[0] * BANDS + np.searchsorted(edges, truth)
@@ -65,12 +69,14 @@ def _widest(
     rings: Array, squares: Array, counts: Array, greatest: Array
 ) -> tuple[float, float]:
     """Edges of the widest interval of rings in which all errors are small, or inf if too narrow."""
-    best, width = (np.inf, np.inf), NARROWEST * (rings[-1] - rings[0])
+    best = (np.inf, np.inf)
+    width = NARROWEST * (rings[-1] - rings[0])
     for i in range(RINGS):
         for j in range(i + 1, RINGS + 1):
             wider = rings[j] - rings[i] > width and (greatest[i:j] > 0.0).all()
             if wider and _small(squares[i:j], counts[i:j], greatest[i]):
-                best, width = (float(rings[i]), float(rings[j])), rings[j] - rings[i]
+                best = (float(rings[i]), float(rings[j]))
+                width = rings[j] - rings[i]
     return best
 
 
@@ -90,13 +96,16 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
 def _scans(
     bodies: Array, exact: LidarArrays, baked: LidarArrays
 ) -> tuple[Array, Array]:
-    mount, directions = exact.mount, exact.beams.directions
+    mount = exact.mount
+    directions = exact.beams.directions
     robots = np.tile(
         [-mount[0], -mount[1], 0.0], (PLACES, 1, 1)
     )  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
-    worlds, lanes = np.arange(PLACES), scan_kernels.scan_lanes()
-    cells, nothing = body_cells(0, bodies.shape[1]), np.zeros(PLACES, np.int64)
+    worlds = np.arange(PLACES)
+    lanes = scan_kernels.scan_lanes()
+    cells = body_cells(0, bodies.shape[1])
+    nothing = np.zeros(PLACES, np.int64)
     around = stack_fixtures([np.zeros((0, 4))], [None], nothing)
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         scan_kernels.scan_worlds(
@@ -107,7 +116,8 @@ def _scans(
 
 
 def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
-    rng, beams = np.random.default_rng(seed), exact.beams
+    rng = np.random.default_rng(seed)
+    beams = exact.beams
     distance = rng.uniform(between[0], between[1], PLACES)
     bearing = exact.mount[2] + beams.first
     bearing += rng.uniform(0.0, beams.step * beams.directions.shape[1], PLACES)
@@ -126,10 +136,8 @@ def _slanted(poses: Array, outline: Array, seed: int) -> Array:
     aside = (along[:, 0] * outline[:, 1] - along[:, 1] * outline[:, 0]) / np.maximum(
         length, 1e-12
     )
-    distance, bearing = (
-        np.hypot(poses[:, 0], poses[:, 1]),
-        np.arctan2(poses[:, 1], poses[:, 0]),
-    )
+    distance = np.hypot(poses[:, 0], poses[:, 1])
+    bearing = np.arctan2(poses[:, 1], poses[:, 0])
     direction = np.arctan2(along[chosen, 1], along[chosen, 0])
     onto = np.arcsin(np.clip(aside[chosen] / distance, -1.0, 1.0))
     heading = bearing - direction + onto + rng.uniform(-SLANT, SLANT, len(poses))

@@ -75,7 +75,8 @@ def _entry(at, step, size):  # type: ignore[no-untyped-def]
     """Distances along a beam to where it enters and leaves [0, size] along one axis [cells]."""
     if step == 0.0:
         return (-np.inf, np.inf) if 0.0 <= at < size else (np.inf, -np.inf)
-    one, other = -at / step, (size - at) / step
+    one = -at / step
+    other = (size - at) / step
     return min(one, other), max(one, other)
 
 
@@ -85,8 +86,11 @@ def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
 
     Where the beam enters one, or from within, where it leaves it. All outside the map is free.
     """
-    rows, columns = squares.shape[0] - 2, squares.shape[1] - 2
-    x, y, t = math.floor(u), math.floor(v), 0.0
+    rows = squares.shape[0] - 2
+    columns = squares.shape[1] - 2
+    x = math.floor(u)
+    y = math.floor(v)
+    t = 0.0
     solid = False
     if 0 <= x < columns and 0 <= y < rows:
         solid = squares[y + 1, x + 1] == 0
@@ -100,13 +104,16 @@ def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
         y = min(max(math.floor(v + dv * t), 0), rows - 1)
         if squares[y + 1, x + 1] == 0:
             return t
-    x_line, y_line = _line(u, du, x), _line(v, dv, y)
+    x_line = _line(u, du, x)
+    y_line = _line(v, dv, y)
     while True:
         if x_line < y_line:
-            t, x = x_line, x + (1 if du > 0.0 else -1)
+            t = x_line
+            x = x + (1 if du > 0.0 else -1)
             x_line = _line(u, du, x)
         else:
-            t, y = y_line, y + (1 if dv > 0.0 else -1)
+            t = y_line
+            y = y + (1 if dv > 0.0 else -1)
             y_line = _line(v, dv, y)
         if t > limit:
             return np.inf
@@ -119,23 +126,25 @@ def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
 @kernel
 def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[no-untyped-def]
     """Fuses a map (`GridArrays`) into a scan (B,) float32 [m]: walks if `exact`, else jumps."""
-    squares, frame = grid.squares, grid.frame
+    squares = grid.squares
+    frame = grid.frame
     if squares.size == 0:
         return
-    dx, dy, cell = lidar.x - frame[0], lidar.y - frame[1], frame[4]
-    u, v = (
-        (frame[2] * dx + frame[3] * dy) / cell,
-        (frame[2] * dy - frame[3] * dx) / cell,
-    )
-    c, s = (
-        lidar.c * frame[2] + lidar.s * frame[3],
-        lidar.s * frame[2] - lidar.c * frame[3],
-    )
-    x, y, limit = math.floor(u), math.floor(v), range_max / cell * SLACK
+    dx = lidar.x - frame[0]
+    dy = lidar.y - frame[1]
+    cell = frame[4]
+    u = (frame[2] * dx + frame[3] * dy) / cell
+    v = (frame[2] * dy - frame[3] * dx) / cell
+    c = lidar.c * frame[2] + lidar.s * frame[3]
+    s = lidar.s * frame[2] - lidar.c * frame[3]
+    x = math.floor(u)
+    y = math.floor(v)
+    limit = range_max / cell * SLACK
     inside = 0.0 <= x < squares.shape[1] - 2 and 0.0 <= y < squares.shape[0] - 2
     if exact or not inside or squares[int(y) + 1, int(x) + 1] == 0:
         for i in range(out.shape[0]):
-            a, b = beams.directions[0, i], beams.directions[1, i]
+            a = beams.directions[0, i]
+            b = beams.directions[1, i]
             value = cell * walk(squares, u, v, c * a - s * b, s * a + c * b, limit)
             if value < out[i]:
                 out[i] = value
@@ -160,37 +169,45 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
 @kernel
 def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-untyped-def]
     """Puts the beams from `first` on into lanes, each mirrored so that it points right and up."""
-    c, s, u, v = np.float32(c), np.float32(s), np.float32(u), np.float32(v)
-    one, none, singles, wholes = (
-        np.float32(1.0),
-        np.float32(0.0),
-        lanes.single,
-        lanes.whole,
-    )
+    c = np.float32(c)
+    s = np.float32(s)
+    u = np.float32(u)
+    v = np.float32(v)
+    one = np.float32(1.0)
+    none = np.float32(0.0)
+    singles = lanes.single
+    wholes = lanes.whole
     for j in range(LANES):
-        k, i = (
-            np.uintp(j),
-            np.uintp(min(first + j, directions.shape[1] - 1)),
-        )  # idle ones repeat the last
-        a, b = np.float32(directions[0, i]), np.float32(directions[1, i])
-        du, dv = c * a - s * b, s * a + c * b
-        right, up = du > none, dv > none
-        du, dv = max(abs(du), PARALLEL), max(abs(dv), PARALLEL)
-        singles[k + DU], singles[k + DV] = du, dv
-        singles[k + PER_U], singles[k + PER_V] = one / du, one / dv
-        singles[k + U], singles[k + V] = u if right else one - u, v if up else one - v
-        singles[k + T], wholes[k + COLUMN], wholes[k + ROW] = none, 0, 0
-        wholes[k + ASIDE], wholes[k + ABOVE] = (
-            1 if right else -1,
-            columns if up else -columns,
-        )
+        # idle ones repeat the last
+        k = np.uintp(j)
+        i = np.uintp(min(first + j, directions.shape[1] - 1))
+        a = np.float32(directions[0, i])
+        b = np.float32(directions[1, i])
+        du = c * a - s * b
+        dv = s * a + c * b
+        right = du > none
+        up = dv > none
+        du = max(abs(du), PARALLEL)
+        dv = max(abs(dv), PARALLEL)
+        singles[k + DU] = du
+        singles[k + DV] = dv
+        singles[k + PER_U] = one / du
+        singles[k + PER_V] = one / dv
+        singles[k + U] = u if right else one - u
+        singles[k + V] = v if up else one - v
+        singles[k + T] = none
+        wholes[k + COLUMN] = 0
+        wholes[k + ROW] = 0
+        wholes[k + ASIDE] = 1 if right else -1
+        wholes[k + ABOVE] = columns if up else -columns
         wholes[k + QUADRANT] = (0 if right else 8) + (0 if up else 16)
 
 
 @kernel
 def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
     """Moves each lane to the end of its free square; True if any moved."""
-    singles, wholes = lanes.single, lanes.whole
+    singles = lanes.single
+    wholes = lanes.whole
     for j in range(
         LANES
     ):  # apart from the loop below, so that LLVM can vectorise that one
@@ -205,13 +222,12 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
     moved = np.int32(0)
     for j in range(LANES):
         k = np.uintp(j)
-        x, y, side, t = (
-            wholes[k + COLUMN],
-            wholes[k + ROW],
-            wholes[k + SIDE],
-            singles[k + T],
-        )
-        x_side, y_side = np.int32(x + side), np.int32(y + side)
+        x = wholes[k + COLUMN]
+        y = wholes[k + ROW]
+        side = wholes[k + SIDE]
+        t = singles[k + T]
+        x_side = np.int32(x + side)
+        y_side = np.int32(y + side)
         x_line = (np.float32(x_side) - singles[k + U]) * singles[k + PER_U]
         y_line = (np.float32(y_side) - singles[k + V]) * singles[k + PER_V]
         sideways = x_line < y_line
@@ -230,7 +246,9 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
 @kernel
 def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped-def]
     """Fuses the lanes that ended at a solid cell, not in the border around the map."""
-    singles, wholes, ranges = lanes.single, lanes.whole, out.view(np.int32)
+    singles = lanes.single
+    wholes = lanes.whole
+    ranges = out.view(np.int32)
     for j in range(out.shape[0]):
         k = np.uintp(j)
         column = x + wholes[k + COLUMN] * wholes[k + ASIDE]

@@ -23,7 +23,9 @@ from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate
 
-FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+FREE = 0
+OCCUPIED = 100
+UNKNOWN = -1
 NO_MAP = map_kernels.GridArrays(
     np.zeros((0, 0), np.uint32), np.zeros(0)
 )  # for the kernels
@@ -80,8 +82,10 @@ class GridMap:
         """Returns the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
         x, y, heading = self.origin
         place = (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution
-        c, s = np.cos(heading), np.sin(heading)
-        across, up = place[..., 1], place[..., 0]
+        c = np.cos(heading)
+        s = np.sin(heading)
+        across = place[..., 1]
+        up = place[..., 0]
         return np.stack([x + c * across - s * up, y + s * across + c * up], axis=-1)
 
     @cached_property
@@ -170,11 +174,13 @@ def map_files(grid: GridMap, path: Path) -> None:
 
     `load_map` gives the same cells. They are trinary, or raw if some are neither free nor occupied.
     """
-    image, mode = path.with_suffix(".pgm"), "trinary"
+    image = path.with_suffix(".pgm")
+    mode = "trinary"
     if np.isin(grid.cells, (FREE, OCCUPIED, UNKNOWN)).all():
         pixels = np.select([grid.cells == FREE, grid.cells == OCCUPIED], [254, 0], 205)
     else:
-        mode, pixels = "raw", np.where(grid.cells == UNKNOWN, 255, grid.cells)
+        mode = "raw"
+        pixels = np.where(grid.cells == UNKNOWN, 255, grid.cells)
     content = io.BytesIO()
     Image.fromarray(pixels.astype(np.uint8)[::-1]).save(content, "PPM")
     write_bytes(image, content.getvalue())
@@ -208,7 +214,8 @@ def _cells_by_brightness(file: MapFile) -> NDArray[np.int8]:
     # In float32, as in Nav2: 0.6 and the pixel 102 are equal there.
     bright = grey.astype(np.float32) / np.float32(255.0)
     dark = bright if file.negate else np.float32(1.0) - bright
-    low, high = np.float32(file.free_thresh), np.float32(file.occupied_thresh)
+    low = np.float32(file.free_thresh)
+    high = np.float32(file.occupied_thresh)
     cells = np.full(grey.shape, UNKNOWN, np.int8)
     if file.mode == "scale":
         between = (dark - low) / (high - low) * np.float32(100.0)
@@ -226,7 +233,8 @@ def read_image(
     Raises ConfigError, with the `source` that names it, if it is missing, damaged or too large.
     """
     if not path.is_file():
-        endings, folder = sum(FORMATS.values(), ()), path.parent
+        endings = sum(FORMATS.values(), ())
+        folder = path.parent
         known = [
             file.name
             for file in folder.glob("*")

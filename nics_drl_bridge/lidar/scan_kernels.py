@@ -81,25 +81,29 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, la
     Walls and maps are the `fixtures`, cells (`BodyCells`) are those of the bodies, which wait in
     the lanes until these are full.
     """
-    robots, found = poses.shape[1], 0
+    robots = poses.shape[1]
+    found = 0
     for n in chosen:
         walls = walls_of(n, fixtures)
         for m in range(robots):
-            out, me = ranges[n, m], first + m if first >= 0 else -1
+            out = ranges[n, m]
+            me = first + m if first >= 0 else -1
             for i in range(out.shape[0]):
                 out[i] = np.float32(np.inf)
             x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
             here = LidarPose(x, y, math.cos(heading), math.sin(heading))
             at = (n * robots + m) * out.shape[0]
             count = cell_kernels.around(n, x, y, lidar.range_max, cells)
-            begin, computed = 0, 0
+            begin = 0
+            computed = 0
             while begin < count:
                 end = min(count, begin + LANES - found)
                 near = cells.found[begin:end]
                 found, more = select(
                     found, near, bodies[n], me, here, heading, at, lidar, lanes
                 )
-                begin, computed = end, computed + more
+                begin = end
+                computed = computed + more
                 if found == LANES:
                     look_up(found, ranges, lidar, lanes)
                     found = 0
@@ -114,25 +118,30 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, la
 @kernel(contracts=True, inline=True)
 def select(found, near, bodies, me, here, heading, at, lidar, lanes):  # type: ignore[no-untyped-def]
     """Lanes the bodies `near` that may be seen; returns lanes in use, and bodies to compute."""
-    wide, computed, behind = lanes.wide, 0, lidar.beams.behind
+    wide = lanes.wide
+    computed = 0
+    behind = lidar.beams.behind
     for j in range(near.shape[0]):
-        b, k = np.uintp(near[j]), np.uintp(found)
-        dx, dy, radius = bodies[b, X] - here.x, bodies[b, Y] - here.y, bodies[b, RADIUS]
-        d2, reach, shape = (
-            dx * dx + dy * dy,
-            lidar.range_max + radius,
-            np.int32(bodies[b, SHAPE]),
-        )
+        b = np.uintp(near[j])
+        k = np.uintp(found)
+        dx = bodies[b, X] - here.x
+        dy = bodies[b, Y] - here.y
+        radius = bodies[b, RADIUS]
+        d2 = dx * dx + dy * dy
+        reach = lidar.range_max + radius
+        shape = np.int32(bodies[b, SHAPE])
         wide[k + DX], wide[k + DY], wide[k + TURNED] = dx, dy, bodies[b, HEADING]
         wide[k + COSINE], wide[k + SINE], wide[k + SIZE] = (
             bodies[b, COS],
             bodies[b, SIN],
             radius,
         )
-        wide[k + BEARING_0], wide[k + SCAN] = heading, at
+        wide[k + BEARING_0] = heading
+        wide[k + SCAN] = at
         lanes.whole[k + KIND] = shape
         h = np.uintp(shape)
-        u, v = here.c * dx + here.s * dy, here.c * dy - here.s * dx
+        u = here.c * dx + here.s * dy
+        v = here.c * dy - here.s * dx
         away = (behind[0, 0] * u + behind[0, 1] * v >= radius) & (
             behind[1, 0] * u + behind[1, 1] * v >= radius
         )
@@ -147,11 +156,11 @@ def select(found, near, bodies, me, here, heading, at, lidar, lanes):  # type: i
 @kernel
 def look_up(found, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
     """Fuses the bodies in the lanes into their scans (N, M, B)."""
-    wide, table, flat = lanes.wide, lidar.table, ranges.reshape(-1).view(np.int32)
-    padded, turn = (
-        (found + BLOCK - 1) // BLOCK * BLOCK,
-        2.0 * math.pi / lidar.beams.step,
-    )
+    wide = lanes.wide
+    table = lidar.table
+    flat = ranges.reshape(-1).view(np.int32)
+    padded = (found + BLOCK - 1) // BLOCK * BLOCK
+    turn = 2.0 * math.pi / lidar.beams.step
     count = np.int32(ranges.shape[2])
     places(padded, lanes)
     cells(found, table, lanes)
@@ -179,16 +188,20 @@ def places(padded, lanes):  # type: ignore[no-untyped-def]
     for j in range(padded):
         k = np.uintp(j)
         distance, bearing = baked.polar(lanes.wide[k + DX], lanes.wide[k + DY])
-        lanes.single[k + DISTANCE], lanes.single[k + BEARING] = distance, bearing
+        lanes.single[k + DISTANCE] = distance
+        lanes.single[k + BEARING] = bearing
 
 
 @kernel(contracts=True)
 def cells(found, table, lanes):  # type: ignore[no-untyped-def]
     """Table cell of each body, and the first corner of its hull."""
-    wide, single, whole = lanes.wide, lanes.single, lanes.whole
+    wide = lanes.wide
+    single = lanes.single
+    whole = lanes.whole
     for j in range(found):
         k = np.uintp(j)
-        shape, distance = table.shapes[np.uintp(whole[k + KIND])], single[k + DISTANCE]
+        shape = table.shapes[np.uintp(whole[k + KIND])]
+        distance = single[k + DISTANCE]
         whole[k + CELL], whole[k + HULL], single[k + BLEND] = baked.nearest_cell(
             distance,
             single[k + BEARING],
@@ -203,11 +216,14 @@ def cells(found, table, lanes):  # type: ignore[no-untyped-def]
 @kernel
 def fetch(found, table, lanes):  # type: ignore[no-untyped-def]
     """Loads cells and corners, the step with most cache misses: nothing waits for them here."""
-    wide, whole = lanes.wide, lanes.whole
+    wide = lanes.wide
+    whole = lanes.whole
     for j in range(found):
         k = np.uintp(j)
-        hull, cell = whole[k + HULL], np.uintp(whole[k + CELL])
-        near, far = table.cells[cell], table.cells[cell + np.uintp(1)]
+        hull = whole[k + HULL]
+        cell = np.uintp(whole[k + CELL])
+        near = table.cells[cell]
+        far = table.cells[cell + np.uintp(1)]
         whole[k + START], whole[k + PLACE] = near[0], near[1]
         whole[k + START2], whole[k + PLACE2] = far[0], far[1]
         whole[k + CLIMBS] = (near[2] | near[3]) >> 16
@@ -231,21 +247,18 @@ def spans(padded, beams, lanes):  # type: ignore[no-untyped-def]
             wide[k + DX], wide[k + DY], wide[k + COSINE], wide[k + SINE]
         )
         radius = wide[k + SIZE]
-        x, y, x2, y2 = (
-            wide[k + RIGHT_X],
-            wide[k + RIGHT_Y],
-            wide[k + RIGHT_X2],
-            wide[k + RIGHT_Y2],
-        )
+        x = wide[k + RIGHT_X]
+        y = wide[k + RIGHT_Y]
+        x2 = wide[k + RIGHT_X2]
+        y2 = wide[k + RIGHT_Y2]
         right = baked.tangent(seen, x, y, x2, y2, radius, 1.0)
-        x, y, x2, y2 = (
-            wide[k + LEFT_X],
-            wide[k + LEFT_Y],
-            wide[k + LEFT_X2],
-            wide[k + LEFT_Y2],
-        )
+        x = wide[k + LEFT_X]
+        y = wide[k + LEFT_Y]
+        x2 = wide[k + LEFT_X2]
+        y2 = wide[k + LEFT_Y2]
         left = baked.tangent(seen, x, y, x2, y2, radius, -1.0)
-        bearing, ahead = lanes.single[k + BEARING], wide[k + BEARING_0]
+        bearing = lanes.single[k + BEARING]
+        ahead = wide[k + BEARING_0]
         wide[k + MIDDLE], wide[k + LOW], wide[k + HIGH] = baked.in_beams(
             right, left, bearing, ahead, beams
         )
@@ -254,15 +267,16 @@ def spans(padded, beams, lanes):  # type: ignore[no-untyped-def]
 @kernel(contracts=True)
 def climb(k, lidar, lanes):  # type: ignore[no-untyped-def]
     """Replaces the silhouettes of a body that two corners do not determine."""
-    wide, whole, table = lanes.wide, lanes.whole, lidar.table
+    wide = lanes.wide
+    whole = lanes.whole
+    table = lidar.table
     seen = baked.seen_at(wide[k + DX], wide[k + DY], wide[k + COSINE], wide[k + SINE])
-    shape, cell = (
-        table.shapes[np.uintp(whole[k + KIND])],
-        table.cells[np.uintp(whole[k + CELL])],
-    )
+    shape = table.shapes[np.uintp(whole[k + KIND])]
+    cell = table.cells[np.uintp(whole[k + CELL])]
     right = baked.silhouette(cell[2], whole[k + HULL], shape, table.hulls, seen, 1.0)
     left = baked.silhouette(cell[3], whole[k + HULL], shape, table.hulls, seen, -1.0)
-    bearing, ahead = lanes.single[k + BEARING], wide[k + BEARING_0]
+    bearing = lanes.single[k + BEARING]
+    ahead = wide[k + BEARING_0]
     wide[k + MIDDLE], wide[k + LOW], wide[k + HIGH] = baked.in_beams(
         right, left, bearing, ahead, lidar.beams
     )
@@ -275,12 +289,12 @@ def aim(k, turn, count, shift, lanes):  # type: ignore[no-untyped-def]
     Whole blocks of beams are fused, at least two, which most bodies need: a varying number would
     often mispredict a branch. Blocks beyond the last of `count` beams begin `BACK` earlier.
     """
-    wide, whole, zero = lanes.wide, lanes.whole, np.int32(0)
-    middle, low, high = (
-        wide[k + MIDDLE] - turn,
-        wide[k + LOW] - turn,
-        wide[k + HIGH] - turn,
-    )
+    wide = lanes.wide
+    whole = lanes.whole
+    zero = np.int32(0)
+    middle = wide[k + MIDDLE] - turn
+    low = wide[k + LOW] - turn
+    high = wide[k + HIGH] - turn
     begin, hits, point, share = baked.beams_between(middle, low, high, count, shift)
     width = np.int32(
         max(np.int32(hits + BLOCK - 1) & np.int32(-BLOCK), np.int32(2 * BLOCK))
@@ -320,16 +334,21 @@ def aims(padded, count, shift, lanes):  # type: ignore[no-untyped-def]
 @kernel(contracts=True, inline=True)
 def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
     """Lowers the beams of one body in blocks, or beam by beam where no block fits."""
-    whole, rows = lanes.whole, lidar.table.rows
-    blocks, hits, back = whole[k + BLOCKS], whole[k + HITS], whole[k + BACK]
-    share, blend = lanes.single[k + SHARE], lanes.single[k + BLEND]
-    least, most = np.float32(lidar.range_min), np.float32(lidar.range_max)
-    at, first = np.uintp(lanes.wide[k + AT]), np.int64(0 if blocks > 0 else back)
-    one, two = np.uintp(whole[k + ONE] + first), np.uintp(whole[k + TWO] + first)
-    other, other2 = (
-        np.uintp(whole[k + OTHER] + first),
-        np.uintp(whole[k + OTHER2] + first),
-    )
+    whole = lanes.whole
+    rows = lidar.table.rows
+    blocks = whole[k + BLOCKS]
+    hits = whole[k + HITS]
+    back = whole[k + BACK]
+    share = lanes.single[k + SHARE]
+    blend = lanes.single[k + BLEND]
+    least = np.float32(lidar.range_min)
+    most = np.float32(lidar.range_max)
+    at = np.uintp(lanes.wide[k + AT])
+    first = np.int64(0 if blocks > 0 else back)
+    one = np.uintp(whole[k + ONE] + first)
+    two = np.uintp(whole[k + TWO] + first)
+    other = np.uintp(whole[k + OTHER] + first)
+    other2 = np.uintp(whole[k + OTHER2] + first)
     # Ranges are fused as whole numbers, in the same order: of floats LLVM masks the store.
     if blocks > 0:
         place = np.int32(-back)
@@ -359,6 +378,7 @@ def add_maps(ranges, poses, chosen, fixtures, lidar, lanes):  # type: ignore[no-
         for m in range(poses.shape[1] if grid.squares.size > 0 else 0):
             x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
             here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-            out, far = ranges[n, m], lidar.range_max
+            out = ranges[n, m]
+            far = lidar.range_max
             map_kernels.map_into(out, lidar.beams, here, far, grid, lidar.exact, lanes)
             exact_kernels.finish(out, lidar.range_min, lidar.range_max)

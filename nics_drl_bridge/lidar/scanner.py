@@ -55,13 +55,15 @@ class Scanner:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for an unknown renderer, ModelError for another lidar's table."""
-        table, spec = self.table, self.spec
+        table = self.table
+        spec = self.spec
         if self.renderer not in RENDERERS:
             known = nearest(str(self.renderer), RENDERERS)
             raise ConfigError(f"unknown renderer {self.renderer!r}; {known}")
         if self.renderer == "exact" or not table.shapes:
             return
-        reach, reason = float((table.grid[:, 0] - table.outlines.radii).min()), ""
+        reach = float((table.grid[:, 0] - table.outlines.radii).min())
+        reason = ""
         if not table.has_rows:
             reason = f"has no rows to look up with the renderer {self.renderer!r}"
         elif not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
@@ -78,7 +80,8 @@ class Scanner:
     @cached_property
     def arguments(self) -> LidarArrays:
         """Lidar and table for the kernels."""
-        spec, table = self.spec, self.table
+        spec = self.spec
+        table = self.table
         return LidarArrays(
             np.array(spec.mount),
             beams_of(
@@ -101,7 +104,9 @@ class Scanner:
         return stack_fixtures([NO_WALLS], [self.grid], np.zeros(1, np.int64))
 
     def _looked_up(self) -> Array:
-        spec, table, radii = self.spec, self.table, self.table.outlines.radii
+        spec = self.spec
+        table = self.table
+        radii = self.table.outlines.radii
         between = np.full((len(radii), 2), np.inf)
         if self.renderer == "baked":
             between[:, 0] = radii
@@ -150,8 +155,10 @@ class Scanner:
         if not out.flags.c_contiguous:
             out[:] = self.scan(poses, bodies, walls)
             return out
-        worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
-        member, first = np.zeros(len(poses), np.int64), np.array([0, len(walls)])
+        worlds = np.arange(len(poses))
+        lanes = scan_kernels.scan_lanes()
+        member = np.zeros(len(poses), np.int64)
+        first = np.array([0, len(walls)])
         around = self._without_walls._replace(member=member, walls=walls, first=first)
         cells = body_cells(0, bodies.shape[1])
         scan_kernels.scan_worlds(
@@ -188,7 +195,8 @@ class Scanner:
             raise ConfigError(f"{given} must be (N, 3) and (N, K, {BODY}).")
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
-        index, known = bodies[..., SHAPE], len(self.table.shapes)
+        index = bodies[..., SHAPE]
+        known = len(self.table.shapes)
         if index.size and not (index.min() >= 0 and index.max() < known):
             reason = f"none of the {known} in the lidar table"  # the kernels would read beyond it
             raise ModelError(

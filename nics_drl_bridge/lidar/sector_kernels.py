@@ -52,7 +52,9 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
     Row k has the least of each 2**k beams in a row. As whole numbers, ranges have the same order,
     NaN is the greatest, and LLVM vectorises.
     """
-    beams, rows, whole = ranges.shape[0], 1, ranges.view(np.int32)
+    beams = ranges.shape[0]
+    rows = 1
+    whole = ranges.view(np.int32)
     for s in range(out.shape[0]):
         while 1 << rows <= count[s]:
             rows += 1
@@ -63,12 +65,16 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
             whole[b] if np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF else UNKNOWN
         )
     for k in range(rows - 1):
-        step, last = 1 << k, beams - (2 << k) + 1
-        one, two, row = least[k, :last], least[k, step : step + last], least[k + 1]
+        step = 1 << k
+        last = beams - (2 << k) + 1
+        one = least[k, :last]
+        two = least[k, step : step + last]
+        row = least[k + 1]
         for b in range(last):
             row[b] = min(one[b], two[b])
     for s in range(out.shape[0]):
-        begin, end = first[s], first[s] + count[s]
+        begin = first[s]
+        end = first[s] + count[s]
         near = _nearest(least, begin, min(end, beams))
         if end > beams:
             near = min(near, _nearest(least, 0, end - beams))
@@ -86,8 +92,10 @@ def _nearest(least, begin, end):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def _by_place(out, ranges, plan):  # type: ignore[no-untyped-def]
     """Fills each sector from its returns, or the nearer of the neighbouring beams around it."""
-    sectors, beams = out.shape[0], ranges.shape[0]
-    where, value = np.empty(beams, np.int32), np.empty(beams, np.float32)
+    sectors = out.shape[0]
+    beams = ranges.shape[0]
+    where = np.empty(beams, np.int32)
+    value = np.empty(beams, np.float32)
     own = np.zeros(sectors, np.bool_)
     for s in range(sectors):
         out[s] = np.nan
@@ -118,7 +126,8 @@ def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
     if r != r:
         return -1, np.float32(np.nan)
     reach = min(max(float(r), 0.5 * plan.range_min), plan.range_max)
-    x, y = plan.shift[0] + reach * direction[0], plan.shift[1] + reach * direction[1]
+    x = plan.shift[0] + reach * direction[0]
+    y = plan.shift[1] + reach * direction[1]
     angle = (math.atan2(y, x) - plan.angle_min) % TURN
     s = (
         int(angle / plan.width) if angle < TURN else 0

@@ -226,16 +226,19 @@ def reader_of(
     A negative `angle_increment` means clockwise beams, and so does `upside_down`. `like` gives
     mount, frame and value for no return. Raises ConfigError if the header describes no lidar.
     """
-    begin, step = header.angle_min, header.angle_increment
+    begin = header.angle_min
+    step = header.angle_increment
     if upside_down:
-        begin, step = -begin, -step
+        begin = -begin
+        step = -step
     if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
         angles = f"angle_min {header.angle_min:g}, angle_increment {header.angle_increment:g}"
         reason = "describes no lidar; mend the driver's parameters."
         raise ConfigError(f"LaserScan of {beams} beams, {angles}: {reason}")
     backwards = step < 0.0
     if backwards:
-        begin, step = begin + step * (beams - 1), -step
+        begin = begin + step * (beams - 1)
+        step = -step
     turn = 2.0 * np.pi
     if begin < -turn or begin + step * (beams - 1) > turn:
         begin = -(-begin % turn)

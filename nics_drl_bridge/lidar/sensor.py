@@ -168,7 +168,8 @@ def unread(sensors: Sequence[Sensor], *lead: int) -> dict[str, Readings]:
 
 def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
     """Raises ConfigError if two sensors, or one and the robot's own topics or frames, collide."""
-    names, used = list(TAKEN), list(frames)
+    names = list(TAKEN)
+    used = list(frames)
     for sensor in sensors:
         if sensor.name in names or sensor.frame in used:
             reason = "another has that name or frame already; choose others."

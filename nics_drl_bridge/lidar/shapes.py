@@ -15,10 +15,9 @@ from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, Outline
 
 MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000  # in one group of obstacles
-SMALLEST, LARGEST = (
-    1e-6,
-    1e4,
-)  # Extent of a shape [m]: less is invisible, more fits in no world
+# Extent of a shape [m]: less is invisible, more fits in no world
+SMALLEST = 1e-6
+LARGEST = 1e4
 SAME_PLACE = (
     1e-9  # corners within this distance, as a share of the shape's radius, coincide
 )
@@ -79,7 +78,8 @@ class Rectangle(Outlined):
     @property
     def outline(self) -> Array:
         """(4, 2) corners, counter-clockwise [m]."""
-        x, y = self.size[0] / 2.0, self.size[1] / 2.0
+        x = self.size[0] / 2.0
+        y = self.size[1] / 2.0
         return np.array([(x, y), (-x, y), (-x, -y), (x, -y)])
 
 
@@ -158,7 +158,8 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
             np.cos(poses[..., 2]),
             np.sin(poses[..., 2]),
         )
-    bodies[..., RADIUS], bodies[..., SHAPE] = radii, shapes
+    bodies[..., RADIUS] = radii
+    bodies[..., SHAPE] = shapes
     return bodies
 
 

@@ -29,7 +29,8 @@ from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 
 FORMAT = "nics_drl_bridge/lidar_table/4"
-ABOUT_FILE, ARRAYS = "about.json", ("grid", "start", "cell", "rows")
+ABOUT_FILE = "about.json"
+ARRAYS = ("grid", "start", "cell", "rows")
 TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))  # and a manifest
 POINT_ANGLE = (
     0.01  # greatest default angle of points in a row, as `MOST_PHASES` allows [rad]
@@ -127,20 +128,21 @@ class LidarTable:
     @cached_property
     def arrays(self) -> TableArrays:
         """The table for the kernels."""
-        outlines, distances = self.outlines, self.density.distances
-        parts, rotations = outlines.orders, self.grid[:, 1]
+        outlines = self.outlines
+        distances = self.density.distances
+        parts = outlines.orders
+        rotations = self.grid[:, 1]
         corners = np.diff(outlines.hull) // 2
         circles = np.array([isinstance(shape, Circle) for shape in self.shapes], bool)
         shapes = np.zeros(len(self.shapes), TABLE_SHAPE)
         shapes["per_metre"] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
         shapes["rotations"] = np.where(circles, 0.0, rotations * parts)
         shapes["parts_per_rotation"] = 1.0 / rotations
-        shapes["first_cell"], shapes["cells_per_part"] = (
-            self.grid[:, 2],
-            rotations * distances,
-        )
+        shapes["first_cell"] = self.grid[:, 2]
+        shapes["cells_per_part"] = rotations * distances
         shapes["hull_end"] = outlines.hull[:-1] + corners
-        shapes["corners_per_part"], shapes["corners"] = corners // parts, corners
+        shapes["corners_per_part"] = corners // parts
+        shapes["corners"] = corners
         shapes["round_radius"] = np.where(circles, outlines.radii, 0.0)
         shift = self.density.phases.bit_length() - 1
         cell = self.cell.astype(np.int32)
@@ -256,7 +258,8 @@ class LidarTable:
         corners = np.repeat(np.diff(self.outlines.hull) // 2, counts.astype(np.int64))[
             :, None
         ]
-        hint, other = self.cell[:, 2::2], self.cell[:, 3::2]
+        hint = self.cell[:, 2::2]
+        other = self.cell[:, 3::2]
         if (
             (hint < 0).any()
             or (hint >= corners).any()

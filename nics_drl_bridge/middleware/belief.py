@@ -13,10 +13,8 @@ from nics_drl_bridge.middleware.turning import Gyro
 
 JITTER_S = 0.2  # Uncertainty of the unobserved time: transmission takes longer now and then [s]
 MARGIN = 1.2  # Factor by which odometry, through noise or slip, may exceed the greatest speed
-LEVELS, MOST_CORNERS = (
-    3,
-    4096,
-)  # values tried per variable for the greatest speed; combinations
+LEVELS = 3  # values tried per variable for the greatest speed
+MOST_CORNERS = 4096  # combinations
 
 
 class Belief(NamedTuple):
@@ -55,7 +53,8 @@ class Foreseen(NamedTuple):
 def parted(covariance: Array) -> Array:
     """Returns a copy of a covariance (3 + S, 3 + S) with pose and state uncorrelated."""
     copied = np.array(covariance)
-    copied[:3, 3:], copied[3:, :3] = 0.0, 0.0
+    copied[:3, 3:] = 0.0
+    copied[3:, :3] = 0.0
     return copied
 
 
@@ -133,7 +132,8 @@ class Unseen:
         third of its variance at the end. A path that was not straight may have led aside, at most
         as far as the greatest speed allows; Thrun et al., Probabilistic Robotics, Sec. 5.4.
         """
-        position, heading = max(self.walk[:2]) * seconds, self.walk[2] * seconds
+        position = max(self.walk[:2]) * seconds
+        heading = self.walk[2] * seconds
         aside = max(far * far - float(lever @ lever), 0.0) / 4.0
         added = np.zeros((3, 3))
         added[:2, :2] = heading / 3.0 * (np.outer(lever, lever) + aside * np.eye(2))

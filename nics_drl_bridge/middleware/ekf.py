@@ -40,7 +40,9 @@ PATIENCE = {
 }  # consecutive outliers after which they are believed
 # Factors of variances, after each outlier and after each measurement that fits well, and the
 # greatest: noise may be more than was told, and nearly all measurements would then be outliers.
-ROUGHER, SMOOTHER, ROUGHEST = 4.0, 0.93, 100.0
+ROUGHER = 4.0
+SMOOTHER = 0.93
+ROUGHEST = 100.0
 WELL = 2.37  # less is half of the squared, normalised innovations of three numbers
 NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
 STILL = np.zeros(3)
@@ -51,10 +53,9 @@ ANYWHERE = (
     100.0,
     np.pi,
 )  # Std of a pose in a pose sensor's map, by odometry [m, rad]
-STANDS, ABOUT_STANDS = (
-    0.01,
-    0.05,
-)  # of a robot at rest: expected and measured speeds [m/s, rad/s]
+# of a robot at rest: expected and measured speeds [m/s, rad/s]
+STANDS = 0.01
+ABOUT_STANDS = 0.05
 LONGEST_GAP_S = (
     10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
 )
@@ -100,10 +101,8 @@ class Estimator:
         walk = self._noise[Kind.TWIST] * model.control_period
         self._wheels = kernels.Wheels(walk, slip, *self._limits)
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
-        self._observe_pose, self._suddenly = (
-            np.eye(3, 3 + size),
-            np.eye(3 + size, size, -3),
-        )
+        self._observe_pose = np.eye(3, 3 + size)
+        self._suddenly = np.eye(3 + size, size, -3)
         self._filter = ExtendedKalmanFilter(3 + size, 3)
         self._anchor: Anchor | None = None
         self._foreseen: Foreseen | None = None  # of the present belief and commands
@@ -111,18 +110,19 @@ class Estimator:
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
         """Begins at a time [ns] and a pose (3,) in `map`, of a deviation [m, rad], at rest."""
-        mean, deviation = (
-            np.zeros(self._filter.dim_x),
-            np.full(self._filter.dim_x, START_STD),
-        )
-        mean[:3], deviation[:3] = pose, std
-        spread, error = np.diag(deviation**2), self._suddenly
+        mean = np.zeros(self._filter.dim_x)
+        deviation = np.full(self._filter.dim_x, START_STD)
+        mean[:3] = pose
+        deviation[:3] = std
+        spread = np.diag(deviation**2)
+        error = self._suddenly
         self.belief = Belief(time_ns, mean, spread, (0, 0, 0), None, False, error)
         self._log = log_of(np.zeros(len(self._least)))
 
     def anchor(self, odom: Array, twist: Array = STILL) -> None:
         """Records the present pose (3,) in `odom` and body twist (3,)."""
-        mean, covariance = self._filter.x, self._filter.P
+        mean = self._filter.x
+        covariance = self._filter.P
         self._anchor = Anchor(
             self.time_ns, odom, twist, mean, covariance, covariance[:, :3].copy()
         )
@@ -201,7 +201,8 @@ class Estimator:
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
-        now, motion = self.time_ns, self._motion
+        now = self.time_ns
+        motion = self._motion
         mean, twist = kernels.look_ahead(
             self._filter.x, now, time_ns, motion, self._log
         )
@@ -234,7 +235,10 @@ class Estimator:
             self._foreseen = here._replace(gains=gains)
 
     def _forecast(self, time_ns: int) -> Foreseen:
-        own, motion, log, now = self._filter, self._motion, self._log, self.time_ns
+        own = self._filter
+        motion = self._motion
+        log = self._log
+        now = self.time_ns
         mean, covariance, expected, error, transition = kernels.forecast(
             own.x, own.P, self._process, now, time_ns, motion, log
         )
@@ -257,7 +261,8 @@ class Estimator:
     def turn(self, time_ns: int, measurement: Measurement) -> Judgement:
         """Takes a yaw rate measured at a time; the next odometry turns by it, see `turning`."""
         variance = None if measurement.noise is None else float(measurement.noise[0, 0])
-        rate, fastest = float(measurement.value[0]), self.unseen.fastest[1]
+        rate = float(measurement.value[0])
+        fastest = self.unseen.fastest[1]
         self._gyro, distance, used = take_rate(
             self._gyro, time_ns, rate, variance, fastest
         )
@@ -300,7 +305,9 @@ class Estimator:
         if measurement.kind is Kind.YAW_RATE:
             return self.turn(self.time_ns, measurement)
         measurement, turned = self._turned(measurement)
-        kind, odom, anchor = measurement.kind, measurement.odom, self._anchor
+        kind = measurement.kind
+        odom = measurement.odom
+        anchor = self._anchor
         lost = self._lost
         if lost and odom is not None:
             self._lost = False
@@ -335,13 +342,16 @@ class Estimator:
         residual = _between_poses if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
-        outcome, scattered = Acceptance.USED, self._scatters(kind, innovation)
+        outcome = Acceptance.USED
+        scattered = self._scatters(kind, innovation)
         if not distance <= GATE[kind]:
             outcome = self._surprise(kind, innovation, derivative, noise, scattered)
         if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
             return Judgement(distance, outcome)
-        anchor, own, way = self._anchor, self._filter, None
+        anchor = self._anchor
+        own = self._filter
+        way = None
         if follows and anchor is not None and anchor.cross is not None:
             way = (
                 np.array(odom),
@@ -360,8 +370,13 @@ class Estimator:
             if kind is Kind.POSE and outcome is Acceptance.JUMP:
                 self._jump(value, noise)
             else:
-                matrix, model = (lambda _: derivative), (lambda _: expected)
-                own.update(value, matrix, model, R=noise, residual=residual)
+                own.update(
+                    value,
+                    HJacobian=lambda _: derivative,
+                    Hx=lambda _: expected,
+                    R=noise,
+                    residual=residual,
+                )
             kernels.settle(own.x, own.P, *self._limits)
             if way:
                 since: Any = self._anchor
@@ -386,12 +401,14 @@ class Estimator:
 
     @property
     def _wheels_now(self) -> kernels.Wheels:
-        wheels, rough = self._wheels, self._roughness[Kind.TWIST]
+        wheels = self._wheels
+        rough = self._roughness[Kind.TWIST]
         return wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
 
     def _scatters(self, kind: Kind, innovation: Array) -> bool:
         """True if a measurement errs in another way than the one before, as noise alone does."""
-        before, size = self._missed[kind], len(innovation)
+        before = self._missed[kind]
+        size = len(innovation)
         self._missed = self._missed.copy()
         self._missed[kind, :size] = np.clip(innovation, -FARTHEST, FARTHEST)
         return bool(self._missed[kind] @ before < 0.0)
@@ -414,7 +431,8 @@ class Estimator:
     def _recall(self, innovation: Array, derivative: Array, noise: Array) -> None:
         """Corrects where the newest odometry was, by what is about to correct the present."""
         if (anchor := self._anchor) is not None and anchor.cross is not None:
-            spread, mean = self._filter.P, anchor.mean.copy()
+            spread = self._filter.P
+            mean = anchor.mean.copy()
             gain, covariance, cross = kernels.recall(anchor, derivative, spread, noise)
             mean[:3] += innovation @ gain
             self._anchor = anchor._replace(
@@ -482,7 +500,8 @@ class Estimator:
         self._part()
         self._filter.P = parted(self._filter.P)
         mean = np.array(self._filter.x)
-        mean[:3], self._filter.P[:3, :3] = pose, noise
+        mean[:3] = pose
+        self._filter.P[:3, :3] = noise
         self._filter.x = mean
 
     def _count(self, kind: Kind, outliers: int) -> None:
@@ -494,7 +513,8 @@ def _with(values: tuple[Any, ...], kind: Kind, value: Any) -> tuple[Any, ...]:
 
 
 def _widened(low: Array, high: Array) -> tuple[Array, Array]:
-    center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
+    center = (high + low) / 2.0
+    half = REACHABLE * (high - low) / 2.0
     return center - half, center + half
 
 

@@ -72,8 +72,10 @@ def log_of(command: ArrayLike) -> Log:
 @kernel(allocates=True)
 def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
     """Computes the derivative (3 + S, V) of `rates` with respect to X."""
-    dof, coefficient = terms.dof, terms.coefficient
-    factors, count = terms.factors, terms.degree
+    dof = terms.dof
+    coefficient = terms.coefficient
+    factors = terms.factors
+    count = terms.degree
     jacobian[:] = 0.0
     for k in range(dof.shape[0]):
         for f in range(count[k]):
@@ -95,9 +97,12 @@ def _kept(value, dt, drag):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-untyped-def]
     """Moves the mean by `steps` of `dt` [s] under a command (C,), and its `unmoved` derivative."""
-    size, width = mean.shape[0] - 3, command.shape[0]
-    x, dq = np.ones(size + width + 1), np.zeros(3 + size)
-    jacobian, step = np.zeros((3 + size, size + width)), np.eye(3 + size)
+    size = mean.shape[0] - 3
+    width = command.shape[0]
+    x = np.ones(size + width + 1)
+    dq = np.zeros(3 + size)
+    jacobian = np.zeros((3 + size, size + width))
+    step = np.eye(3 + size)
     robot.put_command(x, command, motion.terms)
     for _ in range(steps):
         x[:size] = mean[3:]
@@ -105,7 +110,8 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
         rates_jacobian(jacobian, x, motion.terms)
         # The arc is short, so the derivative at its middle heading is good to second order.
         middle = mean[2] + dq[2] * dt / 2.0
-        c, s = math.cos(middle), math.sin(middle)
+        c = math.cos(middle)
+        s = math.sin(middle)
         step[:] = np.eye(3 + size)
         step[0, 2] = -dt * (s * dq[0] + c * dq[1])
         step[1, 2] = dt * (c * dq[0] - s * dq[1])
@@ -135,7 +141,8 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
 @kernel(allocates=True)
 def in_effect(log, time):  # type: ignore[no-untyped-def]
     """Index of the command in effect just before a time: the last that took effect earlier."""
-    low, high = 0, log.effective.shape[0]
+    low = 0
+    high = log.effective.shape[0]
     while low < high:
         middle = (low + high) // 2
         if log.effective[middle] < time:
@@ -148,7 +155,8 @@ def in_effect(log, time):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def logged(log, effective_ns, command, low, high, needed_ns):  # type: ignore[no-untyped-def]
     """Adds a command (C,), clipped; drops those over before `needed_ns`; empty for a duplicate."""
-    effective, commands = log.effective, log.commands
+    effective = log.effective
+    commands = log.commands
     place = count = effective.shape[0]
     while place > 0 and effective[place - 1] >= effective_ns:
         place -= 1
@@ -156,7 +164,8 @@ def logged(log, effective_ns, command, low, high, needed_ns):  # type: ignore[no
     size = count - first + 1
     if place < count and effective[place] == effective_ns:
         size = 0
-    times, values = np.empty(size, np.int64), np.empty((size, command.shape[0]))
+    times = np.empty(size, np.int64)
+    values = np.empty((size, command.shape[0]))
     for i in range(size):
         k = first + i
         if k == place:
@@ -205,16 +214,20 @@ def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped
         mean[3:] = 0.0
         transition[:] = unmoved(mean.shape[0], (end - begin) / NS_PER_S)
         return
-    before, command, now = mean[:3].copy(), np.empty(log.commands.shape[1]), begin
+    before = mean[:3].copy()
+    command = np.empty(log.commands.shape[1])
+    now = begin
     while now < end:
         until = min(take(command, now + 1, motion, log), end)
-        steps, rest = (until - now) // step, (until - now) % step
+        steps = (until - now) // step
+        rest = (until - now) % step
         predict(mean, transition, command, step / NS_PER_S, steps, motion)
         if rest > 0:
             predict(mean, transition, command, rest / NS_PER_S, 1, motion)
         now = until
     if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
-        mean[:3], mean[3:] = before, 0.0
+        mean[:3] = before
+        mean[3:] = 0.0
         transition[:] = unmoved(mean.shape[0], (end - begin) / NS_PER_S)
 
 
@@ -223,9 +236,12 @@ def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
     """Expected body twist (3,) at the time of the mean, and its derivative (3, 3 + S)."""
     command = np.empty(log.commands.shape[1])
     take(command, now, motion, log)
-    size, width = mean.shape[0] - 3, command.shape[0]
-    x, dq = np.ones(size + width + 1), np.zeros(3 + size)
-    jacobian, derivative = np.zeros((3 + size, size + width)), np.zeros((3, 3 + size))
+    size = mean.shape[0] - 3
+    width = command.shape[0]
+    x = np.ones(size + width + 1)
+    dq = np.zeros(3 + size)
+    jacobian = np.zeros((3 + size, size + width))
+    derivative = np.zeros((3, 3 + size))
     x[:size] = mean[3:]
     robot.put_command(x, command, motion.terms)
     robot.rates(dq, x, motion.terms)
@@ -242,10 +258,13 @@ def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignor
     """
     # A model that is wrong stays wrong for a while: the error of the state's rates is constant in
     # between, so that it moves the pose, too. A correction of the state then corrects the pose.
-    moved, width, time = mean.copy(), mean.shape[0], (end - begin) / NS_PER_S
+    moved = mean.copy()
+    width = mean.shape[0]
+    time = (end - begin) / NS_PER_S
     derivative = unmoved(width, 0.0)
     carry(moved, derivative, begin, end, motion, log)
-    transition, error = derivative[:, :width].copy(), derivative[:, width:].copy()
+    transition = derivative[:, :width].copy()
+    error = derivative[:, width:].copy()
     spread = (
         transition @ covariance @ transition.T
         + error @ (process[3:, 3:] / time) @ error.T
@@ -293,10 +312,8 @@ def recall(anchor, derivative, covariance, noise):  # type: ignore[no-untyped-de
     """
     seen = derivative @ anchor.cross
     gain = np.linalg.solve(derivative @ covariance @ derivative.T + noise, seen)
-    less, spread = (
-        anchor.cross - covariance @ (derivative.T @ gain),
-        anchor.covariance.copy(),
-    )
+    less = anchor.cross - covariance @ (derivative.T @ gain)
+    spread = anchor.covariance.copy()
     spread[:3, :3] -= seen.T @ gain
     return gain.copy(), spread, less
 
@@ -310,27 +327,36 @@ def retrace(  # type: ignore[no-untyped-def]
     One that is unlikely, but that of the twists at its ends, replaces what was predicted. Returns
     mean and covariance; `wheels` is `Wheels`.
     """
-    seconds, then, size = (now - anchor.time_ns) / NS_PER_S, anchor.mean, mean.shape[0]
-    c, s = math.cos(anchor.odom[2]), math.sin(anchor.odom[2])
-    x, y = odom[0] - anchor.odom[0], odom[1] - anchor.odom[1]
-    along, aside, turned = (
-        c * x + s * y,
-        c * y - s * x,
-        robot.wrap(odom[2] - anchor.odom[2]),
-    )
-    c, s = math.cos(then[2]), math.sin(then[2])
-    x, y = mean[0] - then[0], mean[1] - then[1]
-    ahead, before = c * x + s * y, c * y - s * x
-    here, there = np.zeros((3, size)), np.zeros((3, 3))
-    here[0, 0], here[0, 1], here[1, 0], here[1, 1], here[2, 2] = c, s, -s, c, 1.0
-    there[0, 0], there[0, 1], there[1, 0], there[1, 1], there[2, 2] = (
-        -c,
-        -s,
-        s,
-        -c,
-        -1.0,
-    )
-    there[0, 2], there[1, 2] = before, -ahead
+    seconds = (now - anchor.time_ns) / NS_PER_S
+    then = anchor.mean
+    size = mean.shape[0]
+    c = math.cos(anchor.odom[2])
+    s = math.sin(anchor.odom[2])
+    x = odom[0] - anchor.odom[0]
+    y = odom[1] - anchor.odom[1]
+    along = c * x + s * y
+    aside = c * y - s * x
+    turned = robot.wrap(odom[2] - anchor.odom[2])
+    c = math.cos(then[2])
+    s = math.sin(then[2])
+    x = mean[0] - then[0]
+    y = mean[1] - then[1]
+    ahead = c * x + s * y
+    before = c * y - s * x
+    here = np.zeros((3, size))
+    there = np.zeros((3, 3))
+    here[0, 0] = c
+    here[0, 1] = s
+    here[1, 0] = -s
+    here[1, 1] = c
+    here[2, 2] = 1.0
+    there[0, 0] = -c
+    there[0, 1] = -s
+    there[1, 0] = s
+    there[1, 1] = -c
+    there[2, 2] = -1.0
+    there[0, 2] = before
+    there[1, 2] = -ahead
     shared = covariance @ here.T + anchor.cross @ there.T
     past = anchor.cross.T @ here.T + anchor.covariance[:3, :3].copy() @ there.T
     total = here @ shared + there @ past + wheels.walk * seconds
@@ -341,7 +367,8 @@ def retrace(  # type: ignore[no-untyped-def]
     slack = np.diag((0.5 * seconds * (twist - anchor.twist)) ** 2)
     if innovation @ np.linalg.solve(total + slack, innovation) <= gate:
         gain = np.linalg.solve(total, shared.T)
-        less, moved = covariance - shared @ gain, mean + innovation @ gain
+        less = covariance - shared @ gain
+        moved = mean + innovation @ gain
         less = (less + less.T) * 0.5
     else:
         arc = np.array(
@@ -355,12 +382,16 @@ def retrace(  # type: ignore[no-untyped-def]
         if seconds > SHORT_S or not off @ np.linalg.solve(spread, off) <= gate:
             return mean, covariance
         # The way is that of its twists: what was predicted is wrong.
-        moved, less, turning = mean.copy(), covariance.copy(), np.eye(3)
+        moved = mean.copy()
+        less = covariance.copy()
+        turning = np.eye(3)
         moved[0], moved[1] = (
             then[0] + c * along - s * aside,
             then[1] + s * along + c * aside,
         )
-        moved[2], less[:3, 3:], less[3:, :3] = then[2] + turned, 0.0, 0.0
+        moved[2] = then[2] + turned
+        less[:3, 3:] = 0.0
+        less[3:, :3] = 0.0
         turning[0, 2], turning[1, 2] = then[1] - moved[1], moved[0] - then[0]
         spread = anchor.covariance[:3, :3].copy()
         less[:3, :3] = turning @ spread @ turning.T + wheels.walk * seconds
@@ -374,8 +405,10 @@ def follow(  # type: ignore[no-untyped-def]
     mean, innovation, update, recall, anchor, odom, twist, now, wheels, gate
 ):
     """Corrects by an innovation (3,) of a twist, by `gain` and `recall`, and then by `retrace`."""
-    weight, covariance = update[0], update[1].copy()
-    here, then = mean + weight @ innovation, anchor.mean.copy()
+    weight = update[0]
+    covariance = update[1].copy()
+    here = mean + weight @ innovation
+    then = anchor.mean.copy()
     settle(here, covariance, wheels.low, wheels.high)
     then[:3] += innovation @ recall[0]
     since = Anchor(
@@ -395,7 +428,8 @@ def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
     for i in range(size):
         for j in range(i + 1):
             both = 0.5 * (covariance[i, j] + covariance[j, i])
-            covariance[i, j], covariance[j, i] = both, both
+            covariance[i, j] = both
+            covariance[j, i] = both
             for k in range(j):
                 both -= factor[i, k] * factor[j, k]
             if j < i:

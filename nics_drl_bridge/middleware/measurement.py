@@ -9,7 +9,11 @@ from numpy.typing import ArrayLike
 
 from nics_drl_bridge.geometry import Array
 
-SCAN, ODOM, CMD_VEL, POSE, IMU = "scan", "odom", "cmd_vel", "pose", "imu"
+SCAN = "scan"
+ODOM = "odom"
+CMD_VEL = "cmd_vel"
+POSE = "pose"
+IMU = "imu"
 
 
 class Kind(IntEnum):

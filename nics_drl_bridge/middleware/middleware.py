@@ -103,7 +103,8 @@ class Middleware:
     """
 
     def __init__(self, model: SimulatorModel) -> None:
-        self._beams, self._width = model.lidar.beams, len(model.robot.command)
+        self._beams = model.lidar.beams
+        self._width = len(model.robot.command)
         self._sensors = model.sensors
         self.estimator = Estimator(model)
         self._timeline = timeline.Timeline(self.estimator)
@@ -126,8 +127,10 @@ class Middleware:
         Its motion, odometry and all topics go on.
         """
         belief = self.estimator.belief
-        mean, spread = belief.mean.copy(), parted(belief.covariance)
-        mean[:3], spread[:3, :3] = pose, covariance
+        mean = belief.mean.copy()
+        spread = parted(belief.covariance)
+        mean[:3] = pose
+        spread[:3, :3] = covariance
         anchor = belief.anchor and belief.anchor._replace(
             mean=mean, covariance=spread, cross=None
         )
@@ -137,7 +140,8 @@ class Middleware:
         self._timeline.reset()
 
     def _begin(self, time_ns: int) -> None:
-        self._start_ns, self._unstamped_ns = time_ns, time_ns - 1
+        self._start_ns = time_ns
+        self._unstamped_ns = time_ns - 1
         self._stamps.reset()
         self._timeline.reset()
 
@@ -312,10 +316,8 @@ class Middleware:
 
     def _follow_clock(self, odometry: ReportedPose) -> None:
         """Continues from an odometry to whose stamp the clock was set, by the motion it shows."""
-        seconds, continuous = (
-            self._trail.seconds(odometry),
-            self._trail.continuous(odometry),
-        )
+        seconds = self._trail.seconds(odometry)
+        continuous = self._trail.continuous(odometry)
         self.estimator.lose(odometry.stamp_ns, seconds, continuous, self._commanded)
         self.estimator.correct(
             Measurement(Kind.TWIST, odometry.twist, odom=odometry.pose)
@@ -340,8 +342,10 @@ class Middleware:
 
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
-        scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
-        sensed, newest = unread(self._sensors), self.cache.newest
+        scan = self.cache.newest.get(SCAN)
+        newest_ns = self.newest_ns
+        sensed = unread(self._sensors)
+        newest = self.cache.newest
         sensed |= {name: newest[name].value for name in sensed if name in newest}
         oldest_s = max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0)
         return RobotView(
@@ -358,14 +362,17 @@ class Middleware:
 
     def health(self, arrival_ns: int) -> measured.Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""
-        cache, outcomes = self.cache, +self._timeline.outcomes  # those that are not 0
+        # those that are not 0
+        cache = self.cache
+        outcomes = +self._timeline.outcomes
         distances = {kind.topic: d for kind, d in self._timeline.distances.items()}
         topics = {}
         for topic, received in cache.received.items():
             age_s = (arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS
             known = received, cache.rate_hz(topic, arrival_ns), age_s
             topics[topic] = measured.TopicHealth(*known, distances.get(topic, math.nan))
-        rejected, noticed = dict(cache.rejected), dict[str, int]()
+        rejected = dict(cache.rejected)
+        noticed = dict[str, int]()
         for (kind, outcome), count in outcomes.items():
             if outcome is not measured.Acceptance.USED:
                 counts = rejected if outcome is measured.Acceptance.OUTLIER else noticed
@@ -377,9 +384,11 @@ class Middleware:
 
 def rehearse(model: SimulatorModel) -> RobotView:
     """Compiles all by two periods of a robot at rest: it could take seconds while a robot moves."""
-    middleware, period_ns = Middleware(model), round(model.control_period * 1e9)
+    middleware = Middleware(model)
+    period_ns = round(model.control_period * 1e9)
     middleware.reset(0, np.zeros(3))
-    still, free = np.zeros(3), np.full(model.lidar.beams, np.inf, np.float32)
+    still = np.zeros(3)
+    free = np.full(model.lidar.beams, np.inf, np.float32)
     for stamp_ns in (period_ns, 2 * period_ns):
         middleware.command(stamp_ns - period_ns, np.zeros(len(model.robot.command)))
         middleware.odometry(stamp_ns, stamp_ns, still, still)

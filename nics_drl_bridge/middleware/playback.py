@@ -75,15 +75,14 @@ def estimate(
     bag is damaged, a topic missing or of a wrong type, or the data are stamped by several clocks.
     """
     messages = played(path, topics, model.gyro)
-    playback, rows = Playback(model, POSE in messages), []
+    playback = Playback(model, POSE in messages)
+    rows = []
     middleware = playback.middleware
     for role, message in in_order(messages):
         if playback.take(role, message) and role == ODOM:
             stamp_ns = max(stamp(message.content), middleware.estimator.time_ns)
-            view, covariance = (
-                middleware.view(stamp_ns),
-                middleware.estimator.covariance,
-            )
+            view = middleware.view(stamp_ns)
+            covariance = middleware.estimator.covariance
             rows.append((stamp_ns, view.pose, view.twist, covariance[:3, :3]))
     if not rows:
         raise RecordingError(
@@ -196,8 +195,11 @@ class Playback:
     def __init__(
         self, model: SimulatorModel, posed: bool, any_lidar: bool = False
     ) -> None:
-        self._model, self._posed, self._any_lidar = model, posed, any_lidar
-        self.middleware, self.lidar = Middleware(model), model.lidar
+        self._model = model
+        self._posed = posed
+        self._any_lidar = any_lidar
+        self.middleware = Middleware(model)
+        self.lidar = model.lidar
         self._reader: Reader | None = None
         self._started = False
         self._gyro = GyroReader()
@@ -233,13 +235,15 @@ class Playback:
         return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
     def _odometry(self, arrival_ns: int, message: Any) -> bool:
-        stamp_ns, pose = stamp(message), np.array(whole_pose(message))
+        stamp_ns = stamp(message)
+        pose = np.array(whole_pose(message))
         if not self._started and np.isfinite(pose).all():
             self.middleware.reset(
                 stamp_ns, pose, ANYWHERE if self._posed else START_STD
             )
             self._started = True
-        twist, variance = np.array(twist_row(message)), turn_variance(message)
+        twist = np.array(twist_row(message))
+        variance = turn_variance(message)
         return self.middleware.odometry(stamp_ns, arrival_ns, pose, twist, variance)
 
     def _command(self, _: int, message: Any) -> bool:

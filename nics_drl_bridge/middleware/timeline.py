@@ -41,7 +41,8 @@ IN_STEP = (
     5  # Odometries in a row in step with their stamps, before arrivals measure time
 )
 # Between odometry's pose and twist: greatest standard deviations, and always allowed [m, rad].
-SIGMA, LEAST = 6.0, 0.01
+SIGMA = 6.0
+LEAST = 0.01
 STILL = 0.02  # Slower motion [m/s, rad/s] gives no information about time
 Moment = tuple[
     int, int
@@ -184,7 +185,8 @@ class Stamps:
         """Records a datum that is used."""
         self._refused = 0
         if self._stamp_ns is None or stamp_ns > self._stamp_ns:
-            self._stamp_ns, self._arrival_ns = stamp_ns, arrival_ns
+            self._stamp_ns = stamp_ns
+            self._arrival_ns = arrival_ns
 
     def refuse(self) -> bool:
         """Records an odometry rejected for its stamp; True if the clock has jumped."""
@@ -233,10 +235,8 @@ class Trail:
         if len(self._recent) <= IN_STEP:
             return False
         last = self._recent[-1]
-        passed, waited = (
-            odometry.stamp_ns - last.stamp_ns,
-            odometry.arrival_ns - last.arrival_ns,
-        )
+        passed = odometry.stamp_ns - last.stamp_ns
+        waited = odometry.arrival_ns - last.arrival_ns
         if (
             abs(passed - waited) < CONTRADICTED_NS
             or not -NEAR_NS <= passed - waited <= FUTURE_NS
@@ -244,8 +244,10 @@ class Trail:
             return False
         if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
             return False
-        seconds, clear = _seconds(last, odometry, 0.0), CONTRADICTED_NS / NS_PER_S
-        stamped, arrived = passed / NS_PER_S, waited / NS_PER_S
+        seconds = _seconds(last, odometry, 0.0)
+        clear = CONTRADICTED_NS / NS_PER_S
+        stamped = passed / NS_PER_S
+        arrived = waited / NS_PER_S
         return (
             seconds > 0.0
             and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * clear)
@@ -255,10 +257,8 @@ class Trail:
         )
 
     def _in_step(self, before: ReportedPose, after: ReportedPose) -> bool:
-        passed, waited = (
-            after.stamp_ns - before.stamp_ns,
-            after.arrival_ns - before.arrival_ns,
-        )
+        passed = after.stamp_ns - before.stamp_ns
+        waited = after.arrival_ns - before.arrival_ns
         return 2 * abs(waited - passed) <= passed and self._fits(
             before, after, passed / NS_PER_S
         )
@@ -290,10 +290,8 @@ class Trail:
         )
 
     def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
-        mean, change = (
-            (before.twist + after.twist) / 2.0,
-            np.abs(after.twist - before.twist),
-        )
+        mean = (before.twist + after.twist) / 2.0
+        change = np.abs(after.twist - before.twist)
         moved = geometry.between(before.pose, after.pose)
         off = np.abs(geometry.between(geometry.exp(mean * seconds), moved))
         span = abs(seconds)

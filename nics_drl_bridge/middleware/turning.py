@@ -356,7 +356,8 @@ def _learn_bias(
 
 def _with_bias(gyro: Gyro, seen: float, variance: float, measured: float) -> Gyro:
     """Corrects a bias by one that was seen, with a variance of `measured`."""
-    apart, spread = seen - gyro.bias, variance + measured
+    apart = seen - gyro.bias
+    spread = variance + measured
     if apart**2 > STANDING**2 * spread:
         return gyro._replace(
             bias_variance=variance

@@ -41,7 +41,9 @@ from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 T = TypeVar("T")
-SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
+SCAN = "scan"
+ODOM = "odom"
+TRUTH = "ground_truth"
 AGAIN_S = 0.05  # data that do not arrive within this time are requested again [s]
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
@@ -62,9 +64,12 @@ class _Mailbox:
         slack_ns: int,
     ) -> None:
         self._slack_ns = slack_ns  # data may be so much older than what is awaited
-        self._mail, self._work = dict.fromkeys(topics, _Mail()), work
-        self._lock, self._awaiting = threading.Lock(), threading.Lock()
-        self._awaited_ns, self._worked_ns = -1, -1
+        self._mail = dict.fromkeys(topics, _Mail())
+        self._work = work
+        self._lock = threading.Lock()
+        self._awaiting = threading.Lock()
+        self._awaited_ns = -1
+        self._worked_ns = -1
         self._failure: Exception | None = None
 
     def put(self, topic: str, message: bytes) -> object:
@@ -104,14 +109,16 @@ class _Mailbox:
 
     def clear(self) -> None:
         with self._lock:
-            self._mail, self._worked_ns = dict.fromkeys(self._mail, _Mail()), -1
+            self._mail = dict.fromkeys(self._mail, _Mail())
+            self._worked_ns = -1
 
     def newest_ns(self) -> int:
         return max(mail.stamp_ns for mail in self._mail.values())
 
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:
         with self._lock:
-            self._awaited_ns, self._failure = stamp_ns, None
+            self._awaited_ns = stamp_ns
+            self._failure = None
             self._awaiting.acquire(blocking=False)
             self._work_in()
             late = self._late(stamp_ns)
@@ -160,13 +167,15 @@ class DdsBackend:
         stamped: bool | None = None,
         standard: Mapping[str, Any] | None = None,
     ) -> None:
-        self._robot, self._lidar = model.robot, model.lidar
+        self._robot = model.robot
+        self._lidar = model.lidar
         self._robot.require_cmd_vel()
         self._sensors = {sensor.name: sensor for sensor in model.sensors}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
         further = (*self._sensors, TRUTH) if truth else (*self._sensors,)
-        self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *further)
+        self.timeout_s = timeout_s
+        self._topics = (ODOM, SCAN, *further)
         # No reference to the backend, which may be garbage.
         take = partial(_take_odometry, self._middleware)
         options = validate(dict(standard or {}), client.StandardOptions, "standard")

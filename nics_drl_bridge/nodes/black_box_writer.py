@@ -22,7 +22,9 @@ from queue import SimpleQueue
 from nics_drl_bridge.files import write_parts
 from nics_drl_bridge.gate.seal import sealed
 
-STATE, ENTRY, WRITE = b"S", b"E", b"W"
+STATE = b"S"
+ENTRY = b"E"
+WRITE = b"W"
 KEPT_S = 30.0  # what is kept reaches back at least as far
 MOST_LINES = 18_000  # fewer than a replay takes
 MOST_BYTES = 48 * 2**20

@@ -56,7 +56,8 @@ from nics_drl_bridge.nodes.sources import Sources
 from nics_drl_bridge.recording.messages import is_rotation
 
 SIM_TIME = "use_sim_time"
-TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
+TWIST = "Twist"
+TWIST_STAMPED = "TwistStamped"
 FOREIGN_SETTINGS = {
     command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
     command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
@@ -134,10 +135,8 @@ def _declare_shield(
     on = runner.declare_row(node, parameters.SHIELD)
     values = {}
     for row in parameters.SHIELD_NUMBERS:
-        value, name = (
-            float(runner.declare_row(node, row)),
-            row.name.removeprefix("shield_"),
-        )
+        value = float(runner.declare_row(node, row))
+        name = row.name.removeprefix("shield_")
         if not math.isnan(value):
             values[name] = value
     if not on:
@@ -228,7 +227,8 @@ class CommandGate(qos.QosWatch):
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
-        model, logger = runner.declare_model(self), self.get_logger()
+        model = runner.declare_model(self)
+        logger = self.get_logger()
         self._lidar, self._config = model.lidar, declare_gate(self, model)
         self._sensors = model.sensors
         self._state = begin(self._config)
@@ -365,7 +365,8 @@ class CommandGate(qos.QosWatch):
         return decision.granted, decision.answer
 
     def _decide(self, given: inputs.Input) -> Decision:
-        now, before = time.monotonic(), self._state
+        now = time.monotonic()
+        before = self._state
         self._state, decision = decide(self._config, before, given, now)
         # Publish first: the rest may take its time.
         instead = self._say(decision, now) if decision.publish else None

@@ -13,7 +13,8 @@ from rclpy.node import Node
 from nics_drl_bridge.nodes import qos, runner
 from nics_drl_bridge.nodes.parameters import STAMPED
 
-TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+TWIST = "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 KINDS: dict[str, Any] = {TWIST: Twist, TWIST_STAMPED: TwistStamped}
 # The setting that selects the type.
 SETTINGS = {TWIST: f"{STAMPED}:=false", TWIST_STAMPED: f"{STAMPED}:=true"}

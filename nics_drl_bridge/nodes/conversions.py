@@ -62,11 +62,15 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
 
 def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion:
     """Returns an orientation turned about the vertical to a heading [rad]; it stays tilted."""
-    x, y, z, w = stood.x, stood.y, stood.z, stood.w
+    x = stood.x
+    y = stood.y
+    z = stood.z
+    w = stood.w
     if not (x or y):
         return heading_to_ros(heading)
     half = (heading - heading_of(x, y, z, w)) / 2.0
-    s, c = math.sin(half), math.cos(half)
+    s = math.sin(half)
+    c = math.cos(half)
     return geometry.Quaternion(
         x=c * x - s * y, y=c * y + s * x, z=c * z + s * w, w=c * w - s * z
     )
@@ -160,7 +164,8 @@ def pose_from_ros(
 
 def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) -> Array:
     """Returns the pose (3,) in the map of `initialpose`. Raises ConfigError if it can't be used."""
-    frame, pose = message.header.frame_id.strip("/"), pose_from_ros(message)[0]
+    frame = message.header.frame_id.strip("/")
+    pose = pose_from_ros(message)[0]
     if frame not in ("", map_frame):
         fix = f"give it in {map_frame!r}, as RViz does if that is its fixed frame."
         raise ConfigError(
@@ -187,7 +192,8 @@ def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
     message = OccupancyGrid(data=array.array("b", grid.cells.tobytes()))
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     info, (x, y, heading) = message.info, grid.origin
-    info.map_load_time, info.resolution = message.header.stamp, grid.resolution
+    info.map_load_time = message.header.stamp
+    info.resolution = grid.resolution
     info.height, info.width = grid.cells.shape
     info.origin.position.x, info.origin.position.y = x, y
     info.origin.orientation = heading_to_ros(heading)
@@ -196,7 +202,8 @@ def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
 
 def map_from_ros(message: OccupancyGrid) -> GridMap:
     """Returns the map of an OccupancyGrid. Raises ConfigError if sizes do not fit."""
-    info, cells = message.info, np.array(message.data, np.int8)
+    info = message.info
+    cells = np.array(message.data, np.int8)
     if (
         cells.size != info.height * info.width
         or not cells.size
@@ -206,7 +213,8 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
         raise ConfigError(
             f"map: {cells.size} cells are no {size}; look at who publishes it."
         )
-    place, turn = info.origin.position, info.origin.orientation
+    place = info.origin.position
+    turn = info.origin.orientation
     origin = place.x, place.y, heading_of(turn.x, turn.y, turn.z, turn.w)
     return GridMap(
         cells.reshape(info.height, info.width), float(info.resolution), origin

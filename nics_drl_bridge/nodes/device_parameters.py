@@ -21,7 +21,8 @@ from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 LOCKSTEP = "lockstep"
-START, GIVEN = "episode_start", "episode_start_given"
+START = "episode_start"
+GIVEN = "episode_start_given"
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 SLACK = (
@@ -95,7 +96,8 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
-    rate, dt = number(node, "odom_rate"), model.timing[0]
+    rate = number(node, "odom_rate")
+    dt = model.timing[0]
     odom = 1.0 / rate if rate else model.control_period
     scan = 1.0 / (number(node, "scan_rate") or model.lidar.rate)
     step = common_step(dt, (odom, scan)) * dt
@@ -105,7 +107,8 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     late = []
     for topic in ("scan", "odom"):
         own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
-        least, jitter = number(node, f"{topic}_latency"), number(node, "latency_jitter")
+        least = number(node, f"{topic}_latency")
+        jitter = number(node, "latency_jitter")
         chosen = (
             least if least >= 0.0 else own.least,
             jitter if jitter >= 0.0 else own.jitter,
@@ -215,10 +218,8 @@ class TopicPace:
     """Decides when a topic is due, so that its mean rate is the requested one with any step."""
 
     def __init__(self, period_ns: int, step_ns: int) -> None:
-        self._period_ns, self._slack_ns = (
-            period_ns,
-            step_ns // 2 if period_ns > step_ns else 0,
-        )
+        self._period_ns = period_ns
+        self._slack_ns = step_ns // 2 if period_ns > step_ns else 0
         self._next_ns = 0
 
     def begin(self, now_ns: int) -> None:
@@ -242,12 +243,14 @@ class RealTime:
     """Tracks by how many steps the world is behind the steady clock."""
 
     def __init__(self, step_ns: int, rate: float) -> None:
-        self._step_ns, self._rate = step_ns, rate
+        self._step_ns = step_ns
+        self._rate = rate
         self._began_ns = self._then_ns = 0
 
     def begin(self, steady_ns: int, now_ns: int) -> None:
         """Aligns a time of the steady clock with a simulated time."""
-        self._began_ns, self._then_ns = steady_ns, now_ns
+        self._began_ns = steady_ns
+        self._then_ns = now_ns
 
     def time_at(self, steady_ns: int) -> int:
         """Returns the simulated time [ns] at a time of the steady clock."""

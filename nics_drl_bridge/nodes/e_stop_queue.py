@@ -31,7 +31,8 @@ class EStopQueue:
 
     def tick(self, now: float) -> str:
         """Returns why the sleep since the last tick may have lost a press; else ""."""
-        before, self._ticked_s = self._ticked_s, now
+        before = self._ticked_s
+        self._ticked_s = now
         if before is None or not self._ever_heard:
             return ""
         asleep = now - before

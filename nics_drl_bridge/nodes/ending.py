@@ -74,7 +74,8 @@ def at_once() -> Iterator[None]:
         yield
         return
     handle = ctypes.CDLL(None).signal
-    handle.argtypes, handle.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
+    handle.argtypes = (ctypes.c_int, ctypes.c_void_p)
+    handle.restype = ctypes.c_void_p
     numbers = ending_signals()
     for number in numbers:
         handle(number, _leave)

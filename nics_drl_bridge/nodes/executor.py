@@ -42,7 +42,9 @@ class StandingExecutor(SingleThreadedExecutor):
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)
         self._entities: _Entities | None = None
-        self._changed, self.stands, self._handed_over_s = True, True, 0.0
+        self._changed = True
+        self.stands = True
+        self._handed_over_s = 0.0
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Waits for an event and handles it; raises ExternalShutdownException, see rclpy."""
@@ -58,7 +60,8 @@ class StandingExecutor(SingleThreadedExecutor):
         self._call(received)
         if received:  # to take what arrived meanwhile costs less than to wait for it
             self._call(self._come())
-        due, asked = list[Any](), list[Callable[[], object]]()
+        due = list[Any]()
+        asked = list[Callable[[], object]]()
         left = False
         try:
             if (
@@ -112,7 +115,8 @@ class StandingExecutor(SingleThreadedExecutor):
         for callback, arguments in received:
             handed_over |= callback(*arguments) is HANDED_OVER
         if handed_over:
-            before_s, self._handed_over_s = self._handed_over_s, time.monotonic()
+            before_s = self._handed_over_s
+            self._handed_over_s = time.monotonic()
             time.sleep(min(REST * (self._handed_over_s - before_s), LONGEST_REST_S))
 
     def _tick(self, timer: Any) -> None:
@@ -146,7 +150,8 @@ class StandingExecutor(SingleThreadedExecutor):
                 task.result()  # re-raises the callback's exception
 
     def _gathered(self) -> "_Entities":
-        nodes, now = self.get_nodes() if self._changed else [], self._entities
+        nodes = self.get_nodes() if self._changed else []
+        now = self._entities
         if now is None or (self._changed and now.all != _entities_of(nodes)):
             self._release()
             guards = [guard for guard in (self._guard, self._sigint_gc) if guard]
@@ -227,7 +232,8 @@ class _Entities:
 
     def asked(self) -> list[Callable[[], object]]:
         """Takes requests to services and answers to clients; returns how each is handled."""
-        ready, found = self._wait_set.get_ready_entities, list[Callable[[], object]]()
+        ready = self._wait_set.get_ready_entities
+        found = list[Callable[[], object]]()
         for service in _known(self._services, ready("service")):
             request, header = service.handle.service_take_request(
                 service.srv_type.Request

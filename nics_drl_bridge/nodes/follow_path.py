@@ -33,17 +33,22 @@ from nics_drl_bridge.policy.follow import (
 from nics_drl_bridge.policy.route import route
 from nics_drl_bridge.recording.messages import pose_row
 
-FOLLOW, NAVIGATE = "follow_path", "navigate_to_pose"
+FOLLOW = "follow_path"
+NAVIGATE = "navigate_to_pose"
 KINDS = {
     FOLLOW: "nav2_msgs/action/FollowPath",
     NAVIGATE: "nav2_msgs/action/NavigateToPose",
 }
-SUCCEED, ABORT, CANCELED = "succeed", "abort", "canceled"
+SUCCEED = "succeed"
+ABORT = "abort"
+CANCELED = "canceled"
 SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
 LOOK_S = 2.0  # time between two looks for another server of `navigate_to_pose` [s]
 PATIENT_PERIODS = 10  # silence of this many control periods is no silence
 TURNING = 1.5  # turn rate at the goal, by the angle that is left [1/s]
-LEAST_TURN, SLOWEST = 0.3, 0.1  # [rad/s], and for the time that is left [m/s]
+# [rad/s], and for the time that is left [m/s]
+LEAST_TURN = 0.3
+SLOWEST = 0.1
 
 
 class Refusal(Exception):  # noqa: N818  (an outcome, by the standard's code)
@@ -76,7 +81,8 @@ class HeldActionServer(ActionServer):
         begin: Callable[[Any], None],
     ) -> None:
         self._begin = begin
-        accept, reject = GoalResponse.ACCEPT, GoalResponse.REJECT
+        accept = GoalResponse.ACCEPT
+        reject = GoalResponse.REJECT
         super().__init__(
             node,
             kind,
@@ -141,13 +147,13 @@ class PathActions:
         drive: Callable[[Array], Wish],
         anew: Callable[[], None],
     ) -> None:
-        self._node, self._topics, self._frames, self._robot = (
-            node,
-            topics,
-            frames,
-            model.robot,
-        )
-        self._parameters, self._drive, self._anew = parameters, drive, anew
+        self._node = node
+        self._topics = topics
+        self._frames = frames
+        self._robot = model.robot
+        self._parameters = parameters
+        self._drive = drive
+        self._anew = anew
         self._run: Run | None = None
         self._map: tuple[str, GridMap] | None = None  # and its frame
         self._limit = math.inf  # of the speed [m/s]
@@ -246,7 +252,8 @@ class PathActions:
     # A goal begins.
 
     def _accept(self, goal: Goal, begin: Callable[[Goal], Run]) -> None:
-        before, self._run = self._run, None
+        before = self._run
+        self._run = None
         try:
             run = self._run = begin(goal)
             if before is not None and before.frame == run.frame:
@@ -265,7 +272,8 @@ class PathActions:
             )
 
     def _follow(self, goal: Goal) -> Run:
-        asked, names = goal.handle.request, []
+        asked = goal.handle.request
+        names = []
         for what, those in self._parameters.names.items():
             name, wrong = chosen(
                 what.replace("_", " "), getattr(asked, f"{what}_id", ""), those
@@ -350,7 +358,8 @@ class PathActions:
         if self._map is None:
             return
         wanted, grid = self._map
-        here, there = self._frames.robot_in(frame), self._frames.robot_in(wanted)
+        here = self._frames.robot_in(frame)
+        there = self._frames.robot_in(wanted)
         if here is None or there is None:
             return
         points = geometry.compose(there, geometry.between(here, poses))[:, :2]
@@ -375,7 +384,8 @@ class PathActions:
             return True
         longest = number(self._node, "costmap_update_timeout")
         longest = max(longest, PATIENT_PERIODS * self._period_s)
-        newest, now_ns = self._topics.middleware.cache.newest, self._topics.now_ns()
+        newest = self._topics.middleware.cache.newest
+        now_ns = self._topics.now_ns()
         silent = [
             topic
             for topic in (SCAN, ODOM)
@@ -469,7 +479,8 @@ class PathActions:
 
     def stop(self, why: str) -> None:
         """Aborts the goal, if there is one."""
-        run, self._run = self._run, None
+        run = self._run
+        self._run = None
         if run is not None:
             self._end(run.goal, ABORT, "UNKNOWN", f"{why}.")
 

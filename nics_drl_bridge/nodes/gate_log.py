@@ -53,7 +53,8 @@ class GateLog:
         self.counters: Counter[str] = Counter()
         self._config = config
         self._logger = logger
-        self._folder, self._hardware = folder, robot
+        self._folder = folder
+        self._hardware = robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
         self._rule: str | None = (
@@ -76,7 +77,8 @@ class GateLog:
     def note(self, entry: Entry) -> None:
         """Accounts for a decision."""
         self._record(entry)
-        decision, cause = entry.decision, entry.decision.cause
+        decision = entry.decision
+        cause = entry.decision.cause
         self._now = entry.now
         if decision.refused:
             self.refuse(decision.refused)
@@ -144,7 +146,9 @@ class GateLog:
 
     def _changed(self, rule: str) -> None:
         was_passing = self._rule == ""
-        self._rule, self._since, self._owed = rule, self._now, True
+        self._rule = rule
+        self._since = self._now
+        self._owed = True
         self._kept[rule] += 1
         if not rule:
             return

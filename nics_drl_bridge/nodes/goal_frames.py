@@ -22,7 +22,8 @@ class GoalFrames:
     """
 
     def __init__(self, node: Node, topics: RobotTopics) -> None:
-        self._node, self._topics = node, topics
+        self._node = node
+        self._topics = topics
         self._mounted: dict[
             str, tuple[str, Array]
         ] = {}  # frame: its parent, and its pose there

@@ -266,7 +266,8 @@ def description(setup: Setup) -> Iterator[Any]:
         ("/map", f"/{setup.robots[0].transforms}/map".replace("//", "/"))
     ]  # of all robots
     topics += [(f"/{topic}", topic) for topic in SHOWN]
-    words, wanted = ("-d", setup["rviz_config"]), IfCondition(setup["rviz"] or "false")
+    words = ("-d", setup["rviz_config"])
+    wanted = IfCondition(setup["rviz"] or "false")
     yield setup.node(
         "rviz2", "rviz2", setup.robots[0], timed, words, topics, condition=wanted
     )
@@ -326,10 +327,8 @@ def of_nodes() -> list[Any]:
 
 def of_simulator(robots: str = "") -> list[Any]:
     """Returns the arguments of a simulator."""
-    kinds, start = (
-        ["simulator", "mujoco"],
-        "x, y, heading [m, rad] of each robot; empty: drawn",
-    )
+    kinds = ["simulator", "mujoco"]
+    start = "x, y, heading [m, rad] of each robot; empty: drawn"
     return [
         argument("simulator", kinds[0], "The fast simulator, or MuJoCo", choices=kinds),
         argument("world", "", "Shipped world, or a YAML file; empty: of params_file"),

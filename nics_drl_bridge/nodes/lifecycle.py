@@ -16,7 +16,8 @@ from nics_drl_bridge.nodes.parameters import Row, frame_fault, managed, sensors
 from nics_drl_bridge.nodes.qos import QosWatch, copied
 from nics_drl_bridge.nodes.runner import ACTIVE, INACTIVE, UNCONFIGURED, declare_row
 
-SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+SUCCESS = TransitionCallbackReturn.SUCCESS
+FAILURE = TransitionCallbackReturn.FAILURE
 
 
 class ManagedNode(QosWatch, LifecycleNode):
@@ -33,10 +34,9 @@ class ManagedNode(QosWatch, LifecycleNode):
         if fault := frame_fault(self._parameters.values()):
             raise ConfigError(fault)
         self._autostart = bool(values[0])
-        self.state, self._starting = (
-            UNCONFIGURED,
-            False,
-        )  # `state`: the last primary one
+        # `state`: the last primary one
+        self.state = UNCONFIGURED
+        self._starting = False
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)
 

@@ -42,7 +42,8 @@ from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-SPIN_S, POLL_S = 0.2, 0.002
+SPIN_S = 0.2
+POLL_S = 0.002
 NO_RANDOMISATION = "none"
 LOST_S = (
     1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
@@ -192,7 +193,8 @@ class Link:
         advice: str,
     ) -> None:
         """Waits until all peers are matched. Raises BackendError with what is missing."""
-        node, commands = self.node, self.commands
+        node = self.node
+        commands = self.commands
         needed = dict[str, Callable[[], Any]]()
         needed[f"subscriber of {self._topic}"] = commands.get_subscription_count
         for name in map(node.resolve_topic_name, topics):
@@ -312,7 +314,9 @@ class CommandTimeout:
 
     # No reference to the link is kept, because it may be garbage.
     def __init__(self, publisher: Publisher, kind: Any, limit_s: float) -> None:
-        self._publisher, self._kind, self._limit_s = publisher, kind, limit_s
+        self._publisher = publisher
+        self._kind = kind
+        self._limit_s = limit_s
         self._due_s = self._answered_s = math.inf
         self.moving = False  # the last command that was sent is none of zero
 
@@ -358,10 +362,8 @@ class EpisodeServices:
     ) -> None:
         self._link = link
         self._identity = identity(model, world, randomisation)
-        client, setting = (
-            link.node.create_client,
-            f"{simulator}/set_parameters_atomically",
-        )
+        client = link.node.create_client
+        setting = f"{simulator}/set_parameters_atomically"
         self._parameters = client(SetParametersAtomically, setting)
         self._reset = client(Trigger, f"{simulator}/reset")
         self._repeat = client(Trigger, f"{simulator}/repeat")
@@ -382,20 +384,20 @@ class EpisodeServices:
 
     def repeat(self) -> None:
         """Requests the present data again, without waiting, unless such a request is pending."""
-        now, asked = time.monotonic(), self._repeating
+        now = time.monotonic()
+        asked = self._repeating
         if asked is not None and not asked.done():
             if now - self._asked_s < LOST_S:
                 return
             self._repeat.remove_pending_request(asked)
         if self._repeat.service_is_ready():
-            self._repeating, self._asked_s = (
-                self._repeat.call_async(Trigger.Request()),
-                now,
-            )
+            self._repeating = self._repeat.call_async(Trigger.Request())
+            self._asked_s = now
 
     def begin(self, start: Start, timeout_s: float) -> int:
         """Begins an episode; returns the stamp of its first data [ns]. Raises BridgeError."""
-        seed, pose = int(start.seed), start.pose.ravel().tolist()
+        seed = int(start.seed)
+        pose = start.pose.ravel().tolist()
         chosen = {
             "episode_seed": seed,
             "episode_start": pose,

@@ -21,7 +21,9 @@ from nics_drl_bridge.report.doctor_facts import (
 )
 
 NAME = "nics_doctor"
-SPIN_S, LOOK_S, DISCOVERY_S = 0.1, 0.5, 10.0
+SPIN_S = 0.1
+LOOK_S = 0.5
+DISCOVERY_S = 10.0
 ANY_PUBLISHER = profile_of(
     Offer(100, reliable=False)
 )  # matches any offer, so hears every topic
@@ -37,7 +39,9 @@ def listen(
     executor.add_node(node)
     facts = Facts(f"the robot in {namespace or '/'}", True, names_in(namespace, imu))
     subscribed: set[str] = set()
-    began, looked, end = time.monotonic(), 0.0, None
+    began = time.monotonic()
+    looked = 0.0
+    end = None
     try:
         while time.monotonic() < (began + DISCOVERY_S if end is None else end):
             if time.monotonic() - looked > LOOK_S:
@@ -79,7 +83,8 @@ def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
         wanted = [kind for kind in there.types if kind in KINDS[role]]
         if there.offers and wanted and role not in subscribed:
             subscribed.add(role)
-            kind, take = message_type(wanted[0]), partial(_take, facts, role)
+            kind = message_type(wanted[0])
+            take = partial(_take, facts, role)
             node.create_subscription(kind, topic, take, ANY_PUBLISHER)
 
 

@@ -48,9 +48,11 @@ class MapToOdom:
     """
 
     def __init__(self, node: Node, tolerance_s: float) -> None:
-        self._node, self._ahead_ns = node, round(tolerance_s * NS_PER_S)
+        self._node = node
+        self._ahead_ns = round(tolerance_s * NS_PER_S)
         self._own: deque[Any] = deque(maxlen=KEPT)  # transforms
-        self._frames, self._heard_s = ("", ""), -math.inf
+        self._frames = ("", "")
+        self._heard_s = -math.inf
         self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._kind is None:
             told = "the package tf2_msgs is not installed, so that map -> odom is not published"

@@ -91,7 +91,8 @@ class MiddlewareNode(ManagedNode):
         if new := sorted(health.rejected.keys() - self._rejected.keys()):
             told = shortened("; ".join(new), LONGEST)
             self.get_logger().warning(f"not used, but counted in /diagnostics: {told}")
-        awaited, missing = self._topics.expected, ""
+        awaited = self._topics.expected
+        missing = ""
         if self._topics.lacks_gyro:
             missing = "nobody publishes one, though the model was made with it: the wheels turn"
             self.get_logger().warning(f"imu: {missing}", once=True)
@@ -109,11 +110,9 @@ def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) 
 
     `before` are earlier counts of `health.rejected`: what has grown since is refused, not silent.
     """
-    silent, since, told = (
-        [topic for topic in expected if topic not in health.topics],
-        "yet",
-        [],
-    )
+    silent = [topic for topic in expected if topic not in health.topics]
+    since = "yet"
+    told = []
     if not silent:
         silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
         since = f"for {SILENCE_S:g} s"

@@ -51,10 +51,8 @@ class ControllerParameters:
 
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
         """Returns the checks of two names, as Nav2's checkers of these plugins make them."""
-        arrives, gets_on = (
-            self._filled(GoalCheck, goal),
-            self._filled(ProgressCheck, progress),
-        )
+        arrives = self._filled(GoalCheck, goal)
+        gets_on = self._filled(ProgressCheck, progress)
         kinds = [
             str(self._node.get_parameter(f"{name}.plugin").value)
             for name in (goal, progress)

@@ -17,7 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 PROGRAM = Path(__file__).with_name("output_forwarder.py")
-STDOUT, STDERR = 1, 2
+STDOUT = 1
+STDERR = 2
 PIPE_BYTES = 2**20  # most that Linux gives a user's process
 COLOUR = (
     "RCUTILS_COLORIZED_OUTPUT"  # of ROS 2: whether log lines are coloured, "0" or "1"

@@ -11,7 +11,8 @@ from nics_drl_bridge.errors import shortened
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 MODES = ("realtime", "lockstep", "as_fast_as_possible")
-NO_POSE, POSE_TYPES = "none", ("PoseStamped", "PoseWithCovarianceStamped")
+NO_POSE = "none"
+POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
 OWN = -1.0  # of a delay: as in the model
 HIGHEST_PRIORITY = 99
 PLAIN_TWISTS = (
@@ -20,7 +21,8 @@ PLAIN_TWISTS = (
     "jazzy",
 )  # distributions whose robots are driven by a Twist
 STAMPED = "enable_stamped_cmd_vel"
-FRAME, MAY_BE_EMPTY = re.compile(r"[^\s/]\S{0,254}"), ("footprint_frame",)
+FRAME = re.compile(r"[^\s/]\S{0,254}")
+MAY_BE_EMPTY = ("footprint_frame",)
 
 
 class Row(NamedTuple):
@@ -53,7 +55,8 @@ def stamped(what: str) -> Row:
     return Row(STAMPED, stamped_by_default(), about)
 
 
-IMU, AUTO = "imu", "auto"
+IMU = "imu"
+AUTO = "auto"
 ABOUT_IMU = (
     "Topic of the gyro that turns odometry. auto: imu or imu/data, if the model was made with a "
     "gyro; none: the wheels alone."
@@ -236,7 +239,8 @@ def nav2() -> list[Row]:
 
 def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Returns the parameters of the checks of these names, as of Nav2's own checkers."""
-    span, plugin = (0.0, 1e6), "Nav2's checker to imitate."
+    span = (0.0, 1e6)
+    plugin = "Nav2's checker to imitate."
     rows: tuple[list[tuple[str, Any, str, tuple[float, float] | None]], ...] = (
         [
             ("xy_goal_tolerance", 0.25, "Greatest distance from the goal [m].", span),

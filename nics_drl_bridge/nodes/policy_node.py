@@ -136,7 +136,8 @@ class PolicyNode(ManagedNode):
             return
         if self._actions.tick():
             self._raw.publish(self._message(np.zeros(3), self._acted_ns))
-        newest, begin_s = self._topics.middleware.cache.newest, time.monotonic()
+        newest = self._topics.middleware.cache.newest
+        begin_s = time.monotonic()
         needed = (SCAN, ODOM, *(sensor.name for sensor in self._task.sensors))
         if not newest.keys() >= set(needed):
             return
@@ -165,7 +166,8 @@ class PolicyNode(ManagedNode):
     def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, warns=False, facts={})
-        done, longest = self._deadline, f"{1e3 * self._deadline.longest_s:.2f}"
+        done = self._deadline
+        longest = f"{1e3 * self._deadline.longest_s:.2f}"
         facts = {
             "answered": done.answered,
             "late": done.late,

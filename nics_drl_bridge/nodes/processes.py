@@ -27,8 +27,12 @@ from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, holds, open_context
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
-PR_SET_PDEATHSIG, LOG_LINES = 1, 5
-PATIENCE_S, ASK_AGAIN_S, ANSWER_S, POLL_S = 5.0, 0.2, 2.0, 0.005
+PR_SET_PDEATHSIG = 1
+LOG_LINES = 5
+PATIENCE_S = 5.0
+ASK_AGAIN_S = 0.2
+ANSWER_S = 2.0
+POLL_S = 0.005
 
 
 def free_domain_id() -> int:

@@ -36,7 +36,8 @@ except ModuleNotFoundError:  # Humble
 
 def profile_of(offer: Offer) -> QoSProfile:
     """Returns an offer, or a request, as a profile."""
-    reliability, durability = rclpy_qos.ReliabilityPolicy, rclpy_qos.DurabilityPolicy
+    reliability = rclpy_qos.ReliabilityPolicy
+    durability = rclpy_qos.DurabilityPolicy
     return QoSProfile(
         history=rclpy_qos.HistoryPolicy.KEEP_LAST,
         depth=offer.depth,
@@ -93,7 +94,8 @@ DIAGNOSTICS = profile_of(
     Offer(10)
 )  # as the diagnostic aggregator expects `/diagnostics`
 
-MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"
+MOMENT_S = 0.5
+UNKNOWN = "_UNKNOWN_"
 MOST_WAITING = 10_000  # messages that are taken at once, if a publisher never pauses
 
 OVERRIDES = (

@@ -20,14 +20,13 @@ from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_
 from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-POLL_S, SAY_EVERY_S = 0.01, 2.0
+POLL_S = 0.01
+SAY_EVERY_S = 2.0
 SERVICES_S = (
     0.5  # a peer that shows no services this long after its topics is a vehicle [s]
 )
-COMMAND_S, PERIODS = (
-    0.5,
-    2,
-)  # least time and periods that a command lasts; then a zero follows
+COMMAND_S = 0.5  # least time and periods that a command lasts
+PERIODS = 2  # then a zero follows
 STILL = (0.02, 0.05)  # a slower robot is at rest [m/s, rad/s]
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
@@ -85,7 +84,8 @@ class RealtimeBackend:
 
     def __init__(self, model: SimulatorModel, world: AnyWorld, **options: Any) -> None:
         chosen = validate(options, RealtimeOptions, "backend_options")
-        self._options, self._robot = chosen, model.robot
+        self._options = chosen
+        self._robot = model.robot
         self._period_ns = round((chosen.period_s or model.control_period) * NS_PER_S)
         self._deadline_ns = self._misses = 0
         self._scan_ns = 0  # stamp of the scan in the newest view [ns]
@@ -141,7 +141,8 @@ class RealtimeBackend:
                 self._topics.begin(stamp_ns, start.pose)
             if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
                 raise StaleDataError(*self._oldest(), timeout_s)
-        self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
+        self._misses = 0
+        self._deadline_ns = time.monotonic_ns() + self._period_ns
         return self._fresh_view()[0]
 
     def present_pose(self) -> Array:
@@ -160,7 +161,8 @@ class RealtimeBackend:
 
     def _await_start(self, start: Start | None) -> None:
         say = self._options.say or self._link.node.get_logger().info
-        began, said = time.monotonic(), -math.inf
+        began = time.monotonic()
+        said = -math.inf
         while (start is None or self._is_vehicle()) and (
             missing := self._missing(start)
         ):
@@ -191,7 +193,8 @@ class RealtimeBackend:
         if start is None or self._options.start == "present":
             return ""
         off = geometry.between(view.pose, start.pose)
-        distance, turn = math.hypot(*off[:2]), math.degrees(abs(off[2]))
+        distance = math.hypot(*off[:2])
+        turn = math.degrees(abs(off[2]))
         if (
             distance <= self._options.tolerance[0]
             and abs(off[2]) <= self._options.tolerance[1]

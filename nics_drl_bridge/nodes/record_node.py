@@ -84,7 +84,9 @@ class DriveLog:
     def __init__(
         self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]
     ) -> None:
-        self._spec, self._roles, self._now = spec, roles, now
+        self._spec = spec
+        self._roles = roles
+        self._now = now
         # Topic, or `odom twist` -> receipt [ns], stamp [ns] or 0, and values of each message.
         self.rows: dict[str, list[tuple[int, int, Array]]] = defaultdict(list)
         self._joints: list[Message] = []
@@ -96,7 +98,8 @@ class DriveLog:
 
     def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
         """Adds a message; returns False if it is not finite, or not newer than the last."""
-        rows, values = self.rows[topic], np.asarray(values, np.float64)
+        rows = self.rows[topic]
+        values = np.asarray(values, np.float64)
         if (rows and 0 != header_ns <= rows[-1][1]) or not np.isfinite(values).all():
             return False
         rows.append((self._now(), header_ns, values))
@@ -104,7 +107,8 @@ class DriveLog:
 
     def odometry(self, message: Odometry) -> Array | None:
         """Records an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
-        header, pose = stamp(message), np.array(pose_row(message))
+        header = stamp(message)
+        pose = np.array(pose_row(message))
         if not self.add("odom", header, pose):
             return None
         self.add("odom twist", header, twist_row(message))
@@ -126,7 +130,8 @@ class DriveLog:
                 f"topic 'joint_states': nothing has arrived, but {what} {fix}"
             )
         receive, header = np.array([row[:2] for row in self.rows["odom"]]).T
-        heard, rate = (receive[-1] - receive[0]) / NS_PER_S, pace(receive, header)
+        heard = (receive[-1] - receive[0]) / NS_PER_S
+        rate = pace(receive, header)
         if not SAME_PACE[0] <= rate <= SAME_PACE[1]:
             off = f"its stamps went on by {rate * heard:.2f} s within {heard:.2f} s"
             fix = "take the time of a simulator by --use-sim-time, or -p use_sim_time:=true."
@@ -167,10 +172,12 @@ class DriveLog:
 
 def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
     """Returns seconds by stamp per second of receipt, by the least delayed of each half."""
-    heard, stamped = receive[-1] - receive[0], header[-1] - header[0]
+    heard = receive[-1] - receive[0]
+    stamped = header[-1] - header[0]
     if heard <= 0 or stamped <= 0:
         return 1.0
-    delay, half = receive - header, len(receive) // 2
+    delay = receive - header
+    half = len(receive) // 2
     apart = heard * half / (len(delay) - 1)
     return float(1.0 - (delay[half:].min() - delay[:half].min()) / apart)
 
@@ -217,7 +224,8 @@ class RecordNode(qos.QosWatch):
             self.create_subscription(
                 Imu, topic, partial(self._take_imu, topic), qos.SENSOR
             )
-        self._began, self._heard = time.monotonic(), -np.inf
+        self._began = time.monotonic()
+        self._heard = -np.inf
         self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
         self._frame = ""  # of the robot, by its odometry
@@ -288,7 +296,8 @@ class RecordNode(qos.QosWatch):
             self._start, self._origin_ns = self._pose, self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:
-            odom, command = ("odom", "nothing arrived"), ("cmd_vel", "nobody listened")
+            odom = ("odom", "nothing arrived")
+            command = ("cmd_vel", "nobody listened")
             name, missing = odom if self._pose is None else command
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
             reason = f"{missing} within {PATIENCE_S:g} s"
@@ -317,14 +326,16 @@ class RecordNode(qos.QosWatch):
         self._send(command)
 
     def _guard(self) -> None:
-        age, limit = time.monotonic() - self._heard, self._order.odom_timeout
+        age = time.monotonic() - self._heard
+        limit = self._order.odom_timeout
         if age > limit:
             reason = f"nothing new for {age:.2f} s, which may be {limit:g} s"
             place = self._place("odom")
             raise BackendError(
                 f"topic {place}: {reason}; find out why odometry stopped."
             )
-        bound, radius = self._order.plan.bound, self._order.plan.robot.footprint_radius
+        bound = self._order.plan.bound
+        radius = self._order.plan.robot.footprint_radius
         x, y, _ = geometry.between(
             self._start, self._start if self._pose is None else self._pose
         )
@@ -352,7 +363,8 @@ class RecordNode(qos.QosWatch):
 
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
         self.outcome = DriveResult(complete, failure, None, "")
-        recording, told = None, "the robot was not moved, nothing is recorded"
+        recording = None
+        told = "the robot was not moved, nothing is recorded"
         if self._ticks:
             self._halt()
             recording, told = self._save()

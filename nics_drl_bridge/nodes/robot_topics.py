@@ -73,24 +73,21 @@ class RobotTopics:
         on_lidar: Callable[[LidarSpec], None] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
-        self._node, self._model, self._robot, self._lidar = (
-            node,
-            model,
-            model.robot,
-            model.lidar,
-        )
+        self._node = node
+        self._model = model
+        self._robot = model.robot
+        self._lidar = model.lidar
         self._robot.require_cmd_vel()
         self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))
         self.lock = threading.RLock()
         self.middleware = Middleware(model)
         self.restart()
-        self._on_odometry, self._on_scan, self._on_lidar = (
-            on_odometry,
-            on_scan,
-            on_lidar,
-        )
+        self._on_odometry = on_odometry
+        self._on_scan = on_scan
+        self._on_lidar = on_lidar
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
-        self._header, self._told = b"", ""
+        self._header = b""
+        self._told = ""
         self._placed: tuple[Array, Array] | None = (
             None  # pose and covariance of `initialpose`
         )
@@ -166,13 +163,16 @@ class RobotTopics:
 
     def restart(self) -> None:
         """Clears all state; the next odometry starts anew."""
-        self._started, self._since_ns, self._placed = False, 0, None
+        self._started = False
+        self._since_ns = 0
+        self._placed = None
         self.frames = ("", "")  # of the newest odometry: its own, and the robot's
         self.middleware.reset(0, np.zeros(3))
 
     def begin(self, stamp_ns: int, pose: Array) -> None:
         """Clears all state before a stamp [ns], at which the robot stands at a pose (3,)."""
-        self._started, self._since_ns = True, stamp_ns
+        self._started = True
+        self._since_ns = stamp_ns
         self.middleware.reset(stamp_ns, pose)
 
     def place(self, pose: Array) -> None:
@@ -259,7 +259,8 @@ class RobotTopics:
         header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
         if header == self._header or self._on_lidar is None:
             return self._reader
-        self._header, self._reader = header, None
+        self._header = header
+        self._reader = None
         upside_down = bool(self._node.get_parameter("lidar_upside_down").value)
         try:
             reader = conversions.reader_from_ros(

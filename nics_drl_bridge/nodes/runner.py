@@ -37,11 +37,15 @@ from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
 UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
-UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
+UNCONFIGURED = "unconfigured"
+INACTIVE = "inactive"
+ACTIVE = "active"
 DELIVERY_S = 0.5
 GREATEST_DOMAIN_ID = 232  # above it there are no ports
 EXIT_BAD_INPUT = 2
-SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
+# time until the graph shows all nodes [s]
+SETTLE_S = 0.3
+POLL_S = 0.02
 ANSWER_S = 1.5  # a node that does not answer within it is dead; the graph shows it for 20 s more
 DIAGNOSTICS_S = 1.0
 RANGES = {
@@ -105,7 +109,9 @@ def run_node(
 
     for number in ending_signals():
         signal.signal(number, end)
-    context, node, alone = None, None, contextlib.ExitStack()
+    context = None
+    node = None
+    alone = contextlib.ExitStack()
     try:
         with at_once():
             words = sys.argv if args is None else args
@@ -265,10 +271,12 @@ def declare(
     if span is not None:
         kind, field = RANGES[type(default)]
         setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
-    given, many = given_values(node), isinstance(default, list)
+    given = given_values(node)
+    many = isinstance(default, list)
     # rclpy itself refuses an integer, as in `rate:=2`, for a floating-point parameter.
     if name in given and isinstance(default[0] if many else default, float):
-        types, value = Parameter.Type, given[name].value
+        types = Parameter.Type
+        value = given[name].value
         if given[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
             value = [float(each) for each in value] if many else float(value)
             given[name] = Parameter(

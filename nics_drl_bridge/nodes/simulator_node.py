@@ -46,11 +46,11 @@ from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, vari
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-CLOCK, CLOCK_NS = (
-    "/clock",
-    15_000_000,
-)  # longest time between two messages in real time [ns]
-WATCH_S, QUIET_S = 2.0, 5.0
+# longest time between two messages in real time [ns]
+CLOCK = "/clock"
+CLOCK_NS = 15_000_000
+WATCH_S = 2.0
+QUIET_S = 5.0
 LONGEST_TICK_S = (
     0.005  # longest time between two checks for delayed data that are due [s]
 )
@@ -117,7 +117,9 @@ class RobotPort:
         time: device_parameters.DeviceTiming,
         outbox: Outbox,
     ) -> None:
-        self._node, self._model, self.frames = node, model, frames
+        self._node = node
+        self._model = model
+        self.frames = frames
         self._outbox = outbox
         self._publishers: list[Publisher] = []
         self._send = partial(outbox.send, late=time.odom_late_ns)
@@ -131,10 +133,8 @@ class RobotPort:
             return made
 
         self._scans = publisher(LaserScan, "scan")
-        self._odoms, self._truths = (
-            publisher(Odometry, "odom"),
-            publisher(Odometry, "ground_truth"),
-        )
+        self._odoms = publisher(Odometry, "odom")
+        self._truths = publisher(Odometry, "ground_truth")
         self._joints = publisher(JointState, "joint_states")
         self._sensors = [
             (each, frames.prefix + each.frame, publisher(sensor_type(each), each.name))
@@ -148,10 +148,8 @@ class RobotPort:
         self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
         self._scan = wire.ScanWriter(scan)
         linear, _, turn = variances(model.noise.odometry)
-        odom, truth = (
-            (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn),
-            (LEAST_VARIANCE,) * 4,
-        )
+        odom = (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn)
+        truth = (LEAST_VARIANCE,) * 4
         at_rest = partial(conversions.odometry_to_ros, np.zeros(3), np.zeros(3), 0)
         self._odom = wire.OdometryWriter(at_rest((frames.odom, frames.base), odom))
         self._truth = wire.OdometryWriter(at_rest((frames.map, frames.base), truth))
@@ -220,17 +218,19 @@ class CommandInlet:
         take: Callable[[Array], None],
         too_old: Callable[[int], bool],
     ) -> None:
-        self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
+        self._node = node
+        self._robot = robot
+        self._take = take
+        self._too_old = too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         self._kind = name_of(stamped)
-        kind, hear = (
-            TwistStamped if stamped else Twist,
-            partial(self._on_bytes, stamped),
-        )
+        kind = TwistStamped if stamped else Twist
+        hear = partial(self._on_bytes, stamped)
         heard = node.create_subscription(
             kind, f"{namespace}cmd_vel", hear, quality, raw=True
         )
-        self._topic, self.heard = heard.topic_name, [heard]
+        self._topic = heard.topic_name
+        self.heard = [heard]
         self._types = TypeWatch(node, f"{namespace}cmd_vel")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
@@ -306,7 +306,9 @@ class DeviceNode(qos.QosWatch):
         self.model = device_parameters.timed_model(self, model, self._time)
         self._make = make
         self.use_world(load_worlds(str(self.get_parameter("world").value)))
-        self.paused, self._lags, self._hardware = False, 0, model.robot.name
+        self.paused = False
+        self._lags = 0
+        self._hardware = model.robot.name
         self._told_ns = 0  # newest time on `/clock`
         self.device.advance()  # compiles before anything waits for it
         self._first_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
@@ -617,10 +619,8 @@ class DeviceNode(qos.QosWatch):
         try:
             self._require_world()
             self.pause(bool(request.data))
-            response.success, response.message = (
-                True,
-                "paused" if self.paused else "running",
-            )
+            response.success = True
+            response.message = "paused" if self.paused else "running"
         except BridgeError as error:
             response.success, response.message = False, str(error)
         return response
@@ -640,12 +640,14 @@ class DeviceNode(qos.QosWatch):
     def _publish(self) -> None:
         now_ns = self.now_ns
         self._tell_time(now_ns)
-        odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
+        odom_due = self._odom_pace.due(now_ns)
+        scan_due = self._scan_pace.due(now_ns)
         if odom_due or scan_due:
             self._publish_data(odom_due, scan_due)
 
     def _publish_data(self, odom_due: bool, scan_due: bool) -> None:
-        now_ns, moving = self.now_ns, []
+        now_ns = self.now_ns
+        moving = []
         for k, port in enumerate(self._ports):
             sensed = self.device.sensed(k)
             if odom_due:
@@ -669,7 +671,8 @@ def fast_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> FastSimulator:
     """Makes the fast simulator, with the lidar that the parameter `renderer` names."""
-    renderer, tell = declare_renderer(node, "baked"), node.get_logger().warning
+    renderer = declare_renderer(node, "baked")
+    tell = node.get_logger().warning
     drawn = device_parameters.randomisation(node)
     given: Any = {"renderer": renderer, "randomisation": drawn, "tell": tell}
     return FastSimulator(model, world, robots=robots, **given)

@@ -23,11 +23,9 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from nics_drl_bridge.errors import BackendError
 
-RANGE, LOCAL, ONLY_LOCAL = (
-    "ROS_AUTOMATIC_DISCOVERY_RANGE",
-    "LOCALHOST",
-    "ROS_LOCALHOST_ONLY",
-)
+RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+LOCAL = "LOCALHOST"
+ONLY_LOCAL = "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
 OTHER_RANGES = (
     "SUBNET",
@@ -36,25 +34,23 @@ OTHER_RANGES = (
     "",
 )  # rcl treats any other value as LOCALHOST
 OLDEST_DISTRIBUTION = "humble"  # it has no discovery ranges
-TRANSPORTS, UDP = "FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"
+TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
+UDP = "UDPv4"
 PROFILE = Path(__file__).with_name("this_machine.xml")
 # The same variable in Fast DDS 3 and 2 (the library's name tells), and files that it reads here.
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 PROFILES_HERE = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
-FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = (
-    b"libfastrtps.so",
-    (OLDEST_DISTRIBUTION, "iron", "jazzy"),
-)
+FAST_DDS_2 = b"libfastrtps.so"
+FAST_DDS_2_DISTRIBUTIONS = (OLDEST_DISTRIBUTION, "iron", "jazzy")
 PEERS = (
     "ROS_DISCOVERY_SERVER",
     "ROS_STATIC_PEERS",
 )  # discovery that the profile does not do
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
 TABLE = Path("/proc/net/udp")
-FIRST_PORT, PORTS_OF_A_DOMAIN = (
-    7400,
-    250,
-)  # RTPS: a domain's first is that of its multicast
+# RTPS: a domain's first is that of its multicast
+FIRST_PORT = 7400
+PORTS_OF_A_DOMAIN = 250
 
 
 def stays_here(environment: Mapping[str, str]) -> bool:

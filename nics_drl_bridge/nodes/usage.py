@@ -7,8 +7,10 @@ from typing import Any
 from nics_drl_bridge.nodes.parameters import NODES, Row
 
 HELP = ("-h", "--help")
-ROS, END = "--ros-args", "--"
-WIDTH, INDENT = 100, 4
+ROS = "--ros-args"
+END = "--"
+WIDTH = 100
+INDENT = 4
 
 
 def help_of(node: str) -> str:

@@ -23,7 +23,8 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
-NAME, GATE = "nics_watch", ": gate"
+NAME = "nics_watch"
+GATE = ": gate"
 PERIOD_S = 1.0 / 30.0
 SIDE_M = 10.0  # of the field that is shown where no world is given
 
@@ -50,12 +51,11 @@ class RosSource:
         self._within = (
             None if world is None else world.members[0]
         )  # the one that is shown
-        self._model, self.period_s, self._title = (
-            model,
-            PERIOD_S,
-            namespace or "live topics",
-        )
-        self._trail, self._goal = Track(), np.zeros((0, 2))
+        self._model = model
+        self.period_s = PERIOD_S
+        self._title = namespace or "live topics"
+        self._trail = Track()
+        self._goal = np.zeros((0, 2))
         self._gate: str | None = None
         self._truth: Array | None = None
         self._map_frame = (
@@ -109,7 +109,8 @@ class RosSource:
     def frame(self) -> Frame:
         """See `show.FrameSource`."""
         with self._topics.lock:
-            middleware, view = self._topics.middleware, self._topics.view()
+            middleware = self._topics.middleware
+            view = self._topics.view()
             command = middleware.commanded
             covariance = middleware.estimator.covariance[None, :3, :3].copy()
             heard = sorted(middleware.cache.newest)
@@ -133,7 +134,8 @@ class RosSource:
     def advance(self) -> bool:
         """Follows the robot's way where there is news; True after scans of another lidar."""
         with self._topics.lock:
-            lidar, self._new_lidar = self._new_lidar, None
+            lidar = self._new_lidar
+            self._new_lidar = None
             newest = self._topics.newest_ns
             pose = self._topics.view().pose if newest else None
         if pose is not None and newest != self._drawn_ns:

@@ -15,7 +15,9 @@ from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
 
 Bytes = bytes | bytearray
 HEAD = 4  # bytes of the header, not counted for alignment; the second one gives the byte order
-STAMP, FRAME = 4, 12  # offsets of stamp and frame of a message's header
+# offsets of stamp and frame of a message's header
+STAMP = 4
+FRAME = 12
 UNREADABLE = (
     ValueError,
     struct.error,
@@ -23,7 +25,9 @@ UNREADABLE = (
 PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
 # Numbers of an odometry before each: pose, its covariance, twist, its covariance.
-POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
+POSE_COVARIANCE = 7
+TWIST = 7 + 36
+DOUBLES = 7 + 36 + 6 + 36
 SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 
@@ -80,7 +84,9 @@ def odometry_of(content: Bytes) -> tuple[Array, Array]:
     """Returns pose (3,) and body twist (3,) of a serialised Odometry."""
     values = numbers_of(content)
     x, y, _, qx, qy, qz, qw = values[:7].tolist()
-    vx, vy, wz = values[TWIST], values[TWIST + 1], values[TWIST + 5]
+    vx = values[TWIST]
+    vy = values[TWIST + 1]
+    wz = values[TWIST + 5]
     return np.array([x, y, heading_of(qx, qy, qz, qw)]), np.array([vx, vy, wz])
 
 
@@ -131,7 +137,8 @@ class OdometryWriter:
         self, stamp_ns: int, pose: Array, twist: Array, covariance: Array | None = None
     ) -> bytes:
         """Returns a message with pose (3,), body twist (3,), and covariance (3, 3) of the pose."""
-        numbers, heading = self._numbers, float(pose[2])
+        numbers = self._numbers
+        heading = float(pose[2])
         self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NS_PER_S))
         numbers[0], numbers[1] = pose[0], pose[1]
         numbers[5], numbers[6] = math.sin(heading / 2.0), math.cos(heading / 2.0)

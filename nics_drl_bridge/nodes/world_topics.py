@@ -25,7 +25,8 @@ class WorldTopics:
     """
 
     def __init__(self, node: Any, world: Callable[[], DeviceWorld]) -> None:
-        self._node, self._world = node, world
+        self._node = node
+        self._world = world
         self._frame = str(node.get_parameter("map_frame").value)
         self._cell = float(node.get_parameter("map_resolution").value or 0.0)
         self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
@@ -34,7 +35,8 @@ class WorldTopics:
 
     def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
         """Listens for a robot, whose number is looked up at each message."""
-        kind, topic = PoseWithCovarianceStamped, f"{namespace}{INITIAL_POSE}"
+        kind = PoseWithCovarianceStamped
+        topic = f"{namespace}{INITIAL_POSE}"
         return self._node.create_subscription(
             kind, topic, partial(self._take, robot), qos.COMMAND
         )
@@ -61,7 +63,8 @@ class WorldTopics:
     def _take(
         self, robot: Callable[[], int], message: PoseWithCovarianceStamped
     ) -> None:
-        logger, simulator = self._node.get_logger(), self._world().simulator
+        logger = self._node.get_logger()
+        simulator = self._world().simulator
         try:
             pose = initial_pose(message, self._frame)
             x1, y1, x2, y2 = simulator.world.members[

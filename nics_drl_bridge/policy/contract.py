@@ -142,7 +142,8 @@ def contract_of(
 
     Raises ConfigError if an entry has a wrong type.
     """
-    entry, observation = task_entry(task), observation_entry(task)
+    entry = task_entry(task)
+    observation = observation_entry(task)
     data: dict[str, Any] = {
         "format": FORMAT,
         "robot": task.robot.model_dump(mode="json"),
@@ -177,10 +178,8 @@ def contract_of(
 def golden_observations(task: Task) -> Rows:
     """Observations (16, O) within the limits of a task's, always the same ones."""
     space = task.observation_space
-    low, high = (
-        np.maximum(space.low, -GOLDEN_SPREAD),
-        np.minimum(space.high, GOLDEN_SPREAD),
-    )
+    low = np.maximum(space.low, -GOLDEN_SPREAD)
+    high = np.minimum(space.high, GOLDEN_SPREAD)
     rng = np.random.default_rng(GOLDEN_SEED)
     return rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
 
@@ -200,7 +199,8 @@ def task_entry(task: Task) -> dict[str, Any]:
 
 def observation_entry(task: Task) -> dict[str, Any]:
     """Observation of a task, as the entries of `ObservationEntry`."""
-    space, parts = task.observation_space, task.scan_parts
+    space = task.observation_space
+    parts = task.scan_parts
     return {
         "size": int(space.shape[0]),
         "scan_parts": parts,
@@ -279,7 +279,8 @@ def _no_constant(word: str) -> Any:
 
 
 def _check_unchanged(data: dict[str, Any], source: str) -> None:
-    now, then = checksums(data), data["checksums"]
+    now = checksums(data)
+    then = data["checksums"]
     for path in (*now, *then):
         if now.get(path) != then.get(path):
             reason = "was changed after the export; take the file as it was exported."
@@ -287,7 +288,8 @@ def _check_unchanged(data: dict[str, Any], source: str) -> None:
 
 
 def _check_agreement(contract: Contract, source: str) -> None:
-    observation, scan = contract.observation, contract.scan
+    observation = contract.observation
+    scan = contract.scan
     parts = contract.lidar.beams if scan is None else scan.sectors
     name = "lidar.beams" if scan is None else "scan.sectors"
     rest = len(observation.rest_low)

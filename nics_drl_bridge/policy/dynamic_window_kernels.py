@@ -49,7 +49,8 @@ def choose_all(out, scans, goals, twists, candidates, ahead, weights, sense):  #
 @kernel
 def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untyped-def]
     """Returns the index of the cheapest candidate (K, 3), preferring those within the window."""
-    best, least = 0, math.inf
+    best = 0
+    least = math.inf
     # Where braking takes time, a robot that could not stop a period later is told to stop now.
     late = ahead.slowness > 0.0 and math.hypot(twist[0], twist[1]) > MOVING
     late = late and cost_of(around, twist, twist, ahead, weights) > INADMISSIBLE
@@ -64,7 +65,8 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
         cost += 1e6 if far and ahead.slowness == 0.0 else 0.0
         cost += 1e6 if late and moves else 0.0
         if cost < least:
-            best, least = k, cost
+            best = k
+            least = cost
     return best
 
 
@@ -74,16 +76,25 @@ def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-de
 
     A robot whose brakes take time comes from its present twist (3,), which may be faster.
     """
-    period, steps, keep = ahead.period, ahead.steps, around.clearance
-    x, y, heading, c, s = 0.0, 0.0, 0.0, 1.0, 0.0
-    least, near, free = kernels.way_at(x, y, around), math.inf, steps
+    period = ahead.period
+    steps = ahead.steps
+    keep = around.clearance
+    x = 0.0
+    y = 0.0
+    heading = 0.0
+    c = 1.0
+    s = 0.0
+    least = kernels.way_at(x, y, around)
+    near = math.inf
+    free = steps
     limit = kernels.touching(around)
     for step in range(steps):
         middle = heading + 0.5 * aimed[2] * period
         x += (aimed[0] * math.cos(middle) - aimed[1] * math.sin(middle)) * period
         y += (aimed[0] * math.sin(middle) + aimed[1] * math.cos(middle)) * period
         heading += aimed[2] * period
-        c, s = math.cos(heading), math.sin(heading)
+        c = math.cos(heading)
+        s = math.sin(heading)
         room = kernels.room_at(x, y, c, s, around)
         if room < limit or max(abs(x), abs(y)) > ahead.far:
             free = step

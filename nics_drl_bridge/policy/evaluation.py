@@ -212,7 +212,8 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
 
     A policy with a state is given by its method `act`, so that its episodes can begin.
     """
-    width, given = env.num_envs, checked_seeds(seeds)
+    width = env.num_envs
+    given = checked_seeds(seeds)
     # The last batch is padded with seeds that are driven but not counted.
     batches = (
         np.resize(given[k : k + width], width) for k in range(0, len(given), width)
@@ -285,7 +286,8 @@ def rate(hits: int, trials: int) -> ConfidenceInterval:
     """A share of trials with Wilson's score interval (1927), valid for few trials too."""
     if trials < 1:
         return ConfidenceInterval(math.nan, 0.0, 1.0)
-    share, z = hits / trials, float(special.ndtri(0.5 + CONFIDENCE / 2.0))
+    share = hits / trials
+    z = float(special.ndtri(0.5 + CONFIDENCE / 2.0))
     scale = 1.0 + z * z / trials
     middle = (share + z * z / (2.0 * trials)) / scale
     half = (
@@ -330,9 +332,11 @@ class Summary:
 
 def summarise(outcomes: Outcomes, control_period: float) -> Summary:
     """Summarises episodes; `control_period` [s]."""
-    count, arrived = len(outcomes.seeds), outcomes.success
+    count = len(outcomes.seeds)
+    arrived = outcomes.success
     flags = arrived, outcomes.collision, outcomes.time_out, outcomes.believed
-    length, time = outcomes.length[arrived], outcomes.steps[arrived] * control_period
+    length = outcomes.length[arrived]
+    time = outcomes.steps[arrived] * control_period
     shares = (rate(int(one.sum()), count) for one in flags)
     return Summary(count, *shares, *map(mean, (length, time)))
 
@@ -364,7 +368,8 @@ def tallies(
     runs: Mapping[str, Sequence[Episode]], control_period: float
 ) -> dict[str, Tally]:
     """Computes the figures of each world, compared with the same seeds in the first."""
-    first, found = next(iter(runs.values())), {}
+    first = next(iter(runs.values()))
+    found = {}
     for place, episodes in runs.items():
         rows = (
             (e.seed, e.result, e.steps, e.length, e.reward, e.believed_success)

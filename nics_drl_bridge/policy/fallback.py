@@ -34,7 +34,9 @@ class Fallback:
         task: Navigation,
         model: SimulatorModel | None,
     ) -> None:
-        self._policy, self._planner, self._task = policy, planner, task
+        self._policy = policy
+        self._planner = planner
+        self._task = task
         self._judge = Mppi(task, model, samples=1, clearance=KEPT)
         self.acted = 0  # actions of the planner
         # So that all is compiled now, not when it is needed.
@@ -67,7 +69,8 @@ def acted(policy: Any) -> int | None:
 
 def check_readable(task: Navigation, planner: str) -> None:
     """Raises ConfigError for observations that no planner reads, and actions that none gives."""
-    kind, named = type(task), f"fallback {planner!r}"
+    kind = type(task)
+    named = f"fallback {planner!r}"
     own = any(getattr(kind, one, None) is not getattr(Navigation, one) for one in READ)
     if own or getattr(kind, "step_into", None) not in (
         Navigation.step_into,

@@ -115,7 +115,9 @@ class GoalChecker:
     """Judges whether a path has been followed to its end."""
 
     def __init__(self, check: GoalCheck, turns: bool) -> None:
-        self._check, self._turns, self._there = check, turns, False
+        self._check = check
+        self._turns = turns
+        self._there = False
 
     def turn_left(self, place: Place, pose: Array, end: Array) -> float | None:
         """Returns the turn that is left [rad], 0 at the goal; None if its place is not reached."""

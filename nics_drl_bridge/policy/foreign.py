@@ -103,7 +103,8 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
 
 
 def _content(order: Order, model: SimulatorModel | None) -> bytes:
-    mapping, source = order.mapping, str(order.path)
+    mapping = order.mapping
+    source = str(order.path)
     if model is None:
         if mapping.robot is None:
             fix = "add `robot:`, or say which it drives with --model or --robot."

@@ -54,12 +54,10 @@ class Composer:
         task: Navigation,
         source: str,
     ) -> None:
-        self._network, self._mapping, self._task, self._source = (
-            network,
-            mapping,
-            task,
-            source,
-        )
+        self._network = network
+        self._mapping = mapping
+        self._task = task
+        self._source = source
         self._states = {**network.states, **mapping.states}
         self._build = Builder()
         self._past: dict[str, str] = {}  # rows of the state by what they keep
@@ -68,7 +66,8 @@ class Composer:
 
     def compose(self) -> tuple[Any, int]:
         """Returns the ModelProto, and the size of its state."""
-        build, theirs = self._build, self._theirs()
+        build = self._build
+        theirs = self._theirs()
         sizes = self._state_sizes()
         ends = np.cumsum([0, *sizes.values()])
         if sizes:
@@ -96,11 +95,9 @@ class Composer:
         return PolicyError(self._source, place, reason)
 
     def _check_names(self) -> None:
-        mapping, taken, given = (
-            self._mapping,
-            self._network.inputs,
-            self._network.outputs,
-        )
+        mapping = self._mapping
+        taken = self._network.inputs
+        given = self._network.outputs
         for name in (*mapping.inputs, *self._states):
             if name not in taken:
                 where = "inputs" if name in mapping.inputs else "states"
@@ -270,7 +267,8 @@ class Composer:
         )
 
     def _part(self, name: str, k: int, part: foreign_mapping.InputPart) -> str:
-        build, size = self._build, self._part_size(part) // part.history
+        build = self._build
+        size = self._part_size(part) // part.history
         self._check_scaled(part, size, f"inputs.{name}.parts.{k}")
         row = build.scale(self._quantity(name, part), part)
         if part.history == 1:
@@ -291,7 +289,8 @@ class Composer:
 
     def _quantity(self, name: str, part: foreign_mapping.InputPart) -> str:
         """A row of a quantity in SI units."""
-        build, scan = self._build, self._task.scan_parts
+        build = self._build
+        scan = self._task.scan_parts
         of, _, which = part.of.partition(".")
         if of == "scan":
             places = range(scan)[::-1] if part.clockwise else range(scan)
@@ -344,7 +343,8 @@ class Composer:
         """The row of the robot's command (1, C)."""
         if self._mapping.choices is not None:
             return self._chosen(self._mapping.choices)
-        outputs, robot = self._mapping.outputs, self._task.robot
+        outputs = self._mapping.outputs
+        robot = self._task.robot
         names = self._names(outputs, "outputs")
         if names == foreign_mapping.TWIST:
             self._check_twist(outputs)
@@ -425,14 +425,16 @@ class Composer:
 
     def _chosen(self, choices: foreign_mapping.Choices) -> str:
         """The command by the greatest element of an output, or by a whole number."""
-        build, robot = self._build, self._task.robot
+        build = self._build
+        robot = self._task.robot
         names = self._names(
             {name: 0.0 for row in choices.commands for name in row}, "choices"
         )
         rows = np.array(
             [[row.get(name, 0.0) for name in names] for row in choices.commands]
         )
-        size, beyond = self._output_size(choices.of), ""
+        size = self._output_size(choices.of)
+        beyond = ""
         kind = self._network.outputs[choices.of].type.tensor_type.elem_type
         if kind in onnx_graph.INTEGERS and size == 1:
             one, *ends = (build.constant(k, np.int64) for k in ([1], 0, len(rows) - 1))
@@ -466,7 +468,8 @@ class Composer:
     def _remember(self) -> None:
         self._next["begun"] = self._build.constant([[1.0]])
         for name, state in self._states.items():
-            size, made = math.prod(self._shape(name)), self._output_size(state.next)
+            size = math.prod(self._shape(name))
+            made = self._output_size(state.next)
             if size != made:
                 reason = f"{state.next!r} has {made} elements, the state {size}."
                 raise self._fault(f"states.{name}.next", reason)
@@ -476,17 +479,13 @@ class Composer:
                 self._next[key] = self._flat(key.removeprefix("output "))
 
     def _model(self, theirs: Any, state: int) -> Any:
-        width, commands = (
-            self._task.observation_space.shape[0],
-            len(self._task.robot.command),
-        )
-        inputs, outputs = (
-            {onnx_graph.INPUT: width},
-            {
-                onnx_graph.ACTION: commands,
-                onnx_graph.COMMAND: commands,
-            },
-        )
+        width = self._task.observation_space.shape[0]
+        commands = len(self._task.robot.command)
+        inputs = {onnx_graph.INPUT: width}
+        outputs = {
+            onnx_graph.ACTION: commands,
+            onnx_graph.COMMAND: commands,
+        }
         if state:
             inputs[onnx_graph.STATE_IN] = outputs[onnx_graph.STATE_OUT] = state
         made = [

@@ -68,7 +68,8 @@ class Builder:
     def blend(self, share: str, row: str, start: str) -> str:
         """Row where the share (1, 1) is 1, `start` where it is 0."""
         rest = self.affine(share, -1.0, 1.0)
-        kept, begun = self.add("Mul", share, row), self.add("Mul", rest, start)
+        kept = self.add("Mul", share, row)
+        begun = self.add("Mul", rest, start)
         return self.add("Add", kept, begun)
 
     def is_negative(self, row: str) -> str:
@@ -77,8 +78,10 @@ class Builder:
 
     def angle(self, cosine: str, sine: str) -> str:
         """The angle [rad] of a direction; exact to rounding in all four quadrants."""
-        across, along = self.add("Abs", sine), self.add("Abs", cosine)
+        across = self.add("Abs", sine)
+        along = self.add("Abs", cosine)
         half = self.add("Atan", self.add("Div", across, self.affine(along, 1.0, 1.0)))
-        ahead, behind = self.affine(half, 2.0, 0.0), self.affine(half, -2.0, np.pi)
+        ahead = self.affine(half, 2.0, 0.0)
+        behind = self.affine(half, -2.0, np.pi)
         size = self.blend(self.is_negative(cosine), behind, ahead)
         return self.add("Mul", size, self.affine(self.is_negative(sine), -2.0, 1.0))

@@ -30,7 +30,8 @@ FOLDED = (
 
 def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
     """Folds small whole numbers that are known; returns shapes of outputs, 0 where unknown."""
-    weights, nodes = {one.name: one for one in graph.initializer}, list(graph.node)
+    weights = {one.name: one for one in graph.initializer}
+    nodes = list(graph.node)
     imports = [helper.make_opsetid("", opset)]
     types = {one.name: one.type for one in graph.input}
     for one in graph.initializer:
@@ -75,7 +76,8 @@ def _is_small(kind: Any) -> bool:
 
 def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) -> Any:
     """Returns None for what is not small, or is not known before the network runs."""
-    name, given = node.output[0], [known.get(one) for one in node.input if one]
+    name = node.output[0]
+    given = [known.get(one) for one in node.input if one]
     if node.op_type == "Shape" and all(shape := _shape(types[node.input[0]])):
         ends = {setting.name: setting.i for setting in node.attribute}
         sizes = np.array(shape[ends.get("start", 0) : ends.get("end")], np.int64)

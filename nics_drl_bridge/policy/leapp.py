@@ -31,7 +31,8 @@ CONFIG_VERSION = "1.3"  # of the format
 OURS = "leapp/"  # before the names of nodes and weights that an export adds
 TAKEN = "nics_drl_bridge_observation"  # metadata: the input that an export replaces
 VELOCITIES = ("x", "y", "z")
-SECTORS, BEAMS = "state/lidar/sectors", "state/lidar/beams"
+SECTORS = "state/lidar/sectors"
+BEAMS = "state/lidar/beams"
 Data = dict[str, Any]
 
 
@@ -46,7 +47,8 @@ class Piece(NamedTuple):
 
 def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
     """Writes a policy file as a bundle; returns its YAML file. See `whole_folder` for errors."""
-    content, place = policy.path.read_bytes(), Path(folder)
+    content = policy.path.read_bytes()
+    place = Path(folder)
     marker = f"{place.resolve().name}.yaml"
     model = onnx.load_model_from_string(content)
     pieces = _pieces(policy)
@@ -74,15 +76,18 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
 def _pieces(policy: PolicyFile) -> list[Piece]:
     """Inputs of a bundle in the order of the observation."""
     contract = policy.contract
-    parts, rest = contract.observation.scan_parts, len(contract.observation.rest_low)
-    layout, lidar = contract.scan, contract.lidar
+    parts = contract.observation.scan_parts
+    rest = len(contract.observation.rest_low)
+    layout = contract.scan
+    lidar = contract.lidar
     seen: Data = {"kind": BEAMS, "lidar": lidar.model_dump(mode="json")}
     if layout is not None:
         seen = {"kind": SECTORS, "scan": layout.model_dump(mode="json")}
     seen["unit"] = "share of range_max; 1 free, 0 too close or unknown"
     pieces = [Piece("scan", parts, tuple(range(parts)), seen)]
     if contract.task.name != "navigation":
-        low, high = contract.observation.rest_low, contract.observation.rest_high
+        low = contract.observation.rest_low
+        high = contract.observation.rest_high
         limits = [list(pair) for pair in zip(low, high, strict=True)]
         facts: Data = {"kind": f"state/task/{contract.task.name}", "limits": limits}
         return [*pieces, Piece("rest", rest, tuple(range(rest)), facts)]
@@ -114,11 +119,14 @@ def _pieces(policy: PolicyFile) -> list[Piece]:
 
 def _split(model: Any, pieces: Iterable[Piece]) -> None:
     """Replaces the observation of a graph by inputs that it is joined of."""
-    build, batch = Builder(OURS), model.graph.input[0].type.tensor_type.shape.dim[0]
+    build = Builder(OURS)
+    batch = model.graph.input[0].type.tensor_type.shape.dim[0]
     entry = model.metadata_props.add()
     entry.key = TAKEN
     entry.value = base64.b64encode(model.graph.input[0].SerializeToString()).decode()
-    rows, infos, others = [], [], list(model.graph.input)[1:]
+    rows = []
+    infos = []
+    others = list(model.graph.input)[1:]
     for piece in pieces:
         infos.append(
             onnx.helper.make_tensor_value_info(piece.name, TensorProto.FLOAT, [1, 1])
@@ -128,7 +136,8 @@ def _split(model: Any, pieces: Iterable[Piece]) -> None:
         whole = len(piece.kept) == piece.width
         rows.append(piece.name if whole else build.pick(piece.name, piece.kept))
     build.join(rows, name=onnx_graph.INPUT)
-    nodes, weights = list(model.graph.node), list(model.graph.initializer)
+    nodes = list(model.graph.node)
+    weights = list(model.graph.initializer)
     for held, values in (
         (model.graph.input, [*infos, *others]),
         (model.graph.node, [*build.nodes, *nodes]),
@@ -146,7 +155,8 @@ def restored(model: Any) -> bytes | None:
     found = [entry for entry in model.metadata_props if entry.key == TAKEN]
     if len(found) != 1:
         return None
-    taken, ours = onnx.ValueInfoProto(), onnx.ModelProto()
+    taken = onnx.ValueInfoProto()
+    ours = onnx.ModelProto()
     try:
         taken.ParseFromString(base64.b64decode(found[0].value))
     except (ValueError, DecodeError):
@@ -171,7 +181,8 @@ def restored(model: Any) -> bytes | None:
 def _described(
     policy: PolicyFile, pieces: Iterable[Piece], made: bytes, place: Path
 ) -> Data:
-    contract, name = policy.contract, place.resolve().name
+    contract = policy.contract
+    name = place.resolve().name
     inputs = [_tensor(piece.name, [1, piece.width], **piece.facts) for piece in pieces]
     outputs = _outputs(contract)
     pipeline: Data = {
@@ -211,7 +222,8 @@ def _outputs(contract: Contract) -> list[Data]:
     """The action, and the command that it means, in the robot's units."""
     commands = contract.robot.command
     limits = [[command.min, command.max] for command in commands]
-    discrete, size = contract.actions == "discrete", len(commands)
+    discrete = contract.actions == "discrete"
+    size = len(commands)
     of_twist = all(command.is_twist for command in commands)
     names = [str(command.cmd_vel) if of_twist else command.name for command in commands]
     return [

@@ -237,7 +237,8 @@ def read_bundle(path: Path) -> Bundle:
     bundle = Bundle(path, description, models, "")
     digests = []
     for name, node in description.models.items():
-        place, given = f"models.{name}.parameters", node.parameters
+        place = f"models.{name}.parameters"
+        given = node.parameters
         if given.backend != "onnx":
             reason = f"is {given.backend!r}, which is never opened here; export it with 'onnx'."
             raise bundle.fault(f"{place}.backend", reason)
@@ -272,8 +273,10 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
 
 def _merged(bundle: Bundle) -> Any:
     """One graph of all nodes in their order: connections are nodes that copy."""
-    description, pipeline = bundle.description, bundle.description.pipeline
-    graph, newest = onnx.GraphProto(name="bundle"), 0
+    description = bundle.description
+    pipeline = bundle.description.pipeline
+    graph = onnx.GraphProto(name="bundle")
+    newest = 0
     opsets: dict[int, Any] = {}
     ready: set[str] = set()
     infos: dict[str, Any] = {}
@@ -374,7 +377,8 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
 
 
 def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
-    kind, extra = entry.kind or "", entry.model_extra or {}
+    kind = entry.kind or ""
+    extra = entry.model_extra or {}
     if kind == BEAMS or (kind == SECTORS and isinstance(extra.get("scan"), dict)):
         layout = extra.get("scan")
         data["scan"] = layout
@@ -382,7 +386,8 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
         far = (extra.get("lidar") if layout is None else layout) or {}
         return [{"of": "scan", "divide": far.get("range_max", 1.0) if share else 1.0}]
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
-    meanings, names = SEEN.get(kind, {}), entry.names
+    meanings = SEEN.get(kind, {})
+    names = entry.names
     if (
         not names and len(meanings) == size and "pose" not in kind
     ):  # that may have a heading
@@ -398,7 +403,8 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
 def _add_commands(
     outputs: Data, name: str, entry: Tensor, model: SimulatorModel
 ) -> None:
-    meanings, size = DONE.get(entry.kind or "", {}), math.prod(entry.shape or [0])
+    meanings = DONE.get(entry.kind or "", {})
+    size = math.prod(entry.shape or [0])
     names = entry.names or (list(meanings) if len(meanings) == size else [])
     own = {command.name for command in model.robot.command}
     for index, one in enumerate(names):

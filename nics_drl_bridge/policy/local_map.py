@@ -10,7 +10,8 @@ from nics_drl_bridge.geometry import Array, depths
 from nics_drl_bridge.policy import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec
 
-CELL_M, MOST_M = 0.05, 4.0  # side of the cells of distances; greatest reach of a map
+CELL_M = 0.05  # side of the cells of distances
+MOST_M = 4.0  # greatest reach of a map
 FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
 """Lattice of the discs, depth from which they cover all, and space of points on the border."""
 MOST_POINTS = 5000  # of a lattice; that of a footprint with more of them is coarser
@@ -30,14 +31,16 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
         radius = robot.footprint_radius
         return kernels.FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
     corners = np.array(robot.footprint)
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
     spacing = max(FINE_M, math.sqrt(float(np.prod(high - low)) / MOST_POINTS))
     axes = (
         np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True)
     )
     lattice = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     depth = depths(lattice, corners)
-    lattice, depth = lattice[depth > 0.0], depth[depth > 0.0]
+    lattice = lattice[depth > 0.0]
+    depth = depth[depth > 0.0]
     chosen = _cover(lattice, depth)
     sides = np.roll(corners, -1, axis=0) - corners
     for corner, side in zip(corners, sides, strict=True):

@@ -104,10 +104,12 @@ def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
             x = rays.origin[0] + share * rays.directions[p, 0]
             y = rays.origin[1] + share * rays.directions[p, 1]
             if count > 0:
-                dx, dy = x - hits[count - 1, 0], y - hits[count - 1, 1]
+                dx = x - hits[count - 1, 0]
+                dy = y - hits[count - 1, 1]
                 if dx * dx + dy * dy < APART_M * APART_M:
                     continue
-            hits[count, 0], hits[count, 1] = x, y
+            hits[count, 0] = x
+            hits[count, 1] = y
             count += 1
     return count
 
@@ -115,19 +117,23 @@ def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
 @kernel
 def put_distances(seen, hits):  # type: ignore[no-untyped-def]
     """Writes the distances of a map to hits (H, 2)."""
-    grid, cell = seen.distances, seen.cell
+    grid = seen.distances
+    cell = seen.cell
     size = grid.shape[0]
-    half, far = 0.5 * size * cell, np.float32(seen.reach * seen.reach)
+    half = 0.5 * size * cell
+    far = np.float32(seen.reach * seen.reach)
     grid[:] = far
     step = np.float32(cell)
     for h in range(hits.shape[0]):
-        x, y = hits[h, 0] + half, hits[h, 1] + half
+        x = hits[h, 0] + half
+        y = hits[h, 1] + half
         left, right = _span(x, seen.reach, cell, size)
         low, high = _span(y, seen.reach, cell, size)
         first = np.float32((left + 0.5) * cell - x)
         for i in range(low, high):
             dy = np.float32((i + 0.5) * cell - y)
-            row, dy2 = grid[i, left:right], dy * dy
+            row = grid[i, left:right]
+            dy2 = dy * dy
             for j in range(row.shape[0]):
                 dx = np.float32(j) * step + first
                 away = dx * dx + dy2
@@ -149,7 +155,8 @@ def _span(middle, reach, cell, size):  # type: ignore[no-untyped-def]
 def value_at(grid, cell, x, y, outside):  # type: ignore[no-untyped-def]
     """Returns a value of a grid at a point, bilinear between the centres of cells."""
     size = grid.shape[0]
-    u, v = x / cell + 0.5 * size - 0.5, y / cell + 0.5 * size - 0.5
+    u = x / cell + 0.5 * size - 0.5
+    v = y / cell + 0.5 * size - 0.5
     if not (0.0 <= u < size - 1.0 and 0.0 <= v < size - 1.0):
         return outside
     return between(grid, u, v)
@@ -158,8 +165,10 @@ def value_at(grid, cell, x, y, outside):  # type: ignore[no-untyped-def]
 @kernel(inline=True)
 def between(grid, u, v):  # type: ignore[no-untyped-def]
     """Returns a value of a grid at a place in cells, column u and row v, which lies within it."""
-    j, i = np.uint32(np.int32(u)), np.uint32(np.int32(v))
-    u, v = np.float32(u) - np.float32(j), np.float32(v) - np.float32(i)
+    j = np.uint32(np.int32(u))
+    i = np.uint32(np.int32(v))
+    u = np.float32(u) - np.float32(j)
+    v = np.float32(v) - np.float32(i)
     one = np.uint32(1)
     low = grid[i, j] + (grid[i, j + one] - grid[i, j]) * u
     high = grid[i + one, j] + (grid[i + one, j + one] - grid[i + one, j]) * u
@@ -172,8 +181,11 @@ def put_ways(around, prices):  # type: ignore[no-untyped-def]
 
     They solve the eikonal equation by fast sweeping (Zhao 2005); beyond the map they are straight.
     """
-    seen, goal, soft = around.map, around.goal, around.clearance.soft
-    ways, side = seen.ways, COARSE * seen.cell
+    seen = around.map
+    goal = around.goal
+    soft = around.clearance.soft
+    ways = seen.ways
+    side = COARSE * seen.cell
     size = ways.shape[0]
     half = 0.5 * size * side
     blocked = around.outline.inner + around.clearance.margin
@@ -213,24 +225,28 @@ def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
 
     It is below 0 if it overlaps; far away it is what is certain.
     """
-    seen, outline = around.map, around.outline
-    grid, discs, centre = seen.distances, outline.discs, outline.centre
-    at_x, at_y = x + c * centre[0] - s * centre[1], y + s * centre[0] + c * centre[1]
+    seen = around.map
+    outline = around.outline
+    grid = seen.distances
+    discs = outline.discs
+    centre = outline.centre
+    at_x = x + c * centre[0] - s * centre[1]
+    at_y = y + s * centre[0] + c * centre[1]
     away = value_at(grid, seen.cell, at_x, at_y, seen.reach)
     if discs.shape[0] == 0 or away >= seen.reach - seen.cell:
         return away - outline.outer
-    middle, per_cell = 0.5 * grid.shape[0] - 0.5, 1.0 / seen.cell
+    middle = 0.5 * grid.shape[0] - 0.5
+    per_cell = 1.0 / seen.cell
     if max(abs(at_x), abs(at_y)) + outline.outer > (middle - 1.0) * seen.cell:
         return away - outline.inner  # at the border of the map
-    u, v, c, s = (
-        middle + x * per_cell,
-        middle + y * per_cell,
-        c * per_cell,
-        s * per_cell,
-    )
+    u = middle + x * per_cell
+    v = middle + y * per_cell
+    c = c * per_cell
+    s = s * per_cell
     least = seen.reach
     for d in range(discs.shape[0]):
-        px, py = discs[d, 0], discs[d, 1]
+        px = discs[d, 0]
+        py = discs[d, 1]
         away = between(grid, u + c * px - s * py, v + s * px + c * py)
         least = min(least, away - discs[d, 2])
     return least

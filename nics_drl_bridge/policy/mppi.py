@@ -91,12 +91,11 @@ class Mppi:
 
     def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
         """Scans (N, P) in shares, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
-        parts, rows = (
-            self.task.scan_parts,
-            np.atleast_2d(observation).astype(np.float64),
-        )
+        parts = self.task.scan_parts
+        rows = np.atleast_2d(observation).astype(np.float64)
         goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
-        scans, twists = rows[:, :parts], rows[:, parts + 3 : parts + 6]
+        scans = rows[:, :parts]
+        twists = rows[:, parts + 3 : parts + 6]
         return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
 
     def _run(self, kernel: Any, arrays: tuple[NDArray[Any], ...], *given: Any) -> None:
@@ -134,7 +133,8 @@ class Mppi:
         half = min(half or np.inf, self.task.sight.range_max) + outline.outer
         scratch = scratch_of(self.task.scan_parts, outline, clearance, half)
         (states, count), many = self._plant.settled.shape, self.samples
-        x, rate = np.ones(states + count + 1), np.zeros(3 + states)
+        x = np.ones(states + count + 1)
+        rate = np.zeros(3 + states)
         return scratch, kernels.RollOuts(
             np.zeros((6, many)),
             np.repeat(x[:, None], many, 1),
@@ -203,8 +203,11 @@ class Mppi:
 
     @cached_property
     def _plant(self) -> kernels.Plant:
-        model, robot, period = self._kinematics, self.task.robot, self._period
-        terms, latency = term_arrays(model), float(model.delays.max(initial=0.0))
+        model = self._kinematics
+        robot = self.task.robot
+        period = self._period
+        terms = term_arrays(model)
+        latency = float(model.delays.max(initial=0.0))
         if self.model is not None:
             latency += max(0.0, self.model.calibration.command_latency_s)
         own = (
@@ -245,7 +248,8 @@ class Mppi:
 
 def _settled(model: TaylorModel, high: Array) -> Array:
     """Returns the state (S, C) to which each command leads, per unit of it."""
-    given, pose = np.diag(0.5 * high), np.zeros((len(high), 3))
+    given = np.diag(0.5 * high)
+    pose = np.zeros((len(high), 3))
     state = np.zeros((len(high), model.state_size))
     for _ in range(round(SETTLED_S / model.dt)):
         pose, state = model.step(pose, state, given)

@@ -21,7 +21,9 @@ BEYOND = (
     1.3  # offers are drawn over this much of the range and cut: many are at its ends
 )
 STOPPED = 0.01  # speed of the outline at which a robot has stopped [m/s]
-PASSES, EASE = 12, 1e-6  # over the commands, to find those that a twist follows
+# over the commands, to find those that a twist follows
+PASSES = 12
+EASE = 1e-6
 
 
 class Plant(NamedTuple):
@@ -157,7 +159,8 @@ def _stops(command, twist, around, plant, halt, lanes):  # type: ignore[no-untyp
             return False
     _wait(twist, plant, lanes)
     _put(lanes, plant.settled.shape[0])
-    states, limit = plant.settled.shape[0], maps.touching(around)
+    states = plant.settled.shape[0]
+    limit = maps.touching(around)
     for t in range(1 + halt.most):
         for c in range(command.shape[0]):
             given = command[c] if t == 0 or halt.holds[c] else halt.rest[c]
@@ -214,7 +217,10 @@ def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
 
     By coordinate descent on the squared difference.
     """
-    held, x, dq, terms = lanes.held, lanes.one, lanes.rate, plant.single
+    held = lanes.held
+    x = lanes.one
+    dq = lanes.rate
+    terms = plant.single
     count = plant.settled.shape[1]
     for c in range(count):
         held[c] = min(max(0.0, plant.low[c]), plant.high[c])
@@ -222,14 +228,20 @@ def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
         for c in range(count):
             _settle(held, plant, lanes)
             rates(dq, x, terms)
-            r0, r1, r2 = twist[0] - dq[0], twist[1] - dq[1], twist[2] - dq[2]
-            b0, b1, b2 = dq[0], dq[1], dq[2]
+            r0 = twist[0] - dq[0]
+            r1 = twist[1] - dq[1]
+            r2 = twist[2] - dq[2]
+            b0 = dq[0]
+            b1 = dq[1]
+            b2 = dq[2]
             step = 1e-3 * (plant.high[c] - plant.low[c])
             held[c] += step
             _settle(held, plant, lanes)
             rates(dq, x, terms)
             held[c] -= step
-            g0, g1, g2 = (dq[0] - b0) / step, (dq[1] - b1) / step, (dq[2] - b2) / step
+            g0 = (dq[0] - b0) / step
+            g1 = (dq[1] - b1) / step
+            g2 = (dq[2] - b2) / step
             size = g0 * g0 + g1 * g1 + g2 * g2 + EASE
             value = held[c] + (g0 * r0 + g1 * r1 + g2 * r2) / size
             held[c] = min(max(value, plant.low[c]), plant.high[c])
@@ -254,13 +266,15 @@ def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
 def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
     """Rolls out the actions of all lanes; writes their costs and returns the cheapest."""
     _begin(around, plant, worth, lanes)
-    states, periods = plant.settled.shape[0], sampling.between.shape[0]
+    states = plant.settled.shape[0]
+    periods = sampling.between.shape[0]
     limit = maps.touching(around)
     for t in range(periods):
         for c in range(plant.low.shape[0]):
             middle = 0.5 * (plant.low[c] + plant.high[c])
             half = 0.5 * (plant.high[c] - plant.low[c])
-            row, curve = lanes.x[states + c], plant.single.curves[c]
+            row = lanes.x[states + c]
+            curve = plant.single.curves[c]
             for k in range(row.shape[0]):
                 action = 0.0
                 for q in range(lanes.nominal.shape[0]):
@@ -337,11 +351,15 @@ def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
 @kernel
 def _put(lanes, states):  # type: ignore[no-untyped-def]
     """Puts all lanes at the start."""
-    x, y, heading = lanes.start[0], lanes.start[1], lanes.start[2]
+    x = lanes.start[0]
+    y = lanes.start[1]
+    heading = lanes.start[2]
     for k in range(lanes.cost.shape[0]):
-        lanes.pose[0, k], lanes.pose[1, k] = x, y
+        lanes.pose[0, k] = x
+        lanes.pose[1, k] = y
         lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
-        lanes.pose[4, k], lanes.pose[5, k] = heading, 0.0
+        lanes.pose[4, k] = heading
+        lanes.pose[5, k] = 0.0
         for s in range(states):
             lanes.x[s, k] = lanes.one[s]
 
@@ -349,8 +367,12 @@ def _put(lanes, states):  # type: ignore[no-untyped-def]
 @kernel
 def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyped-def]
     """Adds what period t of lane k costs."""
-    x, y, c, s = lanes.pose[0, k], lanes.pose[1, k], lanes.pose[2, k], lanes.pose[3, k]
-    room, way = maps.room_at(x, y, c, s, around), maps.way_at(x, y, around)
+    x = lanes.pose[0, k]
+    y = lanes.pose[1, k]
+    c = lanes.pose[2, k]
+    s = lanes.pose[3, k]
+    room = maps.room_at(x, y, c, s, around)
+    way = maps.way_at(x, y, around)
     lanes.way[k] = way
     lanes.cost[k] += worth.early * way / periods
     if room < limit:
@@ -361,7 +383,8 @@ def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyp
     near = max(keep.margin + keep.soft - room, 0.0) / keep.soft
     lanes.cost[k] += worth.near * near * near / periods
     if math.hypot(around.goal[0] - x, around.goal[1] - y) < maps.ARRIVED_M:
-        lanes.ended[k], lanes.way[k] = t, 0.0
+        lanes.ended[k] = t
+        lanes.way[k] = 0.0
     elif t == periods - 1:
         lanes.cost[k] += (
             worth.astray * maps.astray(x, y, c, s, way, around) * min(way, 1.0)

@@ -37,8 +37,12 @@ SMALL = (
 )
 GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
 MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
-INPUT, ACTION, COMMAND = "observation", "action", "command"
-STATE_IN, STATE_OUT = "state_in", "state_out"  # of a policy with a state
+INPUT = "observation"
+ACTION = "action"
+COMMAND = "command"
+# of a policy with a state
+STATE_IN = "state_in"
+STATE_OUT = "state_out"
 RECURRENT = frozenset(
     {"GRU", "LSTM", "RNN"}
 )  # over sequences whose length the graph tells
@@ -123,7 +127,9 @@ OTHER_FORMATS = (
     (b"\x1f\x8b", "a gzip file"),
 )
 """First bytes of files that trainers write and that are never opened here."""
-_VARINT, _BYTES = 0, 2  # types of a field on the wire
+# types of a field on the wire
+_VARINT = 0
+_BYTES = 2
 _FIXED = {1: 8, 5: 4}  # other types, and their sizes [bytes]
 _LONGEST_VARINT = 10
 Shape = tuple[int, ...]
@@ -173,11 +179,14 @@ def metadata_in(data: bytes, source: str) -> str:
     _check_form(data, source)
     bare = onnx.ModelProto()
     field = onnx.ModelProto.DESCRIPTOR.fields_by_name["metadata_props"]
-    view, start, has_graph = memoryview(data), 0, False
+    view = memoryview(data)
+    start = 0
+    has_graph = False
     while start < len(data):
         key, start = _varint(view, start, len(data))
         size, start = _size_of(view, start, len(data), key & 7)
-        number, end = key >> 3, start + size
+        number = key >> 3
+        end = start + size
         if key & 7 == _BYTES and number == field.number:
             try:
                 bare.metadata_props.add().ParseFromString(bytes(view[start:end]))
@@ -234,7 +243,8 @@ class WireError(ValueError):
 
 def check_wire(data: bytes) -> None:
     """Raises WireError unless the bytes are of a ModelProto with few parts and little nesting."""
-    view, parts = memoryview(data), 0
+    view = memoryview(data)
+    parts = 0
     ahead: list[tuple[int, int, Any, int]] = [
         (0, len(data), onnx.ModelProto.DESCRIPTOR, 1)
     ]
@@ -248,7 +258,8 @@ def check_wire(data: bytes) -> None:
                 raise WireError(f"has more than {MOST_PARTS} parts")
             key, start = _varint(view, start, end)
             size, start = _size_of(view, start, end, key & 7)
-            begin, start = start, start + size
+            begin = start
+            start = start + size
             if start > end:
                 raise WireError("is cut off")
             field = kind.fields_by_number.get(key >> 3)
@@ -391,7 +402,8 @@ def check_ends(
             reason = f"are {[end.name for end in ends]}, not {names}; export the policy anew."
             raise PolicyError(source, f"graph.{kind}", reason)
     for end in (*inputs, *model.graph.output):
-        tensor, width = end.type.tensor_type, widths[end.name]
+        tensor = end.type.tensor_type
+        width = widths[end.name]
         kind = TensorProto.INT64 if width is None else TensorProto.FLOAT
         sizes = [
             d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim

@@ -73,7 +73,8 @@ def in_turn(
     """Actions and commands for observations (T, O): of an episode if there is a state (S,)."""
     if start is None:
         return list(run(seen))
-    state, rows = start[None], []
+    state = start[None]
+    rows = []
     for k in range(len(seen)):
         *out, state = run(seen[k : k + 1], state)
         rows.append(out)

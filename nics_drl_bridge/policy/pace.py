@@ -100,7 +100,9 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
 
     Raises ConfigError, and ModelError if there is no such robot.
     """
-    robot, told, shipped = changes.get("robot"), list[str](), shipped_names("training")
+    robot = changes.get("robot")
+    told = list[str]()
+    shipped = shipped_names("training")
     own = f"{task}_{robot}" in shipped
     if name is None and robot is not None and not own and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"
@@ -121,7 +123,9 @@ def fitted(
     Those inherited from another robot get its lidar's layout of a scan, and a time reward and a
     discount that come to the same over an episode.
     """
-    options, told, lidar = dict(settings.task_options), list[str](), model.lidar
+    options = dict(settings.task_options)
+    told = list[str]()
+    lidar = model.lidar
     worlds = [load_worlds(world) for world in settings.worlds]
     class_for(settings.task, options)
     pace = pace_of(model, worlds, options.get("top_speed"))

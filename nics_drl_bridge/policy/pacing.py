@@ -7,7 +7,8 @@ class ActionPace:
     """Allows at most one action per period, as soon as there are data to act on; 0 acts on all."""
 
     def __init__(self, period_s: float) -> None:
-        self._period_s, self._due_s = period_s, -float("inf")
+        self._period_s = period_s
+        self._due_s = -float("inf")
 
     def due(self, now_s: float) -> bool:
         """True if it is time to act."""
@@ -32,7 +33,8 @@ class Deadline:
     """Judges the duration of each inference; after `patience` late ones in a row it says stop."""
 
     def __init__(self, limit_s: float, patience: int) -> None:
-        self._limit_s, self._patience = limit_s, patience
+        self._limit_s = limit_s
+        self._patience = patience
         self.answered = self.late = self._in_a_row = 0
         self.longest_s = 0.0
 

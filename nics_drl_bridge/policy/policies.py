@@ -68,9 +68,12 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
     """
     if model is None or (task.robot.takes_cmd_vel and model.kinematics.is_plain):
         return steady_twist(task.robot, commands)
-    kinematics, start = model.kinematics, np.zeros((len(commands), 3))
-    state, moved = np.zeros((len(commands), kinematics.state_size)), start
-    low, high = kinematics.low[: state.shape[1]], kinematics.high[: state.shape[1]]
+    kinematics = model.kinematics
+    start = np.zeros((len(commands), 3))
+    state = np.zeros((len(commands), kinematics.state_size))
+    moved = start
+    low = kinematics.low[: state.shape[1]]
+    high = kinematics.high[: state.shape[1]]
     for _ in range(round(SETTLED_S / kinematics.dt)):
         moved, state = kinematics.step(start, state, commands)
         state = np.clip(state, low, high)
@@ -96,7 +99,8 @@ class StraightToGoal:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `Policy`."""
-        robot, first = self.task.robot, self.task.scan_parts + 1
+        robot = self.task.robot
+        first = self.task.scan_parts + 1
         cosine, sine = np.moveaxis(
             observation[..., first : first + 2].astype(float), -1, 0
         )

@@ -39,7 +39,9 @@ class PolicyFile:
     def __init__(
         self, path: Path, contract: Contract, session: Any, rows_at_once: int
     ) -> None:
-        self.path, self.contract, self._session = path, contract, session
+        self.path = path
+        self.contract = contract
+        self._session = session
         self._rows_at_once = rows_at_once
 
     def act(self, observation: Rows) -> NDArray[Any]:
@@ -61,7 +63,8 @@ class PolicyFile:
         Raises PolicyError if a shape does not fit, or a state is missing; see `make_policy`.
         """
         given = np.asarray(observation, np.float32)
-        size, kept = self.contract.observation.size, self.contract.state
+        size = self.contract.observation.size
+        kept = self.contract.state
         if given.ndim not in (1, 2) or given.shape[-1] != size:
             reason = f"is {size}, but was given observations {given.shape}; use its own task."
             raise PolicyError(str(self.path), "observation.size", reason)
@@ -184,7 +187,8 @@ class PolicyFile:
 def load_policy(path: str | Path) -> PolicyFile:
     """Loads a policy file, by path or shipped name, with all checks; PolicyError has the field."""
     check_path("policy", path)
-    file, suffix = Path(path), contracts.SUFFIX
+    file = Path(path)
+    suffix = contracts.SUFFIX
     if not (str(path).endswith(suffix) or file.is_file()):
         file = contracts.shipped() / f"{path}{suffix}"
         if not file.is_file():
@@ -196,7 +200,8 @@ def load_policy(path: str | Path) -> PolicyFile:
             )
     source = str(file)
     try:
-        size, limit = file.stat().st_size, onnx_graph.SIZE_LIMIT
+        size = file.stat().st_size
+        limit = onnx_graph.SIZE_LIMIT
         if not file.is_file():
             raise PolicyError(
                 source, "file", "is no file; give the path of an .onnx file."
@@ -250,7 +255,8 @@ def _needs_of(contract: Contract) -> GraphNeeds:
 
 
 def _check_golden(policy: PolicyFile, source: str) -> None:
-    golden, kept = policy.contract.golden, policy.contract.state
+    golden = policy.contract.golden
+    kept = policy.contract.state
     start = None if kept is None else np.full(kept.size, kept.start, np.float32)
     action, command = in_turn(policy.run, golden.rows("observations"), start)
     found = {"actions": action.reshape(len(command), -1), "commands": command}

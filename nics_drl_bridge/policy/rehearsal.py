@@ -158,7 +158,8 @@ def main() -> None:
 
 
 def _do(told: dict[str, Any], data: bytes) -> None:
-    step, source = told["step"], "policy"
+    step = told["step"]
+    source = "policy"
     if step in ("network", "folding"):
         model = onnx_graph.parsed(data, source)
         if step == "network":

@@ -44,12 +44,11 @@ class Shadow:
         """Mean of policy minus drive by command; its magnitude; the share of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
-            one, other, band = (
-                self.policy[:, c],
-                self.driven[:, c],
-                DEAD_BAND * self.scale[c],
-            )
-            gap, size = one - other, np.abs(one - other)
+            one = self.policy[:, c]
+            other = self.driven[:, c]
+            band = DEAD_BAND * self.scale[c]
+            gap = one - other
+            size = np.abs(one - other)
             signed = (np.abs(one) > band) & (np.abs(other) > band)
             opposite = (
                 (one[signed] * other[signed] < 0.0).mean() if signed.any() else 0.0
@@ -107,7 +106,8 @@ def shadow(
 def _moments(
     playback: Playback, messages: Mapping[str, list[Message]], model: SimulatorModel
 ) -> list[_Moment]:
-    pace, moments = ActionPace(model.control_period), list[_Moment]()
+    pace = ActionPace(model.control_period)
+    moments = list[_Moment]()
     held: tuple[int, Array] | None = None
     acted_ns = 0
     for role, message in in_order(messages):
@@ -153,7 +153,9 @@ def _answered(
     moments: list[_Moment], goals: Array, name: str, model: SimulatorModel
 ) -> Shadow:
     policy, task = open_policy(name, model)
-    robot, rows, resets = model.robot, list[tuple[Any, ...]](), 0
+    robot = model.robot
+    rows = list[tuple[Any, ...]]()
+    resets = 0
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
         verdict = task.judge(moment.view, memory := {"goal": goal})

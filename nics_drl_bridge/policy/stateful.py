@@ -27,7 +27,8 @@ class Stateful:
     def __init__(
         self, step: Step, size: int, start: float, longest_gap: float = math.inf
     ) -> None:
-        self._step, self._start = step, np.full(size, start, np.float32)
+        self._step = step
+        self._start = np.full(size, start, np.float32)
         self._longest_gap = longest_gap  # between two observations [s]
         self._state: Rows | None = None
         self._time = math.inf  # of the last observation [s]
@@ -35,13 +36,15 @@ class Stateful:
     def reset(self, worlds: NDArray[np.bool_] | None = None) -> None:
         """Begins an episode, in some worlds (N,) or in all of them."""
         if worlds is None or self._state is None:
-            self._state, self._time = None, math.inf
+            self._state = None
+            self._time = math.inf
         else:
             self._state[worlds] = self._start
 
     def resume(self, time_s: float) -> str:
         """Resets after a gap before an observation of this time [s]; a sentence says so, or ''."""
-        gap, self._time = time_s - self._time, time_s
+        gap = time_s - self._time
+        self._time = time_s
         if gap <= self._longest_gap:
             return ""
         self.reset()

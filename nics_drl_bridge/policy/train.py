@@ -43,8 +43,11 @@ from nics_drl_bridge.policy.training_settings import (
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-CHECKPOINT, SETTINGS, LOCK = "checkpoint.pt", "settings.yaml", ".lock"
-EVALUATION, POLICY = "evaluation.json", "policy.onnx"
+CHECKPOINT = "checkpoint.pt"
+SETTINGS = "settings.yaml"
+LOCK = ".lock"
+EVALUATION = "evaluation.json"
+POLICY = "policy.onnx"
 SEEDS = 2**40
 MOST_WEIGHT = 80.0  # whose exponential, a spread of actions, is just finite
 TRIED = 8  # worlds, and steps in each
@@ -76,7 +79,8 @@ def train(
 
     `on_env` gets the worlds before the first step, as to be called by their `on_step`.
     """
-    begin, path = time.perf_counter(), folder / CHECKPOINT
+    begin = time.perf_counter()
+    path = folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     env, stop = make_train_env(settings), _stop_of(settings)
@@ -273,10 +277,8 @@ def run(
 ) -> list[SeedResult]:
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.settings, order.seeds, order.out, order.resumed)
-    settings, model = (
-        order.settings,
-        open_model(order.settings.robot, order.settings.lidar),
-    )
+    settings = order.settings
+    model = open_model(order.settings.robot, order.settings.lidar)
     trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
     algorithms.check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)

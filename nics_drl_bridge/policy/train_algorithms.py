@@ -32,10 +32,12 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
-LEAST_STD, LIMIT = 0.05, 5.0
+LEAST_STD = 0.05
+LIMIT = 5.0
 NEAR = 0.1  # share of the range that counts as half of it, see `bend`
 LEAST_SHARE = 0.25  # of the span of an observation, or of its mean if that is less
-OBSERVED_STEPS, OBSERVED_WORLDS = 32, 256
+OBSERVED_STEPS = 32
+OBSERVED_WORLDS = 256
 GAIN = 2.0**0.5
 ACTION_GAIN = (
     0.01  # initial gain of an actor's last layer: all its actions are near zero
@@ -128,7 +130,8 @@ def bend(observations: Any, shares: Any) -> Any:
 
     Observations are (N, O); `shares` (O,) are 1 for those to be bent, and 0 for the others.
     """
-    grown, least = 1.0 + NEAR * shares, 1.0 + (NEAR - 1.0) * shares
+    grown = 1.0 + NEAR * shares
+    least = 1.0 + (NEAR - 1.0) * shares
     return observations * grown / (observations * shares + least)
 
 
@@ -176,10 +179,8 @@ class Actor(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.memory = Memory() if memory is None else memory
-        self.discrete, size = (
-            isinstance(actions, gymnasium.spaces.Discrete),
-            actions.shape or (),
-        )
+        self.discrete = isinstance(actions, gymnasium.spaces.Discrete)
+        size = actions.shape or ()
         count = int(
             actions.n
             if isinstance(actions, gymnasium.spaces.Discrete)
@@ -241,7 +242,8 @@ class Sb3Training:
     ) -> None:
         self.policy = make_algorithm(settings, env, seed, normaliser)
         self.networks = self.policy.policy
-        self._total, self._log_every = settings.steps, LOG_EVERY[settings.algorithm]
+        self._total = settings.steps
+        self._log_every = LOG_EVERY[settings.algorithm]
 
     @property
     def steps(self) -> int:
@@ -251,10 +253,8 @@ class Sb3Training:
     def learn(self, watch: Watch, logger: Logger) -> None:
         """Learns until all steps are done."""
         self.policy.set_logger(logger)
-        left, companion = (
-            self._total - self.steps,
-            Companion(watch, act_of(self.policy)),
-        )
+        left = self._total - self.steps
+        companion = Companion(watch, act_of(self.policy))
         self.policy.learn(left, companion, self._log_every, reset_num_timesteps=False)
 
     def state(self) -> dict[str, Any]:
@@ -294,7 +294,8 @@ class Sb3Training:
         if isinstance(algorithm, OffPolicyAlgorithm):
             buffer: Any = algorithm.replay_buffer
             replay = state["replay"]
-            buffer.pos, buffer.full = replay["pos"], replay["full"]
+            buffer.pos = replay["pos"]
+            buffer.full = replay["full"]
             for name in REPLAYED:
                 getattr(buffer, name)[: buffer.size()] = replay[name].numpy()
         _set_random_state(algorithm, state["random"])
@@ -379,7 +380,9 @@ class Companion(BaseCallback):
 
     def __init__(self, watch: Watch, act: Act) -> None:
         super().__init__()
-        self._watch, self._act, self._ends = watch, act, False
+        self._watch = watch
+        self._act = act
+        self._ends = False
 
     def _on_training_start(self) -> None:
         self._watch.begin(self.num_timesteps)

@@ -151,10 +151,14 @@ class Watch:
         tell: Tell,
         stop: Stop,
     ) -> None:
-        self._env, self._seed, self._save, self._tell = env, seed, save, tell
+        self._env = env
+        self._seed = seed
+        self._save = save
+        self._tell = tell
         self._stop = stop
         self._levels = list(settings.worlds) if settings.teaching.curriculum else []
-        self._total, self._every = settings.steps, settings.checkpoint_every
+        self._total = settings.steps
+        self._every = settings.checkpoint_every
         self.collisions: deque[bool] = deque(maxlen=RECENT)  # of the last episodes
 
     def begin(self, steps: int) -> None:
@@ -224,7 +228,8 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
     for name, rows in state.items():
         prefix = next((p for p in (MEMORY, DRAWN) if name.startswith(p)), "")
         parts[prefix][name.removeprefix(prefix)] = np.array(rows)
-    targets, given = env.changing, parts[""]
+    targets = env.changing
+    given = parts[""]
     for name in sorted(given.keys() | targets.keys()):
         was, now = (_kind(rows.get(name)) for rows in (given, targets))
         if was != now:
@@ -233,7 +238,8 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
             raise ConfigError(f"state of a vector env: {reason}; {advice}.")
     for name, target in targets.items():
         target[...] = given[name]  # in place: the compiled steps refer to these arrays
-    env.memory, env.simulator.drawn = parts[MEMORY], parts[DRAWN]
+    env.memory = parts[MEMORY]
+    env.simulator.drawn = parts[DRAWN]
     env.simulator.sort_bodies()
     env.ready = bool((targets["episode"] >= 0).all())
 

@@ -41,7 +41,8 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
         self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None
     ) -> None:
         super().__init__()
-        self.actor, self.discrete = actor, task.actions == "discrete"
+        self.actor = actor
+        self.discrete = task.actions == "discrete"
         self.limit = None if normaliser is None else float(normaliser[2])
         if normaliser is not None:
             self.register_buffer("mean", _vector(normaliser[0]))
@@ -147,7 +148,8 @@ def export_policy(
 def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
     seen = golden_observations(task)
     session = open_session(graph.SerializeToString(), source)
-    inputs, kept = (onnx_graph.INPUT, onnx_graph.STATE_IN), deployed.state
+    inputs = (onnx_graph.INPUT, onnx_graph.STATE_IN)
+    kept = deployed.state
     start = None if kept is None else np.full(kept[0], kept[1], np.float32)
 
     def infer(*given: Rows) -> list[Rows]:
@@ -168,14 +170,14 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
 
 
 def _graph(deployed: Deployed, task: Task) -> Any:
-    inputs, outputs = [onnx_graph.INPUT], [onnx_graph.ACTION, onnx_graph.COMMAND]
-    examples, buffer = [torch.zeros(1, task.observation_space.shape[0])], io.BytesIO()
+    inputs = [onnx_graph.INPUT]
+    outputs = [onnx_graph.ACTION, onnx_graph.COMMAND]
+    examples = [torch.zeros(1, task.observation_space.shape[0])]
+    buffer = io.BytesIO()
     if deployed.state is not None:
         examples.append(torch.zeros(1, deployed.state[0]))
-        inputs, outputs = (
-            [*inputs, onnx_graph.STATE_IN],
-            [*outputs, onnx_graph.STATE_OUT],
-        )
+        inputs = [*inputs, onnx_graph.STATE_IN]
+        outputs = [*outputs, onnx_graph.STATE_OUT]
     with warnings.catch_warnings():
         # This exporter is deprecated; the new one takes several times longer.
         warnings.simplefilter("ignore")

@@ -19,7 +19,9 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 DISTURBANCE = 0.2  # standard deviation of the noise on driven actions
-RATE, BATCH = 1e-3, 512  # of the gradient steps
+# of the gradient steps
+RATE = 1e-3
+BATCH = 512
 LEAST_STD = 0.2  # of the actions with which PPO goes on
 
 
@@ -35,7 +37,8 @@ class Shown(NamedTuple):
 
 def expert_of(settings: TrainingSettings, env: TrainVecEnv) -> Policy:
     """Opens the expert of the settings. Raises ConfigError if the task does not suit it."""
-    name, task = getattr(settings.imitation, "expert", ""), env.envs[0].task
+    name = getattr(settings.imitation, "expert", "")
+    task = env.envs[0].task
     box = isinstance(env.action_space, gymnasium.spaces.Box)
     if not isinstance(task, Navigation) or not box:
         fix = "leave imitation out."
@@ -54,7 +57,10 @@ def drive(
     rng: np.random.Generator,
 ) -> tuple[Shown, NDArray[np.float32]]:
     """Drives all worlds for steps of each, from observations (N, O); returns the last ones, too."""
-    seen, actions, rewards, ended = [], [], [], []
+    seen = []
+    actions = []
+    rewards = []
+    ended = []
     for _ in range(steps):
         wanted = expert.act(last)
         noise = rng.normal(0.0, DISTURBANCE, wanted.shape).astype(np.float32)
@@ -63,7 +69,8 @@ def drive(
         last, reward, done, _ = env.step(np.clip(wanted + noise, -1.0, 1.0))
         rewards.append(reward)
         ended.append(done)
-    after, returns = np.full(len(last), np.nan, np.float32), []
+    after = np.full(len(last), np.nan, np.float32)
+    returns = []
     for reward, done in zip(reversed(rewards), reversed(ended), strict=True):
         after = reward + discount * np.where(done, np.float32(0.0), after)
         returns.append(after)
@@ -80,7 +87,8 @@ def imitate(
     for _ in range(epochs):
         for rows in torch.randperm(len(shown.seen), generator=generator).split(BATCH):
             seen, actions, returns = (each[rows] for each in shown)
-            features, known = actor.normaliser(seen), ~returns.isnan()
+            features = actor.normaliser(seen)
+            known = ~returns.isnan()
             error = (actor.layers(features) - actions).square().mean()
             apart = networks.critic(features[known]).squeeze(-1) - returns[known]
             optimiser.zero_grad(set_to_none=False)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 
-ONE, NONE = np.float32(1.0), np.float32(0.0)
+ONE = np.float32(1.0)
+NONE = np.float32(0.0)
 LOG_NORM = np.float32(0.5 * np.log(2.0 * np.pi))  # of the normal distribution
 
 
@@ -41,16 +42,19 @@ class Batch(NamedTuple):
 @kernel(allocates=True)
 def forward(net, seen):  # type: ignore[no-untyped-def]
     """Outputs (n, C) of a network for inputs (n, O); those of all layers are kept."""
-    n, at, rows = seen.shape[0], 0, seen
+    n = seen.shape[0]
+    at = 0
+    rows = seen
     for k in range(net.widths.shape[0] - 1):
-        ins, outs = net.widths[k], net.widths[k + 1]
-        middle, out = at + ins * outs, net.kept[k, : n * outs].reshape(n, outs)
+        ins = net.widths[k]
+        outs = net.widths[k + 1]
+        middle = at + ins * outs
+        out = net.kept[k, : n * outs].reshape(n, outs)
         np.dot(rows, net.weights[at:middle].reshape(outs, ins).T, out)
-        at, rows = middle + outs, out
-        bias, least = (
-            net.weights[middle:at],
-            NONE if k + 2 < net.widths.shape[0] else -np.inf,
-        )
+        at = middle + outs
+        rows = out
+        bias = net.weights[middle:at]
+        least = NONE if k + 2 < net.widths.shape[0] else -np.inf
         for i in range(n):
             for j in range(outs):
                 out[i, j] = max(out[i, j] + bias[j], np.float32(least))
@@ -63,9 +67,12 @@ def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
 
     `gradient` is the first of the spare arrays.
     """
-    n, at, side = seen.shape[0], net.weights.shape[0], 0
+    n = seen.shape[0]
+    at = net.weights.shape[0]
+    side = 0
     for k in range(net.widths.shape[0] - 2, -1, -1):
-        ins, outs = net.widths[k], net.widths[k + 1]
+        ins = net.widths[k]
+        outs = net.widths[k + 1]
         middle = at - outs
         at = middle - ins * outs
         rows = net.kept[k - 1, : n * ins].reshape(n, ins) if k > 0 else seen
@@ -86,7 +93,9 @@ def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
     """Writes the gradients of the critic; returns its part of the loss, with a weight."""
     values = forward(net, batch.seen)
     n = values.shape[0]
-    out, loss, share = net.spare[0, :n].reshape(n, 1), NONE, weight / np.float32(n)
+    out = net.spare[0, :n].reshape(n, 1)
+    loss = NONE
+    share = weight / np.float32(n)
     for i in range(n):
         off = values[i, 0] - batch.returns[i]
         loss += share * off * off
@@ -101,21 +110,26 @@ def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore
 
     Of discrete actions, `log_std` has none.
     """
-    raw, gains = forward(net, batch.seen), batch.advantages
-    n, actions = raw.shape[0], batch.actions
+    raw = forward(net, batch.seen)
+    gains = batch.advantages
+    n = raw.shape[0]
+    actions = batch.actions
     out = net.spare[0, : raw.size].reshape(raw.shape)
-    mean, share = gains.mean(), ONE / np.float32(n)
+    mean = gains.mean()
+    share = ONE / np.float32(n)
     scale = ONE / (
         np.sqrt(np.square(gains - mean).sum() / np.float32(n - 1)) + np.float32(1e-8)
     )
     spread[:] = -entropy
-    loss, parts = NONE, np.empty(raw.shape[1], np.float32)
+    loss = NONE
+    parts = np.empty(raw.shape[1], np.float32)
     for i in range(n):
         if log_std.size > 0:
             log_prob, mixed = _density(parts, raw[i], actions[i], log_std)
         else:
             log_prob, mixed = _probability(parts, raw[i], int(actions[i, 0]))
-        ratio, gain = np.exp(log_prob - batch.log_probs[i]), (gains[i] - mean) * scale
+        ratio = np.exp(log_prob - batch.log_probs[i])
+        gain = (gains[i] - mean) * scale
         bounded = gain * min(max(ratio, ONE - clip), ONE + clip)
         loss -= share * (min(gain * ratio, bounded) + entropy * mixed)
         pull = share * gain * ratio if gain * ratio <= bounded else NONE
@@ -147,7 +161,9 @@ def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def _probability(parts, raw, action):  # type: ignore[no-untyped-def]
     """Logarithm of the probability of an action, and entropy; `parts` are those of all (C,)."""
-    greatest, total, mixed = raw.max(), NONE, NONE
+    greatest = raw.max()
+    total = NONE
+    mixed = NONE
     for j in range(raw.shape[0]):
         total += np.exp(raw[j] - greatest)
     for j in range(raw.shape[0]):

@@ -49,7 +49,8 @@ class Stack(Memory):
 
     def __init__(self, settings: StackMemory, scan_parts: int) -> None:
         super().__init__()
-        self._parts, self._every = scan_parts, settings.every
+        self._parts = scan_parts
+        self._every = settings.every
         self._kept = (settings.scans - 1) * settings.every
         self.size = self._kept * scan_parts
         self.extra = (settings.scans - 1) * scan_parts

@@ -18,17 +18,16 @@ class Reflection:
     """Mirrors transitions; `extra` features follow an observation, scans of `parts`."""
 
     def __init__(self, mirror: Mirror, extra: int, parts: int) -> None:
-        self._mirror, count = mirror, len(mirror.places)
+        self._mirror = mirror
+        count = len(mirror.places)
         scans = [
             first + mirror.places[:parts]
             for first in range(count, count + extra, parts or 1)
         ]
         places = np.concatenate([mirror.places, *scans])
         signs = np.concatenate([mirror.signs, np.ones(extra)])
-        self._places, self._acted = (
-            torch.from_numpy(places),
-            torch.from_numpy(mirror.acted),
-        )
+        self._places = torch.from_numpy(places)
+        self._acted = torch.from_numpy(mirror.acted)
         self._signs, self._scale, self._offset = (
             torch.from_numpy(each.astype(np.float32))
             for each in (signs, mirror.scale, mirror.offset)
@@ -42,7 +41,8 @@ class Reflection:
 
         A normaliser with them mirrors alike before and after.
         """
-        places, signs = self._mirror.places, self._mirror.signs
+        places = self._mirror.places
+        signs = self._mirror.signs
         other = signs * mean[places]
         spread = 0.5 * (std**2 + std[places] ** 2) + 0.25 * (mean - other) ** 2
         return 0.5 * (mean + other), np.sqrt(spread)

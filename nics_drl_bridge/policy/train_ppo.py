@@ -32,7 +32,9 @@ from nics_drl_bridge.threads import one_blas_thread, run_parts
 
 Ended = list[tuple[bool, bool]]  # success and collision of episodes
 Seen = tuple[torch.Tensor, torch.Tensor]  # features and state
-VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # of the loss, and of the norm of its gradient
+# of the loss, and of the norm of its gradient
+VALUE_WEIGHT = 0.5
+GRADIENT_LIMIT = 0.5
 ADAM_EPSILON = 1e-5
 
 
@@ -157,7 +159,9 @@ class Learner:
         seed: int,
         reflection: Reflection | None = None,
     ) -> None:
-        self.networks, self.ppo, self._reflection = networks, ppo, reflection
+        self.networks = networks
+        self.ppo = ppo
+        self._reflection = reflection
         self.generator = torch.Generator().manual_seed(seed)
         self._all = flattened(networks)
         self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
@@ -168,12 +172,11 @@ class Learner:
 
     def judge(self, driven: Driven) -> Transitions:
         """Advantages and returns of a rollout, by the present critic, and mirror images."""
-        networks, ppo = self.networks, self.ppo
+        networks = self.networks
+        ppo = self.ppo
         with torch.no_grad():
-            values, rewards = (
-                networks.critic(driven.seen).squeeze(-1),
-                driven.rewards.clone(),
-            )
+            values = networks.critic(driven.seen).squeeze(-1)
+            rewards = driven.rewards.clone()
             # What would have come after the time limits:
             rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(
                 driven.final
@@ -234,7 +237,8 @@ class Learner:
         actor = self.networks.actor
         seen = batch.seen[:, : actor.normaliser.features_dim].unflatten(0, done.shape)
         features = actor.memory.unroll(seen, state, done).flatten(0, 1)
-        raw, values = actor.layers(features), self.networks.critic(features.detach())
+        raw = actor.layers(features)
+        values = self.networks.critic(features.detach())
         self._all.grad.zero_()
         loss = loss_of(self.networks, raw, values, batch, self.ppo)
         loss.backward()
@@ -247,22 +251,27 @@ class Collector:
     def __init__(
         self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int
     ) -> None:
-        self.env, self.networks, self.ppo = env, copy.deepcopy(networks), ppo
+        self.env = env
+        self.networks = copy.deepcopy(networks)
+        self.ppo = ppo
         self.generator = torch.Generator().manual_seed(seed)
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
         self.state = networks.actor.memory.begin(env.num_envs)  # (N, S) of the actor
 
     def collect(self) -> tuple[Driven, Ended]:
         """Drives all worlds for the steps of a rollout."""
-        steps, worlds = self.ppo.rollout, self.env.num_envs
-        networks, first, space = (
-            self.networks,
-            self.state,
-            cast("Any", self.env.action_space),
-        )
+        steps = self.ppo.rollout
+        worlds = self.env.num_envs
+        networks = self.networks
+        first = self.state
+        space = cast("Any", self.env.action_space)
         seen = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
         rewards, done = torch.zeros(2, steps, worlds)
-        raw, actions, ended, cut, final = [], [], [], [], [seen[0, :0]]
+        raw = []
+        actions = []
+        ended = []
+        cut = []
+        final = [seen[0, :0]]
         with torch.no_grad():
             for t in range(steps):
                 seen[t], state = self._see(self.last, self.state)
@@ -313,10 +322,14 @@ class LeanPpo:
         train_algorithms.check_serves(settings, env.envs[0])
         torch.set_num_threads(settings.threads)
         torch.manual_seed(seed)
-        self._total, self._ppo, hidden = settings.steps, settings.ppo, settings.hidden
+        self._total = settings.steps
+        self._ppo = settings.ppo
+        hidden = settings.hidden
         spaces = env.observation_space, env.action_space
-        inputs, parts = len(normaliser[0]), env.envs[0].task.scan_parts
-        memory, reflection = memory_of(settings.memory, inputs, parts), None
+        inputs = len(normaliser[0])
+        parts = env.envs[0].task.scan_parts
+        memory = memory_of(settings.memory, inputs, parts)
+        reflection = None
         if self._ppo.mirror:
             reflection = Reflection(env.envs[0].task.mirror(), memory.extra, parts)
             normaliser = reflection.balanced(*normaliser)
@@ -327,11 +340,9 @@ class LeanPpo:
         seeds = np.random.SeedSequence(seed).generate_state(3)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
         self.learner = Learner(self.networks, self._ppo, int(seeds[1]), reflection)
-        self.policy, self._settings, self._imitation_seed = (
-            actor,
-            settings,
-            int(seeds[2]),
-        )
+        self.policy = actor
+        self._settings = settings
+        self._imitation_seed = int(seeds[2])
         self.steps = 0  # of all worlds together, learnt from so far
         self._rollout: Driven | None = None  # the next one to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
@@ -356,13 +367,12 @@ class LeanPpo:
 
     def _imitate(self) -> None:
         """Begins with what an expert does, if the settings say so; its steps count as well."""
-        given, part = self._settings.imitation, self.collector
+        given = self._settings.imitation
+        part = self.collector
         if given is None:
             return
-        steps, rng = (
-            given.steps // part.env.num_envs,
-            np.random.default_rng(self._imitation_seed),
-        )
+        steps = given.steps // part.env.num_envs
+        rng = np.random.default_rng(self._imitation_seed)
         expert = train_imitation.expert_of(self._settings, part.env)
         drive = partial(train_imitation.drive, discount=self._ppo.discount, rng=rng)
         shown, part.last = drive(part.env, expert, part.last, steps)
@@ -423,7 +433,8 @@ class LeanPpo:
         """Continues with the state of another, made with the same arguments."""
         self.networks.load_state_dict(state["weights"])
         self.learner.optimiser.load_state_dict(state["optimiser"])
-        self.steps, rollout = state["steps"], state["rollout"]
+        self.steps = state["steps"]
+        rollout = state["rollout"]
         self._rollout = rollout and Driven(**rollout)
         self._successes.extend(state["recent"])
         self.collector.last = state["last"].numpy()

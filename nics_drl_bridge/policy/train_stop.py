@@ -29,11 +29,10 @@ class Stop:
     def __init__(
         self, given: StopSettings | None, envs: Mapping[str, BridgeVectorEnv]
     ) -> None:
-        self._given, self._envs = given, envs
-        self._due, self._reached = (
-            0,
-            0,
-        )  # number of the latest evaluation; reached in a row
+        self._given = given
+        self._envs = envs
+        self._due = 0  # number of the latest evaluation
+        self._reached = 0  # reached in a row
         self.shares: dict[str, float] = {}  # success by world in the latest evaluation
 
     @property
@@ -72,5 +71,6 @@ class Stop:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues with the state of another; with one of before there was any, as if new."""
         if known := state.get("stop"):
-            self._due, self._reached = known["due"], known["reached"]
+            self._due = known["due"]
+            self._reached = known["reached"]
             self.shares = dict(known["shares"])

@@ -21,7 +21,8 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
-MOST_LAYERS, MOST_WIDE = 16, 8_192
+MOST_LAYERS = 16
+MOST_WIDE = 8_192
 MOST_KEPT = 2**26  # stored transitions: of a roll-out in all worlds, or of SAC's buffer
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 

@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
     AnyBag = Reader | Ros1Reader
 
-METADATA, ABOUT = "metadata.yaml", "rosbag2_bagfile_information"
+METADATA = "metadata.yaml"
+ABOUT = "rosbag2_bagfile_information"
 DATABASE = ".db3"
 SUFFIXES = (".mcap", DATABASE)
 ROS_1 = ".bag"
 COMPRESSED = (".zst", ".zstd")
 URI_SIGNS = "?#%"
-LONGEST_NAME, LONGEST_REASON = (
-    60,
-    260,
-)  # of a topic or type, and of a fault [characters]
+# of a topic or type, and of a fault [characters]
+LONGEST_NAME = 60
+LONGEST_REASON = 260
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,10 @@ def _check_summary(reader: "Reader") -> None:
     from nics_drl_bridge.recording.mcap import check_message
 
     storages: list[Any] = list(getattr(reader.storage, "storages", [reader.storage]))
-    summary, held = _counts(reader), sum(map(_counts, storages), Counter())
-    told, there = summary.total(), sum(each.metadata.message_count for each in storages)
+    summary = _counts(reader)
+    held = sum(map(_counts, storages), Counter())
+    told = summary.total()
+    there = sum(each.metadata.message_count for each in storages)
     if there != told:
         raise ValueError(
             f"its summary speaks of {told} messages, its files hold {there}"
@@ -227,7 +229,8 @@ class BagFile:
             raise RecordingError(
                 f"{place}: holds no messages; record a drive of 20 s or more."
             )
-        self._reader, self._is_ros_1 = reader, is_ros_1
+        self._reader = reader
+        self._is_ros_1 = is_ros_1
         self._store = with_types(reader.connections)
         self.place = place  # its name, for errors
         self._connections: dict[str, list[Connection]] = {}

@@ -147,7 +147,8 @@ def of_one_body(
         for message in messages
         for transform in getattr(message.content, "transforms", (message.content,))
     ]
-    wanted, there = (frame, child), {pair for pair, _ in single}
+    wanted = (frame, child)
+    there = {pair for pair, _ in single}
     pairs = {
         pair
         for pair in there
@@ -175,10 +176,8 @@ def joint_streams(
 ) -> dict[str, TopicData]:
     """Returns state and wheels, each if the joints show it; for errors see `state_of`."""
     joints = gather(topic, messages)
-    state, wheels = (
-        state_of(joints, spec, mapping, place),
-        wheels_of(joints, mapping, place),
-    )
+    state = state_of(joints, spec, mapping, place)
+    wheels = wheels_of(joints, mapping, place)
     found = {"state": state, "wheels": wheels}
     return {name: data for name, data in found.items() if data is not None}
 

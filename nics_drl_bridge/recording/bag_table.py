@@ -48,7 +48,8 @@ def fields_of(message: Any, path: str = "") -> Iterator[str]:
     else:
         labels: Any = getattr(message, NAMES, None)
         for name in (each for each in vars(message) if not each.startswith("__")):
-            inner, where = getattr(message, name), f"{path}.{name}".lstrip(".")
+            inner = getattr(message, name)
+            where = f"{path}.{name}".lstrip(".")
             listed = isinstance(labels, list) and isinstance(inner, (list, np.ndarray))
             if listed and name != NAMES and len(inner) == len(labels) > 0:
                 yield from (f"{where}[{label}]" for label in labels)
@@ -76,7 +77,8 @@ def reader_of_field(path: str) -> Callable[[Any], Any]:
                     return np.nan
                 message = message[k]
             else:
-                within, message = message, getattr(message, part)
+                within = message
+                message = getattr(message, part)
         return (
             message.sec + message.nanosec * S_PER_NS
             if hasattr(message, "nanosec")
@@ -116,10 +118,8 @@ class Bag(Source):
         known = bag.types.keys() - bag.empty
         scenes = {topic for topic in known if SCENES.search(bag.types[topic])}
         super().__init__(bag.place, sorted(t for t in known - scenes if bag.knows(t)))
-        self._bag, self._frames = (
-            bag,
-            (None, None) if mapping is None else mapping.pose.frames,
-        )
+        self._bag = bag
+        self._frames = (None, None) if mapping is None else mapping.pose.frames
         # topics that are read, and whether they come from the robot's computer, for common stamps
         self._used = {} if mapping is None else topics_used(mapping, self.names)
         self._messages: dict[str, Sequence[Message]] = {}
@@ -136,10 +136,8 @@ class Bag(Source):
         messages = self._of(name)
         place = f"{self.place}: topic {name!r}"
         names = tuple(dict.fromkeys(fields_of(messages[0].content)))
-        column, stamps = (
-            partial(column_of, place, names, messages),
-            partial(self._stamps_of, name),
-        )
+        column = partial(column_of, place, names, messages)
+        stamps = partial(self._stamps_of, name)
         notes = self._notes.setdefault(name, [])
         kind = self._bag.types[name]
         return Table(place, names, column, "message {}".format, notes, stamps, kind)

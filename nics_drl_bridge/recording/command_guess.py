@@ -267,7 +267,9 @@ ROUNDABOUT = {
 }
 BARE_TWIST = {"cmd", "vel"}
 
-CERTAIN, LIKELY, POSSIBLE = 3, 2, 1
+CERTAIN = 3
+LIKELY = 2
+POSSIBLE = 1
 MOST_CANDIDATES = 8
 
 
@@ -377,7 +379,8 @@ def _rank_of(table: TableSurvey, context: set[str]) -> int:
 def meaning_of(words: set[str]) -> str | None:
     """Returns what a command with these words in its name means; None if they do not tell."""
     moves = words & {"velocity", "vel", "rate", "speed"}
-    left, right = bool(words & LEFT), bool(words & RIGHT)
+    left = bool(words & LEFT)
+    right = bool(words & RIGHT)
     for corner, short in CORNERS.items():
         ahead, side = corner.split("_")
         spoken = words & (FRONT if ahead == "front" else REAR)

@@ -30,11 +30,13 @@ class EpisodeOfTable(Source):
     ) -> None:
         super().__init__(f"{source.place} (episode {episode})", [name])
         self.episode = episode
-        self._table, self._rows = table, rows
+        self._table = table
+        self._rows = rows
 
     def read(self, name: str) -> Table:
         """Returns the table with the rows of the episode."""
-        table, rows = self._table, self._rows
+        table = self._table
+        rows = self._rows
 
         def column(which: str | int) -> Column:
             return table.column(which)[rows]

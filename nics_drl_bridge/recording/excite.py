@@ -23,24 +23,28 @@ STILL_S = 1.0  # standstill at both ends of a drive [s]
 RAMP_S = 0.25
 SEGMENT_S = (0.4, 1.6)
 CANDIDATES = 12
-ALONE, REDRAWN = (
-    0.5,
-    0.6,
-)  # probability to change a single command; else, each further one
+ALONE = 0.5  # probability to change a single command
+REDRAWN = 0.6  # else, each further one
 BINS = 4
 CENTRED = (
     2.0  # weight of the distance from the centre against the familiarity of a command
 )
 # The path stays inside the circle by a margin plus the way of a reaction at top speed.
-MARGIN_M, REACTION_S, TOLERANCE_M = 0.05, 0.2, 0.005
+MARGIN_M = 0.05
+REACTION_S = 0.2
+TOLERANCE_M = 0.005
 # Turning back uses shares of the greatest commands, as a reserve for a robot that turns worse.
-TURNING_SPEED, TURNING = 0.5, 0.8
-WAY_S, WAY_STEP_S = (3.0, 20.0), 0.1
+TURNING_SPEED = 0.5
+TURNING = 0.8
+WAY_S = (3.0, 20.0)
+WAY_STEP_S = 0.1
 # A path back starts within a share of the circle's radius, or reaches a share of its initial
 # distance from the centre, or turns by half a turn.
-NEAR, NEARER = 0.25, 0.6
+NEAR = 0.25
+NEARER = 0.6
 LOST = 8
-SHORTEST_S, LONGEST_S = 20.0, 3600.0
+SHORTEST_S = 20.0
+LONGEST_S = 3600.0
 SPREAD = 0.17  # least standard deviation of a command as a share of its range (0.29 if uniform)
 ALIKE = 0.6  # greatest correlation of two commands
 ATTEMPTS = 8
@@ -50,24 +54,28 @@ class Exploration:
     """Commands, one per period, that keep a robot in its plan's circle; it rests at both ends."""
 
     def __init__(self, plan: "DrivePlan", rng: np.random.Generator) -> None:
-        spec, self._plan = plan.robot, plan
-        self._motion, self._rng = expected_motion(spec), rng
+        spec = plan.robot
+        self._plan = plan
+        self._motion = expected_motion(spec)
+        self._rng = rng
         share = np.array(
             [1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command]
         )
-        self.low, self.high = share * spec.command_low, share * spec.command_high
+        self.low = share * spec.command_low
+        self.high = share * spec.command_high
         self.rest = np.clip(np.zeros(len(spec.command)), self.low, self.high)
-        self._ticks, self._still = (
-            round(plan.duration / PERIOD_S),
-            round(STILL_S / PERIOD_S),
-        )
+        self._ticks = round(plan.duration / PERIOD_S)
+        self._still = round(STILL_S / PERIOD_S)
         self._ramp = round(RAMP_S / PERIOD_S)
         self._visits = np.full((BINS,) * len(spec.command), 1.0 / BINS)
-        self._tick, self._lost, self._turn = 0, 0, 0
+        self._tick = 0
+        self._lost = 0
+        self._turn = 0
         self._queue = np.zeros((0, len(spec.command)))
         self._command, self._state = self.rest, np.zeros(self._motion.size)
         self.pose: Array = np.zeros(3)
-        self._before, self._seen = self.pose, False
+        self._before = self.pose
+        self._seen = False
         fastest = np.hypot(*(plan.speed * reach(spec)[:2]))
         self._outermost = plan.bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
@@ -83,7 +91,8 @@ class Exploration:
     def see(self, pose: Array) -> None:
         """Observes the pose (3,) at the start of the current period, in the start frame."""
         self.pose = geometry.compose(pose, geometry.between(self._before, self.pose))
-        self._before, self._seen = np.asarray(pose, dtype=np.float64), True
+        self._before = np.asarray(pose, dtype=np.float64)
+        self._seen = True
 
     def next(self) -> Array:
         """Returns the command (C,) for the period that begins now."""
@@ -91,23 +100,28 @@ class Exploration:
         if self._still <= self._tick < self._ticks:
             if len(self._queue) == 0 or self._goes_astray():
                 self._queue = self._segment()
-            command, self._queue = np.asarray(self._queue[0]), self._queue[1:]
+            command = np.asarray(self._queue[0])
+            self._queue = self._queue[1:]
         poses, states = self._roll(command[None, None])
-        self._before, self.pose = self.pose, poses[0, -1]
-        self._state, self._command = states[0, -1], command
+        self._before = self.pose
+        self.pose = poses[0, -1]
+        self._state = states[0, -1]
+        self._command = command
         self._visits[self._cells(command)] += 1.0
         self._tick += 1
         return command
 
     def expected(self) -> "Pattern | None":
         """Drives to the end; None if it finds no way back, or shows too little of a command."""
-        poses, commands = [self.pose], []
+        poses = [self.pose]
+        commands = []
         while not self.done:
             commands.append(self.next())
             poses.append(self.pose)
             if self._lost >= LOST:
                 return None
-        command, plan = np.array(commands), self._plan
+        command = np.array(commands)
+        plan = self._plan
         if (command.std(axis=0) < SPREAD * (self.high - self.low)).any():
             return None
         footprint = plan.robot.footprint_radius
@@ -131,10 +145,8 @@ class Exploration:
 
     def _roll(self, commands: Array, period: float = PERIOD_S) -> tuple[Array, Array]:
         many = len(commands)
-        pose, state = (
-            np.repeat(self.pose[None], many, 0),
-            np.repeat(self._state[None], many, 0),
-        )
+        pose = np.repeat(self.pose[None], many, 0)
+        state = np.repeat(self._state[None], many, 0)
         return self._motion.roll(pose, state, commands, period)
 
     def _cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
@@ -194,7 +206,8 @@ class Exploration:
         high = np.maximum(factor * self.high, self.rest)
         ends = [sorted(set(three)) for three in zip(low, self.rest, high, strict=True)]
         ways = np.array(list(product(*ends)))[:, None]
-        first, last = round(WAY_S[0] / WAY_STEP_S), round(1.0 / WAY_STEP_S)
+        first = round(WAY_S[0] / WAY_STEP_S)
+        last = round(1.0 / WAY_STEP_S)
         poses, _ = self._roll(np.repeat(ways, first, axis=1), WAY_STEP_S)
         heading = np.unwrap(poses[..., 2], axis=1)
         turned = float(np.abs(heading[:, -1] - heading[:, -1 - last]).max())
@@ -306,7 +319,8 @@ class ExpectedMotion:
         self, pose: Array, state: Array, command: Array, period: float
     ) -> tuple[Array, Array]:
         """Rolls commands (K, T, C) out to poses (K, T + 1, 3) and states; one arc a period [s]."""
-        poses, states = [pose], [state]
+        poses = [pose]
+        states = [state]
         for n in range(command.shape[1]):
             now = command[:, n]
             middle = self.respond(state, now, period / 2.0)

@@ -41,10 +41,9 @@ LARGEST_ANGLE = 1.6  # of a steering [rad]
 MOST_LISTED = 20  # unused columns of a table
 STILL = "; it is 0"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
-MIRRORED, MIRRORED_BETTER = (
-    0.6,
-    0.3,
-)  # shares from which on a draft turns a heading round
+# shares from which on a draft turns a heading round
+MIRRORED = 0.6
+MIRRORED_BETTER = 0.3
 
 
 def first_mapping(tables: Sequence[TableSurvey]) -> str:
@@ -124,7 +123,8 @@ def _value_of(
     name: str, candidate: Candidate, when: str, alone: bool, common: str | None
 ) -> str:
     """Returns a command as a mapping has it: a column, or a column with more keys."""
-    table, column = candidate.table, candidate.column
+    table = candidate.table
+    column = candidate.column
     reference = table.reference(column.name, alone)
     keys = [*_unit_keys(name, table, column)]
     if (

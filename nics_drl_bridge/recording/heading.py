@@ -22,10 +22,9 @@ STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at res
 STANDING_RADPS = 0.005
 FEWEST_AT_REST = 2  # blocks; of fewer, the bias is taken from the drive instead
 LEAST_BIAS_STD = 1e-5  # rad/s
-USUAL_BIAS, USUAL_FACTOR = (
-    0.01,
-    0.5,
-)  # deviations of a bias [rad/s], of a factor of turns from 1
+# deviations of a bias [rad/s], of a factor of turns from 1
+USUAL_BIAS = 0.01
+USUAL_FACTOR = 0.5
 LEAST_RATE_NOISE = 1e-3  # of a block's mean rate [rad/s]
 UNLIKE_BLOCKS = (
     2.0  # factor of errors, as blocks of a drive are not independent of each other
@@ -201,17 +200,16 @@ def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     rest = (blocks.speed < STANDING_MPS) & (np.abs(blocks.odom_rate) < STANDING_RADPS)
     if rest.sum() < FEWEST_AT_REST:
         return _bias_while_driving(blocks)
-    rate, when, rest_s = (
-        blocks.gyro_rate[rest],
-        blocks.middle[rest],
-        float(blocks.span[rest].sum()),
-    )
+    rate = blocks.gyro_rate[rest]
+    when = blocks.middle[rest]
+    rest_s = float(blocks.span[rest].sum())
     usual = float(np.median(rate))
     scatter = 1.4826 * float(np.median(np.abs(rate - usual)))
     near = np.abs(rate - usual) <= max(
         5.0 * scatter, 1e-3
     )  # not where somebody turned it
-    rate, when = rate[near], when[near]
+    rate = rate[near]
+    when = when[near]
     middle = float(when.mean())
     bias = float(rate.mean())
     std = max(float(rate.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
@@ -236,7 +234,8 @@ def _bias_while_driving(blocks: _Blocks) -> tuple[float, float, float, float, fl
     left = blocks.gyro_rate - chi @ found
     noise = max(float(left @ left) / max(len(left) - 2, 1), LEAST_RATE_NOISE**2)
     noise *= UNLIKE_BLOCKS**2
-    usual, deviation = np.array([0.0, 1.0]), np.array([USUAL_BIAS, USUAL_FACTOR])
+    usual = np.array([0.0, 1.0])
+    deviation = np.array([USUAL_BIAS, USUAL_FACTOR])
     spread = np.linalg.inv(chi.T @ chi / noise + np.diag(deviation**-2.0))
     bias = (spread @ (chi.T @ blocks.gyro_rate / noise + usual / deviation**2))[0]
     std = float(np.sqrt(spread[0, 0]))
@@ -248,7 +247,8 @@ def _scale_of(
 ) -> tuple[float, float, float]:
     """Returns odometry's turn per turn of the gyro, its deviation, and their correlation."""
     turned = max(float((np.abs(rate) * span).sum()) for rate in (odom_rate, gyro_rate))
-    power, odom_power = float(gyro_rate @ gyro_rate), float(odom_rate @ odom_rate)
+    power = float(gyro_rate @ gyro_rate)
+    odom_power = float(odom_rate @ odom_rate)
     if turned < LEAST_TURN_RAD or power == 0.0 or odom_power == 0.0:
         return np.nan, np.nan, np.nan
     together = float(odom_rate @ gyro_rate)

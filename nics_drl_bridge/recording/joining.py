@@ -71,7 +71,8 @@ def split_at(
 
 
 def _on_one_clock(recording: Recording, offset: float) -> Recording:
-    pose, command = recording.pose, recording.command
+    pose = recording.pose
+    command = recording.command
     if pose.clock == command.clock:
         return recording
     said = f"{recording.source}: the clock of its pose was aligned by {offset:.3f} s."
@@ -128,7 +129,8 @@ def _laid_out(
     ]
     streams: dict[str, list[Stream]] = {name: [] for name in shared}
     episodes = []
-    start, place = 0.0, np.zeros(3)
+    start = 0.0
+    place = np.zeros(3)
     for part in (*learnt, *held_out):
         shift = start - part.start_s
         cut = _cut(part, shared)
@@ -197,7 +199,8 @@ def _moved(pose: Stream, first: Array, place: Array) -> Stream:
     values = geometry.compose(place, geometry.between(first, pose.values))
     if pose.sigma is None:
         return replace(pose, values=values)
-    c, s = np.cos(place[2] - first[2]), np.sin(place[2] - first[2])
+    c = np.cos(place[2] - first[2])
+    s = np.sin(place[2] - first[2])
     x, y, heading = pose.sigma.T
     sigma = np.stack([np.hypot(c * x, s * y), np.hypot(s * x, c * y), heading], axis=1)
     return replace(pose, values=values, sigma=sigma)

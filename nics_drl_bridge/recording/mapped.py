@@ -90,7 +90,8 @@ def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
         keep, note = stamping.not_repeated(stream.t, stream.values, name)
         reader.say(note)
         found[name] = stream.rows(keep)
-    names, streams = (*mapping.state, *mapping.command), cast(Any, found)
+    names = (*mapping.state, *mapping.command)
+    streams = cast(Any, found)
     measured_by = mapping.pose.measured_by or _source_of_pose(source, mapping)
     made = Recording(
         **streams,
@@ -160,7 +161,8 @@ def _turn_rate_of_heading(
     joined = together("imu", [series], held=False)
     t = joined.t
     keep = np.concatenate([[True], np.diff(t) > 0.0])
-    joined, t = joined.rows(keep), t[keep]
+    joined = joined.rows(keep)
+    t = t[keep]
     if len(t) < 2:
         return replace(joined, values=np.zeros((len(t), 3)))
     turned = np.unwrap(joined.values[:, 0])
@@ -215,7 +217,9 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
     """Reads poses, with their deviations where a covariance is mapped."""
     if pose.x is None:
         pose = _of_message(reader, pose)
-    parts, factors, whole = [], [], list[Value]()
+    parts = []
+    factors = []
+    whole = list[Value]()
     for key, kinds in schema.SI["pose"].items():
         value: Value | None = getattr(pose, key)
         if value is None:
@@ -269,7 +273,8 @@ def _heading(
     if lost.any() and lost.mean() <= MOST_UNTRACKED:
         some = f"{int(lost.sum())} of {len(lost)} rows without orientation"
         reader.say(f"pose: {some} were left out.")
-        made, norm = made.rows(~lost), norm[~lost]
+        made = made.rows(~lost)
+        norm = norm[~lost]
     for k in np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)[:1]:
         where = (
             f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
@@ -355,7 +360,8 @@ def _from_zero(
     """Shifts stamps to begin near 0: by one origin, but for clocks whose spans do not overlap."""
     spans: dict[str, list[float]] = {}
     for name, stream in found.items():
-        first, last = float(stream.t[0]), float(stream.t[-1])
+        first = float(stream.t[0])
+        last = float(stream.t[-1])
         span = spans.setdefault(stream.clock, [first, last])
         if first > span[1] or last < span[0]:
             fault = (
@@ -367,7 +373,8 @@ def _from_zero(
         span[:] = min(first, span[0]), max(last, span[1])
     pose = found["pose"]
     for name, stream in found.items():
-        lasts, usual = np.ptp(stream.t), max(np.ptp(pose.t), 1e-9)
+        lasts = np.ptp(stream.t)
+        usual = max(np.ptp(pose.t), 1e-9)
         if name == "pose" and lasts < SHORTEST_S:
             fault = f"{reader.source.place}: the pose lasts {lasts:.3g} s"
             raise RecordingError(

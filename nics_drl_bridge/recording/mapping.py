@@ -96,7 +96,8 @@ NO_COMMAND_NAMED = (
     "geometry_msgs/Twist on cmd_vel"
 )
 
-ARRIVAL, HEADER = "arrival", "header"
+ARRIVAL = "arrival"
+HEADER = "header"
 ROBOT_CLOCK = "robot"
 # Where the variances of x, y and heading stand: alone, and in a 3 x 3 or 6 x 6 matrix by rows.
 COVARIANCES = {3: (0, 1, 2), 9: (0, 4, 8), 36: (0, 7, 35)}

@@ -39,7 +39,9 @@ class DamageError(ValueError):
 
     def __init__(self, offset: int, what: str, end: int | None = None) -> None:
         super().__init__(f"byte {offset}: {what}")
-        self.offset, self.what, self.end = offset, what, end
+        self.offset = offset
+        self.what = what
+        self.end = end
 
 
 class Record(NamedTuple):
@@ -54,10 +56,12 @@ class _View:
     """Bytes for the library, without copies; reading beyond their end fails, as in no file."""
 
     def __init__(self, data: memoryview, place: int) -> None:
-        self._data, self.place = data, place
+        self._data = data
+        self.place = place
 
     def read(self, size: int) -> memoryview:
-        start, self.place = self.place, self.place + size
+        start = self.place
+        self.place = self.place + size
         if not start <= self.place <= len(self._data):
             raise EndOfFile
         return self._data[start : self.place]
@@ -191,7 +195,8 @@ def check_mcap(path: Path) -> None:
     """Checks a file (https://mcap.dev/spec) from its first byte to its last (DamageError)."""
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
-    data, walk = mapped(path), _Walk()
+    data = mapped(path)
+    walk = _Walk()
     end = len(data) - len(MAGIC)
     if data[: len(MAGIC)] != MAGIC:
         raise DamageError(0, "it does not begin as an MCAP file")
@@ -286,9 +291,11 @@ def _in_summary(walk: _Walk, record: Record) -> None:
 
 
 def _agree(walk: _Walk) -> None:
-    data, summary = walk.data, walk.summary
+    data = walk.data
+    summary = walk.summary
     for name in ("schemas", "channels"):
-        ours, theirs = getattr(data, name), getattr(summary, name)
+        ours = getattr(data, name)
+        theirs = getattr(summary, name)
         if theirs and any(theirs.get(key) != value for key, value in ours.items()):
             raise DamageError(
                 walk.data_end, f"the {name} of its summary are not those of its data"

@@ -89,7 +89,8 @@ def with_types(connections: "Sequence[Connection]", header: bool = True) -> "Typ
         name: each for name, each in own.items() if store.fielddefs.get(name) != each
     }
     if new.keys() & store.fielddefs.keys():  # of another release, or of ROS 1
-        new, store = {**store.fielddefs, **new}, get_typestore(Stores.EMPTY)
+        new = {**store.fielddefs, **new}
+        store = get_typestore(Stores.EMPTY)
         new = {name: each for name, each in new.items() if name not in store.fielddefs}
     store.register(new)
     return store
@@ -202,7 +203,8 @@ def profile_of(offer: Offer) -> "Qos":
     from rosbags import interfaces as rosbags
 
     forever = rosbags.QosTime(9223372036, 854775807)
-    reliability, durability = rosbags.QosReliability, rosbags.QosDurability
+    reliability = rosbags.QosReliability
+    durability = rosbags.QosDurability
     return rosbags.Qos(
         rosbags.QosHistory.KEEP_LAST,
         offer.depth,

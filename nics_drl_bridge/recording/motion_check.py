@@ -93,7 +93,8 @@ def _place(candidate: Candidate) -> str:
 def _rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
     """Returns times (K,) [s], speeds (K,) along the heading and turn rates (K,) of a pose."""
     order = np.argsort(t, kind="stable")
-    t, pose = t[order], pose[order]
+    t = t[order]
+    pose = pose[order]
     grid = np.arange(t[0], t[-1], STEP_S)
     if len(grid) < FEWEST or len(grid) > 10 * len(t) + FEWEST:
         return None
@@ -116,12 +117,14 @@ def _likeness(
     candidate: Candidate, t: Array, signal: Array, lags: Array
 ) -> Array | None:
     """Returns the correlation of a signal (K,) at t (K,) with a command, by lags (L,) [s]."""
-    table, column = candidate.table, candidate.column
+    table = candidate.table
+    column = candidate.column
     values = table.data[column.name].astype(np.float64)
     if table.t is None or len(table.t) != len(values) or column.low == column.high:
         return None
     order = np.argsort(table.t, kind="stable")
-    stamps, values = table.t[order], np.nan_to_num(values[order])
+    stamps = table.t[order]
+    values = np.nan_to_num(values[order])
     if stamps[0] > t[-1] or stamps[-1] < t[0]:
         return None  # of another clock
     likeness = []

@@ -322,7 +322,8 @@ def _with_quaternion(
     table: TableSurvey, names: Sequence[str], columns: Sequence[Array], k: int
 ) -> PoseGuess | None:
     """Returns the pose whose quaternion stands in four columns from k on, if they are one."""
-    turn, four = list(names[k : k + 4]), columns[k : k + 4]
+    turn = list(names[k : k + 4])
+    four = columns[k : k + 4]
     if not all(name.isdecimal() or {*words_of(name)} & TURNS for name in turn):
         return None
     if len({len(each) for each in four}) > 1:

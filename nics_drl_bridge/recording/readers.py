@@ -30,10 +30,9 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, definition, robot_from
 
 FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
-FILES, WHEELS = (
-    ("cmd.csv", "vrpn.csv"),
-    ("L_wheel.csv", "R_wheel.csv"),
-)  # what it has, may have
+# what it has, may have
+FILES = ("cmd.csv", "vrpn.csv")
+WHEELS = ("L_wheel.csv", "R_wheel.csv")
 MOST_BYTES = 64 * 2**20  # of each of these; by --map tables may be larger
 
 
@@ -97,7 +96,8 @@ def read_recording(
     RecordingError, ConfigError: it is missing or unreadable, or does not fit robot or mapping.
     """
     check_path("recording", path)
-    path, topics = Path(path), topics or TopicRoles()
+    path = Path(path)
+    topics = topics or TopicRoles()
     if mapping is not None and not is_recording(path):
         return _by_mapping(path, spec, topics, mapping)
     found = next((each for each in FORMATS if each.recognises(path)), None)
@@ -271,7 +271,8 @@ def arranged(recording: Recording, spec: RobotSpec) -> Recording:
         "state": (slice(-count), spec.state),
     }
     for part, (place, variables) in parts.items():
-        known, names = recording.variables[place], [v.name for v in variables]
+        known = recording.variables[place]
+        names = [v.name for v in variables]
         if (stream := recording.streams.get(part)) is None:
             continue
         if set(known) != set(names):

@@ -31,10 +31,9 @@ MeasuredBy = Literal["", "odometry", "tracker", "truth"]
 IRREGULAR = (
     0.5  # share of the median by which a step differs if it is a gap or a repetition
 )
-JITTER, ROUNDING_S = (
-    1e-4,
-    1e-6,
-)  # steps that differ by less are equally long, but for rounding
+# steps that differ by less are equally long, but for rounding
+JITTER = 1e-4
+ROUNDING_S = 1e-6
 
 LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implausible,
 TOO_FAST = 20.0  # and so is a speed of more than this many times the greatest command
@@ -42,7 +41,9 @@ SPEED_OVER_S = 0.5
 SLOWEST_SAMPLING_S = 2.0
 # Acceleration that no wheeled robot reaches for a quarter of the time [m/s^2]: one whose radius is
 # below 1 m; and any, as race cars press themselves to the ground.
-HARDEST, HARDEST_OF_CARS, SMALL_M = 14.0, 60.0, 1.0
+HARDEST = 14.0
+HARDEST_OF_CARS = 60.0
+SMALL_M = 1.0
 SLOWEST_IN_CM = (
     300.0  # speed from which on millimetres are likelier than centimetres [m/s]
 )
@@ -50,15 +51,17 @@ FASTEST_TURN = 15.0  # a robot that turns faster for long [rad/s] does so in deg
 FULL_TURN_DEG = 360.0
 # A heading in degrees leads along the path to this share, better by so much than the same in
 # radians, and than none.
-ALONG, LESS_ALONG, ALONG_BY_CHANCE = 0.9, 0.2, 0.05
+ALONG = 0.9
+LESS_ALONG = 0.2
+ALONG_BY_CHANCE = 0.05
 MIN_DIRECTIONS = 30  # a reversed axis shows in a path of more pieces than this,
 MIN_TURN = 1.0  # that turns by this [rad],
-MIRRORED, BETTER = (
-    0.9,
-    0.15,
-)  # and leads along mirrored headings, by so much more than as given
+# and leads along mirrored headings, by so much more than as given
+MIRRORED = 0.9
+BETTER = 0.15
 # Squares of what a level body has none of, x and y, in quaternions in another order than read.
-TILTED, LEVEL = 0.05, 0.01
+TILTED = 0.05
+LEVEL = 0.01
 W_FIRST = "its quaternions look like w, x, y, z of a level body; list them in the order x, y, z, w"
 WEIGHTS = 0.01, 100.0  # bounds of what variances may weigh
 UNITS_OF_STEP = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
@@ -209,7 +212,8 @@ def samples_on_one_clock(
     length = np.where(np.abs(span - dt) < JITTER * dt + ROUNDING_S, dt, span)[
         regular, None
     ]
-    first, last = np.flatnonzero(regular), np.flatnonzero(regular) + 1
+    first = np.flatnonzero(regular)
+    last = np.flatnonzero(regular) + 1
     twist = geometry.log(geometry.between(pose[first], pose[last])) / length
     rates = (state[last] - state[first]) / length
     return Samples(
@@ -223,10 +227,12 @@ def samples_on_one_clock(
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording that a robot can use; else RecordingError names place and fault."""
-    names, known = spec.variable_names, recording.variables
+    names = spec.variable_names
+    known = recording.variables
     if recording.state is None:  # then only the order of the commands matters
         count = len(spec.command)
-        names, known = names[-count:], known[-count:]
+        names = names[-count:]
+        known = known[-count:]
     if known and known != names:
         problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
         advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
@@ -236,7 +242,8 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
     )
     speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
-    pose, radius = recording.pose, spec.footprint_radius
+    pose = recording.pose
+    radius = spec.footprint_radius
     if fault := implausible_pose(pose.t, pose.values, fastest, radius):
         raise RecordingError(
             f"{recording.source}: pose: {fault.reason}; {fault.cause}."
@@ -252,7 +259,8 @@ def check_streams(recording: Recording, width: dict[str, int]) -> None:
 
 
 def _fault(stream: Stream, width: int) -> str:
-    t, values = stream.t, stream.values
+    t = stream.t
+    values = stream.values
     if values.shape != (len(t), width):
         reason = f"has the shape {values.shape} where ({len(t)}, {width}) is needed"
         return f"{reason}; check that the recording is of this robot"
@@ -358,7 +366,8 @@ def is_recording(path: Path) -> bool:
 
 def _stream(arrays: dict[str, NDArray[Any]], name: str, clock: str) -> Stream:
     sigma = arrays.get(f"{name}_sigma")
-    t, values = arrays[f"{name}_t"].astype(float), arrays[name].astype(float)
+    t = arrays[f"{name}_t"].astype(float)
+    values = arrays[name].astype(float)
     return Stream(t, values, clock, None if sigma is None else sigma.astype(float))
 
 
@@ -490,7 +499,8 @@ def _too_fast(
     t: Array, pose: Array, fastest: float, hardest: float
 ) -> Implausible | None:
     every = _spaced(t)
-    step, took = np.diff(pose[every, :2], axis=0), np.diff(t[every])
+    step = np.diff(pose[every, :2], axis=0)
+    took = np.diff(t[every])
     if not len(took):
         return None
     velocity = step / np.maximum(took, 1e-9)[:, None]

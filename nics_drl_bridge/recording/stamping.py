@@ -18,7 +18,8 @@ from nics_drl_bridge.recording.topic_roles import Stamps
 
 Nanoseconds = NDArray[np.int64]
 
-RECEIVE, HEADER = "receive", "header"
+RECEIVE = "receive"
+HEADER = "header"
 # Median delay from header to receipt on the recorder's own clock: a localiser may take its time,
 # but nothing is received before it was stamped.
 SAME_CLOCK_S = (-0.001, 1.0)
@@ -51,22 +52,20 @@ ROWS_A_SECOND = 5  # from which on stamps in whole seconds lack the rest
 COUNTING = (
     16.0  # times the usual step of a counter fit between its overflows, which lose
 )
-LOST, PARTS = (
-    2.0,
-    10,
-)  # no more than this many steps; its values are in all of so many parts
-GROWN, ONE_WAY = (
-    2000.0,
-    0.95,
-)  # or they go so far, which is this share of all their steps
-BACK, WITHIN = (
-    0.2,
-    25.0,
-)  # a speed goes this share of its steps back at once, within so many
+LOST = 2.0  # no more than this many steps
+PARTS = 10  # its values are in all of so many parts
+# or they go so far, which is this share of all their steps
+GROWN = 2000.0
+ONE_WAY = 0.95
+# a speed goes this share of its steps back at once, within so many
+BACK = 0.2
+WITHIN = 25.0
 TREMBLING = 4.0  # ticks of a wheel that stands
 BITS = (8, 16, 24, 31, 32)  # of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
-LATE_ROWS, LATE_S = 50, 1.0  # rows that come too late do so by less
+# rows that come too late do so by less
+LATE_ROWS = 50
+LATE_S = 1.0
 MOST_BACK = 0.9  # share of steps back in rows that begin with the last
 MOST_STRAY = 0.01  # share of stamps that fit none beside them
 LONGEST_PAUSE_S = 86_400.0  # of a drive; a longer one is a clock that was set
@@ -147,8 +146,11 @@ def _clocks(
     for name, ns in headers.items():
         if ns is None:
             continue
-        topic, delay = data[name].topic, data[name].receive_ns - ns
-        median, least, most = int(np.median(delay)), delay.min(), delay.max()
+        topic = data[name].topic
+        delay = data[name].receive_ns - ns
+        median = int(np.median(delay))
+        least = delay.min()
+        most = delay.max()
         usual = np.percentile(delay, 100.0 - STALLED)
         wander = max(usual - median, median - least) * S_PER_NS
         if wander > MAX_WANDER_S or (most - median) * S_PER_NS > MAX_STALL_S:
@@ -171,7 +173,8 @@ def _clocks(
 
 
 def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
-    ns, topic = part.header_ns, f"{place}: topic {part.topic!r}"
+    ns = part.header_ns
+    topic = f"{place}: topic {part.topic!r}"
     if ns is None or not ns.any():
         if stamps == "header":
             fault = "its messages have no header stamps"
@@ -194,7 +197,8 @@ def _in_order(part: TopicData, place: str) -> TopicData:
         return part
     first = int(np.argmax(ns != 0))
     if first <= MAX_UNSTAMPED * len(ns):
-        part, ns = part.rows(np.arange(first, len(ns))), ns[first:]
+        part = part.rows(np.arange(first, len(ns)))
+        ns = ns[first:]
     if not ns.all():
         return part
     late = np.maximum.accumulate(ns) - ns
@@ -261,14 +265,16 @@ def unwrapped(values: Array, size: float) -> tuple[Array, int]:
 
 def counter(values: Array) -> str:
     """Returns what whole numbers (T,) do as a counter's alone: they overflow, or go on and on."""
-    step, whole = np.abs(np.diff(values)), bool((values == np.round(values)).all())
+    step = np.abs(np.diff(values))
+    whole = bool((values == np.round(values)).all())
     gone = float(abs(values[-1] - values[0]))
     if whole and gone > max(GROWN, ONE_WAY * step.sum()):
         return f"went on by {gone:.10g}"
     size = overflow(values, (1.0,), BITS) if whole else None
     if size is None:
         return ""
-    usual, lost = float(np.percentile(step, 95)), size - step[step > size / 2.0]
+    usual = float(np.percentile(step, 95))
+    lost = size - step[step > size / 2.0]
     calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
     return (
         f"overflows at {size:.10g}"
@@ -318,18 +324,22 @@ def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
 
     Returns stamps (T,) [s] that never decrease, and the row of each.
     """
-    rows, notes = np.arange(len(t)), []
+    rows = np.arange(len(t))
+    notes = []
     if len(t) > 1 and np.mean(np.diff(t) < 0.0) > MOST_BACK:
-        t, rows = t[::-1], rows[::-1]
+        t = t[::-1]
+        rows = rows[::-1]
         notes.append(f"{name}: its rows began with the last, and were turned round.")
     if (stray := _stray(t)).any():
         where = f"(row {rows[stray][0]}: {t[stray][0]:.10g} s)"
         notes.append(
             f"{name}: {stray.sum()} stamps fit none beside them {where}; left out."
         )
-        t, rows = t[~stray], rows[~stray]
+        t = t[~stray]
+        rows = rows[~stray]
     late = np.maximum.accumulate(t) - t
-    run, longest = 0, 0
+    run = 0
+    longest = 0
     for each in late:  # rows in a row that are older than one before them
         run = run + 1 if each > 0.0 else 0
         longest = max(longest, run)
@@ -339,10 +349,12 @@ def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         notes.append(
             f"{name}: {finding}, by up to {late.max():.3g} s, and were sorted."
         )
-        t, rows = t[order], rows[order]
+        t = t[order]
+        rows = rows[order]
     step = np.diff(t)
     if (jump := (step < 0.0) | (step > LONGEST_PAUSE_S)).any() and not jump.all():
-        usual, k = float(np.median(step[~jump])), int(np.argmax(jump))
+        usual = float(np.median(step[~jump]))
+        k = int(np.argmax(jump))
         first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
         said = f"{name}: the clock was set {'back' if step[k] < 0.0 else 'ahead'}"
         joined = f"the parts were joined, a usual step of {usual:.3g} s apart"

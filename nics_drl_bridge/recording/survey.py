@@ -178,7 +178,8 @@ class TableSurvey:
 
 def survey(source: Source) -> list[TableSurvey]:
     """Surveys every table of a source; RecordingError if none is readable."""
-    found, unread = [], None
+    found = []
+    unread = None
     for name in source.names:
         try:
             found.append(_surveyed(name, source.table(name)))
@@ -205,7 +206,8 @@ def survey(source: Source) -> list[TableSurvey]:
 
 
 def _surveyed(name: str, table: Table) -> TableSurvey:
-    columns, data = [], {}
+    columns = []
+    data = {}
     for k, title in list(enumerate(table.names))[:MOST_COLUMNS]:
         which = title if title and table.names.count(title) == 1 else str(k)
         data[which] = column = table.column(which)

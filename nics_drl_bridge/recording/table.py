@@ -54,10 +54,8 @@ class Source:
     """A recording of any format, as tables."""
 
     def __init__(self, place: str, names: Sequence[str]) -> None:
-        self.place, self.names = (
-            place,
-            tuple(names),
-        )  # path, for errors; names of its tables
+        self.place = place  # path, for errors
+        self.names = tuple(names)  # names of its tables
         self._read: dict[str, Table] = {}
 
     @property

@@ -21,7 +21,9 @@ MOST_FILES = 500  # of a folder
 SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
 NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
 MOST_BYTES = 256 * 2**20
-MOST_ROWS, LONGEST_ROW = 2_000_000, 20_000  # longest in characters
+# longest in characters
+MOST_ROWS = 2_000_000
+LONGEST_ROW = 20_000
 TRIED = 400  # lines from which separator and header are found
 MOST_SAMPLED = 50_000  # rows from which their usual width is found
 MOST_BROKEN = 0.01  # share of rows with another number of fields that are left out
@@ -168,7 +170,8 @@ def _of_one_width(
     width: int,
 ) -> tuple[list[list[str]], NDArray[np.intp], list[str]]:
     """Leaves out headers that are repeated, and the few rows that were cut short."""
-    file, notes = path.name, []
+    file = path.name
+    notes = []
     new = np.array([row not in above for row in rows], dtype=np.bool_)
     if not new.all():
         notes.append(

@@ -22,11 +22,10 @@ def _arc(
         )
         for sign in (-1.0, 1.0)
     )
-    wa, wb = early[..., 2], late[..., 2]
-    bx, by = (
-        wb * early[..., 1] - wa * late[..., 1],
-        wa * late[..., 0] - wb * early[..., 0],
-    )
+    wa = early[..., 2]
+    wb = late[..., 2]
+    bx = wb * early[..., 1] - wa * late[..., 1]
+    by = wa * late[..., 0] - wb * early[..., 0]
     bracket = np.stack([bx, by, np.zeros_like(wa)], axis=-1)
     return np.asarray(
         (early + late) * (h / 2.0) + bracket * (np.sqrt(3.0) / 12.0 * h * h)
@@ -43,17 +42,21 @@ def record(
     """Records a textbook robot without noise; commands last `hold`, rows are `dt` apart [s]."""
     book = textbook(spec)
     inner = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))
-    h, per_hold = dt / inner, round(hold / dt)
+    h = dt / inner
+    per_hold = round(hold / dt)
     holds = int(np.ceil(duration / hold))
     held = rng.uniform(spec.command_low, spec.command_high, (holds, len(spec.command)))
     since = np.asarray(np.arange(per_hold * inner)[:, None] * h, dtype=np.float64)
-    now, states, arcs = np.zeros(len(book.lag)), [], []
+    now = np.zeros(len(book.lag))
+    states = []
+    arcs = []
     for goal in book.target(held):
         states.append(book.respond(now, goal, since))
         arcs.append(_arc(book, now, goal, since, h))
         now = book.respond(now, goal, per_hold * inner * h)
     # Relative poses (T, 3) are chained to the poses (T, 3) at their starts, from the origin on.
-    state, relative = np.concatenate(states), geometry.exp(np.concatenate(arcs))
+    state = np.concatenate(states)
+    relative = geometry.exp(np.concatenate(arcs))
     heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
     moved = geometry.rotate(relative[:, :2], heading)
     position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])

@@ -16,14 +16,17 @@ NONE = "none"
 ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
 IMU_NAMES = ("imu", "imu/data")  # usual topics of a gyro, in a robot's namespace
 MOST_LISTED = 20  # maximum number of topics listed in an error
-TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+TWIST = "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
 ACKERMANN_STAMPED = f"{ACKERMANN}Stamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-TRANSFORM, TRANSFORMS = "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
-JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
+JOINTS = "sensor_msgs/msg/JointState"
+IMU = "sensor_msgs/msg/Imu"
 TYPES = {
     "cmd_vel": (TWIST, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN),
     "pose": (POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, ODOMETRY),

@@ -99,7 +99,8 @@ class MappedReader:
         self, table: Table, column: Column, time: schema.Time | None
     ) -> Stamped:
         """Returns the rows of a column in order, by their stamps."""
-        time, count = time or self.mapping.time, len(column)
+        time = time or self.mapping.time
+        count = len(column)
         if time is not None and time.rate is not None:
             return Stamped(np.arange(count) / time.rate, np.arange(count), "", count)
         key = table.place, repr(time)
@@ -130,7 +131,8 @@ class MappedReader:
             )  # the mapping's own clock
             clock = "" if given.clock == main else given.clock
             return Stamped(given.t, rows, clock, len(table.column(0)))
-        raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
+        raw = self._raw_stamps(table, time)
+        name = table.place.rpartition("/")[2]
         known = np.flatnonzero(np.isfinite(raw))
         alone = len(time.columns) == 1 and time.unit in (None, "s")
         if alone and (each := stamping.rows_a_second(raw[known])):
@@ -195,7 +197,8 @@ class MappedReader:
         """
         stream = stream or Measured()
         table, which = self.place(value.from_, stream.in_)
-        column, time = numbers_of(table, which), value.time or stream.time
+        column = numbers_of(table, which)
+        time = value.time or stream.time
         at = self.stamped(table, column, time)
         clock = (
             value.clock
@@ -319,7 +322,8 @@ def _rate(raw: Series, held: bool) -> Series:
     """
     span = np.diff(raw.t)
     last = np.append(span > AT_ONCE * span.mean() if len(span) else span > 0.0, True)
-    t, values = raw.t[last], raw.values[last]
+    t = raw.t[last]
+    values = raw.values[last]
     rate = np.diff(values) / np.diff(t)
     return Series(t[:-1] if held else (t[:-1] + t[1:]) / 2.0, rate, raw.clock)
 
@@ -341,12 +345,11 @@ def together(name: str, parts: Sequence[Series], held: bool) -> Stream:
     if len(clocks) > 1:
         fault = f"{name}: its values are of the clocks {' and '.join(clocks)}"
         raise ConfigError(f"{fault}; a stream needs one clock.")
-    t, columns = parts[0].t, [part.values for part in parts]
+    t = parts[0].t
+    columns = [part.values for part in parts]
     if not all(np.array_equal(t, part.t) for part in parts):
-        start, stop = (
-            max(part.t[0] for part in parts),
-            min(part.t[-1] for part in parts),
-        )
+        start = max(part.t[0] for part in parts)
+        stop = min(part.t[-1] for part in parts)
         if held:
             t = np.unique(np.concatenate([part.t for part in parts]))
             t = t[t >= start]

@@ -76,7 +76,8 @@ def write_bag(
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
     # or `/pose` on its own clock or beside odometry.
     with bag_sink(path, storage) as sink:
-        messages, command = _Messages(store := sink.store), recording.command
+        messages = _Messages(store := sink.store)
+        command = recording.command
         for topic, kind, stream, make in _topics(recording, spec, messages):
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
@@ -101,7 +102,8 @@ def _topics(
     )
     joints, names, still = recording.wheels, list(msgs.WHEELS), np.zeros(2, dtype=bool)
     if recording.state is not None:
-        joints, names = recording.state, [v.name for v in spec.state]
+        joints = recording.state
+        names = [v.name for v in spec.state]
         still = np.array([v.unit in msgs.POSITION_UNITS for v in spec.state])
     topics: list[tuple[str, str, Stream | None, Make]] = [
         (
@@ -157,7 +159,8 @@ class _Messages:
 
     def _pose(self, row: Array) -> Any:
         x, y, heading = (float(value) for value in row)
-        z, w = float(np.sin(heading / 2.0)), float(np.cos(heading / 2.0))
+        z = float(np.sin(heading / 2.0))
+        w = float(np.cos(heading / 2.0))
         turned = self._new("geometry_msgs/Quaternion", 0.0, 0.0, z, w)
         return self._new(
             "geometry_msgs/Pose", self._new("geometry_msgs/Point", x, y, 0.0), turned
@@ -187,11 +190,11 @@ class _Messages:
 
     def imu(self, header: Any, row: Array) -> Any:
         ax, ay, w = (float(value) for value in row)
-        level, absent = (
-            self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
-            np.full(9, -1.0),
-        )
-        rates, pulls, measured = self._vector(z=w), self._vector(ax, ay), np.zeros(9)
+        level = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        absent = np.full(9, -1.0)
+        rates = self._vector(z=w)
+        pulls = self._vector(ax, ay)
+        measured = np.zeros(9)
         return self._new(
             "sensor_msgs/Imu", header, level, absent, rates, measured, pulls, measured
         )
@@ -201,7 +204,9 @@ class BagSink:
     """An open bag, created by `bag_sink` with an open writer of rosbags."""
 
     def __init__(self, writer: "Writer") -> None:
-        self._writer, self.store = writer, msgs.typestore()  # the known message types
+        # the known message types
+        self._writer = writer
+        self.store = msgs.typestore()
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
         self.fault: BaseException | None = (

@@ -27,18 +27,17 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Mismatch = doctor_facts.Mismatch
 Findings = Iterator[Mismatch]
 
-LEAST_PATH_M, LEAST_TURN_RAD = (
-    0.3,
-    0.3,
-)  # a drive with less motion does not determine scales
+# a drive with less motion does not determine scales
+LEAST_PATH_M = 0.3
+LEAST_TURN_RAD = 0.3
 TOLERANCE = 1.4  # differences of the pose and the twist must agree within this factor
 # Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
 # robot follows with delay and within its limits.
-ALIKE, LEAST_ALIKE = 0.8, 0.3
-JUMP, JUMP_M = (
-    5.0,
-    0.2,
-)  # a step is a jump beyond this multiple of the top speed's, and this length
+ALIKE = 0.8
+LEAST_ALIKE = 0.3
+# a step is a jump beyond this multiple of the top speed's, and this length
+JUMP = 5.0
+JUMP_M = 0.2
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
 SHORT_WINDOW_S = (
@@ -53,7 +52,9 @@ UNITS = (
 RATE_TOLERANCE = 0.2
 # Stamps are from the future if this much after their arrival; too old for the command gate if this
 # much before it; and so far before it that the clocks must differ.
-FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0
+FUTURE_S = 0.005
+LATE_S = 0.35
+OFFSET_S = 5.0
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
@@ -61,11 +62,10 @@ ODD_SHARE = (
     0.01  # a value in more than this share of the beams is intended by the lidar
 )
 
-error, warning = partial(Mismatch, "error"), partial(Mismatch, "warning")
-no_match, layout_error = (
-    partial(error, "quality of service"),
-    partial(error, "beam layout", SCAN),
-)
+error = partial(Mismatch, "error")
+warning = partial(Mismatch, "warning")
+no_match = partial(error, "quality of service")
+layout_error = partial(error, "beam layout", SCAN)
 odometry_error = partial(error, "odometry", ODOM)
 odometry_warning = partial(warning, "odometry", ODOM)
 gyro_warning = partial(warning, "gyro", GYRO)
@@ -179,15 +179,11 @@ def rates(facts: Facts, expected: Expected) -> Findings:
         rate = _rate(facts, role)
         if rate is None:
             continue
-        slow, fast = (
-            rate < (1 - RATE_TOLERANCE) * wanted,
-            rate > (1 + RATE_TOLERANCE) * wanted,
-        )
+        slow = rate < (1 - RATE_TOLERANCE) * wanted
+        fast = rate > (1 + RATE_TOLERANCE) * wanted
         if slow or (fast and role == SCAN):
-            least, finding = (
-                "at least " if role == ODOM else "",
-                error if slow else warning,
-            )
+            least = "at least " if role == ODOM else ""
+            finding = error if slow else warning
             fix = "set the driver's rate; on a slow network look for losses (best effort, Wi-Fi)"
             if role == SCAN:
                 fix += f", or set `rate: {rate:.3g}` in the lidar and generate the model anew"
@@ -198,7 +194,8 @@ def rates(facts: Facts, expected: Expected) -> Findings:
 def _rate(facts: Facts, role: str) -> float | None:
     if (heard := facts.heard.get(role)) is None or len(heard.arrivals_ns) <= 2:
         return None
-    stamps, times = heard.stamps_ns, heard.arrivals_ns
+    stamps = heard.stamps_ns
+    times = heard.arrivals_ns
     if facts.clock_ns and len(stamps) > 2 and stamps[-1] > stamps[0]:
         times = stamps  # a simulation may run at another speed
     span = times[-1] - times[0]
@@ -245,7 +242,8 @@ def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
 
 def clock(facts: Facts, _: Expected) -> Findings:
     """Checks that `/clock`, if it has a publisher, advances."""
-    there, heard = facts.topics.get(CLOCK), facts.heard.get(CLOCK)
+    there = facts.topics.get(CLOCK)
+    heard = facts.heard.get(CLOCK)
     if there is None or not there.offers:
         return
     fix = "start the simulation or its clock, or set use_sim_time to false on all nodes"
@@ -394,10 +392,8 @@ def _compared(
     units: Sequence[tuple[float, str]],
     good: str,
 ) -> Findings:
-    ratio, size = (
-        _slope(real, claimed),
-        float(np.sqrt((real @ real) * (claimed @ claimed))),
-    )
+    ratio = _slope(real, claimed)
+    size = float(np.sqrt((real @ real) * (claimed @ claimed)))
     if _alike(ratio):
         return
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
@@ -411,7 +407,8 @@ def _compared(
         fix = "turn the sign: forward and counter-clockwise are positive (REP-103)"
     for factor, name in units:
         if _alike(ratio / factor):
-            what, fix = f"{what}: {name}", f"let the twist be in {good}"
+            what = f"{what}: {name}"
+            fix = f"let the twist be in {good}"
             break
         if _alike(ratio * factor):
             what = (
@@ -432,7 +429,8 @@ def _slope(x: Array, y: Array) -> float:
 
 
 def _scale(facts: Facts) -> float | None:
-    heard, odometry = facts.heard.get(CMD_VEL), facts.heard.get(ODOM)
+    heard = facts.heard.get(CMD_VEL)
+    odometry = facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
         return None
     place = (
@@ -478,7 +476,8 @@ def layout(facts: Facts, expected: Expected) -> Findings:
 
 
 def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
-    want, header = expected.lidar.header, have.header
+    want = expected.lidar.header
+    header = have.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
     if have.beams != expected.lidar.beams:
         yield layout_error(
@@ -495,7 +494,8 @@ def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
         what = f"beams go from {header.angle_min:.4f} to {have.last:.4f} rad, expected {wanted}"
         yield layout_error(what, fix)
     for key in ("range_min", "range_max"):
-        ours, theirs = getattr(want, key), getattr(header, key)
+        ours = getattr(want, key)
+        theirs = getattr(header, key)
         what = f"{key} is {theirs:.4g}, expected {ours:.4g} m"
         if theirs > 100.0 * max(ours, 0.1):
             yield error("unit", SCAN, what, fix)
@@ -507,7 +507,8 @@ def ranges(facts: Facts, expected: Expected) -> Findings:
     """Checks the lidar's values for no return, and the unit of its ranges."""
     if not facts.ranges:
         return
-    spec, convention = expected.lidar, partial(error, "range convention", SCAN)
+    spec = expected.lidar
+    convention = partial(error, "range convention", SCAN)
     values = np.concatenate(facts.ranges).astype(np.float64)
     finite = values[np.isfinite(values) & (values > 0.0)]
     beyond = finite > 1.001 * spec.range_max

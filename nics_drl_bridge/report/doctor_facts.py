@@ -23,7 +23,11 @@ from nics_drl_bridge.recording.messages import Offer, Row
 from nics_drl_bridge.recording.topic_roles import IMU, IMU_NAMES, imu_topics
 from nics_drl_bridge.robot.spec import RobotSpec
 
-SCAN, ODOM, CMD_VEL, CLOCK, GYRO = "scan", "odom", "cmd_vel", "/clock", "imu"
+SCAN = "scan"
+ODOM = "odom"
+CMD_VEL = "cmd_vel"
+CLOCK = "/clock"
+GYRO = "imu"
 TWIST_STAMPED_TYPE = "geometry_msgs/msg/TwistStamped"
 KINDS: dict[str, Sequence[str]] = {  # message types of each role; others are not read
     SCAN: ("sensor_msgs/msg/LaserScan",),

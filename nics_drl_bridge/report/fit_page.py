@@ -95,11 +95,13 @@ def write_fit_page(
     file: Path, source: str, spec: RobotSpec, identified: Identified, report: str
 ) -> None:
     """Writes the page of a fit to a recording from a source, with the fit report as text."""
-    conclusion, folder = conclude(identified), file.parent
+    conclusion = conclude(identified)
+    folder = file.parent
     spec = (
         identified.drive.spec
     )  # of a textbook that was written, which may have another state
-    tile, model = fit_tile(identified), identified.model
+    tile = fit_tile(identified)
+    model = identified.model
     terms = (
         str(model.terms_kept),
         f"terms of a model with a step of {model.dt:g} s",

@@ -35,7 +35,8 @@ from nics_drl_bridge.style import DARK, MARKERS, MEASURED, MODEL, OTHER, panels,
 from nics_drl_bridge.threads import one_blas_thread
 
 SHOWN_S = 8.0
-PATHS, POINTS = 6, 40
+PATHS = 6
+POINTS = 40
 SETTLED_S = 1.0
 LEAST_SHARE = 1e-12
 LEAST_RATE = 1e-6
@@ -44,7 +45,9 @@ MOST_POINTS = 3000
 BINS = 60
 CURVE_POINTS = 400  # of an input curve
 REACH = 5.0  # histograms end at this many standard deviations
-REACH_S, TRIALS = 0.5, 81  # largest shift in time of a curve, and number of its points
+# largest shift in time of a curve, and number of its points
+REACH_S = 0.5
+TRIALS = 81
 CAPTIONS = {
     "accuracy": "Error against the number of terms; circles mark how many are kept.",
     "residuals": "Rates on unseen data, those of the model, and the residuals.",
@@ -122,7 +125,8 @@ def accuracy(identified: Identified) -> bytes:
 def held_out_paths(identified: Identified) -> bytes:
     """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
     paths = _unseen_paths(identified)
-    rows, columns = -(-len(paths) // 3), min(len(paths), 3)
+    rows = -(-len(paths) // 3)
+    columns = min(len(paths), 3)
     figure, grid = panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
     for axes, path in zip(grid, paths, strict=False):
         _unseen_path(axes, path)
@@ -141,11 +145,9 @@ def unseen_paths(identified: Identified, most: int) -> list[bytes]:
 
 def _unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
     """Returns measured and predicted paths, and the distance between their ends [m]."""
-    drive, calibration, pose = (
-        identified.drive,
-        identified.calibration,
-        identified.recording.pose,
-    )
+    drive = identified.drive
+    calibration = identified.calibration
+    pose = identified.recording.pose
     free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
     span = identified.train_until_s, drive.duration_s
     chosen = windows(drive, calibration, *span, HORIZON_S, free / PATHS)
@@ -218,7 +220,8 @@ def yardsticks(identified: Identified) -> bytes:
 def residuals(identified: Identified, unseen: Samples) -> bytes:
     """Draws rates on unseen data, those of the model, and the residuals, over time."""
     model = identified.model
-    predicted, t = model.rates(unseen.x), unseen.t - unseen.t[0]
+    predicted = model.rates(unseen.x)
+    t = unseen.t - unseen.t[0]
     shown = t < SHOWN_S
     moving = np.flatnonzero(np.abs(unseen.dq).max(axis=0) > LEAST_RATE)
     figure, grid = panels(len(moving), 1, (9.0, 1.7 * len(moving) + 0.6), sharex=True)
@@ -240,15 +243,18 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
 
 def alignment(spec: RobotSpec, identified: Identified) -> bytes:
     """Draws each changing command, as stamped and as it takes effect, with its main response."""
-    samples, calibration = identified.samples, identified.calibration
+    samples = identified.samples
+    calibration = identified.calibration
     command = identified.recording.command
     moved = np.flatnonzero(np.ptp(command.values, axis=0) > 0.0)
     figure, grid = panels(len(moved), 1, (9.0, 2.5 * len(moved) + 0.6), sharex=True)
     begin = samples.t[0] + SETTLED_S
     shown = (samples.t >= begin) & (samples.t < begin + SHOWN_S)
-    t, latency = samples.t[shown], calibration.command_latency_s
+    t = samples.t[shown]
+    latency = calibration.command_latency_s
     for axes, c in zip(grid, moved, strict=True):
-        name, unit = spec.command[c].name, spec.command[c].unit
+        name = spec.command[c].name
+        unit = spec.command[c].unit
         acts = latency + float(delays_of([name], calibration.inputs)[0])
         for late, style, label in (
             (0.0, ":", "as stamped"),
@@ -272,7 +278,8 @@ def _response(
     variable: int,
     identified: Identified,
 ) -> None:
-    twist, wanted = samples.dq[:, :3], samples.x[:, variable]
+    twist = samples.dq[:, :3]
+    wanted = samples.x[:, variable]
     with np.errstate(all="ignore"):
         alike = np.abs([np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)])
     d = int(np.argmax(np.nan_to_num(alike)))
@@ -294,11 +301,9 @@ def _predicted(identified: Identified, chosen: Windows) -> Array:
     ends = [
         chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares
     ]
-    model, calibration, drive = (
-        identified.model,
-        identified.calibration,
-        identified.drive,
-    )
+    model = identified.model
+    calibration = identified.calibration
+    drive = identified.drive
     poses = [
         predict(model, calibration, drive, replace(chosen, end_t=end)) for end in ends
     ]
@@ -324,9 +329,11 @@ def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
     figure, grid = panels(1, len(curves), (5.2 * len(curves), 3.8))
     for axes, curve in zip(grid, curves, strict=True):
         estimate = found[curve.name]
-        value, sigma = estimate.value or 0.0, estimate.sigma or 0.0
+        value = estimate.value or 0.0
+        sigma = estimate.sigma or 0.0
         axes.plot(curve.value, curve.unexplained, color=MEASURED)
-        span, label = 2.0 * sigma, "two standard uncertainties"
+        span = 2.0 * sigma
+        label = "two standard uncertainties"
         axes.axvspan(value - span, value + span, color=MODEL, alpha=0.25, label=label)
         axes.axvline(value, color=MODEL, linestyle="--", label="estimate")
         axes.set(
@@ -338,7 +345,8 @@ def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
 
 def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws stamps of the poses as they arrived, and as they were spread."""
-    t, groups = identified.recording.pose.t, identified.drive.bursts
+    t = identified.recording.pose.t
+    groups = identified.drive.bursts
     if groups is None:
         return None
     shown = slice(0, int(BURSTS_SHOWN * groups.size))
@@ -363,7 +371,8 @@ def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
 
 def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
-    rotation, lever_x = found["rotation_rad"], found["lever_arm_x_m"]
+    rotation = found["rotation_rad"]
+    lever_x = found["lever_arm_x_m"]
     lever_y = found["lever_arm_y_m"]
     if rotation.value is None:
         return None
@@ -396,11 +405,13 @@ def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None
 
 def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
-    drive, calibration = identified.drive, identified.calibration
+    drive = identified.drive
+    calibration = identified.calibration
     units = clocks.wheel_means(drive, calibration)
     if units is None or calibration.wheel_scale is None:
         return None
-    turn, along = drive.twists.twist[:, 2], clocks.speed_along(drive, calibration)
+    turn = drive.twists.twist[:, 2]
+    along = clocks.speed_along(drive, calibration)
     rows: tuple[tuple[str, str, str, Array, Array], ...] = (
         (
             "wheel_scale",
@@ -443,10 +454,8 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     names = [command.name for command in spec.command]
     for axes, curve in zip(grid, curves, strict=False):
         place = names.index(curve.command)
-        sent, unit = (
-            identified.recording.command.values[:, place],
-            spec.command[place].unit,
-        )
+        sent = identified.recording.command.values[:, place]
+        unit = spec.command[place].unit
         command = np.linspace(sent.min(), sent.max(), CURVE_POINTS)
         axes.plot(command, command, ":", color=OTHER, label="as commanded")
         axes.plot(command, curve.of(command), color=MODEL, label="in effect")
@@ -468,11 +477,9 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
 
 def _restraint(axes: Axes, identified: Identified, dof: str) -> None:
     """Draws the rates of a state as measured, and as limits, drag and friction let them be."""
-    model, samples, d = (
-        identified.model,
-        identified.samples,
-        identified.model.dofs.index(dof),
-    )
+    model = identified.model
+    samples = identified.samples
+    d = identified.model.dofs.index(dof)
     some = slice(None, None, max(1, len(samples.t) // MOST_POINTS))
     asked = taylor.evaluate(samples.x[some], model.powers) @ model.coefficients[d]
     axes.plot(
@@ -501,12 +508,11 @@ def _finish(axes: Axes, title: str) -> None:
 
 def noise(identified: Identified) -> bytes | None:
     """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
-    levels, histograms = identified.noise, []
-    drive, calibration, model = (
-        identified.drive,
-        identified.calibration,
-        identified.model,
-    )
+    levels = identified.noise
+    histograms = []
+    drive = identified.drive
+    calibration = identified.calibration
+    model = identified.model
     if (
         drive.bursts is None
         and len(pose := pose_residual(drive.recording.pose)) > DIFFERENCE
@@ -604,13 +610,15 @@ def timing_curves(drive: Drive, calibration: Calibration) -> tuple[ShiftCurve, .
 
 
 def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | None:
-    recording, spec, twists = drive.recording, drive.spec, drive.twists
-    state, wheels, command = recording.state, recording.wheels, recording.command
+    recording = drive.recording
+    spec = drive.spec
+    twists = drive.twists
+    state = recording.state
+    wheels = recording.wheels
+    command = recording.command
     value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, TRIALS)
-    signal, of_clock = (
-        (twists.start, twists.end, twists.twist),
-        name == "clock_offset_s",
-    )
+    signal = (twists.start, twists.end, twists.twist)
+    of_clock = name == "clock_offset_s"
     if state is not None and of_clock:
         by_shift = clocks.residual_by_shift(state, signal)
         rest = [by_shift(np.array([-d])) for d in value]

@@ -82,7 +82,8 @@ def tiles(figures: Sequence[tuple[str, str, bool]]) -> str:
 
 def picture(png: bytes, caption: str) -> str:
     """A PNG with its caption."""
-    data, caption = base64.b64encode(png).decode(), escape(caption)
+    data = base64.b64encode(png).decode()
+    caption = escape(caption)
     kind = ' class="wide"' if int.from_bytes(png[16:20], "big") > WIDE else ""
     return (
         f'<figure{kind}><img src="data:image/png;base64,{data}" alt="{caption}">'

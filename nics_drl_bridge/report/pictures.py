@@ -36,10 +36,9 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": MODEL, "linewidth": 1.4, "linestyle": "--"},
     {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
 )
-LEAST_WIDTH, LEAST_PANEL = (
-    5.5,
-    4.6,
-)  # of the pictures of a world, and of an episode [inch]
+# of the pictures of a world, and of an episode [inch]
+LEAST_WIDTH = 5.5
+LEAST_PANEL = 4.6
 WORLD_SIDE = 7.5  # the longer side of a world's picture [inch]
 
 
@@ -48,7 +47,8 @@ def trajectories(
 ) -> bytes:
     """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
     count = max(len(episodes) for episodes in runs.values())
-    columns, rows = min(count, 3), -(-count // 3)
+    columns = min(count, 3)
+    rows = -(-count // 3)
     figure, grid = panels(
         rows, columns, (max(4.2 * columns, LEAST_PANEL), 4.2 * rows + 0.5)
     )
@@ -138,10 +138,8 @@ def robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
     """Draws success [%] with its interval, by what was perturbed."""
     figure, (axes,) = panels(1, 1, (5.2, 3.6))
     value, low, high = 100.0 * np.array([astuple(share) for share in shares.values()]).T
-    names, ends = (
-        [name.replace("_", " ") for name in shares],
-        (value - low, high - value),
-    )
+    names = [name.replace("_", " ") for name in shares]
+    ends = (value - low, high - value)
     axes.errorbar(value, names, xerr=ends, fmt="o", color=MODEL, capsize=3.0)
     axes.invert_yaxis()
     axes.set(xlabel="success [%]", xlim=(min(90.0, low.min() - 2.0), 100.5))
@@ -153,7 +151,8 @@ def shadow_picture(shadow: Shadow) -> bytes:
     count = len(shadow.names)
     figure, grid = panels(count, 2, (11.0, 2.4 * count + 0.6), width_ratios=(4.0, 1.0))
     for c, (wide, narrow) in enumerate(zip(grid[::2], grid[1::2], strict=True)):
-        driven, wanted = shadow.driven[:, c], shadow.policy[:, c]
+        driven = shadow.driven[:, c]
+        wanted = shadow.policy[:, c]
         wide.step(
             shadow.time,
             driven,

@@ -52,7 +52,8 @@ def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
 
 def drawing(spec: RobotSpec) -> kinds.Drawing:
     """A box on four wheels; the right front wheel follows the left one."""
-    wheelbase, angle = spec.parameters["wheelbase"], kinds.steering_angle(spec)
+    wheelbase = spec.parameters["wheelbase"]
+    angle = kinds.steering_angle(spec)
     track, radius = track_and_radius(spec.parameters)
     wheels = []
     for side, y, suffix in (

@@ -37,7 +37,8 @@ class InputCurve(Schema):
     @property
     def equation(self) -> str:
         """The curve as text: `throttle' = 0 within +-0.12, else throttle -+ 0.12`."""
-        name, dead = self.command, f"{abs(self.dead):.4g}"
+        name = self.command
+        dead = f"{abs(self.dead):.4g}"
         text = f"0 within +-{dead}, else {name} -+ {dead}" if self.dead > 0.0 else name
         text += f" +- {dead}, 0 at 0" * (self.dead < 0.0)
         text += ends(self.least, self.most, name)

@@ -10,7 +10,8 @@ from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheeled, w
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
 
-MOVES, LENGTHS = ("vx", "wz"), {"track": 1.4, "wheel_radius": 0.3}
+MOVES = ("vx", "wz")
+LENGTHS = {"track": 1.4, "wheel_radius": 0.3}
 
 
 def kinematics(spec: RobotSpec, slip: float = 1.0) -> Textbook:
@@ -24,7 +25,8 @@ def kinematics(spec: RobotSpec, slip: float = 1.0) -> Textbook:
 
 def drawing(spec: RobotSpec) -> Drawing:
     """A disc between two wheels."""
-    track, radius = spec.parameters["track"], spec.parameters["wheel_radius"]
+    track = spec.parameters["track"]
+    radius = spec.parameters["wheel_radius"]
     places = ((0.0, 0.5 * track), (0.0, -0.5 * track))
     return Drawing(
         0.4 * track, (0.0, radius), wheels_at(spec, places, radius, names_of(WHEELS))

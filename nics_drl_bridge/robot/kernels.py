@@ -23,7 +23,11 @@ WIDE_TURN = (
     0.5  # For larger turns per step sine and cosine are used, not the series [rad]
 )
 GREATEST_ORDER = 4
-DEAD, LEAST, MOST, BACK = 0, 1, 2, 3  # columns of `Terms.curves`, as in `InputCurve`
+# columns of `Terms.curves`, as in `InputCurve`
+DEAD = 0
+LEAST = 1
+MOST = 2
+BACK = 3
 
 
 class Terms(NamedTuple):
@@ -188,7 +192,8 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
 @kernel
 def emf_of(i, x, terms):  # type: ignore[no-untyped-def]
     """Returns the rate [1/s] at which the commands in effect brake state variable i."""
-    total, states = 0.0, terms.emf.shape[0]
+    total = 0.0
+    states = terms.emf.shape[0]
     for c in range(terms.emf.shape[1]):
         total += terms.emf[i, c] * abs(x[states + c])
     return total
@@ -199,7 +204,8 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """Returns x, y [m], cosine and sine of the heading after an arc of `turn` [rad] in dt [s]."""
     if abs(turn) > WIDE_TURN:
         one = series[3] + series[3]
-        sine, versine = math.sin(turn), one - math.cos(turn)
+        sine = math.sin(turn)
+        versine = one - math.cos(turn)
         ahead, aside = _chord(vx, vy, sine / turn, versine / turn, dt)
         return _end(x, y, c, s, ahead, aside, sine, versine)
     return _move_little(x, y, c, s, vx, vy, turn, dt, series)
@@ -223,7 +229,8 @@ def _chord(vx, vy, a, b, dt):  # type: ignore[no-untyped-def]
 
 @kernel
 def _end(x, y, c, s, ahead, aside, sine, versine):  # type: ignore[no-untyped-def]
-    x, y = x + (c * ahead - s * aside), y + (s * ahead + c * aside)
+    x = x + (c * ahead - s * aside)
+    y = y + (s * ahead + c * aside)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
 
@@ -237,7 +244,8 @@ def wrap(heading):  # type: ignore[no-untyped-def]
 def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
     """Moves a pose (3,) in place along the exact arc of a body twist (3,)."""
     turn = twist[2] * dt
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    c = math.cos(pose[2])
+    s = math.sin(pose[2])
     pose[0], pose[1], _, _ = move(
         pose[0], pose[1], c, s, twist[0], twist[1], turn, dt, series
     )
@@ -255,20 +263,25 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
         _rates_of_all(dq, x, terms)
         _move_all(pose, dq, dt, series)
         for d in range(3, dq.shape[0]):
-            state, rate, bounds = x[d - 3], dq[d], bounds_of(terms, d - 3)
+            state = x[d - 3]
+            rate = dq[d]
+            bounds = bounds_of(terms, d - 3)
             for i in range(state.shape[0]):
                 state[i] = next_state(state[i], rate[i], dt, bounds)
 
 
 @kernel
 def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
-    factors, n = terms.factors, x.shape[1]
+    factors = terms.factors
+    n = x.shape[1]
     for d in range(dq.shape[0]):
         rate = dq[d]
         for i in range(n):
             rate[i] = 0.0
     for k in range(terms.dof.shape[0]):
-        rate, value, one = dq[terms.dof[k]], terms.coefficient[k], x[factors[k, 0]]
+        rate = dq[terms.dof[k]]
+        value = terms.coefficient[k]
+        one = x[factors[k, 0]]
         if terms.degree[k] == 1:
             for i in range(n):
                 rate[i] += value[i] * one[i]
@@ -277,11 +290,14 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
             for i in range(n):
                 rate[i] += value[i] * one[i] * other[i]
         elif terms.degree[k] == 3:
-            other, third = x[factors[k, 1]], x[factors[k, 2]]
+            other = x[factors[k, 1]]
+            third = x[factors[k, 2]]
             for i in range(n):
                 rate[i] += value[i] * one[i] * other[i] * third[i]
         elif terms.degree[k] == 4:
-            other, third, last = x[factors[k, 1]], x[factors[k, 2]], x[factors[k, 3]]
+            other = x[factors[k, 1]]
+            third = x[factors[k, 2]]
+            last = x[factors[k, 3]]
             for i in range(n):
                 rate[i] += value[i] * one[i] * other[i] * third[i] * last[i]
         else:  # the constant
@@ -289,24 +305,26 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
                 rate[i] += value[i]
     states = terms.emf.shape[0]
     for d in range(states):
-        rate, state = dq[3 + d], x[d]
+        rate = dq[3 + d]
+        state = x[d]
         for c in range(terms.emf.shape[1]):
-            emf, command = terms.emf[d, c], x[states + c]
+            emf = terms.emf[d, c]
+            command = x[states + c]
             for i in range(n):
                 rate[i] -= emf * abs(command[i]) * state[i]
 
 
 @kernel
 def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
-    px, py, pc, ps, heading, length = (
-        pose[0],
-        pose[1],
-        pose[2],
-        pose[3],
-        pose[4],
-        pose[5],
-    )
-    vx, vy, wz = dq[0], dq[1], dq[2]
+    px = pose[0]
+    py = pose[1]
+    pc = pose[2]
+    ps = pose[3]
+    heading = pose[4]
+    length = pose[5]
+    vx = dq[0]
+    vy = dq[1]
+    wz = dq[2]
     wide = np.int32(0)
     for i in range(px.shape[0]):
         wide |= np.int32(abs(wz[i] * dt) > WIDE_TURN)
@@ -324,15 +342,15 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
-    px, py, pc, ps, heading, length = (
-        pose[0],
-        pose[1],
-        pose[2],
-        pose[3],
-        pose[4],
-        pose[5],
-    )
-    vx, vy, wz = dq[0], dq[1], dq[2]
+    px = pose[0]
+    py = pose[1]
+    pc = pose[2]
+    ps = pose[3]
+    heading = pose[4]
+    length = pose[5]
+    vx = dq[0]
+    vy = dq[1]
+    wz = dq[2]
     for i in range(px.shape[0]):
         turn = wz[i] * dt
         px[i], py[i], pc[i], ps[i] = move(
@@ -345,11 +363,14 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
     """Rolls out robots from the first of poses (W, T + 1, 3), commands in effect (W, T, C)."""
-    size, width = states.shape[2], commands.shape[2]
-    x, dq = np.ones(size + width + 1), np.zeros(3 + size)
+    size = states.shape[2]
+    width = commands.shape[2]
+    x = np.ones(size + width + 1)
+    dq = np.zeros(3 + size)
     for w in range(poses.shape[0]):
         px, py, heading = poses[w, 0]
-        c, s = math.cos(heading), math.sin(heading)
+        c = math.cos(heading)
+        s = math.sin(heading)
         x[:size] = states[w, 0]
         for n in range(commands.shape[1]):
             for i in range(width):
@@ -361,7 +382,9 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
             for i in range(size):
                 x[i] = next_state(x[i], dq[3 + i], dt, bounds_of(terms, i))
                 states[w, n + 1, i] = x[i]
-            poses[w, n + 1, 0], poses[w, n + 1, 1], poses[w, n + 1, 2] = px, py, heading
+            poses[w, n + 1, 0] = px
+            poses[w, n + 1, 1] = py
+            poses[w, n + 1, 2] = heading
 
 
 @kernel

@@ -224,7 +224,8 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
-    robot, kind = f"robot {spec.name!r}", find_kind(require_textbook(spec))
+    robot = f"robot {spec.name!r}"
+    kind = find_kind(require_textbook(spec))
     if kind is None:
         known = ", ".join(kind_names())
         raise ConfigError(

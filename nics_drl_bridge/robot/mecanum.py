@@ -40,7 +40,9 @@ def kinematics(spec: RobotSpec) -> Textbook:
 def drawing(spec: RobotSpec) -> Drawing:
     """A box on four wheels."""
     p = spec.parameters
-    length, width, radius = p["half_length"], p["half_width"], p["wheel_radius"]
+    length = p["half_length"]
+    width = p["half_width"]
+    radius = p["wheel_radius"]
     places = ((length, width), (length, -width), (-length, width), (-length, -width))
     wheels = wheels_at(spec, places, radius, names_of(FOUR_WHEELS))
     return Drawing((2.0 * length + radius, 1.4 * width), (0.0, radius), wheels)

@@ -33,7 +33,8 @@ def kinematics(spec: RobotSpec) -> Textbook:
 
 def drawing(spec: RobotSpec) -> Drawing:
     """A box on four wheels, which stand still."""
-    places, radius = places_of_four(spec.parameters), spec.parameters["wheel_radius"]
+    places = places_of_four(spec.parameters)
+    radius = spec.parameters["wheel_radius"]
     x, y = places["front_left"]
     wheels = (Wheel(f"{name}_wheel", at, radius) for name, at in places.items())
     return Drawing((2.0 * (x + radius), 1.6 * y), (0.0, 1.2 * radius), tuple(wheels))

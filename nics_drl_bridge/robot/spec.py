@@ -44,7 +44,8 @@ TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 Unit = Literal[
     "m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"
 ]
-MOST_CORNERS, MOST_VARIABLES = 512, 32  # of a footprint; of a state or a command
+MOST_CORNERS = 512  # of a footprint
+MOST_VARIABLES = 32  # of a state or a command
 LARGEST = (
     10.0  # reach of a footprint [m]: none of a robot or a car, but many in centimetres
 )
@@ -212,7 +213,8 @@ class RobotSpec(Schema):
                 raise ValueError(
                     "edges of footprint cross or touch; list its corners in order"
                 )
-            reach, radius = _reach(self.footprint), self.footprint_radius
+            reach = _reach(self.footprint)
+            radius = self.footprint_radius
             if not math.isclose(reach, radius, rel_tol=1e-6):
                 raise ValueError(
                     f"footprint reaches {reach:.6g} m from base_link, footprint_radius is "

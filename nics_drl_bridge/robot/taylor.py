@@ -172,7 +172,9 @@ class TaylorModel:
         d = self.dofs.index(dof) - 3
         if d < 0:
             return ""
-        friction, drag, name = self.friction[d], self.drag[d], self.variables[d]
+        friction = self.friction[d]
+        drag = self.drag[d]
+        name = self.variables[d]
         emf = zip(
             self.back_emf[d].tolist(), self.shown_names[self.state_size :], strict=True
         )
@@ -209,7 +211,8 @@ class TaylorModel:
 
     def equations(self) -> list[str]:
         """Returns a line per curve, and per dof with units: `wz = 4.6*speed*steering  [rad/s]`."""
-        lines, names = [curve.equation for curve in self.inputs], self.term_names
+        lines = [curve.equation for curve in self.inputs]
+        names = self.term_names
         for d, dof in enumerate(self.dofs):
             terms = [
                 f"{self.coefficients[d, k]:.5g}"
@@ -232,10 +235,8 @@ class TaylorModel:
             for dof, row in zip(self.dofs, self.coefficients, strict=True)
         }
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
-        states, limits = (
-            self.variables[: self.state_size],
-            map(tuple, self.limits.tolist()),
-        )
+        states = self.variables[: self.state_size]
+        limits = map(tuple, self.limits.tolist())
         friction, drag = (
             {
                 s: each
@@ -398,7 +399,8 @@ class NamedTaylorModel(Schema):
 
     def model(self) -> TaylorModel:
         """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
-        variables, dofs = tuple(self.valid), tuple(self.terms)
+        variables = tuple(self.valid)
+        dofs = tuple(self.terms)
         every = dict.fromkeys(name for row in self.terms.values() for name in row)
         try:
             units = tuple(self.units[dof] for dof in dofs)
@@ -414,8 +416,11 @@ class NamedTaylorModel(Schema):
         rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]
         low, high = np.array(list(self.valid.values())).reshape(len(variables), 2).T
         states = variables[: len(dofs) - 3]
-        friction, drag, limits = self.friction or {}, self.drag or {}, self.limits or {}
-        commands, emf = variables[len(states) :], self.back_emf or {}
+        friction = self.friction or {}
+        drag = self.drag or {}
+        limits = self.limits or {}
+        commands = variables[len(states) :]
+        emf = self.back_emf or {}
         self._check_stages(states, commands)
         return TaylorModel(
             variables,

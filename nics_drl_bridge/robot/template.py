@@ -79,7 +79,8 @@ class Template:
         data["command"] = command = self._command(given, ranges)
         if _mappings(command):
             data["state"] = self._state(given.get("state"), command)
-        own, radius = given.get("parameters", {}), given.get("footprint_radius")
+        own = given.get("parameters", {})
+        radius = given.get("footprint_radius")
         if isinstance(own, Mapping) and isinstance(radius, int | float):
             sizes = {
                 name: round(share * radius, 4) for name, share in self.lengths.items()
@@ -96,7 +97,8 @@ class Template:
         return data
 
     def _command(self, given: Given, ranges: Ranges) -> Any:
-        own, kind = given.get("command"), given["kind"]
+        own = given.get("command")
+        kind = given["kind"]
         if own is not None and not _mappings(own):
             return own  # the check of the whole file reports it
         names = [one.get("name") for one in own] if own is not None else list(ranges)

@@ -31,8 +31,11 @@ def kinematics(spec: RobotSpec) -> kinds.Textbook:
 
 def drawing(spec: RobotSpec) -> kinds.Drawing:
     """A box on three wheels of one size."""
-    p, angle = spec.parameters, kinds.steering_angle(spec)
-    wheelbase, track, radius = p["wheelbase"], p["track"], p["wheel_radius"]
+    p = spec.parameters
+    angle = kinds.steering_angle(spec)
+    wheelbase = p["wheelbase"]
+    track = p["track"]
+    radius = p["wheel_radius"]
     fork = kinds.Pivot("fork", angle.name, angle) if angle else None
     wheels = (
         kinds.Wheel("rear_left_wheel", (0.0, 0.5 * track), radius),

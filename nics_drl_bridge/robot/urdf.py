@@ -69,7 +69,8 @@ def _wheel(robot: Element, parent: str, wheel: Wheel) -> None:
     """Adds a wheel; one that turns turns forwards about y, a steered one's pivot about z."""
     place: Place = (*wheel.place, wheel.radius)
     if wheel.pivot is not None:
-        pivot, angle = wheel.pivot, wheel.pivot.angle
+        pivot = wheel.pivot
+        angle = wheel.pivot.angle
         _add(robot, "link", name=pivot.link)
         joint = _joint(robot, pivot.joint, "revolute", (parent, pivot.link), place)
         _add(joint, "axis", xyz="0 0 1")
@@ -77,8 +78,10 @@ def _wheel(robot: Element, parent: str, wheel: Wheel) -> None:
         _add(joint, "limit", **limits, effort="1", velocity="10")
         if pivot.joint != angle.name:
             _add(joint, "mimic", joint=angle.name)
-        parent, place = pivot.link, (0.0, 0.0, 0.0)
-    name, kind = wheel.name, "continuous" if wheel.turns else "fixed"
+        parent = pivot.link
+        place = (0.0, 0.0, 0.0)
+    name = wheel.name
+    kind = "continuous" if wheel.turns else "fixed"
     joint = _joint(robot, name, kind, (parent, f"{name}_link"), place)
     if wheel.turns:
         _add(joint, "axis", xyz="0 1 0")

@@ -56,7 +56,8 @@ class Sizes:
 def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     """Allocates the arrays of worlds before their first reset, with the model's parameters."""
     _, substeps, delay = model.timing
-    shape, bodies = (sizes.worlds, sizes.robots), sizes.obstacles + sizes.robots
+    shape = (sizes.worlds, sizes.robots)
+    bodies = sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
     # One row for the newest; an age within a period needs the end of the period before it, too.
     terms = term_arrays(model.kinematics)
@@ -189,7 +190,9 @@ def part_of(
 def _scratch(
     model: SimulatorModel, scanner: Scanner, sizes: Sizes, cells: BodyCells, worlds: int
 ) -> arrays.Scratch:
-    kinematics, robots, count = model.kinematics, sizes.robots, sizes.obstacles
+    kinematics = model.kinematics
+    robots = sizes.robots
+    count = sizes.obstacles
     bodies = count + robots
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))

@@ -19,9 +19,14 @@ from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
 
 RADIUS = 0.075  # of each cylinder [m]
 CELL = 0.15  # side of the cells [m]
-CORNER, PATH_CORNER = (-4.425, 0.075), (-4.425, 5.075)  # centre of the first cell [m]
-ROWS, COLUMNS = 64, 30  # along y, along x
-START, GOAL = (-2.25, 3.0, 1.57), (-2.25, 13.0)
+# centre of the first cell [m]
+CORNER = (-4.425, 0.075)
+PATH_CORNER = (-4.425, 5.075)
+# along y, along x
+ROWS = 64
+COLUMNS = 30
+START = (-2.25, 3.0, 1.57)
+GOAL = (-2.25, 13.0)
 BOUNDS = (-4.5, 0.0, 0.0, 14.0)  # the cylinders' field, and 1 m beyond the goal
 FILE = "config/worlds/barn/barn.npz"
 

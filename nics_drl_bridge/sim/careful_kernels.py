@@ -46,7 +46,8 @@ def rates_at(
     n: int, m: int, j: int, state: State, motion: Dynamics, single: Single
 ) -> None:
     """Writes to `single.dq` the rates of robot m in substep j, by the command then in effect."""
-    size, sent = state.state.shape[2], state.history.shape[2]
+    size = state.state.shape[2]
+    sent = state.history.shape[2]
     for s in range(size):
         single.x[s] = state.state[n, m, s]
     for c in range(state.history.shape[3]):
@@ -88,8 +89,11 @@ def _first_touch(
     events: Array,
     moving: Moving,
 ) -> None:
-    near, world, meets = nearby.near, moving.world, nearby.meets[m]
-    event, me = events[m], moving.first + m
+    near = nearby.near
+    world = moving.world
+    meets = nearby.meets[m]
+    event = events[m]
+    me = moving.first + m
     event[TIME] = until
     if meets & contacts.BODIES and event[DEPTH] >= 0.0:
         listed = near[m, 0] <= contacts.SEVERAL
@@ -116,7 +120,9 @@ def _leave(
     single: Single,
     moving: Moving,
 ) -> None:
-    world, events, me = moving.world, single.events, moving.first + m
+    world = moving.world
+    events = single.events
+    me = moving.first + m
     flight = moving.flights[me]
     path = (
         math.sqrt(flight[VX] ** 2 + flight[VY] ** 2)
@@ -134,13 +140,17 @@ def _leave(
         )
         if depth < events[m, AFTER]:
             break
-        events[m, AFTER], flight[STOP] = depth, time
+        events[m, AFTER] = depth
+        flight[STOP] = time
 
 
 @kernel
 def _within(p: int, b: int, until: float, moving: Moving) -> bool:
-    world, flights, a = moving.world, moving.flights, moving.first + p
-    dx, dy = world[a, X] - world[b, X], world[a, Y] - world[b, Y]
+    world = moving.world
+    flights = moving.flights
+    a = moving.first + p
+    dx = world[a, X] - world[b, X]
+    dy = world[a, Y] - world[b, Y]
     paths = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
     far = world[a, RADIUS] + world[b, RADIUS] + paths * until + impact.SLACK
     return dx * dx + dy * dy <= far * far  # type: ignore[no-any-return]
@@ -158,7 +168,8 @@ def _hold(
     moving: Moving,
 ) -> None:
     """Lets robot m, whose point (px, py) approaches something against n, come no nearer."""
-    flight, event = moving.flights[moving.first + m], events[m]
+    flight = moving.flights[moving.first + m]
+    event = events[m]
     slides = (
         event[impact.PRESSED] != 0.0
         and event[DEPTH] >= 0.0
@@ -180,12 +191,10 @@ def _settle(
     moving: Moving,
 ) -> None:
     """Stops bodies at their contacts within a substep, in order of time; marks `touched` (M,)."""
-    flights, first, meets, robots = (
-        moving.flights,
-        moving.first,
-        nearby.meets,
-        events.shape[0],
-    )
+    flights = moving.flights
+    first = moving.first
+    meets = nearby.meets
+    robots = events.shape[0]
     for m in range(robots):
         events[m, TIME] = until
         if meets[m] != contacts.FREE:
@@ -195,21 +204,26 @@ def _settle(
         for p in range(1, robots):
             if events[p, TIME] < events[m, TIME]:
                 m = p
-        time, k = events[m, TIME], int(events[m, impact.WITH])
+        time = events[m, TIME]
+        k = int(events[m, impact.WITH])
         if time >= until:
             return
-        own, others = -events[m, impact.OWN], -events[m, impact.OTHERS]
+        own = -events[m, impact.OWN]
+        others = -events[m, impact.OTHERS]
         touched[m] = 1
         if k >= first:
             touched[k - first] = 1
         touch = events[m]
-        nx, ny = touch[impact.NX], touch[impact.NY]
+        nx = touch[impact.NX]
+        ny = touch[impact.NY]
         if own >= SHARE * (own + others):
-            px, py = touch[impact.OWN_X], touch[impact.OWN_Y]
+            px = touch[impact.OWN_X]
+            py = touch[impact.OWN_Y]
             _hold(m, nx, ny, px, py, time, events, moving)
         if k >= 0 and others >= SHARE * (own + others):
             if k >= first:
-                px, py = touch[impact.OTHERS_X], touch[impact.OTHERS_Y]
+                px = touch[impact.OTHERS_X]
+                py = touch[impact.OTHERS_Y]
                 _hold(k - first, -nx, -ny, px, py, time, events, moving)
             else:
                 flights[k, STOP] = min(flights[k, STOP], time)
@@ -232,14 +246,20 @@ def _arrive(
     single: Single,
     moving: Moving,
 ) -> None:
-    bodies, velocity, start = state.bodies[n], state.velocity[n], single.start
+    bodies = state.bodies[n]
+    velocity = state.velocity[n]
+    start = single.start
     for m in range(nearby.meets.shape[0]):
         if nearby.meets[m] != contacts.FREE:
             me = velocity.shape[0] + m
-            body, flight = bodies[me], moving.flights[me]
+            body = bodies[me]
+            flight = moving.flights[me]
             x, y, c, s = impact.pose_at(me, flight[STOP], moving)
             body[HEADING] += flight[TURN] * (flight[STOP] - flight[impact.FROM])
-            body[X], body[Y], body[COS], body[SIN] = x, y, c, s
+            body[X] = x
+            body[Y] = y
+            body[COS] = c
+            body[SIN] = s
             if flight[STOP] < motion.dt or flight[impact.HOLDS] > 0.0:
                 single.events[m, impact.PRESSED] = 1.0
             if single.events[m, DEPTH] < 0.0:
@@ -272,8 +292,11 @@ def move_carefully(
     stopped by a robot is left with its mean velocity over the period; `any_moves` is true if any
     obstacle does.
     """
-    events, touched, dt = single.events, state.collided[n], motion.dt
-    first, meets = state.velocity.shape[1], nearby.meets
+    events = single.events
+    touched = state.collided[n]
+    dt = motion.dt
+    first = state.velocity.shape[1]
+    meets = nearby.meets
     moving = Moving(
         state.bodies[n], single.flights, first, scene.outlines, motion.series
     )
@@ -294,7 +317,8 @@ def move_carefully(
         for m in range(meets.shape[0]):
             if meets[m] != contacts.FREE:
                 rates_at(n, m, j, state, motion, single)
-                flight, dq = single.flights[first + m], single.dq
+                flight = single.flights[first + m]
+                dq = single.dq
                 flight[VX], flight[VY], flight[TURN], flight[STOP] = (
                     dq[0],
                     dq[1],
@@ -303,7 +327,8 @@ def move_carefully(
                 )
                 flight[impact.FROM] = flight[impact.HOLDS] = 0.0
                 for s in range(state.state.shape[2]):
-                    now, bounds = state.state[n, m, s], robot.bounds_of(motion.terms, s)
+                    now = state.state[n, m, s]
+                    bounds = robot.bounds_of(motion.terms, s)
                     state.state[n, m, s] = robot.next_state(now, dq[3 + s], dt, bounds)
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
@@ -328,7 +353,8 @@ def _check_overlap(
     touched: Array,
     moving: Moving,
 ) -> None:
-    events, body = single.events, moving.world[moving.first + m]
+    events = single.events
+    body = moving.world[moving.first + m]
     depth, whom = contacts.contact(
         body, m, moving.world, scene, nearby, single.spare, 4.0 * impact.SLACK
     )
@@ -344,12 +370,10 @@ def _check_overlap(
 
 @kernel
 def _average_velocities(n: int, period: float, state: State, single: Single) -> None:
-    bodies, velocity, start, began = (
-        state.bodies,
-        state.velocity,
-        single.start,
-        single.began,
-    )
+    bodies = state.bodies
+    velocity = state.velocity
+    start = single.start
+    began = single.began
     for k in range(velocity.shape[1]):
         stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]
         if stopped or start[k, 2] != began[k, 2]:
@@ -368,8 +392,12 @@ def drift_carefully(
     single: Single,
 ) -> None:
     """Lets the robots of one world drift, one after the other, up to their contacts."""
-    pose, collided, meets = state.pose, state.collided, nearby.meets
-    flights, events, first = single.flights, single.events, state.velocity.shape[1]
+    pose = state.pose
+    collided = state.collided
+    meets = nearby.meets
+    flights = single.flights
+    events = single.events
+    first = state.velocity.shape[1]
     moving = Moving(state.bodies[n], flights, first, scene.outlines, motion.series)
     stood = False
     for m in range(pose.shape[1]):
@@ -382,14 +410,19 @@ def drift_carefully(
         if meets[m] != contacts.FREE:
             flight = flights[first + m]
             if not stood:
-                flights[:], stood = 0.0, True
+                flights[:] = 0.0
+                stood = True
             contacts.put_body(state.bodies, n, first + m, pose[n, m])
-            flight[VX], flight[VY], flight[TURN], flight[STOP] = ahead, aside, turn, 1.0
+            flight[VX] = ahead
+            flight[VY] = aside
+            flight[TURN] = turn
+            flight[STOP] = 1.0
             events[m, DEPTH] = 0.0
             _first_touch(m, 0.0, 1.0, scene, nearby, events, moving)
             flight[STOP] = 0.0
             if events[m, TIME] < 1.0:
-                stop, collided[n, m] = events[m, TIME], 1
+                stop = events[m, TIME]
+                collided[n, m] = 1
                 if events[m, impact.WITH] >= first:
                     collided[n, int(events[m, impact.WITH]) - first] = 1
         x, y, _, _ = robot.move(

@@ -20,7 +20,9 @@ from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
 
 MOST_CELLS = 10_000
 TRIES = 200  # fields drawn for one world, until there is a way through
-FILLED, EMPTIED = 5, 1  # at least, at most so many of a cell's 8 neighbours are filled
+# at least, at most so many of a cell's 8 neighbours are filled
+FILLED = 5
+EMPTIED = 1
 FINE = 2  # points of the search for a way, along a cell
 
 
@@ -110,16 +112,20 @@ def _has_way(filled: NDArray[np.bool_], given: Cellular) -> bool:
 
 def _world(filled: NDArray[np.bool_], given: Cellular, number: int) -> World:
     rows, columns = np.nonzero(filled)
-    x, y = (columns + 0.5) * given.cell, given.margin + (rows + 0.5) * given.cell
-    wide, deep = given.columns * given.cell, given.rows * given.cell
-    long, middle = deep + 2.0 * given.margin, wide / 2.0
+    x = (columns + 0.5) * given.cell
+    y = given.margin + (rows + 0.5) * given.cell
+    wide = given.columns * given.cell
+    deep = given.rows * given.cell
+    long = deep + 2.0 * given.margin
+    middle = wide / 2.0
     poses = [(px, py, 0.0) for px, py in np.round(np.stack([x, y], axis=1), 6).tolist()]
     one = (
         Obstacles(shapes=(Circle(radius=given.cell / 2.0),), at=tuple(poses))
         if poses
         else None
     )
-    start, goal = given.margin / 2.0, long - given.margin / 2.0
+    start = given.margin / 2.0
+    goal = long - given.margin / 2.0
     return World(
         name=f"cellular_{given.seed}_{number}",
         bounds=(0.0, 0.0, wide, long),

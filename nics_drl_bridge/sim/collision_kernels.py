@@ -48,7 +48,10 @@ def is_round(body, outlines):  # type: ignore[no-untyped-def]
 @kernel
 def from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     """Returns the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
-    ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
+    ex = bx - ax
+    ey = by - ay
+    dx = x - ax
+    dy = y - ay
     along = dx * ex + dy * ey
     if along > 0.0:
         share = min(along / (ex * ex + ey * ey), 1.0)
@@ -92,18 +95,25 @@ def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped
 @kernel
 def outline_point(x, y, outline):  # type: ignore[no-untyped-def]
     """Signed distance from (x, y) to an outline; negative inside."""
-    corners, begin, end = outline.corners, outline.begin, outline.end
-    least, inside = np.inf, False
-    ax, ay = corners[end - 1, 0], corners[end - 1, 1]
+    corners = outline.corners
+    begin = outline.begin
+    end = outline.end
+    least = np.inf
+    inside = False
+    ax = corners[end - 1, 0]
+    ay = corners[end - 1, 1]
     if end - begin == 2:
-        bx, by = corners[begin, 0], corners[begin, 1]
+        bx = corners[begin, 0]
+        by = corners[begin, 1]
         return math.sqrt(segment_distance2(x, y, bx, by, ax, ay))
     for v in range(begin, end):
-        bx, by = corners[v, 0], corners[v, 1]
+        bx = corners[v, 0]
+        by = corners[v, 1]
         least = min(least, segment_distance2(x, y, ax, ay, bx, by))
         if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
             inside = not inside
-        ax, ay = bx, by
+        ax = bx
+        ay = by
     return -math.sqrt(least) if inside else math.sqrt(least)
 
 
@@ -111,10 +121,13 @@ def outline_point(x, y, outline):  # type: ignore[no-untyped-def]
 def _next_cut(ax, ay, ex, ey, after, q):  # type: ignore[no-untyped-def]
     """Next cut of the edge from (ax, ay) along (ex, ey) by outline q, as a share of its length."""
     least = 1.0
-    cx, cy = q.corners[q.end - 1, 0], q.corners[q.end - 1, 1]
+    cx = q.corners[q.end - 1, 0]
+    cy = q.corners[q.end - 1, 1]
     for w in range(q.begin, q.end):
-        dx, dy = q.corners[w, 0], q.corners[w, 1]
-        fx, fy = dx - cx, dy - cy
+        dx = q.corners[w, 0]
+        dy = q.corners[w, 1]
+        fx = dx - cx
+        fy = dy - cy
         cross = ex * fy - ey * fx
         if cross != 0.0:
             at = ((cx - ax) * fy - (cy - ay) * fx) / cross
@@ -122,7 +135,8 @@ def _next_cut(ax, ay, ex, ey, after, q):  # type: ignore[no-untyped-def]
                 along = ((cx - ax) * ey - (cy - ay) * ex) / cross
                 if -ON_EDGE <= along <= 1.0 + ON_EDGE:
                     least = at
-        cx, cy = dx, dy
+        cx = dx
+        cy = dy
     return least
 
 
@@ -131,10 +145,13 @@ def _deepest(p, q):  # type: ignore[no-untyped-def]
     depth = 0.0
     if q.end - q.begin == 2:
         return depth
-    ax, ay = p.corners[p.end - 1, 0], p.corners[p.end - 1, 1]
+    ax = p.corners[p.end - 1, 0]
+    ay = p.corners[p.end - 1, 1]
     for v in range(p.begin, p.end):
-        bx, by = p.corners[v, 0], p.corners[v, 1]
-        ex, ey = bx - ax, by - ay
+        bx = p.corners[v, 0]
+        by = p.corners[v, 1]
+        ex = bx - ax
+        ey = by - ay
         depth = max(depth, -outline_point(bx, by, q))
         at = 0.0
         while at < 1.0:
@@ -142,28 +159,37 @@ def _deepest(p, q):  # type: ignore[no-untyped-def]
             middle = 0.5 * (at + cut)
             depth = max(depth, -outline_point(ax + middle * ex, ay + middle * ey, q))
             at = cut
-        ax, ay = bx, by
+        ax = bx
+        ay = by
     return depth
 
 
 @kernel
 def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
     """Signed clearance of two outlines in one frame; a circle (x, y, reach) encloses p."""
-    least, crossing, touching = limit * limit, False, False
-    ax, ay = q.corners[q.end - 1, 0], q.corners[q.end - 1, 1]
+    least = limit * limit
+    crossing = False
+    touching = False
+    ax = q.corners[q.end - 1, 0]
+    ay = q.corners[q.end - 1, 1]
     for v in range(q.begin, q.end):
-        bx, by = q.corners[v, 0], q.corners[v, 1]
+        bx = q.corners[v, 0]
+        by = q.corners[v, 1]
         near = reach + math.sqrt(least)
         if segment_distance2(x, y, ax, ay, bx, by) <= near * near:
-            cx, cy = p.corners[p.end - 1, 0], p.corners[p.end - 1, 1]
+            cx = p.corners[p.end - 1, 0]
+            cy = p.corners[p.end - 1, 1]
             for w in range(p.begin, p.end):
-                dx, dy = p.corners[w, 0], p.corners[w, 1]
+                dx = p.corners[w, 0]
+                dy = p.corners[w, 1]
                 distance2 = _edges_distance2(ax, ay, bx, by, cx, cy, dx, dy)
                 crossing = crossing or distance2 < 0.0
                 touching = touching or distance2 <= TOUCHING * TOUCHING
                 least = min(least, max(distance2, 0.0))
-                cx, cy = dx, dy
-        ax, ay = bx, by
+                cx = dx
+                cy = dy
+        ax = bx
+        ay = by
     overlapping = crossing or touching
     if not overlapping and q.end - q.begin > 2:
         overlapping = (
@@ -186,13 +212,17 @@ def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
 @kernel
 def body_gap(body, other, outlines, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of two bodies; see the module."""
-    dx, dy = body[X] - other[X], body[Y] - other[Y]
+    dx = body[X] - other[X]
+    dy = body[Y] - other[Y]
     far = body[RADIUS] + other[RADIUS] + max(limit, 0.0)
     if dx * dx + dy * dy > far * far:
         return limit
-    mine, outline = outline_of(body, outlines), outline_of(other, outlines)
-    c, s = other[COS], other[SIN]
-    x, y = c * dx + s * dy, c * dy - s * dx
+    mine = outline_of(body, outlines)
+    outline = outline_of(other, outlines)
+    c = other[COS]
+    s = other[SIN]
+    x = c * dx + s * dy
+    y = c * dy - s * dx
     if mine.begin == mine.end:
         if outline.begin == outline.end:
             gap = math.sqrt(dx * dx + dy * dy) - other[RADIUS]
@@ -200,12 +230,16 @@ def body_gap(body, other, outlines, limit, spare):  # type: ignore[no-untyped-de
             gap = outline_point(x, y, outline)
         return min(gap - body[RADIUS], limit)
     if outline.begin == outline.end:
-        x, y = -(body[COS] * dx + body[SIN] * dy), -(body[COS] * dy - body[SIN] * dx)
+        x = -(body[COS] * dx + body[SIN] * dy)
+        y = -(body[COS] * dy - body[SIN] * dx)
         return min(outline_point(x, y, mine) - other[RADIUS], limit)
-    cos, sin = body[COS] * c + body[SIN] * s, body[SIN] * c - body[COS] * s
+    cos = body[COS] * c + body[SIN] * s
+    sin = body[SIN] * c - body[COS] * s
     for v in range(mine.end - mine.begin):
-        px, py = mine.corners[mine.begin + v, 0], mine.corners[mine.begin + v, 1]
-        spare[v, 0], spare[v, 1] = x + cos * px - sin * py, y + sin * px + cos * py
+        px = mine.corners[mine.begin + v, 0]
+        py = mine.corners[mine.begin + v, 1]
+        spare[v, 0] = x + cos * px - sin * py
+        spare[v, 1] = y + sin * px + cos * py
     placed = Outline(spare, 0, mine.end - mine.begin)
     return min(
         _outline_gap(placed, x, y, body[RADIUS], outline, max(limit, 0.0)), limit
@@ -223,12 +257,14 @@ def wall_gap(body, wall, outlines, limit, spare):  # type: ignore[no-untyped-def
     if outline.begin == outline.end:
         return min(math.sqrt(distance2) - body[RADIUS], limit)
     for v in range(2):
-        dx, dy = wall[2 * v] - body[X], wall[2 * v + 1] - body[Y]
+        dx = wall[2 * v] - body[X]
+        dy = wall[2 * v + 1] - body[Y]
         spare[v, 0], spare[v, 1] = (
             body[COS] * dx + body[SIN] * dy,
             body[COS] * dy - body[SIN] * dx,
         )
-    x, y = 0.5 * (spare[0, 0] + spare[1, 0]), 0.5 * (spare[0, 1] + spare[1, 1])
+    x = 0.5 * (spare[0, 0] + spare[1, 0])
+    y = 0.5 * (spare[0, 1] + spare[1, 1])
     reach = math.hypot(spare[0, 0] - x, spare[0, 1] - y)
     return min(
         _outline_gap(Outline(spare, 0, 2), x, y, reach, outline, max(limit, 0.0)), limit
@@ -237,7 +273,8 @@ def wall_gap(body, wall, outlines, limit, spare):  # type: ignore[no-untyped-def
 
 @kernel
 def _along(x, y, wall):  # type: ignore[no-untyped-def]
-    ex, ey = wall[2] - wall[0], wall[3] - wall[1]
+    ex = wall[2] - wall[0]
+    ey = wall[3] - wall[1]
     length2 = ex * ex + ey * ey
     if length2 > 0.0:
         return min(max(((x - wall[0]) * ex + (y - wall[1]) * ey) / length2, 0.0), 1.0)
@@ -256,8 +293,11 @@ def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
     """Distance from a point to the nearest straight wall (W, 4) [m]; inf if there is none."""
     least = np.inf
     for w in range(walls.shape[0]):
-        ax, ay, share = walls[w, 0], walls[w, 1], _along(x, y, walls[w])
-        ex, ey = walls[w, 2] - ax, walls[w, 3] - ay
+        ax = walls[w, 0]
+        ay = walls[w, 1]
+        share = _along(x, y, walls[w])
+        ex = walls[w, 2] - ax
+        ey = walls[w, 3] - ay
         least = min(least, np.hypot(x - ax - share * ex, y - ay - share * ey))
     return least
 
@@ -265,7 +305,8 @@ def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
 @kernel
 def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
     """Returns a point of the map frame in the frame of a grid [m]."""
-    dx, dy = x - grid.x, y - grid.y
+    dx = x - grid.x
+    dy = y - grid.y
     return grid.cos * dx + grid.sin * dy, grid.cos * dy - grid.sin * dx
 
 
@@ -273,8 +314,10 @@ def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
 def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
     """Returns first and last + 1 row and column of the cells up to `far` [m] from a point."""
     rows, columns = grid.distances.shape
-    low_i, high_i = math.floor((y - far) / grid.cell), math.floor((y + far) / grid.cell)
-    low_j, high_j = math.floor((x - far) / grid.cell), math.floor((x + far) / grid.cell)
+    low_i = math.floor((y - far) / grid.cell)
+    high_i = math.floor((y + far) / grid.cell)
+    low_j = math.floor((x - far) / grid.cell)
+    high_j = math.floor((x + far) / grid.cell)
     return (
         max(low_i, 0),
         min(high_i, rows - 1) + 1,
@@ -291,7 +334,8 @@ def _bounds(x, y, grid):  # type: ignore[no-untyped-def]
     i = min(max(math.floor(y / size), 0), rows - 1)
     j = min(max(math.floor(x / size), 0), columns - 1)
     # From outside, the nearest point of the map is nearer to each of its cells than (x, y) is.
-    px, py = min(max(x, 0.0), columns * size), min(max(y, 0.0), rows * size)
+    px = min(max(x, 0.0), columns * size)
+    py = min(max(y, 0.0), rows * size)
     within = math.hypot(px - (j + 0.5) * size, py - (i + 0.5) * size)
     outside = math.hypot(x - px, y - py)
     middle = grid.distances[i, j]
@@ -314,14 +358,17 @@ def map_gap(body, grid, outlines, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of a body and the solid cells of a map."""
     if grid.distances.size == 0:
         return limit
-    size, radius, outline = grid.cell, body[RADIUS], outline_of(body, outlines)
+    size = grid.cell
+    radius = body[RADIUS]
+    outline = outline_of(body, outlines)
     x, y = in_grid(body[X], body[Y], grid)
     low, high = _bounds(x, y, grid)
     if low - radius > limit:
         return limit
     c = body[COS] * grid.cos + body[SIN] * grid.sin
     s = body[SIN] * grid.cos - body[COS] * grid.sin
-    far, least = radius + max(min(limit, high), 0.0) + size, limit
+    far = radius + max(min(limit, high), 0.0) + size
+    least = limit
     low_i, end_i, low_j, end_j = cells_near(x, y, far, grid)
     for i in range(low_i, end_i):
         for j in range(low_j, end_j):
@@ -336,12 +383,12 @@ def map_gap(body, grid, outlines, limit, spare):  # type: ignore[no-untyped-def]
             for v in range(4):
                 across = (j + ((v + 1) // 2) % 2) * size - x
                 up = (i + v // 2) * size - y
-                spare[v, 0], spare[v, 1] = c * across + s * up, c * up - s * across
-            mx, my = (
-                0.5 * (spare[0, 0] + spare[2, 0]),
-                0.5 * (spare[0, 1] + spare[2, 1]),
-            )
-            square, reach = Outline(spare, 0, 4), 0.75 * size
+                spare[v, 0] = c * across + s * up
+                spare[v, 1] = c * up - s * across
+            mx = 0.5 * (spare[0, 0] + spare[2, 0])
+            my = 0.5 * (spare[0, 1] + spare[2, 1])
+            square = Outline(spare, 0, 4)
+            reach = 0.75 * size
             gap = _outline_gap(square, mx, my, reach, outline, max(least, 0.0))
             least = min(least, gap)
     return least

@@ -14,7 +14,11 @@ from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Nearby, State, Surroundings
 
-FREE, BODIES, WALLS, MAP = 0, 1, 2, 4  # Bit flags of what a robot may meet
+# Bit flags of what a robot may meet
+FREE = 0
+BODIES = 1
+WALLS = 2
+MAP = 4
 SEVERAL = (
     32  # Most bodies that are listed near a robot; if there are more, all are tested
 )
@@ -25,21 +29,22 @@ def reaches(
     n: int, state: State, scene: Surroundings, nearby: Nearby, period: float
 ) -> tuple[float, bool]:
     """Writes how far what may move reaches in a period [s]; longest path, if an obstacle moves."""
-    reach, way, bodies, velocity = (
-        nearby.reach,
-        nearby.way,
-        state.bodies,
-        state.velocity,
-    )
-    longest, moving = 0.0, False
+    reach = nearby.reach
+    way = nearby.way
+    bodies = state.bodies
+    velocity = state.velocity
+    longest = 0.0
+    moving = False
     obstacles = velocity.shape[1]
     for k in range(0 if scene.standing else obstacles):
         reach[k] = bodies[n, k, RADIUS]
-        vx, vy = velocity[n, k, 0], velocity[n, k, 1]
+        vx = velocity[n, k, 0]
+        vy = velocity[n, k, 1]
         if (vx != 0.0 or vy != 0.0 or velocity[n, k, 2] != 0.0) and reach[k] > 0.0:
             moved = math.sqrt(vx * vx + vy * vy) * period
             reach[k] += moved
-            longest, moving = max(longest, moved), True
+            longest = max(longest, moved)
+            moving = True
     for m in range(way.shape[0]):
         reach[obstacles + m] = bodies[n, obstacles + m, RADIUS] + way[m]
         longest = max(longest, way[m])
@@ -51,14 +56,21 @@ def find_near(
     n: int, m: int, bodies: Array, scene: Surroundings, nearby: Nearby, cells: BodyCells
 ) -> int:
     """Returns flags of what robot m of world n may meet; writes row m of `nearby.near`."""
-    near, reach, walls = nearby.near, nearby.reach, scene.walls
+    near = nearby.near
+    reach = nearby.reach
+    walls = scene.walls
     me = bodies.shape[1] - near.shape[0] + m
-    x, y, own = bodies[n, me, X], bodies[n, me, Y], reach[me]
-    count, standing = 0, bodies.shape[1] - near.shape[0] if scene.standing else 0
+    x = bodies[n, me, X]
+    y = bodies[n, me, Y]
+    own = reach[me]
+    count = 0
+    standing = bodies.shape[1] - near.shape[0] if scene.standing else 0
     for i in range(around(n, x, y, own, cells)):
         k = cells.found[i]
         other = bodies[n, k, RADIUS] if k < standing else reach[k]
-        dx, dy, far = bodies[n, k, X] - x, bodies[n, k, Y] - y, own + other
+        dx = bodies[n, k, X] - x
+        dy = bodies[n, k, Y] - y
+        far = own + other
         if dx * dx + dy * dy <= far * far and k != me and other > 0.0:
             if count < SEVERAL:
                 near[m, 1 + count] = k
@@ -88,7 +100,10 @@ def contact(
     limit: float,
 ) -> tuple[float, int]:
     """Clearance [m], up to `limit`, of robot m placed as `body` (7,), and nearest body or -1."""
-    outlines, near, least, whom = scene.outlines, nearby.near, limit, -1
+    outlines = scene.outlines
+    near = nearby.near
+    least = limit
+    whom = -1
     if nearby.meets[m] & BODIES:
         me = world.shape[0] - near.shape[0] + m
         listed = near[m, 0] <= SEVERAL
@@ -98,16 +113,19 @@ def contact(
                 continue
             gap = collision.body_gap(body, world[k], outlines, limit, spare)
             if gap < least:
-                least, whom = gap, k
+                least = gap
+                whom = k
     if nearby.meets[m] & WALLS:
         for w in range(scene.walls.shape[0]):
             gap = collision.wall_gap(body, scene.walls[w], outlines, limit, spare)
             if gap < least:
-                least, whom = gap, -1
+                least = gap
+                whom = -1
     if nearby.meets[m] & MAP:
         gap = collision.map_gap(body, scene.grid, outlines, limit, spare)
         if gap < least:
-            least, whom = gap, -1
+            least = gap
+            whom = -1
     return least, whom
 
 

@@ -42,7 +42,8 @@ class DeviceWorld:
     def __init__(
         self, simulator: FastSimulator, model: SimulatorModel, robots: int
     ) -> None:
-        self.simulator, self._period = simulator, model.control_period
+        self.simulator = simulator
+        self._period = model.control_period
         # Completes a scene that was drawn; the starts (1, M, 3) of its robots, if they were given.
         self.arrange: Callable[[Scenes, Array | None], Array | None] = (
             lambda _, starts: starts
@@ -216,7 +217,8 @@ class DrivenSimulator(FastSimulator):
         wheel odometry, without noise; and (M,) true for robots that touched anything.
         """
         data = self.data
-        data.pose[0], data.state[0] = pose, state
+        data.pose[0] = pose
+        data.state[0] = state
         data.collided[0] |= touched.astype(np.uint8)
         given = twist[None], self.wheels[None], wheels[None], counted[None]
         step_kernels.end_period(self.packed[0], *given)

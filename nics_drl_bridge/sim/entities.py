@@ -72,7 +72,8 @@ class Entities:
 
     def __post_init__(self) -> None:
         self._own = self.device.simulator.sampler.count
-        self._launched, self._spare = list(self.robots), list[Shape]()
+        self._launched = list(self.robots)
+        self._spare = list[Shape]()
         self._table: Array = np.zeros(
             (self._own, 7)
         )  # the bodies, in the order of slots
@@ -118,7 +119,8 @@ class Entities:
 
     def __iter__(self) -> Iterator[Entity]:
         yield from (Entity(name, robot=m) for m, name in enumerate(self._launched))
-        sampler, bodies = self.simulator.sampler, self.bodies()
+        sampler = self.simulator.sampler
+        bodies = self.bodies()
         motions = sampler.motions[int(self.simulator.data.member[0])]
         for k in np.flatnonzero(bodies[: self._own, RADIUS] > 0.0).tolist():
             part = ((sampler.shapes[int(bodies[k, SHAPE])], (0.0, 0.0, 0.0)),)
@@ -225,9 +227,11 @@ class Entities:
         taken = {entity.name for entity in self}
         # A name of the world's own obstacles may come back with the next episode.
         taken |= {f"{OBSTACLE}{k}" for k in range(self._own)}
-        free, number = name, 1
+        free = name
+        number = 1
         while free in taken:
-            free, number = f"{name}_{number}", number + 1
+            free = f"{name}_{number}"
+            number = number + 1
         return free
 
     def spawn(self, name: str, parts: Sequence[Placed], pose: Array) -> Entity:
@@ -237,7 +241,8 @@ class Entities:
         """
         self.require_inside(pose)
         used = {slot for entity in self.spawned.values() for slot in entity.slots}
-        spare, slots = list(self._spare), list[int]()
+        spare = list(self._spare)
+        slots = list[int]()
         for shape, _ in parts:
             free = (
                 k
@@ -311,7 +316,8 @@ class Entities:
         self, spare: Sequence[Shape], robots: Sequence[int], count: int = 0
     ) -> None:
         """Makes a simulator for robots of these numbers here, and so many in all; goes on in it."""
-        old, bodies = self.simulator, self.bodies().copy()
+        old = self.simulator
+        bodies = self.bodies().copy()
         # An own world, as the simulator of the present one goes on if this one can't be made.
         new = self.make(self.world.with_spare(tuple(spare)), count or len(robots))
         slots = np.arange(new.sampler.count)
@@ -321,7 +327,8 @@ class Entities:
         # The shapes that are spare come last, and each of them has a slot of its own.
         new.take_over(old, np.array(robots, np.int64), slots)
         new.put_bodies(table)
-        self._spare, self._table = list(spare), table
+        self._spare = list(spare)
+        self._table = table
         self.device.exchange(new, np.array(robots, np.int64))
 
 
@@ -340,7 +347,8 @@ def overlap(one: Array, other: Array) -> bool:
         axes = np.column_stack([-edges[:, 1], edges[:, 0]])
         if len(corners) == 2:  # a segment: also along itself
             axes = np.concatenate([axes[:1], edges[:1]])
-        mine, theirs = one @ axes.T, other @ axes.T
+        mine = one @ axes.T
+        theirs = other @ axes.T
         apart = (mine.max(axis=0) < theirs.min(axis=0)) | (
             theirs.max(axis=0) < mine.min(axis=0)
         )

@@ -13,10 +13,8 @@ from nics_drl_bridge.sim.guide_kernels import GuideGrid
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
 from nics_drl_bridge.sim.state import State
 
-CELL, MOST_CELLS = (
-    0.15,
-    10_000,
-)  # side of a cell [m]; in fields with more cells it is larger
+CELL = 0.15  # side of a cell [m]
+MOST_CELLS = 10_000  # in fields with more cells it is larger
 
 
 class Guide:
@@ -73,7 +71,8 @@ class Guide:
 
         Where there is no room for one it stays as drawn. Call `begin` before.
         """
-        starts, member = scenes.starts.copy(), np.asarray(scenes.member, np.int64)
+        starts = scenes.starts.copy()
+        member = np.asarray(scenes.member, np.int64)
         kernels.nearer(
             starts, worlds, member, scenes.bodies, share, self.fields, self._grid
         )

@@ -48,7 +48,8 @@ def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
     """
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            x, y = extent[0] + (j + 0.5) * cell, extent[1] + (i + 0.5) * cell
+            x = extent[0] + (j + 0.5) * cell
+            y = extent[1] + (i + 0.5) * cell
             row, column, _ = scene_kernels.cell_of(x, y, cells)
             inside = (
                 0 <= row < cells.distances.shape[0]
@@ -63,14 +64,17 @@ def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-
 
     Of the worlds (n,) given: member (n,), bodies (n, K, 7), goals (n, M, 2).
     """
-    rows, columns = grid.walls.shape[1], grid.walls.shape[2]
+    rows = grid.walls.shape[1]
+    columns = grid.walls.shape[2]
     gaps = np.empty((rows, columns), np.float32)
     for n in range(worlds.shape[0]):
         p = member[n]
         wide = grid.sizes[p]
         space = gaps[: wide[0], : wide[1]]
         space[...] = grid.walls[p, : wide[0], : wide[1]]
-        x, y, cell = grid.frames[p, 0], grid.frames[p, 1], grid.frames[p, 2]
+        x = grid.frames[p, 0]
+        y = grid.frames[p, 1]
+        cell = grid.frames[p, 2]
         for k in range(bodies.shape[1]):
             if grid.stands[p, k] and bodies[n, k, RADIUS] > 0.0:
                 _approach(space, bodies[n, k], x, y, cell, grid)
@@ -79,7 +83,8 @@ def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-
                 space[i, j] = np.float32(cell * _cost(space[i, j], grid))
         for m in range(goals.shape[1]):
             field = out[worlds[n], m, : wide[0], : wide[1]]
-            u, v = (goals[n, m, 0] - x) / cell - 0.5, (goals[n, m, 1] - y) / cell - 0.5
+            u = (goals[n, m, 0] - x) / cell - 0.5
+            v = (goals[n, m, 1] - y) / cell - 0.5
             _spread(field, space, u, v)
 
 
@@ -101,7 +106,8 @@ def _approach(space, body, x, y, cell, grid):  # type: ignore[no-untyped-def]
 @kernel
 def _gap(x, y, body, outline):  # type: ignore[no-untyped-def]
     """Distance of a point from a body with an outline [m]."""
-    dx, dy = x - body[X], y - body[Y]
+    dx = x - body[X]
+    dy = y - body[Y]
     if outline.begin < outline.end:
         across = body[COS] * dy - body[SIN] * dx
         return collision.outline_point(body[COS] * dx + body[SIN] * dy, across, outline)
@@ -128,7 +134,8 @@ def _spread(field, cost, u, v):  # type: ignore[no-untyped-def]
     """Arrival times of a front that starts at column u, row v (fractions) and takes `cost`."""
     rows, columns = field.shape
     field[...] = np.inf
-    gi, gj = min(max(round(v), 0), rows - 1), min(max(round(u), 0), columns - 1)
+    gi = min(max(round(v), 0), rows - 1)
+    gj = min(max(round(u), 0), columns - 1)
     for i in range(max(gi - 1, 0), min(gi + 2, rows)):
         for j in range(max(gj - 1, 0), min(gj + 2, columns)):
             field[i, j] = math.sqrt((u - j) ** 2 + (v - i) ** 2) * cost[i, j]
@@ -154,7 +161,8 @@ def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
             j = columns - 1 - b if left else b
             beside = min(ways[i, max(j - 1, 0)], ways[i, min(j + 1, columns - 1)])
             above = min(ways[max(i - 1, 0), j], ways[min(i + 1, rows - 1), j])
-            price, apart = prices[i, j], beside - above
+            price = prices[i, j]
+            apart = beside - above
             least = min(beside, above)
             if not least < ways[i, j]:
                 continue
@@ -181,31 +189,38 @@ def nearer(out, worlds, member, bodies, share, fields, grid):  # type: ignore[no
     for n in range(out.shape[0]):
         p = member[n]
         wide = grid.sizes[p]
-        x, y, cell = grid.frames[p, 0], grid.frames[p, 1], grid.frames[p, 2]
+        x = grid.frames[p, 0]
+        y = grid.frames[p, 1]
+        cell = grid.frames[p, 2]
         for m in range(out.shape[1]):
             ways = fields[worlds[n], m, : wide[0], : wide[1]]
             i = min(max(int((out[n, m, 1] - y) / cell), 0), wide[0] - 1)
             j = min(max(int((out[n, m, 0] - x) / cell), 0), wide[1] - 1)
             i, j = _descend(i, j, share * ways[i, j], ways)
-            at_x, at_y = x + (j + 0.5) * cell, y + (i + 0.5) * cell
+            at_x = x + (j + 0.5) * cell
+            at_y = y + (i + 0.5) * cell
             if grid.walls[p, i, j] >= grid.outer + ROOM and _is_clear(
                 at_x, at_y, bodies[n], grid
             ):
-                out[n, m, 0], out[n, m, 1] = at_x, at_y
+                out[n, m, 0] = at_x
+                out[n, m, 1] = at_y
 
 
 @kernel
 def _descend(i, j, wanted, ways):  # type: ignore[no-untyped-def]
     """The first cell, down the ways (rows, columns) from row i, column j, with no longer a way."""
     while ways[i, j] > wanted:
-        row, column = i, j
+        row = i
+        column = j
         for a in range(max(i - 1, 0), min(i + 2, ways.shape[0])):
             for b in range(max(j - 1, 0), min(j + 2, ways.shape[1])):
                 if ways[a, b] < ways[row, column]:
-                    row, column = a, b
+                    row = a
+                    column = b
         if row == i and column == j:
             break
-        i, j = row, column
+        i = row
+        j = column
     return i, j
 
 
@@ -226,14 +241,20 @@ def lengths(out, poses, member, fields, grid):  # type: ignore[no-untyped-def]
     """Writes the lengths (N, M) [m] of the ways from poses (N, M, 3), interpolated linearly."""
     for n in range(out.shape[0]):
         p = member[n]
-        x, y, cell = grid.frames[p, 0], grid.frames[p, 1], grid.frames[p, 2]
-        rows, columns = grid.sizes[p, 0], grid.sizes[p, 1]
+        x = grid.frames[p, 0]
+        y = grid.frames[p, 1]
+        cell = grid.frames[p, 2]
+        rows = grid.sizes[p, 0]
+        columns = grid.sizes[p, 1]
         for m in range(out.shape[1]):
             u = min(max((poses[n, m, 0] - x) / cell - 0.5, 0.0), columns - 1.000001)
             v = min(max((poses[n, m, 1] - y) / cell - 0.5, 0.0), rows - 1.000001)
-            i, j = int(v), int(u)
-            s, t = v - i, u - j
-            one, two = fields[n, m, i], fields[n, m, i + 1]
+            i = int(v)
+            j = int(u)
+            s = v - i
+            t = u - j
+            one = fields[n, m, i]
+            two = fields[n, m, i + 1]
             out[n, m] = (1.0 - s) * ((1.0 - t) * one[j] + t * one[j + 1]) + s * (
                 (1.0 - t) * two[j] + t * two[j + 1]
             )

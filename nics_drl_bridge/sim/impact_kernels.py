@@ -109,14 +109,21 @@ def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, f
     """Returns x, y [m], cosine and sine of the heading of a body at a time."""
     if b < 0:
         return 0.0, 0.0, 1.0, 0.0
-    world, flights = moving.world, moving.flights
+    world = moving.world
+    flights = moving.flights
     time = max(min(time, flights[b, STOP]) - flights[b, FROM], 0.0)
-    x, y, c, s = world[b, X], world[b, Y], world[b, COS], world[b, SIN]
-    vx, vy, turn = flights[b, VX], flights[b, VY], flights[b, TURN] * time
+    x = world[b, X]
+    y = world[b, Y]
+    c = world[b, COS]
+    s = world[b, SIN]
+    vx = flights[b, VX]
+    vy = flights[b, VY]
+    turn = flights[b, TURN] * time
     if in_own_frame(b, moving):
         return move(x, y, c, s, vx, vy, turn, time, moving.series)  # type: ignore[no-any-return]
     if turn != 0.0:
-        cos, sin = math.cos(turn), math.sin(turn)
+        cos = math.cos(turn)
+        sin = math.sin(turn)
         c, s = c * cos - s * sin, s * cos + c * sin
     return x + vx * time, y + vy * time, c, s
 
@@ -128,7 +135,9 @@ def _placed_at(b: int, edge: Edge, time: float, moving: Moving) -> Placed:
     if b < 0 or time >= moving.flights[b, STOP]:
         return Placed(there, x, y, 0.0, 0.0, 0.0, 0.0)
     flight = moving.flights[b]
-    vx, vy, turn = flight[VX], flight[VY], flight[TURN]
+    vx = flight[VX]
+    vy = flight[VY]
+    turn = flight[TURN]
     if not in_own_frame(b, moving):
         return Placed(there, x, y, vx, vy, turn, 0.0)
     bend = abs(turn) * math.sqrt(vx * vx + vy * vy)
@@ -158,7 +167,8 @@ def _between(p: Edge, q: Edge) -> tuple[float, float]:
     ):
         ox, oy = collision.from_segment(x, y, edge.ax, edge.ay, edge.bx, edge.by)
         if ox * ox + oy * oy < nx * nx + ny * ny:
-            nx, ny = sign * ox, sign * oy
+            nx = sign * ox
+            ny = sign * oy
     return nx, ny
 
 
@@ -173,7 +183,10 @@ def _root(gap: float, rate: float, bend: float) -> float:
 
 @kernel
 def _in_map(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
-    ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
+    ax = edge.ax
+    ay = edge.ay
+    bx = edge.bx
+    by = edge.by
     return Edge(
         x + c * ax - s * ay,
         y + s * ax + c * ay,
@@ -184,7 +197,10 @@ def _in_map(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
 
 @kernel
 def _reach(edge: Edge) -> float:
-    ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
+    ax = edge.ax
+    ay = edge.ay
+    bx = edge.bx
+    by = edge.by
     return math.sqrt(max(ax * ax + ay * ay, bx * bx + by * by))
 
 
@@ -206,29 +222,35 @@ def _free_time(
     p: Placed, q: Placed, nx: float, ny: float, gap: float, bend: float
 ) -> tuple[float, float, float]:
     """Time in which edges `gap` [m] apart along n (q to p) cannot meet, with its corners' rates."""
-    far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
-    near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
-    rate_p, rate_p2 = (
-        _rate(nx, ny, p, p.edge.ax, p.edge.ay),
-        _rate(nx, ny, p, p.edge.bx, p.edge.by),
-    )
+    far = nx * p.edge.ax + ny * p.edge.ay
+    far2 = nx * p.edge.bx + ny * p.edge.by
+    near = nx * q.edge.ax + ny * q.edge.ay
+    near2 = nx * q.edge.bx + ny * q.edge.by
+    rate_p = _rate(nx, ny, p, p.edge.ax, p.edge.ay)
+    rate_p2 = _rate(nx, ny, p, p.edge.bx, p.edge.by)
     rate_q = -_rate(nx, ny, q, q.edge.ax, q.edge.ay)
     rate_q2 = -_rate(nx, ny, q, q.edge.bx, q.edge.by)
-    front, beyond = min(far, far2), max(near, near2)
+    front = min(far, far2)
+    beyond = max(near, near2)
     keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
-    free, own, others = np.inf, 0.0, 0.0
+    free = np.inf
+    own = 0.0
+    others = 0.0
     for ahead, u in ((far, rate_p), (far2, rate_p2)):
         for behind, v in ((near, rate_q), (near2, rate_q2)):
             root = _root(gap - keep + (ahead - front) + (beyond - behind), u + v, bend)
             if root < free:
-                free, own, others = root, u, v
+                free = root
+                own = u
+                others = v
     return free, own, others
 
 
 @kernel
 def _note(event: Array, nx: float, ny: float, p: Placed, q: Placed) -> None:
     """Writes where the edges of a contact met: at the corners whose rates it has, or the nearer."""
-    event[NX], event[NY] = nx, ny
+    event[NX] = nx
+    event[NY] = ny
     event[OWN_X], event[OWN_Y] = _corner(nx, ny, p, event[OWN])
     event[OTHERS_X], event[OTHERS_Y] = _corner(-nx, -ny, q, event[OTHERS])
 
@@ -260,15 +282,21 @@ def touch(
 
     The edges are in the bodies' frames, with a radius [m] around each.
     """
-    reach_a, reach_b, time, flights = _reach(edge), _reach(other), begin, moving.flights
+    reach_a = _reach(edge)
+    reach_b = _reach(other)
+    time = begin
+    flights = moving.flights
     until = event[TIME]
     for _ in range(MOST_LOOKS):
-        p, q = _placed_at(a, edge, time, moving), _placed_at(b, other, time, moving)
+        p = _placed_at(a, edge, time, moving)
+        q = _placed_at(b, other, time, moving)
         nx, ny = _between(p.edge, q.edge)
         away = math.sqrt(nx * nx + ny * ny)
         if away <= NOTHING:
             break
-        gap, nx, ny = max(away - round_a - round_b, NOTHING), nx / away, ny / away
+        gap = max(away - round_a - round_b, NOTHING)
+        nx = nx / away
+        ny = ny / away
         bend = p.bend + q.bend + p.turn * p.turn * reach_a + q.turn * q.turn * reach_b
         free, own, others = _free_time(p, q, nx, ny, gap, bend)
         rest = _next_stop(b, time, _next_stop(a, time, until, flights), flights) - time
@@ -281,17 +309,18 @@ def touch(
         least = 0.5 * gap if gap > 0.5 * SLACK else NOTHING
         if gap <= SLACK and -(own + others) * rest >= least:
             if time < until:
-                event[TIME], event[WITH], event[OWN], event[OTHERS] = (
-                    time,
-                    b,
-                    own,
-                    others,
-                )
+                event[TIME] = time
+                event[WITH] = b
+                event[OWN] = own
+                event[OTHERS] = others
                 _note(event, nx, ny, p, q)
             return
         time += free
     if time < until:
-        event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, -1.0, -1.0
+        event[TIME] = time
+        event[WITH] = b
+        event[OWN] = -1.0
+        event[OTHERS] = -1.0
         event[NX] = event[NY] = 0.0
 
 
@@ -305,31 +334,50 @@ def hold(
     ring: it slides without friction, and a corner that is held turns it aside. The speeds
     that the holds give are found by projected Gauss-Seidel sweeps.
     """
-    flight, body = moving.flights[b], moving.world[b]
+    flight = moving.flights[b]
+    body = moving.world[b]
     holds = flight[FIRST_HOLD:FLIGHT].reshape(MOST_HOLDS, HOLD)
-    count, inertia = int(flight[HOLDS]), body[RADIUS] * body[RADIUS]
+    count = int(flight[HOLDS])
+    inertia = body[RADIUS] * body[RADIUS]
     x, y, c, s = pose_at(b, time, moving)
     if count == 0:
-        vx, vy = flight[VX], flight[VY]
-        flight[WISH_X], flight[WISH_Y] = c * vx - s * vy, s * vx + c * vy
+        vx = flight[VX]
+        vy = flight[VY]
+        flight[WISH_X] = c * vx - s * vy
+        flight[WISH_Y] = s * vx + c * vy
         flight[WISH_TURN] = flight[TURN]
     body[HEADING] += flight[TURN] * (time - flight[FROM])
-    body[X], body[Y], body[COS], body[SIN] = x, y, c, s
-    holds[count, HOLD_X], holds[count, HOLD_Y], holds[count, PUSH] = nx, ny, 0.0
+    body[X] = x
+    body[Y] = y
+    body[COS] = c
+    body[SIN] = s
+    holds[count, HOLD_X] = nx
+    holds[count, HOLD_Y] = ny
+    holds[count, PUSH] = 0.0
     holds[count, ARM] = (px - x) * ny - (py - y) * nx
-    vx, vy, turn = flight[WISH_X], flight[WISH_Y], flight[WISH_TURN]
+    vx = flight[WISH_X]
+    vy = flight[WISH_Y]
+    turn = flight[WISH_TURN]
     for i in range(count):
         vx += holds[i, PUSH] * holds[i, HOLD_X]
         vy += holds[i, PUSH] * holds[i, HOLD_Y]
         turn += holds[i, PUSH] * holds[i, ARM] / inertia
     for _ in range(SWEEPS if count else 1):
         for i in range(count + 1):
-            ux, uy, arm = holds[i, HOLD_X], holds[i, HOLD_Y], holds[i, ARM]
+            ux = holds[i, HOLD_X]
+            uy = holds[i, HOLD_Y]
+            arm = holds[i, ARM]
             lacks = PARTING - ux * vx - uy * vy - turn * arm
             push = max(holds[i, PUSH] + lacks / (1.0 + arm * arm / inertia), 0.0)
-            more, holds[i, PUSH] = push - holds[i, PUSH], push
-            vx, vy, turn = vx + more * ux, vy + more * uy, turn + more * arm / inertia
-    flight[VX], flight[VY], flight[TURN], flight[FROM] = vx, vy, turn, time
+            more = push - holds[i, PUSH]
+            holds[i, PUSH] = push
+            vx = vx + more * ux
+            vy = vy + more * uy
+            turn = turn + more * arm / inertia
+    flight[VX] = vx
+    flight[VY] = vy
+    flight[TURN] = turn
+    flight[FROM] = time
     flight[HOLDS] += 1.0
 
 
@@ -341,10 +389,13 @@ def _edges(outline: collision.Outline) -> int:
 
 @kernel
 def _edge_of(v: int, outline: collision.Outline) -> Edge:
-    corners, begin, end = outline.corners, outline.begin, outline.end
+    corners = outline.corners
+    begin = outline.begin
+    end = outline.end
     if begin == end:
         return Edge(0.0, 0.0, 0.0, 0.0)
-    i, j = begin + v, begin + (v + 1 if begin + v + 1 < end else 0)
+    i = begin + v
+    j = begin + (v + 1 if begin + v + 1 < end else 0)
     return Edge(corners[i, 0], corners[i, 1], corners[j, 0], corners[j, 1])
 
 
@@ -359,7 +410,8 @@ def touch_edge(
     moving: Moving,
 ) -> None:
     """Makes `event` (EVENT,) a's first contact from `begin` on with an edge, in b's frame."""
-    world, flights = moving.world, moving.flights
+    world = moving.world
+    flights = moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, oc, os = pose_at(b, begin, moving)
     there = _in_map(other, ox, oy, oc, os)
@@ -385,7 +437,8 @@ def touch_edge(
 @kernel
 def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> None:
     """Does the same as `touch_edge` for all of body b."""
-    world, flights = moving.world, moving.flights
+    world = moving.world
+    flights = moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, _, _ = pose_at(b, begin, moving)
     speed = speed_at(a, begin, flights) + speed_at(b, begin, flights)
@@ -409,7 +462,9 @@ def touch_map(
     event: Array, a: int, grid: MapField, begin: float, moving: Moving
 ) -> None:
     """Does the same as `touch_edge` for the sides of the solid cells of a map."""
-    distances, world, size = grid.distances, moving.world, grid.cell
+    distances = grid.distances
+    world = moving.world
+    size = grid.cell
     if distances.size == 0:
         return
     speed = speed_at(a, begin, moving.flights)
@@ -432,7 +487,8 @@ def touch_map(
                 (0, -1, 0, 0),
             ):
                 if not _solid(distances, i + up, j + right):
-                    near_x, near_y = (j + u) * size, (i + v) * size
+                    near_x = (j + u) * size
+                    near_y = (i + v) * size
                     side = Edge(
                         near_x, near_y, (j + u + up) * size, (i + v - right) * size
                     )

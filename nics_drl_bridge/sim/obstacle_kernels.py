@@ -47,18 +47,23 @@ def _share(seed, counter):  # type: ignore[no-untyped-def]
 @kernel
 def begin(n: int, state: State, plans: Array) -> None:
     """Begins an episode of world n: draws the speed and initial direction of each obstacle."""
-    seed, bodies = state.seeds[n], state.bodies
+    seed = state.seeds[n]
+    bodies = state.bodies
     for k in range(plans.shape[0]):
-        mark, row, counter = state.marks[n, k], plans[k], k * DRAWS
+        mark = state.marks[n, k]
+        row = plans[k]
+        counter = k * DRAWS
         mark[:] = 0.0
         if row[at.KIND] == at.STILL:
             continue
-        low, high = row[at.SPEED_LOW], row[at.SPEED_HIGH]
+        low = row[at.SPEED_LOW]
+        high = row[at.SPEED_HIGH]
         mark[at.SPEED] = low + (high - low) * _share(seed, counter)
         mark[at.DIRECTION] = (2.0 * _share(seed, counter + 1) - 1.0) * math.pi
         mark[at.AIM] = mark[at.DIRECTION]
         mark[at.GOAL_X], mark[at.GOAL_Y] = bodies[n, k, X], bodies[n, k, Y]
-        mark[at.UNTIL], mark[at.WAY] = -1.0, 1.0
+        mark[at.UNTIL] = -1.0
+        mark[at.WAY] = 1.0
 
 
 @kernel
@@ -69,13 +74,13 @@ def steer(
 
     An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
     """
-    velocity, seed, step, movers = (
-        state.velocity[n],
-        state.seeds[n],
-        state.steps[n],
-        scene.movers,
-    )
-    count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
+    velocity = state.velocity[n]
+    seed = state.seeds[n]
+    step = state.steps[n]
+    movers = scene.movers
+    count = velocity.shape[0]
+    plans = movers.plans
+    bodies = state.bodies[n]
     traffic = at.Traffic(
         bodies, count, speeds, plans, scene.walls, movers.field, scene.grid, period
     )
@@ -89,19 +94,24 @@ def steer(
                 state.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
             )
     for k in range(count):
-        kind, mark, body = plans[k, at.KIND], state.marks[n, k], bodies[k]
+        kind = plans[k, at.KIND]
+        mark = state.marks[n, k]
+        body = bodies[k]
         if kind == at.STILL or body[RADIUS] <= 0.0:
             continue
-        dx, dy = velocity[k, 0] * period, velocity[k, 1] * period
+        dx = velocity[k, 0] * period
+        dy = velocity[k, 1] * period
         if kind == at.WANDER:
             dx, dy = _wander(mark, k, traffic, seed, (draws + k) * DRAWS)
         elif kind == at.PATROL:
             dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
-        wished_x, wished_y = dx, dy
+        wished_x = dx
+        wished_y = dy
         dx, dy = at.restrain(dx, dy, k, traffic, kind != at.PATROL)
         if kind == at.PATROL and dx == wished_x and dy == wished_y:
             _follow(mark, body, plans[k], movers.waypoints, period, True)
-        mark[at.VX], mark[at.VY] = dx / period, dy / period
+        mark[at.VX] = dx / period
+        mark[at.VY] = dy / period
         velocity[k, 0], velocity[k, 1] = mark[at.VX], mark[at.VY]
         if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
             turn = wrap(math.atan2(dy, dx) - body[HEADING]) / period
@@ -122,11 +132,16 @@ def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-unt
 
 @kernel
 def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
-    body, speed, period = traffic.bodies[k], mark[at.SPEED], traffic.period
-    x, y, radius = body[X], body[Y], body[RADIUS]
+    body = traffic.bodies[k]
+    speed = mark[at.SPEED]
+    period = traffic.period
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
     here, nx, ny = at.clearance(x, y, k, traffic)
     reach = LOOK * speed + radius
-    aim, near = mark[at.AIM], here < reach + radius + MARGIN
+    aim = mark[at.AIM]
+    near = here < reach + radius + MARGIN
     if near and _blocked(x, y, aim, reach, here, radius + MARGIN, k, traffic):
         away = math.atan2(-ny, -nx)
         for i in range(TRIES):
@@ -146,26 +161,38 @@ def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
 @kernel
 def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untyped-def]
     """Displacement of a patrol along its path in a period; `keep` stores its progress."""
-    index, way, rest = int(mark[at.INDEX]), mark[at.WAY], mark[at.REST]
-    x, y, left = body[X], body[Y], period
+    index = int(mark[at.INDEX])
+    way = mark[at.WAY]
+    rest = mark[at.REST]
+    x = body[X]
+    y = body[Y]
+    left = period
     for _ in range(MOST_CORNERS):
         pause = min(rest, left)
-        rest, left = rest - pause, left - pause
+        rest = rest - pause
+        left = left - pause
         if left <= 0.0:
             break
         goal = waypoints[int(row[at.FIRST]) + index]
-        away, reach = math.hypot(goal[0] - x, goal[1] - y), mark[at.SPEED] * left
+        away = math.hypot(goal[0] - x, goal[1] - y)
+        reach = mark[at.SPEED] * left
         if away > reach:
-            x, y = x + (goal[0] - x) * reach / away, y + (goal[1] - y) * reach / away
+            x = x + (goal[0] - x) * reach / away
+            y = y + (goal[1] - y) * reach / away
             break
-        x, y, left, rest = goal[0], goal[1], left - away / mark[at.SPEED], row[at.PAUSE]
+        x = goal[0]
+        y = goal[1]
+        left = left - away / mark[at.SPEED]
+        rest = row[at.PAUSE]
         if row[at.LOOP] != 0.0:
             index = (index + 1) % int(row[at.COUNT])
         else:
             way = way if 0 <= index + way < int(row[at.COUNT]) else -way
             index += int(way)
     if keep:
-        mark[at.INDEX], mark[at.WAY], mark[at.REST] = index, way, rest
+        mark[at.INDEX] = index
+        mark[at.WAY] = way
+        mark[at.REST] = rest
     return x - body[X], y - body[Y]
 
 
@@ -176,9 +203,12 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
     2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2), with r [m] from the other to this one, not zero,
     its relative velocity v [m/s], `foresight` dt, `strength` V0 [m^2/s^2] and `reach` sigma [m].
     """
-    sx, sy = vx * foresight, vy * foresight
-    qx, qy = rx - sx, ry - sy
-    one, two = math.sqrt(rx * rx + ry * ry), max(math.sqrt(qx * qx + qy * qy), NEAREST)
+    sx = vx * foresight
+    sy = vy * foresight
+    qx = rx - sx
+    qy = ry - sy
+    one = math.sqrt(rx * rx + ry * ry)
+    two = max(math.sqrt(qx * qx + qy * qy), NEAREST)
     both = one + two
     b = 0.5 * math.sqrt(max(both * both - sx * sx - sy * sy, NEAREST * NEAREST))
     if b > FAR * reach:
@@ -189,22 +219,24 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 
 @kernel
 def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
-    bodies, first, row, ax, ay = (
-        traffic.bodies,
-        traffic.first,
-        traffic.plans[k],
-        0.0,
-        0.0,
-    )
+    bodies = traffic.bodies
+    first = traffic.first
+    row = traffic.plans[k]
+    ax = 0.0
+    ay = 0.0
     for j in range(bodies.shape[0]):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
-        rx, ry = bodies[k, X] - bodies[j, X], bodies[k, Y] - bodies[j, Y]
+        rx = bodies[k, X] - bodies[j, X]
+        ry = bodies[k, Y] - bodies[j, Y]
         if j < first:
-            vx, vy = marks[j, at.VX], marks[j, at.VY]
+            vx = marks[j, at.VX]
+            vy = marks[j, at.VY]
         else:
-            vx, vy = traffic.speeds[j - first, 0], traffic.speeds[j - first, 1]
-        vx, vy = vx - marks[k, at.VX], vy - marks[k, at.VY]
+            vx = traffic.speeds[j - first, 0]
+            vy = traffic.speeds[j - first, 1]
+        vx = vx - marks[k, at.VX]
+        vy = vy - marks[k, at.VY]
         near = bodies[k, RADIUS] + bodies[j, RADIUS]
         far = (
             near
@@ -228,24 +260,27 @@ def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
         # Less (8) from outside the angle of sight of a walker that looks along e.
         seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
         weight = 1.0 if seen else row[at.BEHIND]
-        ax, ay = ax + weight * fx, ay + weight * fy
+        ax = ax + weight * fx
+        ay = ay + weight * fy
     return ax, ay
 
 
 @kernel
 def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
-    body, row, walls, ax, ay = (
-        traffic.bodies[k],
-        traffic.plans[k],
-        traffic.walls,
-        0.0,
-        0.0,
-    )
-    x, y, radius, reach = body[X], body[Y], body[RADIUS], row[at.WALL_RANGE]
+    body = traffic.bodies[k]
+    row = traffic.plans[k]
+    walls = traffic.walls
+    ax = 0.0
+    ay = 0.0
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
+    reach = row[at.WALL_RANGE]
     far = radius + FAR * reach
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
-        ox, oy = x - px, y - py
+        ox = x - px
+        oy = y - py
         away2 = ox * ox + oy * oy
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
@@ -254,28 +289,35 @@ def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
                 / reach
                 * math.exp(-max(away - radius, 0.0) / reach)
             )
-            ax, ay = ax + size * ox / away, ay + size * oy / away
+            ax = ax + size * ox / away
+            ay = ay + size * oy / away
     away = at.map_distance(x, y, traffic.grid)
     if away < far:
         nx, ny = at.map_direction(x, y, traffic.grid)
         size = (
             row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
         )
-        ax, ay = ax - size * nx, ay - size * ny
+        ax = ax - size * nx
+        ay = ay - size * ny
     return ax, ay
 
 
 @kernel
 def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
-    body, field = traffic.bodies[k], traffic.field
-    x, y, radius = body[X], body[Y], body[RADIUS]
-    middle_x, middle_y = (field[0] + field[2]) / 2.0, (field[1] + field[3]) / 2.0
+    body = traffic.bodies[k]
+    field = traffic.field
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
+    middle_x = (field[0] + field[2]) / 2.0
+    middle_y = (field[1] + field[3]) / 2.0
     wide = max((field[2] - field[0]) / 2.0 - radius - ROOM, 0.0)
     deep = max((field[3] - field[1]) / 2.0 - radius - ROOM, 0.0)
     for i in range(CANDIDATES):
         gx = middle_x + (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
         gy = middle_y + (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
-        mark[at.GOAL_X], mark[at.GOAL_Y] = gx, gy
+        mark[at.GOAL_X] = gx
+        mark[at.GOAL_Y] = gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
             free, _, _ = at.clearance(gx, gy, k, traffic)
             if free >= radius + ROOM:
@@ -287,20 +329,21 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
 @kernel
 def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
     """Returns the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
-    mark, row, body, period = (
-        marks[k],
-        traffic.plans[k],
-        traffic.bodies[k],
-        traffic.period,
-    )
-    x, y = body[X], body[Y]
+    mark = marks[k]
+    row = traffic.plans[k]
+    body = traffic.bodies[k]
+    period = traffic.period
+    x = body[X]
+    y = body[Y]
     away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
     if step >= mark[at.UNTIL] or away < ARRIVED:
         _new_goal(mark, k, traffic, seed, counter + 4, step)
         away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
-    ex, ey = 0.0, 0.0
+    ex = 0.0
+    ey = 0.0
     if away > 0.0:
-        ex, ey = (mark[at.GOAL_X] - x) / away, (mark[at.GOAL_Y] - y) / away
+        ex = (mark[at.GOAL_X] - x) / away
+        ey = (mark[at.GOAL_Y] - y) / away
     ax, ay = _from_bodies(k, ex, ey, marks, traffic)
     bx, by = _from_walls(k, traffic)
     ax += bx + (mark[at.SPEED] * ex - mark[at.VX]) / row[at.RELAXATION]
@@ -314,8 +357,10 @@ def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-de
         )
     size = math.hypot(ax, ay)
     share = period * min(1.0, STRONGEST / size) if size > 0.0 else 0.0
-    vx, vy = mark[at.VX] + share * ax, mark[at.VY] + share * ay
+    vx = mark[at.VX] + share * ax
+    vy = mark[at.VY] + share * ay
     fast = math.hypot(vx, vy)
     if fast > row[at.SPEED_HIGH]:
-        vx, vy = vx * row[at.SPEED_HIGH] / fast, vy * row[at.SPEED_HIGH] / fast
+        vx = vx * row[at.SPEED_HIGH] / fast
+        vy = vy * row[at.SPEED_HIGH] / fast
     return vx, vy

@@ -104,7 +104,8 @@ def plan_arrays(
     motions: Sequence[Wander | Patrol | Pedestrian | None],
 ) -> tuple[Array, Array]:
     """Returns the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
-    rows, waypoints = np.zeros((len(motions), at.PLAN)), np.zeros((0, 2))
+    rows = np.zeros((len(motions), at.PLAN))
+    waypoints = np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):
         if motion is None:
             continue

@@ -17,10 +17,8 @@ from nics_drl_bridge.sim.scenes import SetSampler
 from nics_drl_bridge.sim.world import World
 
 Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
-CELL, MOST_CELLS = (
-    0.01,
-    1_000_000,
-)  # side of a cell [m]; in fields with more cells it is larger
+CELL = 0.01  # side of a cell [m]
+MOST_CELLS = 1_000_000  # in fields with more cells it is larger
 SAMPLES = 8  # of an edge, in a cell
 ROUNDING = 1e-6  # share of a cell by which a field may exceed whole cells
 
@@ -71,7 +69,8 @@ def _frame_of(
     world: World, cell: float
 ) -> tuple[Any, NDArray[np.int_], tuple[int, int], float]:
     """Frame (3,) of the rows, first column and row, their numbers, and the side of a cell [m]."""
-    grid, ends = world.grid, world.all_walls().reshape(-1, 2)
+    grid = world.grid
+    ends = world.all_walls().reshape(-1, 2)
     if world.size is not None or world.bounds is not None:
         ends = np.concatenate([ends, np.reshape(world.extent, (2, 2))])
     place: Any = grid.origin if grid is not None else (*ends.min(axis=0), 0.0)
@@ -79,7 +78,8 @@ def _frame_of(
     if grid is not None:
         own = np.array([(0, 0), grid.cells.shape[::-1]]) * grid.resolution
         corners = np.concatenate([corners, own])
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
     cell = max(cell, math.sqrt(float(np.prod(high - low)) / MOST_CELLS))
     if grid is not None:
         cell = grid.resolution / max(1, math.ceil(grid.resolution / cell - ROUNDING))
@@ -138,7 +138,8 @@ def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
     if isinstance(shape, Circle):
         return np.asarray(np.hypot(points[..., 0], points[..., 1]) <= shape.radius)
     within = np.zeros(points.shape[:-1], np.bool_)
-    x, y = points[..., 0], points[..., 1]
+    x = points[..., 0]
+    y = points[..., 1]
     corners = shape.outline if len(shape.outline) > 2 else np.zeros((0, 2))
     for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y1 != y2:  # a ray along x crosses an odd number of edges

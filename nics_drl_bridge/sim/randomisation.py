@@ -240,7 +240,8 @@ class Sampler:
     def __init__(
         self, randomisation: Randomisation, model: SimulatorModel, robots: int = 1
     ) -> None:
-        self.randomisation, self._robots = randomisation, robots
+        self.randomisation = randomisation
+        self._robots = robots
         where = f"randomisation {randomisation.name!r}"
         self._coefficient = _coefficients(
             randomisation.kinematics, model.kinematics, where
@@ -250,7 +251,8 @@ class Sampler:
         self._rates = (
             np.nonzero(model.kinematics.coefficients)[0] >= 3
         )  # (T,) terms of the state's
-        self._timing, self._step = _latencies(randomisation, model), model.timing[0]
+        self._timing = _latencies(randomisation, model)
+        self._step = model.timing[0]
         self._noise = _levels(randomisation, model, where)
         self._faults = _faults(randomisation, model.lidar, where)
         self._choices = {
@@ -271,7 +273,8 @@ class Sampler:
 
     def draw(self, seeds: ArrayLike) -> Draws:
         """Draws the numbers of the episodes of some seeds (n,)."""
-        chosen, robots = checked_seeds(seeds), self._robots
+        chosen = checked_seeds(seeds)
+        robots = self._robots
         timing = np.floor(_between(self._timing, chosen, robots, LATENCY_GROUP)).astype(
             np.int64
         )
@@ -287,10 +290,8 @@ class Sampler:
         for column, values in self._choices.items():
             drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
             faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
-        counts, sizes = (
-            self.randomisation.obstacles.count is not None,
-            len(self._sizes) > 1,
-        )
+        counts = self.randomisation.obstacles.count is not None
+        sizes = len(self._sizes) > 1
         return Draws(
             coefficient,
             response[..., 0],
@@ -306,7 +307,8 @@ class Sampler:
         )
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
-        kept, terms = zip(*np.nonzero(model.kinematics.coefficients), strict=True), []
+        kept = zip(*np.nonzero(model.kinematics.coefficients), strict=True)
+        terms = []
         for d, k in kept:
             terms.append(
                 f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}"
@@ -338,11 +340,9 @@ def _between(
 ) -> Array:
     """Draws (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
     drawn = np.empty((len(seeds), robots, len(bounds[0])))
-    first, stride, stream = (
-        group * PLACES + column,
-        GROUPS * PLACES,
-        random.RANDOMISATION_STREAM,
-    )
+    first = group * PLACES + column
+    stride = GROUPS * PLACES
+    stream = random.RANDOMISATION_STREAM
     random.uniform_between(drawn, *bounds, seeds, stream, first, stride)
     return drawn
 
@@ -359,10 +359,8 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
     for dof, span in ranges.dofs.items():
         spans[model.dofs.index(dof)] = span
     for dof, terms in ranges.terms.items():
-        d, place = (
-            model.dofs.index(dof),
-            f"{where}: key 'kinematics.terms', rate {dof!r}",
-        )
+        d = model.dofs.index(dof)
+        place = f"{where}: key 'kinematics.terms', rate {dof!r}"
         for term, span in terms.items():
             spans[d, _term(d, term, model, place)] = span
     if ranges.response != AS_IT_IS and not model.state_size:
@@ -389,11 +387,9 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
     if not (size := model.state_size):
         return
-    linear, low, high = (
-        np.zeros((size, size)),
-        np.ones((size, size)),
-        np.ones((size, size)),
-    )
+    linear = np.zeros((size, size))
+    low = np.ones((size, size))
+    high = np.ones((size, size))
     for k in np.flatnonzero(model.powers.sum(axis=1) == 1):
         if (v := int(np.argmax(model.powers[k]))) < size:
             linear[:, v] = model.coefficients[3:, k]
@@ -424,7 +420,8 @@ def _latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
 def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
     odometry = ranges.odometry
     base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
-    low, high = base.copy(), base.copy()
+    low = base.copy()
+    high = base.copy()
     for key, (part, (one, other)) in SCALED.items():
         if (factor := getattr(odometry, key)) is None:
             continue

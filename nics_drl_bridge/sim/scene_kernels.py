@@ -27,7 +27,9 @@ DETOURS = (
     4  # Pairs of start and goal without a path after which the obstacles are redrawn
 )
 MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
-DRAWN, NO_OBSTACLES, NO_ROBOTS = 0, 1, 2
+DRAWN = 0
+NO_OBSTACLES = 1
+NO_ROBOTS = 2
 LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(
     8
 )  # columns of a group
@@ -100,7 +102,8 @@ def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
 @kernel
 def place_in(row, column, cells):  # type: ignore[no-untyped-def]
     """Returns x, y [m] of a place in the grid, given as fractional row and column."""
-    u, v = column * cells.cell, row * cells.cell
+    u = column * cells.cell
+    v = row * cells.cell
     return (
         cells.x + cells.cos * u - cells.sin * v,
         cells.y + cells.sin * u + cells.cos * v,
@@ -111,8 +114,10 @@ def place_in(row, column, cells):  # type: ignore[no-untyped-def]
 def cell_of(x, y, cells):  # type: ignore[no-untyped-def]
     """Returns row and column of a point, and its distance from the centre of that cell [m]."""
     u, v = collision.in_grid(x, y, cells)
-    u, v = u / cells.cell, v / cells.cell
-    i, j = math.floor(v), math.floor(u)
+    u = u / cells.cell
+    v = v / cells.cell
+    i = math.floor(v)
+    j = math.floor(u)
     return i, j, cells.cell * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
 
 
@@ -128,7 +133,8 @@ def area_of(x, y, space):  # type: ignore[no-untyped-def]
 @kernel
 def _within(x, y, space):  # type: ignore[no-untyped-def]
     """True if a point is in field and grid; with lower and upper bound of its distance to walls."""
-    distances, bounds = space.cells.distances, space.bounds
+    distances = space.cells.distances
+    bounds = space.bounds
     i, j, off = cell_of(x, y, space.cells)
     inside = 0 <= i < distances.shape[0] and 0 <= j < distances.shape[1]
     inside = inside and bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]
@@ -144,7 +150,8 @@ def _within(x, y, space):  # type: ignore[no-untyped-def]
 
 @kernel
 def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
-    space, outlines = plan.space, plan.outlines
+    space = plan.space
+    outlines = plan.outlines
     inside, low, high = _within(body[X], body[Y], space)
     if inside and low >= body[RADIUS] + room:
         return True
@@ -165,11 +172,9 @@ def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
 
 @kernel
 def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-def]
-    dx, dy, far = (
-        body[X] - other[X],
-        body[Y] - other[Y],
-        body[RADIUS] + other[RADIUS] + room,
-    )
+    dx = body[X] - other[X]
+    dy = body[Y] - other[Y]
+    far = body[RADIUS] + other[RADIUS] + room
     if dx * dx + dy * dy >= far * far:
         return True
     if collision.is_round(body, outlines) and collision.is_round(other, outlines):
@@ -180,7 +185,8 @@ def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-de
 @kernel
 def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-untyped-def]
     disc = scratch.disc
-    disc[X], disc[Y] = x, y
+    disc[X] = x
+    disc[Y] = y
     near = scratch.cells.found
     for i in range(
         cell_kernels.around_added(0, x, y, disc[RADIUS] + room, scratch.cells)
@@ -209,30 +215,37 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
     Searches from both ends, each towards the other first: where there is no path, one end is often
     enclosed and its search ends soon. The cells of both points count as free.
     """
-    cells, label, room = (
-        plan.space.cells,
-        plan.space.area,
-        plan.space.room - plan.footprint,
-    )
-    seen, stack, latest = scratch.seen, scratch.stack, scratch.latest
+    cells = plan.space.cells
+    label = plan.space.area
+    room = plan.space.room - plan.footprint
+    seen = scratch.seen
+    stack = scratch.stack
+    latest = scratch.latest
     rows, columns = label.shape
     i, j, _ = cell_of(x, y, cells)
     gi, gj, _ = cell_of(gx, gy, cells)
-    area, start, goal = label[i, j], i * columns + j, gi * columns + gj
+    area = label[i, j]
+    start = i * columns + j
+    goal = gi * columns + gj
     if start == goal:
         return True
     latest[0] += 2
     blocked = -latest[0]  # a mark of either side's search
-    stack[0, 0], stack[1, 0] = start, goal
+    stack[0, 0] = start
+    stack[1, 0] = goal
     seen[start], seen[goal] = latest[0], latest[0] + 1
-    height, other = 1, 1  # of the stack of this side, and of that of the other one
+    # of the stack of this side, and of that of the other one
+    height = 1
+    other = 1
     side = 0
     while height > 0:
         height -= 1
         cell = stack[side, height]
-        i, j = cell // columns, cell % columns
+        i = cell // columns
+        j = cell % columns
         ti, tj = (gi, gj) if side == 0 else (start // columns, start % columns)
-        up, right = (1 if ti >= i else -1), (1 if tj >= j else -1)
+        up = 1 if ti >= i else -1
+        right = 1 if tj >= j else -1
         steep = abs(ti - i) >= abs(tj - j)
         for way in range(4):  # the last one is popped first
             toward = 1 if way > 1 else -1
@@ -252,7 +265,8 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
                 continue
             cx, cy = place_in(row + 0.5, column + 0.5, cells)
             free = _is_clear(cx, cy, room, False, plan, bodies, scratch)
-            seen[new], stack[side, height] = latest[0] + side if free else blocked, new
+            seen[new] = latest[0] + side if free else blocked
+            stack[side, height] = new
             height += int(free)
         height, other, side = other, height, 1 - side
     return False
@@ -266,7 +280,8 @@ def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
         chosen.shape[0] < cells.distances.size
     ):  # of all cells, a look-up would only miss the cache
         cell = chosen[cell]
-    i, j = cell // cells.distances.shape[1], cell % cells.distances.shape[1]
+    i = cell // cells.distances.shape[1]
+    j = cell % cells.distances.shape[1]
     return place_in(
         i + uniform_of(source, counter + 1), j + uniform_of(source, counter + 2), cells
     )
@@ -274,30 +289,39 @@ def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def _put(body, x, y, heading, shape, plan):  # type: ignore[no-untyped-def]
-    body[X], body[Y], body[HEADING] = x, y, heading
+    body[X] = x
+    body[Y] = y
+    body[HEADING] = heading
     body[COS], body[SIN] = math.cos(heading), math.sin(heading)
-    body[RADIUS], body[SHAPE] = plan.radii[shape], shape
+    body[RADIUS] = plan.radii[shape]
+    body[SHAPE] = shape
 
 
 @kernel
 def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
     groups = plan.groups
-    counter, total, before, k = 0, 0, 0, 0
+    counter = 0
+    total = 0
+    before = 0
+    k = 0
     for g in range(groups.shape[0]):
         if groups[g, FIXED] == 0.0:
             total += int(groups[g, GREATEST])
     for g in range(groups.shape[0]):
-        least, greatest = int(groups[g, LEAST]), int(groups[g, GREATEST])
+        least = int(groups[g, LEAST])
+        greatest = int(groups[g, GREATEST])
         count = least + int(uniform_of(source, counter) * (greatest - least + 1))
         counter += 1
         if groups[g, FIXED] == 0.0:
             if wanted >= 0:  # each group gets its share
-                most, after = min(wanted, total), before + greatest
+                most = min(wanted, total)
+                after = before + greatest
                 count = (most * after + total // 2) // total - (
                     most * before + total // 2
                 ) // total
             before += greatest
-        first, shapes = int(groups[g, FIRST_SHAPE]), int(groups[g, SHAPES])
+        first = int(groups[g, FIRST_SHAPE])
+        shapes = int(groups[g, SHAPES])
         for number in range(greatest):
             taken = plan.choices[first + int(uniform_of(source, counter) * shapes)]
             counter += 1
@@ -310,16 +334,16 @@ def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-unty
 
 @kernel
 def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    space, outlines, gaps, trial = (
-        plan.space,
-        plan.outlines,
-        scratch.gaps,
-        scratch.trial,
-    )
-    cells, widest = scratch.cells, MARGIN
+    space = plan.space
+    outlines = plan.outlines
+    gaps = scratch.gaps
+    trial = scratch.trial
+    cells = scratch.cells
+    widest = MARGIN
     cell_kernels.clear(0, cells)
     for k in range(bodies.shape[0]):
-        group, shape = plan.groups[plan.group[k]], int(bodies[k, SHAPE])
+        group = plan.groups[plan.group[k]]
+        shape = int(bodies[k, SHAPE])
         gaps[k] = max(group[GAP], MARGIN)
         widest = max(widest, gaps[k])
         bodies[k, RADIUS] = 0.0
@@ -330,7 +354,9 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
     for k in range(bodies.shape[0]):
         if plan.groups[plan.group[k], FIXED] > 0.0 or not scratch.active[k]:
             continue
-        shape, heading, placed = int(bodies[k, SHAPE]), 0.0, False
+        shape = int(bodies[k, SHAPE])
+        heading = 0.0
+        placed = False
         for _ in range(TRIES):
             x, y = _point(source, counter, space.for_anything, space.cells)
             counter += 3
@@ -352,7 +378,9 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
 
 @kernel
 def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    trial, gaps, near = scratch.trial, scratch.gaps, scratch.cells.found
+    trial = scratch.trial
+    gaps = scratch.gaps
+    near = scratch.cells.found
     reach = trial[RADIUS] + widest
     for i in range(
         cell_kernels.around_added(0, trial[X], trial[Y], reach, scratch.cells)
@@ -373,7 +401,8 @@ def _spot(source, counter, places, space):  # type: ignore[no-untyped-def]
     if places.shape[0] == 0:
         x, y = _point(source, counter, space.for_robots, space.cells)
         return x, y, (2.0 * turn - 1.0) * math.pi
-    share, p = uniform_of(source, counter), 0
+    share = uniform_of(source, counter)
+    p = 0
     while p < places.shape[0] - 1 and share >= places[p, SHARE]:
         p += 1
     place = places[p]
@@ -386,7 +415,8 @@ def _spot(source, counter, places, space):  # type: ignore[no-untyped-def]
 @kernel
 def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
     for other in range(m):
-        dx, dy = x - others[other, 0], y - others[other, 1]
+        dx = x - others[other, 0]
+        dy = y - others[other, 1]
         if dx * dx + dy * dy <= least * least:
             return False
     return True
@@ -398,7 +428,8 @@ def _goal_of(source, counter, x, y, plan):  # type: ignore[no-untyped-def]
     if not plan.around:
         gx, gy, _ = _spot(source, counter, plan.goals, plan.space)
         return gx, gy
-    least, greatest = plan.least, plan.greatest
+    least = plan.least
+    greatest = plan.greatest
     turn = 2.0 * math.pi * uniform_of(source, counter)
     share = uniform_of(source, counter + 1)
     far = math.sqrt(least * least + share * (greatest * greatest - least * least))
@@ -409,7 +440,8 @@ def _goal_of(source, counter, x, y, plan):  # type: ignore[no-untyped-def]
 def _place_robots(source, counter, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     between = 2.0 * plan.footprint + plan.clearance
     for m in range(starts.shape[0]):
-        placed, detours = False, 0
+        placed = False
+        detours = 0
         for _ in range(TRIES):
             x, y, heading = _spot(source, counter, plan.starts, plan.space)
             counter += 4
@@ -434,8 +466,11 @@ def _place_robots(source, counter, plan, bodies, starts, goals, scratch):  # typ
                 if detours == DETOURS:
                     break
                 continue
-            starts[m, 0], starts[m, 1], starts[m, 2] = x, y, heading
-            goals[m, 0], goals[m, 1] = gx, gy
+            starts[m, 0] = x
+            starts[m, 1] = y
+            starts[m, 2] = heading
+            goals[m, 0] = gx
+            goals[m, 1] = gy
             placed = True
             break
         if not placed:
@@ -464,7 +499,9 @@ def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  
 
 @kernel
 def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
-    count, s, cells = plan.group.shape[0], scratch, scratch.cells
+    count = plan.group.shape[0]
+    s = scratch
+    cells = scratch.cells
     found = cells.found[
         :count
     ]  # the scratch may be for the most obstacles of several worlds
@@ -476,7 +513,8 @@ def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: 
     _put(s.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
     s.disc[RADIUS] = plan.footprint
     for n in range(seeds.shape[0]):
-        state, source = NO_OBSTACLES, random.source(seeds[n], random.SCENE_STREAM)
+        state = NO_OBSTACLES
+        source = random.source(seeds[n], random.SCENE_STREAM)
         counter = _choose(
             source, wanted[n], sizes[n], plan, bodies[n, :count], scratch.active
         )

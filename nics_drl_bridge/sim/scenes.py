@@ -57,7 +57,8 @@ class Scenes(Scene):
     @classmethod
     def of(cls, n: int, obstacles: int, robots: int) -> "Scenes":
         """Allocates n scenes, without anything in them."""
-        starts, goals = np.zeros((n, robots, 3)), np.zeros((n, robots, 2))
+        starts = np.zeros((n, robots, 3))
+        goals = np.zeros((n, robots, 2))
         return cls(np.zeros((n, obstacles, BODY)), starts, goals, np.zeros(n, np.int64))
 
     def __len__(self) -> int:
@@ -108,7 +109,8 @@ class SceneSampler:
         known: Catalogue | None = None,
     ) -> None:
         self.world = world = world if most is None else _with_room(world, most)
-        self.robots, self._sizes = robots, len(sizes)
+        self.robots = robots
+        self._sizes = len(sizes)
         known = known or Catalogue.of(world, sizes)
         self.shapes = known.shapes
         slots = [
@@ -187,7 +189,8 @@ class SceneSampler:
             raise self._no_room(int(numbers[drawn]), why)
 
     def _no_room(self, seed: int, why: int) -> ConfigError:
-        where, scene = self.world.source, f"in the scene of seed {seed}"
+        where = self.world.source
+        scene = f"in the scene of seed {seed}"
         if why == kernels.NO_OBSTACLES:
             reason = f"no free place for {self.count} obstacles {scene}"
             fix = "lower `count` or `gap`, or enlarge the field."
@@ -218,15 +221,15 @@ class SetSampler:
         known = Catalogue.of(world, sizes)
         given = footprint_radius, robots, sizes, most, known
         self.samplers = [SceneSampler(member, *given) for member in world.members]
-        scratches, rooms = (
-            self.samplers[0].scratches,
-            [each.room for each in self.samplers],
-        )
+        scratches = self.samplers[0].scratches
+        rooms = [each.room for each in self.samplers]
         room = tuple(max(each) for each in zip(*rooms, strict=True))
         for each in self.samplers:
-            each.room, each.scratches = room, scratches
+            each.room = room
+            each.scratches = scratches
         drawn = max(each.count for each in self.samplers)
-        self.robots, self.count = robots, drawn + len(world.spare)
+        self.robots = robots
+        self.count = drawn + len(world.spare)
         self.shapes = (*known.shapes, *world.spare)  # those that are spare come last
 
     @property
@@ -311,12 +314,14 @@ def _plan(
     alike = f"{drawn} {world.model_dump_json(exclude={'name', 'obstacles'})}"
     if alike not in known.spaces:
         known.spaces[alike] = _free_space(world, footprint, drawn)
-    space, outlines = known.spaces[alike], known.outlines
+    space = known.spaces[alike]
+    outlines = known.outlines
     groups = np.zeros((len(world.obstacles), kernels.GROUP))
     choices: list[int] = []
     poses = np.zeros((len(slots), 3))
     for g, group in enumerate(world.obstacles):
-        fixed, moving = float(bool(group.at)), float(group.motion is not None)
+        fixed = float(bool(group.at))
+        moving = float(group.motion is not None)
         groups[g] = (
             *group.counts,
             group.gap,
@@ -393,7 +398,8 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     grid = NO_FIELD if world.grid is None else _closed(world.grid)
     cells = _cells_of(world) if world.grid is None else grid
     cells = cells._replace(distances=np.array(cells.distances, order="C"))
-    walls, bounds = world.all_walls(), np.array([-np.inf, -np.inf, np.inf, np.inf])
+    walls = world.all_walls()
+    bounds = np.array([-np.inf, -np.inf, np.inf, np.inf])
     kernels.wall_distances(cells, walls)
     if world.size is not None or world.bounds is not None:
         bounds = np.array(world.extent)
@@ -404,7 +410,8 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     room = math.hypot(footprint + world.clearance, cells.cell / 2.0)
     area, _ = ndimage.label(cells.distances >= room)
     robot = f"a robot of radius {footprint:g} m with {world.clearance:g} m around it"
-    least, fault = world.goal_distance[0], ""
+    least = world.goal_distance[0]
+    fault = ""
     if not area.any():
         fault = f"key 'clearance': no free space for {robot}; lower `clearance`"
     elif not (area := _large_enough(area, cells.cell, least)).any():
@@ -429,7 +436,9 @@ def _closed(grid: GridMap) -> MapField:
     x, y = grid.cell_to_world([-1.5, -1.5]).tolist()
     heading = grid.origin[2]
     whole = GridMap(closed, grid.resolution, (x, y, heading), unknown_stops=True)
-    distances, cosine, sine = whole.distance_field, math.cos(heading), math.sin(heading)
+    distances = whole.distance_field
+    cosine = math.cos(heading)
+    sine = math.sin(heading)
     return MapField(
         np.ascontiguousarray(distances), x, y, cosine, sine, float(grid.resolution)
     )

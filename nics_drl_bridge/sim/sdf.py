@@ -30,7 +30,9 @@ from nics_drl_bridge.sim.world import MOST_OBSTACLES
 
 MOST_BYTES = 2**24  # of a file; the largest saved worlds have some megabytes
 MOST_MODELS = 20_000  # with all that are included
-OLDEST, NEWEST = (1, 4), (1, 12)  # versions of SDF
+# versions of SDF
+OLDEST = (1, 4)
+NEWEST = (1, 12)
 PATHS = "GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH"
 ABSENT = "which is neither"
 HARMLESS = "sun", "ground_plane"  # included by most worlds, and nothing to run into
@@ -72,7 +74,9 @@ def read_sdf(
     """
     check_path("path", path)
     path = Path(path)
-    placed, unknown, seen = list[Placed](), dict[str, list[str]](), 0
+    placed = list[Placed]()
+    unknown = dict[str, list[str]]()
+    seen = 0
     try:
         for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
             seen += 1
@@ -132,7 +136,8 @@ class _Order:
     """Names to leave out, and which files and how many models have been opened."""
 
     def __init__(self, without: tuple[str, ...]) -> None:
-        self._without, self._models = without, 0
+        self._without = without
+        self._models = 0
         self.root = cache(root_of)  # of a file
 
     def takes(self, name: str) -> bool:
@@ -157,16 +162,15 @@ class _Scope:
         order: _Order,
         include: Element | None = None,
     ) -> None:
-        self.element, self.file, self.name, self._order = element, file, name, order
-        self.pose, self.placement = (
-            element.find("pose"),
-            element.get("placement_frame", ""),
-        )
+        self.element = element
+        self.file = file
+        self.name = name
+        self._order = order
+        self.pose = element.find("pose")
+        self.placement = element.get("placement_frame", "")
         if include is not None and include.find("pose") is not None:
-            self.pose, self.placement = (
-                include.find("pose"),
-                _text(include, "placement_frame"),
-            )
+            self.pose = include.find("pose")
+            self.placement = _text(include, "placement_frame")
         self.models: list[_Scope] = []
         self.strange: list[
             tuple[str, str]
@@ -363,10 +367,8 @@ def _matrix(pose: Element | None, where: str) -> Array:
         raise ConfigError(
             f"{where}: unknown attribute {unknown[0]!r} of a <pose>; {hint}"
         )
-    form, degrees = (
-        pose.get("rotation_format", "euler_rpy"),
-        pose.get("degrees", "false"),
-    )
+    form = pose.get("rotation_format", "euler_rpy")
+    degrees = pose.get("degrees", "false")
     for name, given, known in (
         ("rotation_format", form, list(NUMBERS)),
         ("degrees", degrees, ["true", "false", "1", "0"]),

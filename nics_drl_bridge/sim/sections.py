@@ -179,7 +179,8 @@ def _of_leaning_box(box: Box, pose: Array, up: float) -> _Cut:
     for a, b in combinations(range(8), 2):
         if np.count_nonzero(signs[a] != signs[b]) > 1:
             continue  # no edge
-        below, above = corners[a, 2] - up, corners[b, 2] - up
+        below = corners[a, 2] - up
+        above = corners[b, 2] - up
         if below * above < 0.0:
             cuts.append(
                 corners[a] + below / (below - above) * (corners[b] - corners[a])

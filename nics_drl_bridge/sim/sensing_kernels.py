@@ -16,15 +16,24 @@ from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim.state import Array, Dynamics, Members, Scratch, State
 
-POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12  # Columns of `past`
+# Columns of `past`
+POSE = 0
+TWIST = 3
+ODOM = 6
+MEASURED = 9
+PAST = 12
 
 
 @kernel
 def begin(n: int, m: int, state: State) -> None:
     """Records the true state of a robot at the start of an episode."""
-    past, pose, odom, twist = state.past, state.pose, state.odom, state.twist
+    past = state.past
+    pose = state.pose
+    odom = state.odom
+    twist = state.twist
     for i in range(3):
-        past[n, m, 0, POSE + i], past[n, m, 0, TWIST + i] = pose[n, m, i], 0.0
+        past[n, m, 0, POSE + i] = pose[n, m, i]
+        past[n, m, 0, TWIST + i] = 0.0
         past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = (
             odom[n, m, i],
             twist[n, m, i],
@@ -43,12 +52,11 @@ def at_lag(
 ) -> tuple[float, float, float]:
     """Returns three columns of `past`, `lag` substeps before the end of period `steps`."""
     rows = past.shape[2]
-    new, share = (steps - lag // substeps) % rows, (lag % substeps) / substeps
-    x, y, z = (
-        past[n, m, new, column],
-        past[n, m, new, column + 1],
-        past[n, m, new, column + 2],
-    )
+    new = (steps - lag // substeps) % rows
+    share = (lag % substeps) / substeps
+    x = past[n, m, new, column]
+    y = past[n, m, new, column + 1]
+    z = past[n, m, new, column + 2]
     if share > 0.0:
         old = (steps - lag // substeps - 1) % rows
         x += share * (past[n, m, old, column] - x)
@@ -82,23 +90,33 @@ def measure(
 
     From the pose (3,) `before`, poses (N, M, 3) by the wheels, and rates (3 + S,) at the end.
     """
-    steps, rows, substeps = state.steps[n], state.past.shape[2], motion.substeps
+    steps = state.steps[n]
+    rows = state.past.shape[2]
+    substeps = motion.substeps
     this = steps % rows
     last = state.past[n, m, this - 1 if this > 0 else rows - 1]
-    noise_x, noise_y = _odometry_noise(n, m, 0, state), _odometry_noise(n, m, 1, state)
+    noise_x = _odometry_noise(n, m, 0, state)
+    noise_y = _odometry_noise(n, m, 1, state)
     noise_turn = _odometry_noise(n, m, 2, state)
-    c, s = math.cos(before[2]), math.sin(before[2])
-    dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
-    ahead, aside, turned = c * dx + s * dy, c * dy - s * dx, pose[n, m, 2] - before[2]
-    x, y, heading = last[ODOM], last[ODOM + 1], last[ODOM + 2]
-    c, s = math.cos(heading), math.sin(heading)
-    x, y, heading = (
-        x + (c * ahead - s * aside),
-        y + (s * ahead + c * aside),
-        heading + turned,
-    )
+    c = math.cos(before[2])
+    s = math.sin(before[2])
+    dx = pose[n, m, 0] - before[0]
+    dy = pose[n, m, 1] - before[1]
+    ahead = c * dx + s * dy
+    aside = c * dy - s * dx
+    turned = pose[n, m, 2] - before[2]
+    x = last[ODOM]
+    y = last[ODOM + 1]
+    heading = last[ODOM + 2]
+    c = math.cos(heading)
+    s = math.sin(heading)
+    x = x + (c * ahead - s * aside)
+    y = y + (s * ahead + c * aside)
+    heading = heading + turned
     if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
-        period, c, s = motion.dt * substeps, math.cos(heading), math.sin(heading)
+        period = motion.dt * substeps
+        c = math.cos(heading)
+        s = math.sin(heading)
         turn = noise_turn * period
         x, y, _, _ = move(x, y, c, s, noise_x, noise_y, turn, period, motion.series)
         heading = wrap(heading + turn)
@@ -108,7 +126,8 @@ def measure(
     row[MEASURED + 2] = now[2] + noise_turn
     for i in range(3):
         row[POSE + i], row[TWIST + i] = pose[n, m, i], now[i]
-    odom, twist = state.odom[n, m], state.twist[n, m]
+    odom = state.odom[n, m]
+    twist = state.twist[n, m]
     if state.age[n, m] == 0:  # dividing for each robot takes a thirtieth of a step
         for i in range(3):
             odom[i], twist[i] = row[ODOM + i], row[MEASURED + i]
@@ -123,9 +142,11 @@ def measure(
 @kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
     """Draws ahead, aside [m], at most std sqrt(3 period), and turn [rad]; moves the state."""
-    std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
+    std = state.noise
+    counter = state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
-    count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)
+    count = std.shape[2] - 2
+    scale = math.sqrt(12.0 * period)
     ahead = aside = turn = 0.0
     for i in range(count):
         if std[n, m, 2 + i] > 0.0:
@@ -177,7 +198,8 @@ def scan_together(
 ) -> None:
     """Scans the first `waiting` worlds of the list in the scratch memory, as they stand."""
     scans = scratch.scans
-    chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
+    chosen = scans.waiting[:waiting]
+    first = state.velocity.shape[1]
     scan_kernels.scan_worlds(
         state.ranges,
         state.pose,
@@ -213,14 +235,15 @@ def _scan_alone(
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
-    scans, beams = scratch.scans, state.ranges.shape[2]
-    spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
-    past, steps, substeps, here = (
-        state.past,
-        state.steps[n],
-        motion.substeps,
-        spot[0, 0],
-    )
+    scans = scratch.scans
+    beams = state.ranges.shape[2]
+    spot = scans.spot
+    drive = scans.drive
+    skew = state.faults[n, m, fault_kernels.SKEW]
+    past = state.past
+    steps = state.steps[n]
+    substeps = motion.substeps
+    here = spot[0, 0]
     lag = lag_of(state.age[n, m], steps, past.shape[2], substeps)
     here[0], here[1], here[2] = at_lag(past, n, m, POSE, lag, steps, substeps)
     drive[0], drive[1], drive[2] = at_lag(past, n, m, TWIST, lag, steps, substeps)
@@ -228,7 +251,8 @@ def _scan_alone(
     if skew != 0.0:
         reach += math.hypot(drive[0], drive[1]) * lidar.sweep_time
     count = _gather(n, m, lag, reach, state, members, motion, scratch)
-    seen, every = scans.seen[:count].reshape((1, count, 7)), scans.every
+    seen = scans.seen[:count].reshape((1, count, 7))
+    every = scans.every
     every = BodyCells(
         every.first, every.then, every.ordered, every.frame, every.found[:count]
     )
@@ -267,20 +291,20 @@ def _gather(
     scratch: Scratch,
 ) -> int:
     """Copies the bodies around `spot`, as they were `lag` substeps ago; returns their number."""
-    scans, cells, bodies, velocity = (
-        scratch.scans,
-        scratch.cells,
-        state.bodies,
-        state.velocity,
-    )
+    scans = scratch.scans
+    cells = scratch.cells
+    bodies = state.bodies
+    velocity = state.velocity
     spot = scans.spot[0, 0]
-    first, several = velocity.shape[1], bodies.shape[1]
+    first = velocity.shape[1]
+    several = bodies.shape[1]
     in_cells = members.standing or (
         members.crowded and lag == 0
     )  # those of a crowd are of now
     if in_cells:
         several = around(n, spot[0], spot[1], reach, cells)
-    count, ago = 0, lag * motion.dt
+    count = 0
+    ago = lag * motion.dt
     for i in range(several):
         k = cells.found[i] if in_cells else i
         radius = bodies[n, k, RADIUS]
@@ -302,7 +326,8 @@ def _gather(
             body[HEADING] -= velocity[n, k, 2] * ago
         if turned:
             body[COS], body[SIN] = math.cos(body[HEADING]), math.sin(body[HEADING])
-        dx, dy = body[X] - spot[0], body[Y] - spot[1]
+        dx = body[X] - spot[0]
+        dy = body[Y] - spot[1]
         if dx * dx + dy * dy <= (reach + radius) * (reach + radius):
             count += 1
     return count

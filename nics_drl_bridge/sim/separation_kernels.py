@@ -69,12 +69,16 @@ def map_distance(x, y, grid):  # type: ignore[no-untyped-def]
     if rows < 2 or columns < 2:
         return np.inf
     u, v = in_grid(x, y, grid)
-    u, v = u / grid.cell - 0.5, v / grid.cell - 0.5
-    u, v = min(max(u, 0.0), columns - 1.0), min(max(v, 0.0), rows - 1.0)
-    j, i = min(int(u), columns - 2), min(int(v), rows - 2)
+    u = u / grid.cell - 0.5
+    v = v / grid.cell - 0.5
+    u = min(max(u, 0.0), columns - 1.0)
+    v = min(max(v, 0.0), rows - 1.0)
+    j = min(int(u), columns - 2)
+    i = min(int(v), rows - 2)
     if distances[i, j] == np.inf:
         return np.inf
-    u, v = u - j, v - i
+    u = u - j
+    v = v - i
     low = distances[i, j] * (1.0 - u) + distances[i, j + 1] * u
     high = distances[i + 1, j] * (1.0 - u) + distances[i + 1, j + 1] * u
     return low * (1.0 - v) + high * v
@@ -95,29 +99,40 @@ def map_direction(x, y, grid):  # type: ignore[no-untyped-def]
 @kernel
 def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
     """Distance from a point to the nearest object except body k [m], and the unit vector to it."""
-    bodies, walls, field = traffic.bodies, traffic.walls, traffic.field
-    left, right, low, high = x - field[0], field[2] - x, y - field[1], field[3] - y
-    least, nx, ny = min(left, right), (1.0 if right <= left else -1.0), 0.0
+    bodies = traffic.bodies
+    walls = traffic.walls
+    field = traffic.field
+    left = x - field[0]
+    right = field[2] - x
+    low = y - field[1]
+    high = field[3] - y
+    least = min(left, right)
+    nx = 1.0 if right <= left else -1.0
+    ny = 0.0
     if min(low, high) < least:
-        least, nx, ny = min(low, high), 0.0, (1.0 if high <= low else -1.0)
+        least = min(low, high)
+        nx = 0.0
+        ny = 1.0 if high <= low else -1.0
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
-        ox, oy = px - x, py - y
+        ox = px - x
+        oy = py - y
         away2 = ox * ox + oy * oy
         if least > 0.0 and 0.0 < away2 < least * least:
             least = math.sqrt(away2)
-            nx, ny = ox / least, oy / least
+            nx = ox / least
+            ny = oy / least
     for j in range(bodies.shape[0]):
         if j != k and bodies[j, RADIUS] > 0.0:
-            ox, oy, reach = (
-                bodies[j, X] - x,
-                bodies[j, Y] - y,
-                least + bodies[j, RADIUS],
-            )
+            ox = bodies[j, X] - x
+            oy = bodies[j, Y] - y
+            reach = least + bodies[j, RADIUS]
             away2 = ox * ox + oy * oy
             if reach > 0.0 and 0.0 < away2 < reach * reach:
                 away = math.sqrt(away2)
-                least, nx, ny = away - bodies[j, RADIUS], ox / away, oy / away
+                least = away - bodies[j, RADIUS]
+                nx = ox / away
+                ny = oy / away
     away = map_distance(x, y, traffic.grid)
     if away < least:
         nx, ny = map_direction(x, y, traffic.grid)
@@ -139,21 +154,24 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
-    bodies, first, speeds, period = (
-        traffic.bodies,
-        traffic.first,
-        traffic.speeds,
-        traffic.period,
-    )
-    x, y, radius = bodies[k, X], bodies[k, Y], bodies[k, RADIUS]
+    bodies = traffic.bodies
+    first = traffic.first
+    speeds = traffic.speeds
+    period = traffic.period
+    x = bodies[k, X]
+    y = bodies[k, Y]
+    radius = bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
     for j in range(bodies.shape[0]):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
-        ox, oy, near = bodies[j, X] - x, bodies[j, Y] - y, radius + bodies[j, RADIUS]
+        ox = bodies[j, X] - x
+        oy = bodies[j, Y] - y
+        near = radius + bodies[j, RADIUS]
         step = 0.0
         if j >= first:
-            vx, vy = speeds[j - first, 0], speeds[j - first, 1]
+            vx = speeds[j - first, 0]
+            vy = speeds[j - first, 1]
             step = math.sqrt(vx * vx + vy * vy) * period
             near += ROBOT_GAP
         reach = near + 2.0 * (length + SLACK) + step
@@ -161,7 +179,9 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
         if away2 >= reach * reach or away2 == 0.0:
             continue
         away = math.sqrt(away2)
-        nx, ny, room = ox / away, oy / away, away - near
+        nx = ox / away
+        ny = oy / away
+        room = away - near
         if j >= first:
             towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
             room += min(towards, 0.0) * period
@@ -173,13 +193,11 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
-    x, y, radius, walls, field = (
-        body[X],
-        body[Y],
-        body[RADIUS],
-        traffic.walls,
-        traffic.field,
-    )
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
+    walls = traffic.walls
+    field = traffic.field
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side, bound in ((-1.0, 0), (1.0, 2)):
         dx, dy = _hold(dx, dy, side, 0.0, side * field[bound] - radius - side * x, bend)
@@ -188,7 +206,8 @@ def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
         )
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
-        ox, oy = px - x, py - y
+        ox = px - x
+        oy = py - y
         away2 = ox * ox + oy * oy
         if 0.0 < away2 < reach * reach:
             away = math.sqrt(away2)
@@ -198,7 +217,9 @@ def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
-    x, y, radius = body[X], body[Y], body[RADIUS]
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
     here = map_distance(x, y, grid) - radius
     if here - SLACK > length or length == 0.0:
@@ -213,7 +234,10 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
             if map_distance(x + dx, y + dy, grid) - radius >= here
             else (0.0, 0.0)
         )
-    free, way, room, finest = 0.0, 0.0, here, FINEST * grid.cell / length
+    free = 0.0
+    way = 0.0
+    room = here
+    finest = FINEST * grid.cell / length
     while way < 1.0:
         way = min(way + max(room / length, finest), 1.0)
         room = map_distance(x + dx * way, y + dy * way, grid) - radius
@@ -234,7 +258,8 @@ def restrain(dx, dy, k, traffic, bends):  # type: ignore[no-untyped-def]
     """Returns the displacement [m] that obstacle k can make of one; with `bends` it slides."""
     body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):
-        wished_x, wished_y = dx, dy
+        wished_x = dx
+        wished_y = dy
         dx, dy = _hold_bodies(dx, dy, k, traffic, True)
         dx, dy = _hold_walls(dx, dy, body, traffic, True)
         dx, dy = _hold_map(dx, dy, body, traffic.grid, True)

@@ -80,11 +80,10 @@ class CommandBox:
     def __init__(
         self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
     ) -> None:
-        first, margin = (
-            len(robot.state),
-            TOLERANCE * (robot.command_high - robot.command_low),
-        )
-        self._tell, self._names = tell, robot.variable_names[first:]
+        first = len(robot.state)
+        margin = TOLERANCE * (robot.command_high - robot.command_low)
+        self._tell = tell
+        self._names = robot.variable_names[first:]
         edges = np.stack([model.low[first:], model.high[first:]])
         for curve in model.inputs:  # the model's box is of commands in effect
             place = self._names.index(curve.command)
@@ -99,15 +98,18 @@ class CommandBox:
 
     def begin(self) -> None:
         """Begins an episode: the next step is checked, and one warning may be issued."""
-        self._steps, self._armed = 0, True
+        self._steps = 0
+        self._armed = True
 
     def check(self, commands: Array) -> None:
         """Warns once per episode if commands (..., C) are outside the range."""
-        steps, self._steps = self._steps, self._steps + 1
+        steps = self._steps
+        self._steps = self._steps + 1
         if not self._armed or steps % EVERY:
             return
         flat = commands.reshape(-1, commands.shape[-1])
-        least, most = flat.min(axis=0), flat.max(axis=0)
+        least = flat.min(axis=0)
+        most = flat.max(axis=0)
         outside = (least < self._low) | (most > self._high)
         if outside.any():
             self._armed, i = False, int(np.argmax(outside))
@@ -221,7 +223,9 @@ class FastSimulator:
         if randomisation is not None and not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
         _check_speed(model.kinematics, model.robot, world)
-        self.model, self.world, self.randomisation = model, world, randomisation
+        self.model = model
+        self.world = world
+        self.randomisation = randomisation
         self.episodes = EpisodeSampler(model, world, robots, randomisation)
         if (draws := self.episodes.draws) is not None:
             delay = max(delay, draws.longest_delay)
@@ -249,7 +253,8 @@ class FastSimulator:
 
     @cached_property
     def _members(self) -> Members:
-        members, motions = self.world.members, self.sampler.motions
+        members = self.world.members
+        motions = self.sampler.motions
         outlines = self._scanner.table.outlines.arguments
         return allocation.members_of(
             members, motions, outlines, self._sizes, self.data.member
@@ -284,7 +289,8 @@ class FastSimulator:
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
         """Puts a robot of the first world at a pose (3,) with a state (S,); odometry stays."""
-        self.data.pose[0, robot], self.data.state[0, robot] = pose, state
+        self.data.pose[0, robot] = pose
+        self.data.state[0, robot] = state
         body = place(pose, self.footprint.radius, self._in_table[-1])
         self.data.bodies[0, self.sampler.count + robot] = body
         self.sort_bodies()
@@ -297,7 +303,8 @@ class FastSimulator:
         `robots` are indices of the other's robots, which become the first ones here, `obstacles`
         (K,) those of its obstacles; -1 is none of them. Obstacles are put by `put_bodies`.
         """
-        mine, theirs = self.data, other.data
+        mine = self.data
+        theirs = other.data
         for name in OF_ROBOT:
             getattr(mine, name)[0, : len(robots)] = getattr(theirs, name)[0, robots]
         for name in ("steps", "seeds", "member"):
@@ -398,11 +405,13 @@ class FastSimulator:
         draws: Draws | None,
     ) -> None:
         data = self.data
-        data.pose[chosen], data.odom[chosen] = starts, starts
+        data.pose[chosen] = starts
+        data.odom[chosen] = starts
         for name in ("state", "history", "twist", "collided", "steps", "velocity"):
             getattr(data, name)[chosen] = 0
         data.seeds[chosen], data.member[chosen] = seeds, scenes.member
-        count, shapes = self.sampler.count, scenes.bodies[..., SHAPE].astype(np.int64)
+        count = self.sampler.count
+        shapes = scenes.bodies[..., SHAPE].astype(np.int64)
         data.bodies[chosen, :count] = scenes.bodies
         data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
         data.bodies[chosen, count:] = place(

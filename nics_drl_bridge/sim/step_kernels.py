@@ -72,15 +72,21 @@ def move_freely(
     begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes
 ) -> None:
     """Moves robot m of world n of [begin, end) one period freely, in lane (n - begin) M + m."""
-    robots, size = state.pose.shape[1], state.state.shape[2]
-    substeps, history = motion.substeps, state.history
-    where, x, late = lanes.pose, lanes.x, lanes.late
+    robots = state.pose.shape[1]
+    size = state.state.shape[2]
+    substeps = motion.substeps
+    history = state.history
+    where = lanes.pose
+    x = lanes.x
+    late = lanes.late
     for n in range(begin, end):
         for m in range(robots):
-            i, heading = (n - begin) * robots + m, state.pose[n, m, 2]
+            i = (n - begin) * robots + m
+            heading = state.pose[n, m, 2]
             where[0, i], where[1, i] = state.pose[n, m, 0], state.pose[n, m, 1]
             where[2, i], where[3, i] = math.cos(heading), math.sin(heading)
-            where[4, i], where[5, i] = heading, 0.0
+            where[4, i] = heading
+            where[5, i] = 0.0
             for s in range(size):
                 x[s, i] = state.state[n, m, s]
             for t in range(lanes.coefficient.shape[0]):
@@ -88,7 +94,8 @@ def move_freely(
             for c in range(late.shape[0]):  # each command changes once, after this many
                 late[c, i] = (state.delay[n, m] + motion.terms.late[c]) % substeps
     terms = with_coefficients(motion.terms, lanes.coefficient)
-    at, used = 0, (end - begin) * robots
+    at = 0
+    used = (end - begin) * robots
     while at < substeps:
         until = substeps
         for c in range(late.shape[0]):
@@ -96,7 +103,8 @@ def move_freely(
                 if late[c, i] > at:
                     until = min(until, late[c, i])
                 if late[c, i] == at or at == 0:
-                    n, m = begin + i // robots, i % robots
+                    n = begin + i // robots
+                    m = i % robots
                     delay = state.delay[n, m] + motion.terms.late[c]
                     row = delayed(at, delay, substeps, history.shape[2])
                     x[size + c, i] = history[n, m, row, c]
@@ -113,9 +121,13 @@ def _move_world(
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
-    lanes, nearby, single = scratch.lanes, scratch.nearby, scratch.single
-    pose, period = state.pose, motion.dt * motion.substeps
-    robots, first = pose.shape[1], state.velocity.shape[1]
+    lanes = scratch.lanes
+    nearby = scratch.nearby
+    single = scratch.single
+    pose = state.pose
+    period = motion.dt * motion.substeps
+    robots = pose.shape[1]
+    first = state.velocity.shape[1]
     for m in range(robots):
         drift = math.sqrt(3.0 * period) * (state.noise[n, m, 2] + state.noise[n, m, 3])
         nearby.way[m] = lanes.pose[5, skip + m] + drift
@@ -169,17 +181,20 @@ def _step(
     begin: int,
 ) -> None:
     """See `step_worlds`; without reference counts, which took longer than the step."""
-    many, end = state.pose.shape[1], begin + commands.shape[0]
+    many = state.pose.shape[1]
+    end = begin + commands.shape[0]
     _send(state.history, commands, begin, motion.terms.curves)
     block = scratch.lanes.pose.shape[1] // many
     for low in range(begin, end, block):
         high = min(low + block, end)
         _begin_period(low, high, state, members, motion, scratch)
         move_freely(low, high, state, motion, scratch.lanes)
-        waiting, scanned = np.int64(0), low
+        waiting = np.int64(0)
+        scanned = low
         for n in range(low, high):
             state.steps[n] += 1
-            skip, scene = (n - low) * many, surroundings_of(n, members)
+            skip = (n - low) * many
+            scene = surroundings_of(n, members)
             _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, scene, motion, scratch)
             waiting = sensing.scan_or_wait(
@@ -188,7 +203,8 @@ def _step(
             if n + 1 == high or (n + 1 - scanned) * many >= TOGETHER:
                 sensing.scan_together(waiting, state, members, lidar, scratch)
                 sensing.distort(scanned, n + 1, state, lidar)
-                waiting, scanned = np.int64(0), n + 1
+                waiting = np.int64(0)
+                scanned = n + 1
 
 
 @kernel(inline=True)
@@ -200,10 +216,13 @@ def _begin_period(
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
-    pose, before, speeds = state.pose, scratch.scans.before, scratch.nearby.speeds
+    pose = state.pose
+    before = scratch.scans.before
+    speeds = scratch.nearby.speeds
     for n in range(low, high):
         for m in range(pose.shape[1]):
-            i, row = (n - low) * pose.shape[1] + m, state.steps[n] % state.past.shape[2]
+            i = (n - low) * pose.shape[1] + m
+            row = state.steps[n] % state.past.shape[2]
             before[i, 0], before[i, 1], before[i, 2] = (
                 pose[n, m, 0],
                 pose[n, m, 1],
@@ -213,7 +232,8 @@ def _begin_period(
                 sensing.begin(n, m, state)
             if members.moves:
                 twist = state.past[n, m, row, sensing.TWIST : sensing.TWIST + 2]
-                c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
+                c = math.cos(pose[n, m, 2])
+                s = math.sin(pose[n, m, 2])
                 speeds[m, 0] = c * twist[0] - s * twist[1]
                 speeds[m, 1] = s * twist[0] + c * twist[1]
         if members.moves:
@@ -230,14 +250,17 @@ def _measure(
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
-    frame, pose, first = scratch.cells.frame, state.pose, state.velocity.shape[1]
+    frame = scratch.cells.frame
+    pose = state.pose
+    first = state.velocity.shape[1]
     for m in range(pose.shape[1]):
         contacts.put_body(state.bodies, n, first + m, pose[n, m])
         rates_at(n, m, motion.substeps - 1, state, motion, scratch.single)
         before = scratch.scans.before[skip + m]
         sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
         if scene.crowded:  # the cells count how far the robots came, drift included
-            dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
+            dx = pose[n, m, 0] - before[0]
+            dy = pose[n, m, 1] - before[1]
             frame[n, cells.MOVED] = max(
                 frame[n, cells.MOVED], math.sqrt(dx * dx + dy * dy)
             )
@@ -249,7 +272,8 @@ def sort(n: int, state: State, scene: Surroundings, scratch: Scratch) -> None:
     if scene.crowded:
         cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
     elif scene.standing:
-        first, spare = state.velocity.shape[1], scratch.scans.seen
+        first = state.velocity.shape[1]
+        spare = scratch.scans.seen
         cells.put_in_order(n, state.bodies[n], first, spare, scratch.cells)
 
 
@@ -265,7 +289,8 @@ def sort_worlds(packed: Any, begin: int, end: int) -> None:
 def begin(packed: Any, chosen: records.Integers) -> None:
     """Begins episodes in the worlds `chosen` (n,): all is in place and stands still."""
     part = packed.content
-    state, waiting = part.state, part.scratch.scans.waiting
+    state = part.state
+    waiting = part.scratch.scans.waiting
     for i in range(chosen.shape[0]):
         waiting[i] = chosen[i]
         scene = surroundings_of(chosen[i], part.members)
@@ -297,13 +322,12 @@ def end_period(
     the end, the pose by the wheels alone before and after, and the twist by the wheels at the end.
     """
     part = packed.content
-    state, members, motion, scratch = (
-        part.state,
-        part.members,
-        part.motion,
-        part.scratch,
-    )
-    first, waiting = state.velocity.shape[1], 0
+    state = part.state
+    members = part.members
+    motion = part.motion
+    scratch = part.scratch
+    first = state.velocity.shape[1]
+    waiting = 0
     for n in range(state.pose.shape[0]):
         state.steps[n] += 1
         row = state.past[n, :, state.steps[n] % state.past.shape[2]]

@@ -201,7 +201,8 @@ class World(Schema):
     def extent(self) -> Region:
         """Least x, least y, greatest x, greatest y of the field, or without one of the map [m]."""
         if self.size is not None:
-            x, y = self.size[0] / 2.0, self.size[1] / 2.0
+            x = self.size[0] / 2.0
+            y = self.size[1] / 2.0
             return -x, -y, x, y
         if self.bounds is not None:
             return self.bounds
@@ -217,7 +218,8 @@ class World(Schema):
         """Returns (W, 4) the four sides of the field, if any, then the further walls [m]."""
         sides: list[Region] = []
         if self.size is not None:
-            x, y = self.size[0] / 2.0, self.size[1] / 2.0
+            x = self.size[0] / 2.0
+            y = self.size[1] / 2.0
             sides = [(-x, -y, x, -y), (x, -y, x, y), (x, y, -x, y), (-x, y, -x, -y)]
         return np.array([*sides, *self.walls], dtype=np.float64).reshape(-1, 4)
 

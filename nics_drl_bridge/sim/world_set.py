@@ -22,7 +22,9 @@ from nics_drl_bridge.sim.cellular import Cellular, grow
 from nics_drl_bridge.sim.world import Region, World, load_world
 
 MOST_MEMBERS = 10_000
-YAML, GAZEBO, IMPORT = (".yaml", ".yml"), (".world", ".sdf"), "nics world import"
+YAML = (".yaml", ".yml")
+GAZEBO = (".world", ".sdf")
+IMPORT = "nics world import"
 SPECIAL = "*?["
 KEYS = ("worlds", "generate")  # one of which only a set has
 MAP_KEYS = ("image",)  # of a Nav2 map's file, which may lie beside its world
@@ -73,10 +75,8 @@ class WorldSet:
     def extent(self) -> Region:
         """Least x, least y, greatest x, greatest y of all members [m]."""
         extents = np.array([world.extent for world in self.members])
-        low, high = (
-            extents[:, :2].min(axis=0).tolist(),
-            extents[:, 2:].max(axis=0).tolist(),
-        )
+        low = extents[:, :2].min(axis=0).tolist()
+        high = extents[:, 2:].max(axis=0).tolist()
         return low[0], low[1], high[0], high[1]
 
 
@@ -97,7 +97,8 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
             needed = "a name, the path of a YAML file or a folder, a World, or a list of names"
             raise ConfigError(f"world={shown(name)}: must be {needed}.")
         return _set_of("worlds", _members([str(one) for one in name], Path()))
-    text, sets = str(name), share_folder() / "config" / "world_sets"
+    text = str(name)
+    sets = share_folder() / "config" / "world_sets"
     path = shipped if (shipped := sets / f"{name}.yaml").is_file() else Path(name)
     if (content := _content(path, KEYS)) is not None:
         return _read_set(path, validate(content, SetFile, text))
@@ -156,7 +157,8 @@ def _set_of(name: str, members: Sequence[World], source: str = "") -> WorldSet:
 def _members(names: Sequence[str], base: Path) -> list[World]:
     found: list[World] = []
     for name in names:
-        special, path = any(sign in name for sign in SPECIAL), base / name
+        special = any(sign in name for sign in SPECIAL)
+        path = base / name
         if special or (name and path.is_dir()):
             pattern = str(path) if special else f"{path}/*"
             every = [Path(one) for one in sorted(glob(pattern)) if one.endswith(YAML)]

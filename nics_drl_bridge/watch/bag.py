@@ -93,8 +93,10 @@ def _read(
     """Times from the first on [s], shots, and the lidar of the bag."""
     messages = played(path, topics, model.gyro)
     playback = Playback(model, POSE in messages, any_lidar=True)
-    stamps, shots = list[int](), list[Snapshot]()
-    middleware, every = playback.middleware, SCAN if SCAN in messages else ODOM
+    stamps = list[int]()
+    shots = list[Snapshot]()
+    middleware = playback.middleware
+    every = SCAN if SCAN in messages else ODOM
     command: Array | None = None
     for role, message in in_order(messages):
         used = playback.take(role, message)

@@ -50,14 +50,18 @@ class Lane:
     """One world in which episodes are driven, one after the other."""
 
     def __init__(self, make: Make, policy: str, world: AnyWorld, seed: int) -> None:
-        self._make, self._policy, self.trail = make, policy, Track()
-        self.seed, self._native = seed, world
+        self._make = make
+        self._policy = policy
+        self.trail = Track()
+        self.seed = seed
+        self._native = world
         self._open(policy, world)
         self.begin()
 
     def _open(self, policy: str, world: AnyWorld) -> None:
         self._env, self._driver = self._make(policy, world)
-        self._policy, self.world = policy, world
+        self._policy = policy
+        self.world = world
         self.env: BridgeEnv = self._env.unwrapped  # type: ignore[assignment]
 
     @property
@@ -74,7 +78,8 @@ class Lane:
         """Begins the episode of the seed, with options of `reset`."""
         self._seen, _ = self._env.reset(seed=self.seed, options=options)
         begin(self._driver)
-        self.state, self._over_s = "", 0.0
+        self.state = ""
+        self._over_s = 0.0
         if not options:  # otherwise the way so far is still that of this episode
             self.time_s, self.trail = 0.0, Track()
         self.trail.add(self.env.snapshot().poses, 1)
@@ -149,7 +154,8 @@ class Lane:
 
     def _rebuild(self, policy: str, *more: Obstacles, emptied: bool = False) -> None:
         """Goes on from here in a new env: with another policy, or other obstacles."""
-        shot, kept = self.env.snapshot(), dict(vars(self))
+        shot = self.env.snapshot()
+        kept = dict(vars(self))
         world = standing(self.env, *more, emptied=emptied)
         try:
             self._open(policy, world)
@@ -173,7 +179,9 @@ class Lane:
 def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
     """The world of an env with its obstacles where they are now, or none, and more of them."""
     shot = env.snapshot()
-    world, shapes, groups = env.world.members[shot.member], env.world.shapes, list(more)
+    world = env.world.members[shot.member]
+    shapes = env.world.shapes
+    groups = list(more)
     motions = [
         group.motion for group in world.obstacles for _ in range(group.counts[1])
     ]
@@ -197,18 +205,18 @@ class EpisodeSource:
         self._given_worlds = {world.name: world for world in worlds}
         self.lanes = [Lane(make, policy, world, seed) for world in worlds]
         self.model = self.lanes[0].env.model
-        self.period_s, self._policy = self.model.control_period, policy
+        self.period_s = self.model.control_period
+        self._policy = policy
         robot = self.model.robot
         self._drives = robot.takes_cmd_vel
-        self._command, self._by_hand, self._asked_s = (
-            0.0 * robot.command_low,
-            False,
-            0.0,
-        )
+        self._command = 0.0 * robot.command_low
+        self._by_hand = False
+        self._asked_s = 0.0
 
     def stage(self) -> Stage:
         """See `show.FrameSource`."""
-        robot, first = self.model.robot.name, self.lanes[0].world.name
+        robot = self.model.robot.name
+        first = self.lanes[0].world.name
         fitting = [name for name in shipped_policies() if name == robot]
         can = CAN | {"drive"} if self._drives else CAN
         policies = dict.fromkeys(

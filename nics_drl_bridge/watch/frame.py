@@ -42,7 +42,8 @@ class Stage:
 
     def plain(self) -> dict[str, Any]:
         """The stage as plain data."""
-        robot, lidar = self.model.robot, self.model.lidar
+        robot = self.model.robot
+        lidar = self.model.lidar
         commands = [
             {"name": one.name, "unit": one.unit, "min": one.min, "max": one.max}
             for one in robot.command

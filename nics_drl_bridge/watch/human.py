@@ -15,12 +15,11 @@ class HumanView:
     """
 
     def __init__(self, model: SimulatorModel, world: AnyWorld, fps: int) -> None:
-        self._server, self._pace, self._period_s = (
-            PageServer(port=0),
-            Tempo(),
-            1.0 / fps,
-        )
-        self._trail, self._frames = Track(), 0
+        self._server = PageServer(port=0)
+        self._pace = Tempo()
+        self._period_s = 1.0 / fps
+        self._trail = Track()
+        self._frames = 0
         self._server.set_stage(Stage(world.name, model, (world,), PACE))
         open_page(self._server.url)
 

@@ -45,7 +45,8 @@ def beside(row: list[Pixels]) -> Pixels:
     """Pictures side by side, of even sides, as videos need."""
     height = -(-max(len(each) for each in row) // 2) * 2
     width = -(-sum(each.shape[1] for each in row) // 2) * 2
-    whole, left = np.full((height, width, 3), 255, np.uint8), 0
+    whole = np.full((height, width, 3), 255, np.uint8)
+    left = 0
     for each in row:
         whole[: len(each), left : left + each.shape[1]] = each
         left += each.shape[1]
@@ -62,7 +63,8 @@ def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
         Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE)
         for each in every
     ]
-    buffer, duration = io.BytesIO(), round(1000.0 / fps)
+    buffer = io.BytesIO()
+    duration = round(1000.0 / fps)
     first.save(
         buffer, "GIF", save_all=True, append_images=rest, duration=duration, loop=0
     )
@@ -131,7 +133,8 @@ FLIP = np.array([1.0, -1.0])  # Rerun draws y downwards
 
 
 def _log(rerun: Any, recording: Any, at: str, stage: Stage, world: WorldFrame) -> None:
-    shot, model = world.shot, stage.model
+    shot = world.shot
+    model = stage.model
     shapes = [shape for each in stage.worlds for shape in each.shapes]
     bodies = [
         FLIP
@@ -149,7 +152,8 @@ def _log(rerun: Any, recording: Any, at: str, stage: Stage, world: WorldFrame) -
         rerun.Points2D(FLIP * shot.goals, radii=0.1, colors=[230, 159, 0]),
     )
     for m, (pose, ranges) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
-        robot, own = model.robot, f"{at}/robot_{m}"
+        robot = model.robot
+        own = f"{at}/robot_{m}"
         ring = _ring(pose, robot.footprint_radius, robot)
         recording.log(
             f"{own}/footprint", rerun.LineStrips2D([FLIP * ring], colors=[0, 114, 178])

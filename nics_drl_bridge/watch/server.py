@@ -18,8 +18,10 @@ from nics_drl_bridge.extensions import missing
 from nics_drl_bridge.seeds import GREATEST_SEED
 from nics_drl_bridge.watch.frame import Frame, Stage
 
-HOST, PORT = "127.0.0.1", 8765
-MOST_REQUESTS, MOST_BYTES = 256, 4096
+HOST = "127.0.0.1"
+PORT = 8765
+MOST_REQUESTS = 256
+MOST_BYTES = 4096
 QUIET = logging.Logger(
     "pages", logging.CRITICAL + 1
 )  # one that sleeps or errs is no news
@@ -91,10 +93,9 @@ class PageServer:
             ) from None
         self._requests: queue.Queue[Request] = queue.Queue(MOST_REQUESTS)
         self._news = threading.Condition()
-        self._texts, self._numbers = (
-            ["", "", ""],
-            [0, 0, 0],
-        )  # newest stage, notice and frame
+        # newest stage, notice and frame
+        self._texts = ["", "", ""]
+        self._numbers = [0, 0, 0]
         self._pages: set[Any] = set()
         self.closed = False
         try:

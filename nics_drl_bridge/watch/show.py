@@ -14,7 +14,8 @@ from nics_drl_bridge.watch.server import PageServer, Request
 
 POLL_S = 0.2
 MOST_FRAMES_PER_S = 60.0
-SLOWEST, FASTEST = 0.05, 64.0
+SLOWEST = 0.05
+FASTEST = 64.0
 PACE = frozenset({"pause", "speed", "step"})
 Handle = Callable[[Request], None]
 
@@ -44,8 +45,10 @@ class Tempo:
     """Tells when the next frame is due: at a speed, after a pause, or one by one."""
 
     def __init__(self) -> None:
-        self.speed, self.paused = 1.0, False
-        self._single, self._due = False, 0.0
+        self.speed = 1.0
+        self.paused = False
+        self._single = False
+        self._due = 0.0
 
     def take(self, request: Request) -> None:
         """Changes the pace, if that is what a page asks for."""
@@ -61,7 +64,8 @@ class Tempo:
             now = time.monotonic()
             going = self._single or not (self.paused and server.watched)
             if going and now >= self._due:
-                self._single, period_s = False, period_s / self.speed
+                self._single = False
+                period_s = period_s / self.speed
                 self._due = max(self._due + period_s, now)
                 return True
             request = server.request(min(POLL_S, self._due - now) if going else POLL_S)
@@ -92,7 +96,8 @@ def check_listed(request: Request, stage: Stage) -> None:
 
 def show(source: FrameSource, server: PageServer) -> None:
     """Shows a source until the server is closed."""
-    pace, shown_s = Tempo(), 0.0
+    pace = Tempo()
+    shown_s = 0.0
 
     def publish() -> None:
         server.publish(source.frame(), **pace.plain())

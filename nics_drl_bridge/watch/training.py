@@ -21,7 +21,8 @@ class TrainingView:
     """Shows the first worlds of each vector env; to be called after each step of them all."""
 
     def __init__(self, server: PageServer, training: Envs) -> None:
-        self._server, envs = server, training.envs
+        self._server = server
+        envs = training.envs
         each = max(1, MOST_WORLDS // len(envs))
         sizes = [len(env.world.members) for env in envs]
         self._worlds = [  # with the place of the first member of their world set
@@ -29,7 +30,9 @@ class TrainingView:
             for k, env in enumerate(envs[:MOST_WORLDS])
             for n in range(min(each, env.num_envs))
         ]
-        self._shown_s, self._steps, self.note = 0.0, 0, ""
+        self._shown_s = 0.0
+        self._steps = 0
+        self.note = ""
         names = ", ".join(env.world.name for env in envs)
         places = tuple(env.world for env in envs)
         server.set_stage(Stage(f"training in {names}", envs[0].model, places))
@@ -50,7 +53,8 @@ class TrainingView:
     def _frame(self) -> Frame:
         worlds = []
         for env, n, first, trail in self._worlds:
-            shot, name = env.snapshot(n), f"{env.world.name} {n}"
+            shot = env.snapshot(n)
+            name = f"{env.world.name} {n}"
             worlds.append(WorldFrame(shot, name, first + shot.member, trail.ways))
         period_s = self._worlds[0][0].model.control_period
         return Frame(self._steps * period_s, tuple(worlds), self.note)

@@ -50,7 +50,8 @@ def folder(tmp_path):
 
 
 def test_worlds_of_a_folder_are_those_that_come_with_the_package(barn, folder):
-    own, given = barn.courses(None), barn.courses(folder)
+    own = barn.courses(None)
+    given = barn.courses(folder)
     assert tuple(given) == NUMBERS
     for number, course in given.items():
         assert course.length == pytest.approx(own[number].length)
@@ -178,7 +179,8 @@ def test_what_is_not_done_in_mujoco_is_refused(word):
 
 
 def test_each_bar_can_be_missed_in_each_place(barn):
-    good, bad = {"success": 0.97, "collision": 0.01, "score": 0.46}, (0.94, 0.03, 0.39)
+    good = {"success": 0.97, "collision": 0.01, "score": 0.46}
+    bad = (0.94, 0.03, 0.39)
     for place, bars in barn.BARS.items():
         assert barn.missed(place, good, "jackal") == []
         for name, value in zip(good, bad, strict=True):

@@ -6,7 +6,8 @@ import pytest
 
 from .runs import asked, fails
 
-SCRIPT, SMALL = "estimator.py", ("--drives", "11", "--steps", "3000")
+SCRIPT = "estimator.py"
+SMALL = ("--drives", "11", "--steps", "3000")
 TINY = ("--drives", "3", "--steps", "300")
 
 

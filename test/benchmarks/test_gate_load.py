@@ -9,7 +9,8 @@ from .runs import asked, fails
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
-SCRIPT, SHORT = "gate_load.py", ("--seconds", "4", "--burst", "4")
+SCRIPT = "gate_load.py"
+SHORT = ("--seconds", "4", "--burst", "4")
 
 
 @pytest.mark.campaign

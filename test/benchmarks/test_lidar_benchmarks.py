@@ -221,7 +221,8 @@ def test_the_nearest_row_is_half_a_grid_step_away_at_most(scenes):
     table = bake(scenes.SPEC, scenes.SCENES["strip"])
     batch = scenes.random_batch(scenes.SCENES["strip"], 300, 1)
     snapped = scenes.nearest_row(batch, table)
-    radius, step = scenes.STRIP.radius, scenes.SPEC.angle_increment
+    radius = scenes.STRIP.radius
+    step = scenes.SPEC.angle_increment
     distance, _ = polar(batch.poses)
     row, beam = polar(snapped.poses)
     beyond = distance < radius

@@ -6,11 +6,9 @@ import pytest
 
 from .runs import BENCHMARKS, asked, fails
 
-TABLE1, REAL, MUJOCO = (
-    "table1_kinematics.py",
-    "real_robot.py",
-    "generate_from_mujoco.py",
-)
+TABLE1 = "table1_kinematics.py"
+REAL = "real_robot.py"
+MUJOCO = "generate_from_mujoco.py"
 SHORT = ("--robots", "differential", "--train", "40", "--unseen", "10", "--drives", "1")
 DRIVE = (
     BENCHMARKS.parents[1]

@@ -89,7 +89,8 @@ def test_a_topic_whose_quality_of_service_does_not_fit_is_named(
     kind = {"map": OccupancyGrid, "odom": Odometry, "cmd_vel": Twist}[topic]
     with claimed_domain() as domain_id:
         context = open_context(domain_id=domain_id)
-        robot, asker = Node("robot", context=context), Node("asker", context=context)
+        robot = Node("robot", context=context)
+        asker = Node("asker", context=context)
         if hears:
             robot.create_subscription(kind, topic, print, profile)
         else:

@@ -19,7 +19,8 @@ pytestmark = [
         reason="packet loss needs root and the tools ip and nft",
     ),
 ]
-SCRIPT, SHORT = "packet_loss.py", ("--seconds", "6", "--loss", "20")
+SCRIPT = "packet_loss.py"
+SHORT = ("--seconds", "6", "--loss", "20")
 
 
 @pytest.mark.campaign

@@ -138,7 +138,10 @@ def test_every_drive_has_its_mapping(module):
 
 
 def test_wheels_are_found_in_a_model_that_moves_by_them(module):
-    left, right, base, lag = 0.1, 0.11, 0.4, 0.2
+    left = 0.1
+    right = 0.11
+    base = 0.4
+    lag = 0.2
     powers = np.eye(4, dtype=np.int64)  # vx, wz, left, right
     coefficients = np.zeros((5, 4))
     coefficients[0, 0] = coefficients[2, 1] = 1.0

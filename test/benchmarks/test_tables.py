@@ -156,7 +156,8 @@ def test_rows_are_of_runs_that_there_are_and_as_long_as_their_head(tables):
 def test_each_table_stands_in_one_place_and_again_only_where_all_figures_or_the_papers_are(
     tables,
 ):
-    again, first = ("paper.md", "results.md"), []
+    again = ("paper.md", "results.md")
+    first = []
     for path in tables.documents():
         found = [match[1] for match in tables.REGION.finditer(path.read_text())]
         assert len(found) == len(set(found)), path

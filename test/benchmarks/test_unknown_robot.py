@@ -32,7 +32,8 @@ def place(dart):
 
 def turned(engine, dart, seconds: float) -> tuple[float, float]:
     """Lets the robot turn on the spot; returns its true turn and that by its wheels [rad]."""
-    true_turn, by_wheels = 0.0, 0.0
+    true_turn = 0.0
+    by_wheels = 0.0
     for _ in range(round(seconds / dart.STEP_S)):
         engine.wheel_speeds[:] = [-2.0, 2.0, -2.0, 2.0]
         engine.step()

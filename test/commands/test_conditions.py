@@ -42,7 +42,8 @@ def test_an_unknown_condition_is_one_sentence(conditions, said, tmp_path):
 
 @pytest.mark.slow
 def test_an_episode_is_driven_through_the_gate_and_with_what_was_drawn():
-    model, told = builtin_model("differential"), []
+    model = builtin_model("differential")
+    told = []
     for gate in (None, "differential"):
         given = {
             "estimator": True,

@@ -104,7 +104,8 @@ def test_without_in_an_evaluation_leaves_out_where_it_can_not_run_in_one_line(
         monkeypatch.setattr(
             episodes, "find_spec", lambda name: None if name == lacking else there(name)
         )
-    said, spec = list[str](), load_robot(robot)
+    said = list[str]()
+    spec = load_robot(robot)
     assert _places(order(), spec, said.append) == places
     assert len(said) == 1
     assert re.match(why, said[0])
@@ -138,7 +139,8 @@ def test_a_policy_of_a_robot_that_is_gone_asks_for_its_model(tmp_path):
 
 
 def test_an_evaluation_uses_the_time_limit_of_the_policy_and_tells_if_it_is_short():
-    said, world = list[str](), load_worlds("doorway")
+    said = list[str]()
+    world = load_worlds("doorway")
     slow = SimpleNamespace(robot=load_robot("turtlebot3_burger"), control_period=0.1)
     known = {"mine.onnx": contract("mine", max_episode_steps=400)}
     assert limited(NO_CONDITIONS, known, slow, world, said.append).steps == 400

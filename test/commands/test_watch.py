@@ -69,7 +69,8 @@ def test_an_episode_has_the_time_that_its_policy_was_learnt_with(monkeypatch):
     learnt = SimpleNamespace(
         provenance={}, robot=SimpleNamespace(name="differential"), max_episode_steps=777
     )
-    driven, env_of = [], driving.env_of
+    driven = []
+    env_of = driving.env_of
     monkeypatch.setattr(
         driving, "contracts_of", lambda policies: dict.fromkeys(policies, learnt)
     )

@@ -230,7 +230,8 @@ def test_an_imported_world_of_barn_is_the_one_that_is_shipped(tmp_path):
         pytest.skip("the benchmark's worlds are not on this machine")
     words = ("--start", "-2.25", 3, 1.57, "--goal", "-2.25", 13, "--out", "one.yaml")
     done("import", gazebo, *words, cwd=tmp_path)
-    world, shipped = load_world(tmp_path / "one.yaml"), barn_world(1)
+    world = load_world(tmp_path / "one.yaml")
+    shipped = barn_world(1)
     assert set(world.obstacles[0].at) == set(shipped.obstacles[0].at)
     assert (world.bounds, world.starts, world.goals) == (
         shipped.bounds,

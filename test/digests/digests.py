@@ -46,7 +46,8 @@ def worlds() -> Found:
                 6, robot, world, randomisation=random, max_episode_steps=40
             )
             seen, _ = env.reset(seed=5)
-            rng, rows = np.random.default_rng(1), [seen.copy()]
+            rng = np.random.default_rng(1)
+            rows = [seen.copy()]
             for _ in range(80):
                 action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(
                     np.float32
@@ -74,7 +75,8 @@ def single() -> Found:
     for robot in ROBOTS:
         env = BridgeEnv(backend="sim", model=robot, world="arena", estimator=True)
         seen, info = env.reset(seed=3)
-        rng, rows = np.random.default_rng(2), [seen]
+        rng = np.random.default_rng(2)
+        rows = [seen]
         for _ in range(60):
             action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
             seen, reward, ended, cut, info = env.step(action)

@@ -16,7 +16,8 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 @pytest.mark.parametrize("name", sorted(DIGESTS))
 def test_what_the_package_computes_is_what_it_computed_before(name, monkeypatch):
     monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
-    kept, found = json.loads(FILE.read_text())[name], DIGESTS[name]()
+    kept = json.loads(FILE.read_text())[name]
+    found = DIGESTS[name]()
     assert sorted(found) == sorted(kept)
     for part, numbers in found.items():
         scale = np.sqrt(max(1.0, numbers[0]))

@@ -85,14 +85,16 @@ def bag(path: Path) -> None:
     import bags
 
     env = BridgeEnv(model="differential", world="empty", estimator=True)
-    data, rng = env._backend.simulator.data, np.random.default_rng(2)
+    data = env._backend.simulator.data
+    rng = np.random.default_rng(2)
     topics: dict[str, list[Any]] = {
         "/odom": [],
         "/scan": [],
         "/cmd_vel": [],
         "/mocap": [],
     }
-    known, nothing = np.diag(np.full(6, 0.01)).ravel(), np.zeros(0, np.float32)
+    known = np.diag(np.full(6, 0.01)).ravel()
+    nothing = np.zeros(0, np.float32)
     env.reset(seed=1)
     actions = np.repeat(rng.uniform(-0.8, 0.8, (60, 2)), 5, axis=0)
     for k, action in enumerate(actions, 1):
@@ -146,7 +148,10 @@ def map_of(path: Path) -> None:
 
 def picture(path: Path) -> None:
     cells = np.full((160, 160), 255, np.uint8)
-    cells[:4], cells[-4:], cells[:, :4], cells[:, -4:] = 0, 0, 0, 0
+    cells[:4] = 0
+    cells[-4:] = 0
+    cells[:, :4] = 0
+    cells[:, -4:] = 0
     Image.fromarray(cells).save(path)
 
 

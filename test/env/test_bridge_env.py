@@ -88,7 +88,8 @@ def test_a_world_may_be_given_by_its_path_or_as_a_list(tmp_path, make):
 
 
 def test_the_same_seed_and_actions_give_the_same_bits_in_another_env():
-    one, other = BridgeEnv(), BridgeEnv()
+    one = BridgeEnv()
+    other = BridgeEnv()
     actions = random_actions(one, 30)
     assert_same(drive(one, 7, actions), drive(other, 7, actions))
 
@@ -106,7 +107,8 @@ def test_resets_without_a_seed_follow_from_the_last_seed():
         env.reset(seed=5)
         return [env.reset()[1]["episode_seed"] for _ in range(5)]
 
-    one, other = starts(BridgeEnv()), starts(BridgeEnv())
+    one = starts(BridgeEnv())
+    other = starts(BridgeEnv())
     assert one == other
     assert len(set(one)) == 5
 
@@ -114,7 +116,8 @@ def test_resets_without_a_seed_follow_from_the_last_seed():
 def test_two_envs_in_one_process_do_not_disturb_each_other():
     actions = random_actions(BridgeEnv(), 20)
     alone = drive(BridgeEnv(), 1, actions)
-    one, other = BridgeEnv(), BridgeEnv(model=direct_model(), world=field())
+    one = BridgeEnv()
+    other = BridgeEnv(model=direct_model(), world=field())
     observation, info = one.reset(seed=1)
     together = [(observation, 0.0, False, info["pose"])]
     other.reset(seed=2)
@@ -135,7 +138,8 @@ def test_start_and_goal_can_be_given(env):
 
 def test_driving_to_the_goal_ends_in_success(env):
     env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (1.05, 0.0)})
-    total, approach = 0.0, 0.0
+    total = 0.0
+    approach = 0.0
     for _ in range(20):
         _, reward, terminated, truncated, info = env.step(
             np.array([0.5, 0.0, 0.0], np.float32)
@@ -195,7 +199,8 @@ def test_infos_of_earlier_steps_do_not_change(env):
     _, first = env.reset(seed=0)
     kept = {name: np.array(first[name]) for name in ("goal", "pose", "start")}
     observation, *_, second = env.step(np.ones(3, np.float32))
-    seen, pose = observation.copy(), second["true_pose"].copy()
+    seen = observation.copy()
+    pose = second["true_pose"].copy()
     env.step(np.ones(3, np.float32))
     env.reset(seed=1)
     assert all(np.array_equal(first[name], array) for name, array in kept.items())
@@ -208,7 +213,8 @@ class Recorder:
 
     def __init__(self):
         self.inner = SimBackend(direct_model(), field())
-        self.commands, self.closed = [], 0
+        self.commands = []
+        self.closed = 0
 
     def reset(self, start):
         return self.inner.reset(start)
@@ -262,7 +268,9 @@ def test_facts_of_a_backend_of_ones_own_are_those_of_its_last_step_unless_it_has
 
 
 def test_a_randomised_backend_gives_the_same_episode_as_an_backendas_by_its_name():
-    model, world, strong = direct_model(), field(count=4), "strong"
+    model = direct_model()
+    world = field(count=4)
+    strong = "strong"
     backend = SimBackend(model, world, randomisation=strong)
     given = (
         BridgeEnv("sim", model, world, randomisation=strong),
@@ -435,7 +443,8 @@ def test_many_worlds_begin_at_a_start_where_an_obstacle_stands_in_some_of_them()
     model = replace(
         direct_model(), table=bake(lidar(), (*world.shapes, Circle(radius=FOOTPRINT)))
     )
-    single, taken = BridgeEnv(model=model, world=world), []
+    single = BridgeEnv(model=model, world=world)
+    taken = []
     for seed in range(16):
         with contextlib.suppress(ConfigError):
             single.reset(seed=seed, options={"start": (0.0, 0.0, 0.0)})

@@ -23,7 +23,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.evaluation import drive
 
-MODEL, FIELD = direct_model(), field()
+MODEL = direct_model()
+FIELD = field()
 AHEAD = np.array([1.0, 0.5, -0.5], np.float32)
 ERRORS = (
     ValueError,
@@ -49,7 +50,10 @@ class Fault:
     """Raises an error at one of the calls that pass through it."""
 
     def __init__(self, when=-1, error=ValueError):
-        self.when, self.error, self.calls, self.names = when, error, 0, set()
+        self.when = when
+        self.error = error
+        self.calls = 0
+        self.names = set()
 
     def at(self, name):
         self.names.add(name)
@@ -83,7 +87,9 @@ class Robot:
 
     def __init__(self, robots=1):
         self.lead = () if robots == 1 else (robots,)
-        self.last, self.driven, self.pose = np.zeros((*self.lead, 3)), 0, None
+        self.last = np.zeros((*self.lead, 3))
+        self.driven = 0
+        self.pose = None
 
     def view(self):
         ranges = np.full((*self.lead, MODEL.lidar.beams), np.inf, np.float32)
@@ -142,12 +148,14 @@ def single(robot, whole, mode):
 
 
 def team(robot, whole, mode):
-    task, options = throwing(CooperativeReaching, whole), {"robots": 2}
+    task = throwing(CooperativeReaching, whole)
+    options = {"robots": 2}
     return BridgeEnv(robot, MODEL, FIELD, task, options, render_mode=mode)
 
 
 def parallel(robot, whole, mode):
-    task, options = throwing(CooperativeReaching, whole), {"robots": 2}
+    task = throwing(CooperativeReaching, whole)
+    options = {"robots": 2}
     agents = BridgeParallelEnv(MODEL, FIELD, task, options, render_mode=mode)
     agents.env._backend = robot
     return agents
@@ -327,7 +335,8 @@ class Stubborn:
     """Told to stop, it is asked for a moment whether Ctrl-C comes through."""
 
     def __init__(self, press):
-        self.press, self.halted = press, 0
+        self.press = press
+        self.halted = 0
 
     def halt(self):
         self.press()
@@ -349,7 +358,8 @@ def test_ctrl_c_does_not_cut_short_what_stops_the_robot_and_is_answered_afterwar
 
 
 def test_an_error_in_a_thread_stops_the_robot_too():
-    robot, caught = Stubborn(lambda: None), []
+    robot = Stubborn(lambda: None)
+    caught = []
 
     def run():
         try:

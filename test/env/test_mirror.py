@@ -56,7 +56,8 @@ def test_mirrored_actions_in_a_mirrored_world_show_the_mirrored_observation(
         else:
             action = rng.uniform(-1.0, 1.0, 3).astype(np.float32)
             mirrored = np.float32(action[mirror.acted] * mirror.scale + mirror.offset)
-        seen, other = left.step(action)[0], right.step(mirrored)[0]
+        seen = left.step(action)[0]
+        other = right.step(mirrored)[0]
 
 
 def test_the_mirror_image_of_a_mirror_image_is_the_thing_itself():

@@ -134,7 +134,8 @@ def test_one_beam_that_errs_is_no_touch_and_what_is_as_wide_as_a_finger_is_one()
 
 
 def test_noise_of_two_centimetres_is_no_touch_five_centimetres_away():
-    rng, sensor = np.random.default_rng(0), lidar(beams=720)
+    rng = np.random.default_rng(0)
+    sensor = lidar(beams=720)
     task = Navigation(DIRECT, sensor)
     near = FOOTPRINT + 0.05
     scans = near + 0.02 * rng.standard_normal((200, 720))
@@ -146,7 +147,8 @@ def test_noise_of_two_centimetres_is_no_touch_five_centimetres_away():
 
 
 def reward(task, before, after, goal, ranges=None):
-    one, other = view(before), view(after, ranges=ranges)
+    one = view(before)
+    other = view(after, ranges=ranges)
     return task.reward(one, other, {"goal": np.array(goal)})
 
 
@@ -171,11 +173,13 @@ def test_the_goal_and_a_touch_are_paid_once_and_a_touch_at_the_goal_is_no_succes
 
 def test_a_batch_gives_what_its_robots_give_one_by_one(task):
     rng = np.random.default_rng(1)
-    pose, twist = rng.normal(size=(4, 3, 3)), rng.normal(size=(4, 3, 3))
+    pose = rng.normal(size=(4, 3, 3))
+    twist = rng.normal(size=(4, 3, 3))
     ranges = rng.uniform(0.0, 4.0, (4, 3, B)).astype(np.float32)
     goal = rng.normal(size=(4, 3, 2)) * 0.3
     batch = RobotView(pose, twist, ranges, 0.0, 0.0, 0.0)
-    observation, verdict = observe(task, batch, goal), judge(task, batch, goal)
+    observation = observe(task, batch, goal)
+    verdict = judge(task, batch, goal)
     terms = task.reward(batch, batch, {"goal": goal})
     assert observation.shape == (4, 3, B + 6)
     for n in range(4):

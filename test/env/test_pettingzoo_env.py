@@ -49,12 +49,14 @@ def test_pettingzoos_checkers_find_nothing_to_warn_of(task, options):
 
 @pytest.mark.parametrize("task", ["cooperative_reaching", "pursuit_evasion"])
 def test_its_rewards_sum_to_the_teams_and_its_rows_are_the_teams(task):
-    each, team = env(task), BridgeEnv(model=direct_model(), world=field(8.0), task=task)
+    each = env(task)
+    team = BridgeEnv(model=direct_model(), world=field(8.0), task=task)
     (seen, _), (rows, _) = each.reset(seed=5), team.reset(seed=5)
     assert np.array_equal(np.concatenate(list(seen.values())), rows)
     moves = sampled(each)
     while each.agents:
-        before, actions = list(each.agents), next(moves)
+        before = list(each.agents)
+        actions = next(moves)
         rest = np.zeros(3, np.float32)
         joint = np.concatenate(
             [actions.get(name, rest) for name in each.possible_agents]
@@ -76,7 +78,8 @@ def test_a_robot_that_touched_something_leaves_and_stands_still_as_an_obstacle()
     starts = [(3.0, 0.0, 0.0), (-3.0, 0.0, 0.0)]
     goals = [(0.0, 3.0), (0.0, -3.0)]
     parallel.reset(seed=0, options={"start": starts, "goal": goals})
-    ahead, rest = np.array([1.0, 0.0, 0.0], np.float32), np.zeros(3, np.float32)
+    ahead = np.array([1.0, 0.0, 0.0], np.float32)
+    rest = np.zeros(3, np.float32)
     while "robot_0" in parallel.agents:
         _, rewards, ended, _, infos = parallel.step({"robot_0": ahead, "robot_1": rest})
     assert ended == {"robot_0": True, "robot_1": False}

@@ -63,7 +63,8 @@ def test_every_robot_of_a_team_is_drawn():
 
 @pytest.mark.parametrize("method", ["reset", "step"])
 def test_render_mode_human_shows_each_reset_and_step_on_the_viewer(monkeypatch, method):
-    shown, closed = [], []
+    shown = []
+    closed = []
 
     class Viewer:
         def __init__(self, model, world, fps):

@@ -118,7 +118,8 @@ def test_an_action_of_no_numbers_is_refused_by_its_type(action):
 
 @pytest.mark.parametrize("kind", [np.float16, np.int8, np.uint64, np.bool_, list])
 def test_an_action_of_any_real_numbers_is_an_action(kind):
-    env, ones = single(), [1, 0, 1]
+    env = single()
+    ones = [1, 0, 1]
     env.reset(seed=0)
     told = env.step(ones if kind is list else np.array(ones, kind))
     env.reset(seed=0)

@@ -64,7 +64,8 @@ def test_a_task_from_a_file_passes_the_checker_and_steps_alike_alone_and_in_a_ve
 def test_the_own_tasks_terms_stand_in_info_and_sum_to_the_reward():
     env = gymnasium.make(TASK, model=direct_model(), world=field(), task=PATROL)
     env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (1.0, 0.0)})
-    arrivals, ahead = 0, np.array([0.5, 0.0, 0.0], np.float32)
+    arrivals = 0
+    ahead = np.array([0.5, 0.0, 0.0], np.float32)
     for _ in range(40):
         back = arrivals % 2 == 1
         _, reward, terminated, _, info = env.step(-ahead if back else ahead)
@@ -207,7 +208,8 @@ def test_a_robot_without_cmd_vel_gets_each_command_alone():
 
 def test_bearing_and_distance_agree_with_plane_geometry():
     rng = np.random.default_rng(0)
-    pose, points = rng.normal(size=(50, 3)) * 3.0, rng.normal(size=(50, 2)) * 3.0
+    pose = rng.normal(size=(50, 3)) * 3.0
+    points = rng.normal(size=(50, 2)) * 3.0
     offset = points - pose[:, :2]
     angle = np.arctan2(offset[:, 1], offset[:, 0]) - pose[:, 2]
     expected = np.stack([np.hypot(*offset.T), np.cos(angle), np.sin(angle)], axis=1)
@@ -222,7 +224,8 @@ def test_bearing_and_distance_agree_with_plane_geometry():
 )
 def test_a_task_sees_sectors_where_a_layout_is_given_and_judges_touches_by_beams(name):
     model = direct_model(sensor=lidar(beams=720))
-    own, sectors = make_task(name, model), make_task(name, model, {"scan": "around"})
+    own = make_task(name, model)
+    sectors = make_task(name, model, {"scan": "around"})
     width = own.observation_space.shape[0] - 720
     assert sectors.observation_space.shape == (72 + width,)
     ranges = np.full((5, 720), np.inf, np.float32)
@@ -371,10 +374,8 @@ def test_a_step_of_ones_own_in_one_pass_is_kept():
 @pytest.mark.parametrize("task", [Mixed, Own])
 def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
     arguments = {"model": direct_model(), "world": field(), "task": task}
-    alone, several = (
-        gymnasium.make(TASK, **arguments),
-        gymnasium.make_vec(TASK, 2, **arguments),
-    )
+    alone = gymnasium.make(TASK, **arguments)
+    several = gymnasium.make_vec(TASK, 2, **arguments)
     alone.reset(seed=0)
     several.reset(seed=0)
     ahead = np.ones((2, 3), np.float32)
@@ -386,10 +387,8 @@ def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
 
 def test_a_memory_that_update_binds_anew_counts_alone_and_in_a_vector():
     arguments = {"model": direct_model(), "world": field(), "task": Counting}
-    alone, several = (
-        gymnasium.make(TASK, **arguments),
-        gymnasium.make_vec(TASK, 3, **arguments),
-    )
+    alone = gymnasium.make(TASK, **arguments)
+    several = gymnasium.make_vec(TASK, 3, **arguments)
     alone.reset(seed=0)
     several.reset(seed=0)
     still_there = np.zeros((3, 3), np.float32)

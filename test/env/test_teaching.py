@@ -216,7 +216,8 @@ def test_levels_do_not_depend_on_the_number_of_threads():
             seen = env.step(np.tile(AHEAD, (120, 1)))[0]
         return seen, env.level, env._starts.copy()
 
-    one, three = driven(1), driven(3)
+    one = driven(1)
+    three = driven(3)
     assert 0.2 < one[1] == three[1]
     np.testing.assert_array_equal(one[0], three[0])
     np.testing.assert_array_equal(one[2], three[2])

@@ -42,7 +42,8 @@ GOALS = [(0.0, 0.0), (3.0, 0.0)]
 
 def test_the_team_is_paid_for_the_approach_of_whoever_is_nearest_to_a_goal(team):
     memory = begun(team, [(1.0, 0, 0), (5.0, 0, 0)], GOALS)
-    before, after = views([(1.0, 0, 0), (5.0, 0, 0)]), views([(0.8, 0, 0), (4.5, 0, 0)])
+    before = views([(1.0, 0, 0), (5.0, 0, 0)])
+    after = views([(0.8, 0, 0), (4.5, 0, 0)])
     outcome, _ = step(team, before, after, memory)
     # Goal 0 came 0.2 m nearer to robot 0; goal 1 0.5 m to robot 1, from 2 m to 1.5 m.
     assert outcome.terms["progress"] == pytest.approx(
@@ -53,7 +54,8 @@ def test_the_team_is_paid_for_the_approach_of_whoever_is_nearest_to_a_goal(team)
 
 
 def test_a_goal_is_reached_once_for_all_and_the_last_one_ends_it(team):
-    far, near = [(1.0, 0, 0), (5.0, 0, 0)], [(0.2, 0, 0), (5.0, 0, 0)]
+    far = [(1.0, 0, 0), (5.0, 0, 0)]
+    near = [(0.2, 0, 0), (5.0, 0, 0)]
     memory = begun(team, far, GOALS)
     first, _ = step(team, views(far), views(near), memory)
     assert first.terms["reached"].tolist() == [[5.0, 5.0]]
@@ -68,7 +70,8 @@ def test_a_goal_is_reached_once_for_all_and_the_last_one_ends_it(team):
 
 
 def test_a_reached_goal_pays_no_further_approach(team):
-    far, near = [(1.0, 0, 0), (5.0, 0, 0)], [(0.2, 0, 0), (5.0, 0, 0)]
+    far = [(1.0, 0, 0), (5.0, 0, 0)]
+    near = [(0.2, 0, 0), (5.0, 0, 0)]
     memory = begun(team, far, GOALS)
     step(team, views(far), views(near), memory)
     away, _ = step(team, views(near), views([(-1.0, 0, 0), (5.0, 0, 0)]), memory)
@@ -89,11 +92,9 @@ def test_what_a_robot_of_a_team_sees_is_laid_out_as_documented(team):
     memory["reached"][0, 1] = True
     seen = team.observation(views(poses), memory)[0]
     assert seen.shape == (2, B + 4 * 2 + 3 + 3)
-    goal_0, goal_1, mate = (
-        seen[0, B : B + 4],
-        seen[0, B + 4 : B + 8],
-        seen[0, B + 8 : B + 11],
-    )
+    goal_0 = seen[0, B : B + 4]
+    goal_1 = seen[0, B + 4 : B + 8]
+    mate = seen[0, B + 8 : B + 11]
     assert goal_0 == pytest.approx([1.0, 0.0, 1.0, 0.0], abs=1e-6)
     assert goal_1 == pytest.approx([2.0, 0.0, -1.0, 1.0], abs=1e-6)
     assert mate == pytest.approx([2.0, 1.0, 0.0], abs=1e-6)
@@ -105,7 +106,8 @@ def chase():
     return PursuitEvasion(DIRECT, lidar())
 
 
-PURSUERS, EVADER = [(0.0, 0, 0), (0.0, 3.0, 0)], (2.0, 0, 0)
+PURSUERS = [(0.0, 0, 0), (0.0, 3.0, 0)]
+EVADER = (2.0, 0, 0)
 
 
 def test_a_pursuer_is_paid_for_coming_nearer_and_the_evader_for_getting_away(chase):
@@ -199,8 +201,10 @@ def test_a_team_gets_an_action_for_each_robot():
 @pytest.mark.parametrize(("lead", "robots"), [((), 2), ((3,), 5), ((2, 2), 3)])
 def test_pairs_are_seen_as_each_would_be_alone(lead, robots):
     rng = np.random.default_rng(0)
-    pose, points = rng.normal(size=(*lead, robots, 3)), rng.normal(size=(*lead, 4, 2))
-    seen, away = bearing(*pairs(pose, points)), distance(*pairs(pose, points))
+    pose = rng.normal(size=(*lead, robots, 3))
+    points = rng.normal(size=(*lead, 4, 2))
+    seen = bearing(*pairs(pose, points))
+    away = distance(*pairs(pose, points))
     for m in range(robots):
         for p in range(4):
             alone = pose[..., m, :], points[..., p, :]

@@ -80,7 +80,8 @@ def assert_alike(ours, theirs, path="info"):
     """Both infos hold the same entries, arrays and types."""
     assert ours.keys() == theirs.keys(), path
     for name, value in theirs.items():
-        mine, here = ours[name], f"{path}[{name!r}]"
+        mine = ours[name]
+        here = f"{path}[{name!r}]"
         if isinstance(value, dict):
             assert_alike(mine, value, here)
         elif value.dtype == object:
@@ -108,7 +109,8 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
     assert_alike(facts, known)
     ended = 0
     for action in actions_of(ours, 120):
-        one, another = ours.step(action), theirs.step(action)
+        one = ours.step(action)
+        another = theirs.step(action)
         for a, b in zip(one[:4], another[:4], strict=True):
             assert a.dtype == b.dtype
             assert np.array_equal(a, b)
@@ -201,7 +203,8 @@ def test_returned_arrays_are_the_callers_own_unless_it_wants_none():
     for copy in (True, False):
         env = vector(2, copy=copy)
         observation, info = env.reset(seed=0)
-        kept, poses = observation.copy(), info["pose"].copy()
+        kept = observation.copy()
+        poses = info["pose"].copy()
         for action in actions_of(env, 5):
             env.step(action)
         assert np.array_equal(observation, kept) == copy
@@ -209,7 +212,8 @@ def test_returned_arrays_are_the_callers_own_unless_it_wants_none():
 
 
 def test_a_mask_resets_some_worlds_only():
-    env, other = vector(3), vector(3)
+    env = vector(3)
+    other = vector(3)
     (observation, _), _ = env.reset(seed=0), other.reset(seed=0)
     moves = actions_of(env, 3)
     for action in moves:

@@ -25,7 +25,8 @@ from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.spec import load_robot
 
 LIDAR = load_lidar("paper")
-TICK_S, PERIOD_S = 0.02, 0.1
+TICK_S = 0.02
+PERIOD_S = 0.1
 START_STAMP = 1_700_000_000 * NS_PER_S
 
 
@@ -60,12 +61,17 @@ class Rig:
     def __init__(self, given: GateConfig | None = None) -> None:
         self.config = given or config()
         self.state = begin(self.config)
-        self.now, self.ticks, self.stamp = 100.0, 0, START_STAMP
-        self.pose, self.speed = np.zeros(3), 0.0
+        self.now = 100.0
+        self.ticks = 0
+        self.stamp = START_STAMP
+        self.pose = np.zeros(3)
+        self.speed = 0.0
         self.covariance = np.diag([1e-4, 1e-4, 1e-4])  # of the estimate
-        self.wish, self.frozen = np.array([0.5, 0.0, 0.1]), False
+        self.wish = np.array([0.5, 0.0, 0.1])
+        self.frozen = False
         self.ranges = np.linspace(1.0, 2.0, LIDAR.beams, dtype=np.float32)
-        self.decision, self.published = None, []
+        self.decision = None
+        self.published = []
 
     def give(self, event, now=None):
         """One input, and the decision about it."""

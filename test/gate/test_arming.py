@@ -119,7 +119,8 @@ def test_an_estimate_that_moves_while_odometry_stands_is_named():
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_an_estimate_that_is_no_number_is_refused(bad):
     rig = settled(without="estimate")
-    zeros, nothing = np.zeros(3), np.zeros((3, 3))
+    zeros = np.zeros(3)
+    nothing = np.zeros((3, 3))
     assert rig.give(Estimate(np.full(3, bad), zeros, nothing)).refused
     assert rig.give(Estimate(zeros, np.full(3, bad), nothing)).refused
     assert rig.give(Estimate(zeros, zeros, np.full((3, 3), bad))).refused

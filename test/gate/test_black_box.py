@@ -115,7 +115,8 @@ def test_another_decision_than_the_recorded_one_is_found(tmp_path):
 def test_every_flipped_bit_is_refused(tmp_path):
     path = tmp_path / "stop.jsonl"
     stopped(path)
-    data, rng = path.read_bytes(), np.random.default_rng(0)
+    data = path.read_bytes()
+    rng = np.random.default_rng(0)
     for _ in range(40):
         damaged = bytearray(data)
         damaged[rng.integers(len(data))] ^= 1 << rng.integers(8)

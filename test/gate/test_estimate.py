@@ -22,7 +22,8 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Kind, Measurement
 
-PERIOD_S, REARMED_S = 0.1, 300.0
+PERIOD_S = 0.1
+REARMED_S = 300.0
 
 
 def stops(rig, seconds=0.3):
@@ -144,7 +145,8 @@ class DeadReckoning:
     def __init__(self):
         self.gate = Rig(config("differential", estimate_position=0.2))
         self.estimator = Estimator(builtin_model("differential"))
-        self.steps, self.pose = 0, np.zeros(3)
+        self.steps = 0
+        self.pose = np.zeros(3)
         self.std = np.zeros(2)
 
     def step(self, twist):

@@ -16,7 +16,8 @@ BEND = np.abs(LIDAR.angles)
 
 def room(x, size=(2.5, 1.5)):
     """Ranges of the paper's lidar in a rectangular room, seen from `x` on its middle line."""
-    cos, sin = np.cos(LIDAR.angles), np.sin(LIDAR.angles)
+    cos = np.cos(LIDAR.angles)
+    sin = np.sin(LIDAR.angles)
     with np.errstate(divide="ignore"):
         along = np.where(cos > 0, size[0] - x, size[0] + x) / np.abs(cos)
         across = size[1] / np.abs(sin)
@@ -28,7 +29,8 @@ class Looking(Rig):
 
     def __init__(self, given=None):
         super().__init__(given)
-        self.broken, self.shown = None, []
+        self.broken = None
+        self.shown = []
 
     def scan(self, **changes):
         true = room(float(self.pose[0]) - 1.5)
@@ -127,7 +129,8 @@ class Turning(Rig):
 
     def __init__(self):
         super().__init__(config("differential"))
-        self.ranges, self.frozen = np.full(LIDAR.beams, 1.0, np.float32), True
+        self.ranges = np.full(LIDAR.beams, 1.0, np.float32)
+        self.frozen = True
         self.wish = np.array([0.0, 0.0, 1.0])
 
     def odom(self, **changes):
@@ -161,8 +164,10 @@ def test_no_drive_in_the_simulator_looks_frozen(world, quantum):
     sim, given = FastSimulator(model, load_world(world)), config("differential")
     sim.reset([3])
     rig = Rig(given)
-    rng, command = np.random.default_rng(0), np.zeros((1, 1, 2))
-    rig.frozen, known = True, 0
+    rng = np.random.default_rng(0)
+    command = np.zeros((1, 1, 2))
+    rig.frozen = True
+    known = 0
 
     def sense():
         nonlocal known
@@ -223,7 +228,8 @@ def test_a_robot_that_follows_late_is_not_taken_for_stuck(lag_s):
     rig.wish = np.array([0.5, 0.0, 0.0])
     rig.run(1.5)
     assert rig.arm().granted
-    late, rng = [0.0] * round(lag_s / TICK_S), np.random.default_rng(0)
+    late = [0.0] * round(lag_s / TICK_S)
+    rng = np.random.default_rng(0)
     for k in range(800):
         if k % 40 == 0:
             rig.wish = np.array([rng.choice([-0.5, 0.0, 0.2, 0.5]), 0.0, 0.0])

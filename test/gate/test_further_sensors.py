@@ -16,8 +16,10 @@ class Backed(Rig):
 
     def __init__(self, wish=(-0.3, 0.0, 0.0), behind=10.0):
         super().__init__(config(shield=CAR, frozen_distance=1e9, sensors=("rear",)))
-        self.ranges, self.frozen = FAR.copy(), True
-        self.wish, self.behind = np.array(wish), behind
+        self.ranges = FAR.copy()
+        self.frozen = True
+        self.wish = np.array(wish)
+        self.behind = behind
 
     def send(self, without: str = ""):
         super().send(without)
@@ -43,7 +45,8 @@ def test_its_silence_stops_the_robot():
 
 
 def test_what_it_shows_behind_keeps_the_robot_from_backing_into_it():
-    free, blocked = Backed(wish=(0.5, 0.0, 0.0)), Backed(wish=(0.5, 0.0, 0.0))
+    free = Backed(wish=(0.5, 0.0, 0.0))
+    blocked = Backed(wish=(0.5, 0.0, 0.0))
     blocked.behind = -0.6  # ahead, where the lidar sees nothing
     for rig in (free, blocked):
         rig.run(1.5)

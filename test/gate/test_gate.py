@@ -110,7 +110,8 @@ def test_before_the_first_command_nothing_moves():
 
 def test_a_republisher_does_not_hide_a_policy_that_hangs():
     rig = driving()
-    stamp, began = rig.stamp, rig.now
+    stamp = rig.stamp
+    began = rig.now
     while rig.moves:
         rig.now += TICK_S
         rig.stamp += 20_000_000
@@ -194,7 +195,9 @@ def test_refused_commands_feed_no_watchdog():
 )
 def test_a_scan_that_is_none_of_this_lidar_is_refused_and_feeds_no_watchdog(changes):
     rig = driving()
-    rig.now, rig.stamp, before = rig.now + TICK_S, rig.stamp + 1, rig.state.scans
+    rig.now = rig.now + TICK_S
+    rig.stamp = rig.stamp + 1
+    before = rig.state.scans
     assert rig.scan(**changes).refused
     assert rig.state.scans == before
 
@@ -209,7 +212,9 @@ def test_a_scan_that_is_none_of_this_lidar_is_refused_and_feeds_no_watchdog(chan
 )
 def test_odometry_that_is_no_number_is_refused_and_feeds_no_watchdog(changes):
     rig = driving()
-    rig.now, rig.stamp, before = rig.now + TICK_S, rig.stamp + 1, rig.state.odometries
+    rig.now = rig.now + TICK_S
+    rig.stamp = rig.stamp + 1
+    before = rig.state.odometries
     assert rig.odom(**changes).refused
     assert rig.state.odometries == before
 
@@ -229,7 +234,8 @@ def test_stamps_that_jump_latch_a_stop(jump_s, topic):
 @pytest.mark.parametrize("topic", ["scan", "odom"])
 def test_stamps_that_freeze_are_no_new_data(topic):
     rig = driving()
-    frozen, before = rig.stamp, len(rig.published)
+    frozen = rig.stamp
+    before = len(rig.published)
     for _ in range(30):
         rig.run(TICK_S, without=topic)
         getattr(rig, topic)(stamp_ns=frozen)
@@ -369,7 +375,8 @@ def test_identical_scans_while_the_robot_moves_latch_a_stop():
 
 def test_identical_scans_of_a_robot_that_stands_still_are_fine():
     rig = Rig()
-    rig.wish, rig.frozen = np.zeros(3), True
+    rig.wish = np.zeros(3)
+    rig.frozen = True
     rig.run(2.0)
     assert rig.arm().granted
     rig.run(3.0)
@@ -431,7 +438,8 @@ def test_whatever_comes_in_what_goes_out_is_finite_within_limits_and_zero_when_s
     odd = np.array([np.nan, np.inf, -np.inf, 1e308, 5e-324, 0.0, -1.0, 0.3])
     for _ in range(4):
         rig = driving()
-        low, high = rig.config.limits.low, rig.config.limits.high
+        low = rig.config.limits.low
+        high = rig.config.limits.high
         for _ in range(150):
             rig.run(TICK_S, without=str(rng.choice(["", "scan", "odom", "command"])))
             stamp = int(rng.choice([rig.stamp, 0, -1, rig.stamp + 10**12]))

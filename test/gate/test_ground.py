@@ -22,12 +22,16 @@ SHIELD = ShieldConfig(
 )
 ANGLES = np.deg2rad(np.linspace(-135.0, 135.0, 541))
 BLIND = config(shield=SHIELD, beam_angles=ANGLES, mount=(0.12, 0.0, 0.0))
-BODY, PERIOD_S, REACT_S = body_of(SHIELD), 0.1, 0.2
-SEEDS, FAR = 8, np.zeros((0, 4))
+BODY = body_of(SHIELD)
+PERIOD_S = 0.1
+REACT_S = 0.2
+SEEDS = 8
+FAR = np.zeros((0, 4))
 BOX = np.array(
     [[-2, -2, 2, -2], [2, -2, 2, 2], [2, 2, -2, 2], [-2, 2, -2, -2]], dtype=float
 )
-BACK, TURN = (-0.3, 0.0, 0.0), (0.0, 0.0, 0.6)
+BACK = (-0.3, 0.0, 0.0)
+TURN = (0.0, 0.0, 0.6)
 
 
 def scan(pose, walls):
@@ -36,7 +40,8 @@ def scan(pose, walls):
     along = np.stack([np.cos(ANGLES + heading), np.sin(ANGLES + heading)], axis=1)[
         :, None
     ]
-    start, edge = walls[:, :2] - (x, y), walls[:, 2:] - walls[:, :2]
+    start = walls[:, :2] - (x, y)
+    edge = walls[:, 2:] - walls[:, :2]
     turned = along[..., 0] * edge[:, 1] - along[..., 1] * edge[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         away = (start[:, 0] * edge[:, 1] - start[:, 1] * edge[:, 0]) / turned
@@ -49,7 +54,10 @@ class Robot:
     """A robot that does at once what it is told, and a shield that looks every period."""
 
     def __init__(self, walls=FAR, given=BLIND):
-        self.walls, self.given, self.pose, self.time = walls, given, np.zeros(3), 0.0
+        self.walls = walls
+        self.given = given
+        self.pose = np.zeros(3)
+        self.time = 0.0
         self.known = None
         self.looks()
 
@@ -106,7 +114,8 @@ def test_at_the_start_the_ground_behind_is_free_as_far_as_all_that_it_sees(
 
 
 def test_it_backs_up_as_far_as_it_came():
-    robot, back = Robot(), 0.0
+    robot = Robot()
+    back = 0.0
     robot.moves((0.3, 0.0, 0.0), 3.0)
     while robot.may(BACK) and back < 2.0:
         robot.moves(BACK)
@@ -198,7 +207,9 @@ def drive(seed, remembers):
     walls = np.concatenate(
         [BOX, np.hstack([ends, ends + rng.uniform(-0.3, 0.3, ends.shape)])]
     )
-    lines, robot, way = shapely.linestrings(walls.reshape(-1, 2, 2)), Robot(walls), 0.0
+    lines = shapely.linestrings(walls.reshape(-1, 2, 2))
+    robot = Robot(walls)
+    way = 0.0
     for _ in range(25):
         twist = np.array([rng.choice([-0.5, -0.3, 0.4]), 0.0, rng.uniform(-1.0, 1.0)])
         twist[0] *= rng.random() > 0.3
@@ -256,5 +267,6 @@ class HalfBlind(Rig):
         self.ranges = np.linspace(1.0, 2.0, len(given.beam_angles), dtype=np.float32)
 
     def scan(self, **changes):
-        first, step = self.config.beam_angles[0], LIDAR.angle_increment
+        first = self.config.beam_angles[0]
+        step = LIDAR.angle_increment
         return super().scan(angles=(first, step), **changes)

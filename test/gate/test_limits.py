@@ -69,7 +69,8 @@ def test_a_command_within_the_limits_stays_as_it_is(robot):
 def test_no_wish_at_any_interval_exceeds_speed_rate_or_jerk(robot, steps):
     limits = LIMITS[robot]
     size = len(limits.low)
-    value, slope = np.zeros(size), np.zeros(size)
+    value = np.zeros(size)
+    slope = np.zeros(size)
     last_change = np.zeros(size)
     for *wish, dt in steps:
         before = value
@@ -99,7 +100,8 @@ def test_a_wish_that_lasts_is_reached_exactly_and_never_overshot(robot):
 
 
 def test_a_robot_that_speeds_up_is_on_its_curve_from_the_start():
-    limits, wish = LIMITS["differential"], np.array([0.8, 0.8])
+    limits = LIMITS["differential"]
+    wish = np.array([0.8, 0.8])
     value = slope = np.zeros(2)
     for _ in range(30):
         value, slope = follow(value, slope, wish, 0.02, limits)
@@ -116,7 +118,8 @@ def test_the_gate_speeds_up_within_rate_and_jerk_and_cuts_what_is_too_fast():
     rig.run(0.5)
     assert rig.decision.twist.tolist() == [1.0, 0.0, 0.5]
     moving = np.array([(time, *twist) for time, twist in rig.published])
-    dt, change = np.diff(moving[:, 0]), np.diff(moving[:, [1, 3]], axis=0)
+    dt = np.diff(moving[:, 0])
+    change = np.diff(moving[:, [1, 3]], axis=0)
     assert (
         np.abs(change) <= np.array([2.0, 4.0]) * dt[:, None] * (1 + TOLERANCE)
     ).all()
@@ -253,7 +256,8 @@ def absurd_limits(draw):
 def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_within(
     limits, steps
 ):
-    value, slope = np.zeros(2), np.zeros(2)
+    value = np.zeros(2)
+    slope = np.zeros(2)
     with np.errstate(all="ignore"):
         for *wish, dt in steps:
             value, slope = follow(

@@ -37,9 +37,12 @@ NOWHERE = np.zeros((0, 4))
 def seen_from(pose, angles, walls):
     """Ranges (B,) to the nearest of walls (W, 4) from a pose (3,)."""
     bearings = angles + pose[2]
-    ux, uy = np.cos(bearings)[:, None], np.sin(bearings)[:, None]
-    ax, ay = walls[:, 0] - pose[0], walls[:, 1] - pose[1]
-    ex, ey = walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]
+    ux = np.cos(bearings)[:, None]
+    uy = np.sin(bearings)[:, None]
+    ax = walls[:, 0] - pose[0]
+    ay = walls[:, 1] - pose[1]
+    ex = walls[:, 2] - walls[:, 0]
+    ey = walls[:, 3] - walls[:, 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         across = ux * ey - uy * ex
         along = (ax * ey - ay * ex) / across
@@ -71,10 +74,13 @@ class Scene(Rig):
             **changes,
         )
         super().__init__(given)
-        self.period_s, self.walls = period_s, walls
+        self.period_s = period_s
+        self.walls = walls
         self.wish = np.array(twist)
         self.body = np.zeros(3)
-        self.held, self.people, self.scale = False, None, np.ones(3)
+        self.held = False
+        self.people = None
+        self.scale = np.ones(3)
         self.rng = np.random.default_rng(3)
 
     def run(self, seconds, without=""):
@@ -100,7 +106,8 @@ class Scene(Rig):
         return super().odom(twist=self.twist.copy(), **changes)
 
     def scan(self, **changes):
-        lidar, walls = self.lidar, self.walls
+        lidar = self.lidar
+        walls = self.walls
         if self.people is not None:
             walls = np.concatenate([walls, self.people(self)])
         ranges = seen_from(self.body, lidar.angles, walls)
@@ -118,7 +125,8 @@ class Scene(Rig):
 
     def stops_after(self, limit_s):
         """Holds the body, and returns how long the gate lets the wheels spin [s]."""
-        self.held, began = True, self.now
+        self.held = True
+        began = self.now
         while self.moves:
             assert self.now - began < limit_s, f"still moves after {limit_s} s"
             self.run(TICK_S)
@@ -262,10 +270,8 @@ def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_
 
     def scan_of_before(**changes):
         past.append(scene.body.copy())
-        now, scene.body = (
-            scene.body,
-            past[max(0, len(past) - 1 - round(late_s / PERIOD_S))],
-        )
+        now = scene.body
+        scene.body = past[max(0, len(past) - 1 - round(late_s / PERIOD_S))]
         decision = scan(**changes)
         scene.body = now
         return decision

@@ -54,7 +54,8 @@ class Faced(Rig):
 
     def __init__(self, seen, shield=CAR, wish=(1.0, 0.0, 0.0), robot="ackermann"):
         super().__init__(config(robot, shield=shield, frozen_distance=1e9))
-        self.ranges, self.frozen = seen, True
+        self.ranges = seen
+        self.frozen = True
         self.wish = np.array(wish)
 
     def settles(self, seconds=1.5):
@@ -208,10 +209,13 @@ def disc(room):
 
 def test_the_sweep_agrees_with_geometry():
     rng = np.random.default_rng(0)
-    room, step, unclear = 0.2, 0.005, 0
+    room = 0.2
+    step = 0.005
+    unclear = 0
     for _ in range(200):
         twist = np.array([rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-2, 2)])
-        blind, point = rng.uniform(0.1, 0.8), rng.uniform(-1.2, 1.2, 2)
+        blind = rng.uniform(0.1, 0.8)
+        point = rng.uniform(-1.2, 1.2, 2)
         duration = blind + np.hypot(*twist[:2]) / (2.0 * BRAKE)
         path = LineString(
             [place(twist, t)[:2] for t in np.linspace(0.0, duration, 400)]
@@ -269,7 +273,8 @@ def test_a_command_of_before_that_the_scan_does_not_show_yet_is_reckoned_with():
     while rig.now - rig.state.scans.times[-1] < 0.09:
         rig.run(0.02, without="scan")
     straight = rig.decision.twist[0]
-    told, before = np.array([0.6, 0.5]), rig.state
+    told = np.array([0.6, 0.5])
+    before = rig.state
     for ago, cut in ((0.33, True), (0.6, False)):  # that of 0.6 s ago the scan shows
         later = (one for one in before.recent if one[0] > rig.now - ago)
         recent = ((rig.now - ago, told), *later)
@@ -300,7 +305,8 @@ def test_what_was_told_before_a_pause_of_the_gate_counts_as_long_as_it_was_in_fo
     )
     rig.wish = np.array([0.6, 0.0, 0.0])
     rig.settles()
-    straight, before = rig.decision.twist[0], rig.state
+    straight = rig.decision.twist[0]
+    before = rig.state
     since = rig.now - before.scans.times[-1] + 0.3
     kept = tuple(one for one in before.recent if one[0] > rig.now - since + 0.05)
     recent = ((rig.now - since - 0.05, np.array([0.6, 0.5])), *kept)
@@ -322,7 +328,8 @@ def seen(pose, discs=(), noise=0.0, rng=None):
         wall = (WALL_Y - pose[1]) / np.sin(angles)
     out = np.where((wall > 0.0) & (wall < LIDAR.range_max), wall, np.inf)
     for x, y, radius in discs:
-        dx, dy = x - pose[0], y - pose[1]
+        dx = x - pose[0]
+        dy = y - pose[1]
         along = dx * np.cos(angles) + dy * np.sin(angles)
         beside2 = dx**2 + dy**2 - along**2
         hit = (along > 0.0) & (beside2 < radius**2)
@@ -359,7 +366,8 @@ def test_what_stands_does_not_move_however_the_robot_does(twist):
 @pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (0.5, 0.0, 1.0)])
 def test_somebody_who_comes_on_moves(speed, twist):
     views = drive(twist, lambda t: [(2.0 - speed * t, 0.3, 0.2)])
-    found, pose = movers(GIVEN, SHIELD, views), views[-1].pose
+    found = movers(GIVEN, SHIELD, views)
+    pose = views[-1].pose
     where = geometry.between(pose, np.array([2.0 - speed * 0.3, 0.3, 0.0]))
     assert found[facing(views, np.arctan2(where[1], where[0]))].all()
     assert found.sum() < 60
@@ -419,7 +427,8 @@ def test_where_all_is_taken_to_stand_nothing_moves():
 
 
 def test_the_views_of_the_last_moments_are_kept_apart_from_each_other():
-    state, step = begin(GIVEN), NS_PER_S // 40
+    state = begin(GIVEN)
+    step = NS_PER_S // 40
     for index in range(40):
         state = replace(
             state, odometry=Odometry(index * step, np.zeros(3), np.zeros(3))

@@ -13,7 +13,9 @@ from nics_drl_bridge.gate.shield import body_of
 from nics_drl_bridge.gate.shield_kernels import clearance, free, grid
 from nics_drl_bridge.gate.state import ShieldConfig
 
-BRAKE, STEP, MARGIN = 1.5, 0.005, 0.05
+BRAKE = 1.5
+STEP = 0.005
+MARGIN = 0.05
 LONG = ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2))
 FORK = ((0.4, 0.2), (0.1, 0.15), (0.1, -0.15), (0.4, -0.2), (-0.2, -0.2), (-0.2, 0.2))
 
@@ -35,7 +37,8 @@ def signed(outline, points):
     """Distances of points (T, 2) from an outline, negative inside; of a circle without corners."""
     if not outline:
         return np.hypot(*points.T) - 0.2
-    shape, made = shapely.Polygon(outline), shapely.points(points)
+    shape = shapely.Polygon(outline)
+    made = shapely.points(points)
     away = shapely.distance(shape.exterior, made)
     return np.where(shapely.contains(shape, made), -away, away)
 
@@ -57,17 +60,16 @@ def nearest(outline, point, twist, blind):
 @pytest.mark.parametrize("make", [star, lambda _: LONG, lambda _: FORK, lambda _: ()])
 @pytest.mark.parametrize("speed", [0.0, 0.3])
 def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
-    rng, told = np.random.default_rng(3), []
+    rng = np.random.default_rng(3)
+    told = []
     for _ in range(200):
         outline = make(rng)
         twist = rng.uniform(-1.0, 1.0, 3) * rng.choice(
             [(1, 0, 2), (1, 1, 2), (0, 0, 2), (1, 0, 0)]
         )
         twist[:2] += 0.0 if outline else 0.05  # a turn alone does not move a circle
-        blind, point = (
-            rng.uniform(0.1, 0.6),
-            np.array([*rng.uniform(-0.7, 0.7, 2), speed]),
-        )
+        blind = rng.uniform(0.1, 0.6)
+        point = np.array([*rng.uniform(-0.7, 0.7, 2), speed])
         least, now = nearest(outline, point, twist, blind)
         leaves = now < MARGIN and least > -1e-12
         if abs(least) < STEP and not leaves:
@@ -81,7 +83,8 @@ def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
 def test_the_distance_from_an_outline_is_that_of_geometry():
     rng = np.random.default_rng(0)
     for _ in range(50):
-        outline, points = star(rng), rng.uniform(-0.6, 0.6, (20, 2))
+        outline = star(rng)
+        points = rng.uniform(-0.6, 0.6, (20, 2))
         found = [clearance(x, y, body(outline)) for x, y in points]
         assert found == pytest.approx(signed(outline, points), abs=1e-12)
 
@@ -146,16 +149,15 @@ def test_what_noise_puts_inside_the_outline_must_not_get_deeper(speed, may):
 
 
 def test_a_speed_next_to_nothing_is_swept():
-    twist, ahead = (
-        np.array([[1e-300, 0.0, 0.0]]),
-        np.array([[0.29, 0.0, 0.0], [9.0, 0.0, 1e-9]]),
-    )
+    twist = np.array([[1e-300, 0.0, 0.0]])
+    ahead = np.array([[0.29, 0.0, 0.0], [9.0, 0.0, 1e-9]])
     assert free(ahead, twist, body(LONG), 0.5, BRAKE, STEP)
     assert free(ahead, 0.0 * twist, body(LONG), 0.5, BRAKE, STEP)
 
 
 def test_a_grid_of_twists_has_both_ends_and_what_lies_evenly_between():
-    low, high = np.array([-0.1, 0.0, -0.7]), np.array([0.5, 0.0, 0.3])
+    low = np.array([-0.1, 0.0, -0.7])
+    high = np.array([0.5, 0.0, 0.3])
     axes = [np.linspace(*ends) for ends in zip(low, high, (3, 1, 9), strict=True)]
     expected = {(x, y, turn) for x in axes[0] for y in axes[1] for turn in axes[2]}
     assert set(map(tuple, grid(low, high, np.array([3, 1, 9])))) == expected

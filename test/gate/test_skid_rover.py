@@ -161,8 +161,10 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
         if not all(free(point, twist, *stop, STEP) for stop in stops):
             continue
         count += 1
-        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        dx, dy = x - poses[:, 0], y - poses[:, 1]
+        c = np.cos(poses[:, 2])
+        s = np.sin(poses[:, 2])
+        dx = x - poses[:, 0]
+        dy = y - poses[:, 1]
         seen = zip(c * dx + s * dy, c * dy - s * dx, strict=True)
         assert min(clearance(*each, body) for each in seen) > 0.5 * shield.margin
     assert count > 100

@@ -15,7 +15,8 @@ def test_a_changed_record_is_what_the_standard_library_makes_of_it():
         "latched": Cause("rule", "topic", "detail"),
         "armed": False,
     }
-    mine, theirs = replace(state, **changes), dataclasses.replace(state, **changes)
+    mine = replace(state, **changes)
+    theirs = dataclasses.replace(state, **changes)
     assert type(mine) is type(theirs)
     assert list(vars(mine)) == [field.name for field in dataclasses.fields(state)]
     assert all(vars(mine)[name] is vars(theirs)[name] for name in vars(theirs))

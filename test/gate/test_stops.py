@@ -16,7 +16,8 @@ class Stamped(Rig):
         delay_s: by which data come late.
     """
 
-    pace, delay_s = 1.0, 0.0
+    pace = 1.0
+    delay_s = 0.0
 
     def send(self, without=""):
         self.stamp += round((self.pace - 1.0) * PERIOD_S * NS_PER_S)
@@ -45,7 +46,8 @@ def test_stamps_that_run_ahead_of_time_latch_a_stop(step_s):
 
 @pytest.mark.parametrize("topic", ["scan", "odom"])
 def test_stamps_of_one_topic_that_run_ahead_are_named(topic):
-    rig, lead = driving(), [0.0]
+    rig = driving()
+    lead = [0.0]
     send = getattr(rig, topic)
 
     def ahead():
@@ -62,7 +64,8 @@ def test_stamps_of_one_topic_that_run_ahead_are_named(topic):
 )
 def test_data_whose_stamps_fall_behind_get_older_and_stop_the_robot_for_good(pace):
     rig = driven(pace)
-    began, known = rig.now, len(rig.published)
+    began = rig.now
+    known = len(rig.published)
     rig.run(0.4 / (1.0 - pace) + 1.0)
     last = max(time for time, twist in rig.published[known:] if twist.any())
     assert (1.0 - pace - 1e-3) * (last - began) <= 0.36
@@ -93,7 +96,8 @@ def test_a_delay_that_comes_and_stays_is_not_taken_for_the_new_normal():
 
 
 def test_jitter_does_not_stop_the_robot():
-    rng, rig = np.random.default_rng(0), driven()
+    rng = np.random.default_rng(0)
+    rig = driven()
     for _ in range(100):
         rig.delay_s = float(rng.uniform(0.0, 0.08))
         assert rig.run(PERIOD_S).cause is None

@@ -18,8 +18,13 @@ from nics_drl_bridge.robot.spec import RobotSpec, robot_from
 TICKS_PER_METRE = 70.0
 TRACK = 0.16
 STEERED = {"speed_command": (-0.5, 1.2), "steering_command": (-1.1, 1.1)}
-MOTOR, SERVO = ([1.0], [0.15, 1.0]), ([180.0], [1.0, 22.0, 180.0])  # transfer functions
-FINE_S, COMMAND_S, POSE_S, BASE = 0.002, 0.02, 0.01, 0.9
+# transfer functions
+MOTOR = ([1.0], [0.15, 1.0])
+SERVO = ([180.0], [1.0, 22.0, 180.0])
+FINE_S = 0.002
+COMMAND_S = 0.02
+POSE_S = 0.01
+BASE = 0.9
 
 
 def drive(
@@ -112,8 +117,10 @@ def servoed(
         slew: greatest acceleration that the robot's driver asks of its motor [m/s^2].
         motor: transfer function.
     """
-    rng, count = np.random.default_rng(seed), round(duration / FINE_S)
-    per_hold, late = round(0.5 / FINE_S), round(latency / FINE_S)
+    rng = np.random.default_rng(seed)
+    count = round(duration / FINE_S)
+    per_hold = round(0.5 / FINE_S)
+    late = round(latency / FINE_S)
     ranges = np.array([STEERED["speed_command"], (-steering, steering)]).T
     command = np.repeat(rng.uniform(*ranges, (count // per_hold, 2)), per_hold, axis=0)
     acting = np.concatenate([np.zeros((late, 2)), command[: count - late]])
@@ -131,7 +138,8 @@ def servoed(
     heading = np.cumsum(moved[:, 2]) - moved[:, 2]
     step = geometry.rotate(moved[:, :2], heading)
     path = np.concatenate([np.cumsum(step, axis=0) - step, heading[:, None]], axis=1)
-    rows, poses = round(COMMAND_S / FINE_S), path[:: round(POSE_S / FINE_S)]
+    rows = round(COMMAND_S / FINE_S)
+    poses = path[:: round(POSE_S / FINE_S)]
     poses = geometry.compose(poses, np.array(mounting))
     poses = poses + noise * rng.normal(size=poses.shape) * [1.0, 1.0, 2.0]
     t = FINE_S * np.arange(count)
@@ -151,10 +159,8 @@ def with_wheels(recording: Recording, truth: Recording, swapped: bool) -> Record
     """Adds wheel encoders of a car, counts per tick, on the robot's clock."""
     state = truth.state
     assert state is not None
-    speed, turn = (
-        state.values[:, 0],
-        state.values[:, 0] * np.tan(state.values[:, 1]) / 0.2,
-    )
+    speed = state.values[:, 0]
+    turn = state.values[:, 0] * np.tan(state.values[:, 1]) / 0.2
     left = np.round(TICKS_PER_METRE * (speed - turn * TRACK / 2.0))
     right = np.round(TICKS_PER_METRE * (speed + turn * TRACK / 2.0))
     both = np.stack([right, left] if swapped else [left, right], axis=1)
@@ -191,21 +197,24 @@ def slipping_car(
     limits = {"throttle": (-0.3, 0.6), "steering": (-1.0, 1.0)}
     given = {"kind": "ackermann_throttle", "footprint_radius": 0.25}
     spec = robot_from(given | {"parameters": {"wheelbase": 0.26}}, limits)
-    rng, count = np.random.default_rng(seed), round(duration / COMMAND_S)
+    rng = np.random.default_rng(seed)
+    count = round(duration / COMMAND_S)
     draws = rng.uniform(*np.array(list(limits.values())).T, (count // 40 + 1, 2))
     command = np.repeat(
         np.where(rng.random(draws.shape) < 0.15, 0.0, draws), 40, axis=0
     )[:count]
     if throttle is not None:
         command[:, 0] = throttle
-    state, poses = np.zeros(6), []
+    state = np.zeros(6)
+    poses = []
     for u, steering in np.repeat(command, round(COMMAND_S / FINE_S), axis=0):
         poses.append(state[:3].copy())
         x, y, heading, v, angle, turn = state
         push = 9.0 * np.sign(u) * max(abs(u) - dead, 0.0) - 0.5 * v - drag * v * abs(v)
         wanted = v * np.tan(angle) / (0.26 + 0.03 * v * v)
         aside = -slip * v * v * turn
-        c, s = np.cos(heading), np.sin(heading)
+        c = np.cos(heading)
+        s = np.sin(heading)
         v += FINE_S * push
         v = np.sign(v) * max(abs(v) - FINE_S * friction, 0.0)
         state = np.array(

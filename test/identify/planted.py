@@ -243,7 +243,8 @@ def wheeled_drive(seed: int = 0, duration: float = 60.0, levels: int = 0) -> Rec
     command = np.repeat(command[::told], told, axis=0)[:count]
     late = round(LATENCY_S / STEP_S)
     acting = np.concatenate([np.zeros((late, 2)), command[: count - late]])
-    wheels, poses = np.zeros((count, 2)), np.zeros((count, 3))
+    wheels = np.zeros((count, 2))
+    poses = np.zeros((count, 3))
     x = y = heading = left = right = 0.0
     for k, (forward, around) in enumerate(acting):
         poses[k] = x, y, heading

@@ -27,10 +27,12 @@ FINE = 10
 
 def driven(spec, commands, dt=0.02, noise=(0.0, 0.0), seed=0) -> Recording:
     """The textbook robot's drive under given commands (T, C)."""
-    book, rng = textbook(spec), np.random.default_rng(seed)
+    book = textbook(spec)
+    rng = np.random.default_rng(seed)
     goals = book.target(np.clip(commands, spec.command_low, spec.command_high))
     share = np.exp(-np.arange(FINE)[:, None] * dt / FINE / book.lag)
-    state, states = np.zeros(len(spec.state)), []
+    state = np.zeros(len(spec.state))
+    states = []
     for goal in goals:
         states.append(goal + (state - goal) * share)
         state = goal + (state - goal) * np.exp(-dt / book.lag)
@@ -60,7 +62,8 @@ def said(found, text: str) -> bool:
 
 def harmless(found, spec) -> bool:
     """Whether no rate within the robot's limits is out of this world."""
-    book, model = textbook(spec), found.model
+    book = textbook(spec)
+    model = found.model
     rng = np.random.default_rng(1)
     low = [v.min for v in (*spec.state, *spec.command)]
     high = [v.max for v in (*spec.state, *spec.command)]
@@ -182,7 +185,8 @@ def test_repeated_rows_are_left_out_and_change_nothing(car):
         name: Stream(np.repeat(s.t, 2), np.repeat(s.values, 2, axis=0), s.clock)
         for name, s in once.streams.items()
     }
-    plain, twice = identify(once, car), identify(Recording(**again), car)
+    plain = identify(once, car)
+    twice = identify(Recording(**again), car)
     assert said(twice, "repeat the row before them")
     assert twice.model.named.terms == plain.model.named.terms
 
@@ -324,7 +328,8 @@ def test_a_model_of_every_partial_drive_stays_finite(car):
         commands = random_commands(car)
         commands[:, column] = value
         model = identify(driven(car, commands), car).model
-        poses, states = np.zeros((1, 501, 3)), np.zeros((1, 501, 2))
+        poses = np.zeros((1, 501, 3))
+        states = np.zeros((1, 501, 2))
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
             rollout(
@@ -341,7 +346,8 @@ def test_a_model_of_every_partial_drive_stays_finite(car):
 def test_where_predictions_run_away_the_model_is_linear(monkeypatch):
     """Each half second of commands comes late by another time, as over a bad link."""
     monkeypatch.setattr(acceptance, "loses_to_textbook", lambda judgement: False)
-    spec, rng = load_robot("differential"), np.random.default_rng(9)
+    spec = load_robot("differential")
+    rng = np.random.default_rng(9)
     whole = record(spec, rng, 40.0, dt=0.02)
     poses = whole.pose.values + rng.normal(0.0, 1e-3, whole.pose.values.shape)
     late = np.repeat(rng.uniform(0.0, 0.4, len(whole.command.t) // 25 + 1), 25)

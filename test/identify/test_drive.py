@@ -49,14 +49,13 @@ def test_after_a_gap_a_burst_fills_one_period_only():
 
 def test_a_motion_is_trusted_by_the_variances_of_the_poses_at_both_ends():
     spec, recording = slipping_car(duration=4.0)
-    pose, start = recording.pose, np.array([0.5, 0.5])
+    pose = recording.pose
+    start = np.array([0.5, 0.5])
     assert (Drive(recording, spec).trust(start, start + 1.0) == 1.0).all()
     sigma = np.where((pose.t > 1.4)[:, None], [0.03, 0.03, 0.01], 0.01)
     drive = Drive(replace(recording, pose=replace(pose, sigma=sigma)), spec)
     usual = np.array([0.03, 0.03, 0.01])  # of most poses
-    before, across = (
-        1.0 / (0.01 / usual) ** 2,
-        1.0 / (((0.01 / usual) ** 2 + 1.0) / 2.0),
-    )
+    before = 1.0 / (0.01 / usual) ** 2
+    across = 1.0 / (((0.01 / usual) ** 2 + 1.0) / 2.0)
     trust = drive.trust(start, np.array([1.0, 2.0]))
     assert trust == pytest.approx(np.stack([before, across]))

@@ -195,7 +195,8 @@ def step_error(name, alpha):
     model = fit(aligned(drive), spec, alpha=alpha).model
     other = record(spec, np.random.default_rng(6), duration=5.0, dt=1e-3, hold=0.1)
     still = np.zeros((len(other.pose.t), 3))
-    state, command = other.state.values, other.command.values
+    state = other.state.values
+    command = other.command.values
     ours, _ = model.step(still, state, command)
     true, _ = integrate(textbook(spec), still, state, command, 1e-3)
     return np.sqrt((geometry.between(true, ours) ** 2).mean(axis=0))

@@ -150,7 +150,8 @@ def test_each_of_several_recordings_turns_by_its_own_bias():
 
 def heading_errors(model, drive, latency_s):
     """Returns mean errors after 5 s, as shares of the turn: of headings, by a model alone."""
-    errors, turns = [], []
+    errors = []
+    turns = []
     step = round(model.dt / 0.01)
     for start in range(400, len(drive.t) - 600, 250):
         pose = np.zeros(3)

@@ -31,7 +31,8 @@ def base(**given):
     found = run(STAGES[: STAGES.index(fit)], drive)
     samples = aligned(found.training, found)
     best = base_of(found.training, found.calibration, samples, found.clear)
-    names, values = best.draft.inputs.names, best.found.values.tolist()
+    names = best.draft.inputs.names
+    values = best.found.values.tolist()
     return best.draft.form, dict(zip(names, values, strict=True))
 
 

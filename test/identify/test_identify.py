@@ -48,10 +48,13 @@ def held(angle: float, assume: bool) -> Identified:
 def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
     model = identify(drive(car, duration=20.0), car).model
     rng = np.random.default_rng(1)
-    pose, state = rng.normal(size=(4, 3)), rng.normal(size=(4, 2)) * 0.3
+    pose = rng.normal(size=(4, 3))
+    state = rng.normal(size=(4, 2)) * 0.3
     command = rng.uniform(-0.5, 0.5, (4, 30, 2))
-    poses, states = np.empty((4, 31, 3)), np.empty((4, 31, 2))
-    poses[:, 0], states[:, 0] = pose, state
+    poses = np.empty((4, 31, 3))
+    states = np.empty((4, 31, 2))
+    poses[:, 0] = pose
+    states[:, 0] = state
     rollout(poses, states, command, term_arrays(model), SERIES, model.dt)
     for n in range(30):
         pose, state = model.step(pose, state, command[:, n])
@@ -79,14 +82,16 @@ def test_the_held_out_part_is_not_used_for_the_model(car):
     spoiled = recording.pose.values.copy()
     spoiled[recording.pose.t > 26.7, :2] *= 1.5
     other = replace(recording, pose=replace(recording.pose, values=spoiled))
-    a, b = noisy().trial, identify(other, car).trial
+    a = noisy().trial
+    b = identify(other, car).trial
     assert np.array_equal(a.model.coefficients, b.model.coefficients)
     assert a.calibration == b.calibration
 
 
 @pytest.mark.slow
 def test_a_prediction_knows_no_pose_after_its_start(car):
-    found, recording = noisy(), noisy().recording
+    found = noisy()
+    recording = noisy().recording
     chosen = windows(found.drive, found.calibration, 30.0, 36.0, 5.0, 0.1)
     values = recording.pose.values.copy()
     values[recording.pose.t > chosen.start_t[-1]] = 7.0
@@ -149,7 +154,8 @@ def test_steering_that_never_moved_has_no_terms_and_a_sentence():
 
 @pytest.mark.slow
 def test_on_request_the_textbook_completes_what_was_measured_at_a_constant():
-    plain, completed = held(-0.4, assume=False), held(-0.4, assume=True)
+    plain = held(-0.4, assume=False)
+    completed = held(-0.4, assume=True)
     learnt = term(plain.model, "wz", "speed")
     assert term(completed.model, "wz", "speed*steering") == pytest.approx(learnt / -0.4)
     assert ("wz", "speed*steering") in completed.model.assumed
@@ -159,7 +165,8 @@ def test_on_request_the_textbook_completes_what_was_measured_at_a_constant():
 
 @pytest.mark.slow
 def test_at_the_same_steering_the_completed_model_moves_like_the_learnt_one():
-    plain, completed = held(-0.4, assume=False).model, held(-0.4, assume=True).model
+    plain = held(-0.4, assume=False).model
+    completed = held(-0.4, assume=True).model
     x = np.array([0.3, -0.4, 0.5, -0.4])
     assert np.allclose(plain.rates(x), completed.rates(x), atol=1e-9)
 
@@ -221,9 +228,11 @@ def by_throttle(steering: float, **given) -> tuple[RobotSpec, TaylorModel]:
     )
     powers = np.eye(5, dtype=np.int64)[[0, 2, 3]]
     rows = np.zeros((6, 3))
-    rows[0, 0], rows[3, [0, 2]] = 1.0, (-2.0, 6.0)
+    rows[0, 0] = 1.0
+    rows[3, [0, 2]] = (-2.0, 6.0)
     if steering:
-        rows[2, 1], rows[5, :2] = 1.0, (10.0 * 1.5 * steering, -10.0)
+        rows[2, 1] = 1.0
+        rows[5, :2] = (10.0 * 1.5 * steering, -10.0)
     low = np.array([-1.0, -0.01, -0.01, -0.5, steering])
     high = np.array([2.0, 0.01, 0.01, 0.5, steering])
     model = TaylorModel(
@@ -252,7 +261,8 @@ def test_what_is_assumed_of_a_car_by_its_motion_turns_it_by_its_speed(steering):
     assert all(
         dof == "d_wz" for dof, _ in completed.assumed
     )  # no twist, which is by definition
-    pose, state = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    pose = np.zeros(3)
+    state = np.array([1.0, 0.0, 0.0])
     for _ in range(100):
         state[0] = 1.0
         pose, state = completed.step(pose, state, np.array([1.0 / 3.0, 0.3]))

@@ -48,7 +48,8 @@ def driven(
     t = STEP * np.arange(count)
     held = rng.uniform(-1.0, 1.0, (count // 40 + 1, 2)).repeat(40, axis=0)[:count]
     command = held * np.array([forward, turn])
-    twist, pose = np.zeros((count, 2)), np.zeros((count, 3))
+    twist = np.zeros((count, 2))
+    pose = np.zeros((count, 3))
     for k in range(1, count):
         twist[k] = twist[k - 1] + (STEP / LAG_S) * (
             gain * command[k - 1] - twist[k - 1]
@@ -92,7 +93,8 @@ def test_no_prediction_window_crosses_from_one_drive_to_another():
 
 def test_no_window_of_the_fit_crosses_either(together):
     _, identified = together
-    samples, recording = identified.samples, identified.recording
+    samples = identified.samples
+    recording = identified.recording
     problem = Shooting(
         samples, lambda _: samples.x, lambda model, _: model, lambda *_: np.ones(3)
     )

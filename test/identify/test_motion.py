@@ -82,7 +82,8 @@ def test_samples_have_the_commands_in_effect_after_their_latency(drive):
     late = replace(MOUNTED, command_latency_s=0.1)
     grid = grid_of(drive, late, 0.1)
     at = samples_of(with_motion(drive, late, grid, 0.07), late, 0.07)
-    command, row = drive.recording.command, 500
+    command = drive.recording.command
+    row = 500
     before = np.searchsorted(command.t, at.t[row] - 0.1 + 1e-9, "right") - 1
     assert at.x[row, 3:] == pytest.approx(command.values[before])
 
@@ -93,13 +94,15 @@ def test_a_surrogate_has_a_state_for_each_command(drive):
 
 
 def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
-    pose, rng = drive.recording.pose, np.random.default_rng(3)
+    pose = drive.recording.pose
+    rng = np.random.default_rng(3)
     lost = rng.random(len(pose.t)) < 0.2
     values = pose.values + np.where(
         lost[:, None], rng.normal(0.0, 0.05, pose.values.shape), 0.0
     )
     sigma = np.where(lost, 0.05, 0.0005)[:, None] * np.ones(3)
-    grid, off = grid_of(drive, MOUNTED, 0.1), []
+    grid = grid_of(drive, MOUNTED, 0.1)
+    off = []
     truth = known_state(with_motion(drive, MOUNTED, grid, 0.07)).values
     for known in (None, sigma):
         stream = replace(pose, values=values, sigma=known)
@@ -110,7 +113,8 @@ def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
 
 
 def test_commands_are_as_smooth_as_the_twist_so_that_they_begin_and_end_together():
-    step, width = 0.02, 0.25
+    step = 0.02
+    width = 0.25
     speed = np.where(np.arange(400) * step < 4.0, 0.2, 0.6)[:, None]
     smooth = as_smooth(speed, step, width)[:, 0]
     changed = np.flatnonzero((smooth > 0.201) & (smooth < 0.599)) * step

@@ -56,7 +56,8 @@ def test_a_drive_that_shows_nothing_has_no_mounting(mecanum):
 
 
 def test_a_robot_that_keeps_its_heading_and_goes_anywhere_tells_nothing_of_its_mounting():
-    course, n = np.linspace(0.0, 6.0, 50), np.arange(50.0)
+    course = np.linspace(0.0, 6.0, 50)
+    n = np.arange(50.0)
     twist = np.stack([np.cos(course), np.sin(course), 0.0 * course], axis=1)
     motion = TwistIntervals(n, n + 1.0, twist)
     assert mounting_without_lateral_motion(motion, np.ones(50)) is None
@@ -117,7 +118,8 @@ def test_a_car_that_drives_backwards_first_faces_where_it_is_told_to(car):
 
 @pytest.mark.parametrize(("bend", "ways"), [(0.0, 0), (0.5, 1), (-0.5, 1)])
 def test_the_noise_of_a_heading_is_no_turning(bend, ways):
-    rng, n = np.random.default_rng(0), np.arange(900)
+    rng = np.random.default_rng(0)
+    n = np.arange(900)
     heading_noise = 0.005
     heading = heading_noise * rng.normal(size=901)
     twist = np.stack(
@@ -132,7 +134,8 @@ def test_the_noise_of_a_heading_is_no_turning(bend, ways):
 
 def skidded(slip: float, slowest: float, seed: int = 0) -> TwistIntervals:
     """Noisy twists of a point 0.1 m before the middle of a robot that slips in proportion."""
-    rng, n = np.random.default_rng(seed), np.arange(900)
+    rng = np.random.default_rng(seed)
+    n = np.arange(900)
     speed = np.repeat(rng.uniform(slowest, 1.0, 90), 10)
     turn = np.repeat(rng.uniform(-1.0, 1.0, 90), 10)
     twist = np.stack([speed, 0.1 * turn + slip * speed * turn, turn], axis=1)

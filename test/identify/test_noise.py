@@ -41,7 +41,8 @@ def drifting(spec, seed: int, duration: float = 150.0) -> Recording:
     """A textbook drive that drifts, with noisy odometry."""
     rng = np.random.default_rng(seed)
     clean = record(spec, rng, duration)
-    pose, dt = clean.pose.values, float(clean.pose.t[1] - clean.pose.t[0])
+    pose = clean.pose.values
+    dt = float(clean.pose.t[1] - clean.pose.t[0])
     step = geometry.between(pose[:-1], pose[1:])
     push = rng.normal(size=step.shape) * np.sqrt(dt) * np.array([DRIFT[0], *DRIFT])
     path = [pose[0]]
@@ -59,8 +60,10 @@ def drifting(spec, seed: int, duration: float = 150.0) -> Recording:
 def driven(model, seconds: float, seed: int) -> Recording:
     """A drive of the simulator of a model, recorded a hundred times a second."""
     fast = replace(model, control_period=model.kinematics.dt)
-    simulator, dt = FastSimulator(fast, field(400.0)), fast.control_period
-    rng, spec = np.random.default_rng(seed), model.robot
+    simulator = FastSimulator(fast, field(400.0))
+    dt = fast.control_period
+    rng = np.random.default_rng(seed)
+    spec = model.robot
     simulator.reset([seed], starts=np.zeros((1, 1, 3)))
     rows: dict[str, list[np.ndarray]] = {
         "pose": [],

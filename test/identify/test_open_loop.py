@@ -26,10 +26,8 @@ STEP = 1e-6
 def courses(request):
     """Model, drive, windows and their course; of some a step ends within the last window."""
     spec = builtin_model("mecanum").robot
-    model, driven = (
-        builtin_model("mecanum").kinematics,
-        Drive(drive(spec, duration=20.0), spec),
-    )
+    model = builtin_model("mecanum").kinematics
+    driven = Drive(drive(spec, duration=20.0), spec)
     chosen = windows(driven, MOUNTING, 0.0, 20.0, 1.0, 1.0)
     chosen = replace(chosen, end_t=chosen.start_t + request.param * 2.0)
     return model, driven, chosen, course_of(model, MOUNTING, driven, chosen)

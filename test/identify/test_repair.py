@@ -62,7 +62,8 @@ def with_jumps(recording: Recording, share: float = 0.05, seed: int = 0) -> Reco
 
 def same_motion(a, b, share: float) -> None:
     """The rates of two models differ by less than a share of their size, at clean samples."""
-    rates, others = a.model.rates(b.samples.x), b.model.rates(b.samples.x)
+    rates = a.model.rates(b.samples.x)
+    others = b.model.rates(b.samples.x)
     apart = np.sqrt(((rates - others) ** 2).mean(axis=0))
     assert (
         apart <= share * np.maximum(np.sqrt((others**2).mean(axis=0)), 1e-2)
@@ -121,10 +122,8 @@ def test_steering_in_degrees_is_refused_though_the_limits_are_those_recorded():
 @pytest.mark.parametrize("name", ["ackermann", "differential"])
 @pytest.mark.parametrize("ahead", [0.0, 0.4])
 def test_a_swapped_speed_and_turn_is_refused_by_what_they_move(name, ahead):
-    plain, spec = (
-        drive(load_robot(name), pose_clock_ahead=ahead, rotation=0.4),
-        load_robot(name),
-    )
+    plain = drive(load_robot(name), pose_clock_ahead=ahead, rotation=0.4)
+    spec = load_robot(name)
     assert check_commands(Drive(plain, spec)) == ()
     command = replace(plain.command, values=plain.command.values[:, ::-1])
     with pytest.raises(
@@ -172,7 +171,8 @@ def test_poses_of_a_mount_that_is_turned_by_90_degrees_are_not_swapped_commands(
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_turn_that_moves_the_pose_sensor_aside_is_no_reversed_command(seed):
-    random, t = np.random.default_rng(seed), np.arange(0.0, 60.0, 0.02)
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, 60.0, 0.02)
     asked = np.repeat(random.uniform(-1.0, 1.0, (len(t) // 50, 3)), 50, axis=0) * [
         0.5,
         0.05,
@@ -192,7 +192,8 @@ def test_a_turn_that_moves_the_pose_sensor_aside_is_no_reversed_command(seed):
 
 def test_a_reversed_heading_is_refused_though_noise_hides_short_ways(differential):
     """At rest and between rows 6 mm apart, 2 mm of noise lead anywhere."""
-    t, rng = np.arange(0.0, 90.0, 0.02), np.random.default_rng(1)
+    t = np.arange(0.0, 90.0, 0.02)
+    rng = np.random.default_rng(1)
     speed, turn = (np.repeat(rng.uniform(-a, a, 60), 75) for a in (0.3, 1.5))
     moved = np.stack([speed, 0.0 * t, turn], axis=1) * 0.02
     pose = [np.zeros(3)]
@@ -210,7 +211,8 @@ def test_a_reversed_heading_is_refused_though_noise_hides_short_ways(differentia
 
 def test_two_commands_a_quarter_of_a_period_apart_are_not_swapped(differential):
     """Late by as much, each goes as the other does."""
-    t, turn = np.arange(0.0, 60.0, 0.02), 2.0 * np.pi / 3.8
+    t = np.arange(0.0, 60.0, 0.02)
+    turn = 2.0 * np.pi / 3.8
     asked, moved = (
         np.stack([0.5 * np.sin(turn * since), np.cos(turn * since)], axis=1)
         for since in (t, t - 0.05)
@@ -274,7 +276,8 @@ def test_commands_in_volts_and_poses_with_gaps_are_compared_without_harm(differe
 def test_wheels_in_rpm_are_told_if_their_radius_is_known():
     parameters = {"wheel_radius": 0.05, "track": 0.3, "wheel_lag": 0.1}
     wheels = {"kind": "differential_wheels", "footprint_radius": 0.2}
-    known, unknown = robot_from(wheels | {"parameters": parameters}), robot_from(wheels)
+    known = robot_from(wheels | {"parameters": parameters})
+    unknown = robot_from(wheels)
     plain = drive(known, measured_state=False)
     assert check_commands(Drive(plain, known)) == ()
     other = replace(
@@ -297,7 +300,8 @@ def test_the_jump_of_a_real_localiser_is_found_and_told():
 def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     spec = load_robot(name)
     plain = drive(spec, duration=40.0)
-    clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
+    clean = identify(plain, spec)
+    faulty = identify(with_jumps(plain), spec)
     assert any("jump away" in note for note in faulty.notes)
     same_motion(faulty, clean, 0.02)
     assert (
@@ -311,7 +315,8 @@ def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
 def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     spec = load_robot(name)
     plain = drive(spec, noise=(5e-4, 1e-3), rotation=0.3)
-    clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
+    clean = identify(plain, spec)
+    faulty = identify(with_jumps(plain), spec)
     same_motion(faulty, clean, 0.05)
     assert (
         faulty.held_out.mean_position_error_m
@@ -324,14 +329,16 @@ def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
 @pytest.mark.parametrize("apart", [False, True])
 def test_an_exact_fit_survives_ten_per_cent_of_the_rows_missing(name, apart):
     """Either whole rows are missing, or each stream misses rows of its own."""
-    spec, rng = load_robot(name), np.random.default_rng(1)
+    spec = load_robot(name)
+    rng = np.random.default_rng(1)
     plain = drive(spec, duration=40.0)
     count = len(plain.pose.t)
     rows = rng.random(count) > 0.1
     keep = {n: rng.random(count) > 0.1 if apart else rows for n in plain.streams}
     for kept in keep.values():
         kept[1000:1030] = False
-    clean, gappy = identify(plain, spec), identify(some(plain, keep), spec)
+    clean = identify(plain, spec)
+    gappy = identify(some(plain, keep), spec)
     assert gappy.calibration.is_exact
     same_motion(gappy, clean, 0.02)
     assert gappy.fit.rmse == pytest.approx(clean.fit.rmse, rel=0.3, abs=1e-6)
@@ -370,12 +377,14 @@ def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
     samples = align(Drive(drive(car, noise=(0.0, 0.0)), car), Calibration())
     rng = np.random.default_rng(3)
     bad = rng.random(len(samples.t)) < 0.05
-    dq, x = samples.dq.copy(), samples.x.copy()
+    dq = samples.dq.copy()
+    x = samples.x.copy()
     dq[bad] += rng.normal(size=(bad.sum(), 5)) * 30.0 * samples.dq.std(axis=0)
     x[bad[::-1], 0] += 40.0
     clean = fit(samples, car)
     faulty = fit(Samples(samples.t, samples.q, x, dq, samples.dt), car)
-    terms, others = faulty.model.named.terms, clean.model.named.terms
+    terms = faulty.model.named.terms
+    others = clean.model.named.terms
     for dof in ("vx", "d_speed", "d_steering"):
         assert terms[dof] == pytest.approx(others[dof], rel=1e-5)
     assert terms["wz"]["speed*steering"] == pytest.approx(

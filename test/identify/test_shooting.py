@@ -14,7 +14,9 @@ from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-DT, STEPS, DELAY = 0.02, 2000, 0.1
+DT = 0.02
+STEPS = 2000
+DELAY = 0.1
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,8 @@ def car() -> TaylorModel:
     )
     rows = np.zeros((6, 4))
     rows[0, 0] = rows[2, 1] = 1.0
-    rows[3], rows[5] = [-2.0, 0.0, 4.0, 0.0], [0.0, -5.0, 0.0, 8.0]
+    rows[3] = [-2.0, 0.0, 4.0, 0.0]
+    rows[5] = [0.0, -5.0, 0.0, 8.0]
     box = np.zeros(5)
     return TaylorModel(
         spec.variable_names, spec.dof_names, spec.dof_units, powers, rows, DT, box, box
@@ -41,10 +44,12 @@ def equally(start, end):
 @pytest.fixture(scope="module")
 def problem(car) -> Shooting:
     """A drive of it, whose commands act after a delay."""
-    rng, t = np.random.default_rng(2), DT * np.arange(STEPS + 1)
+    rng = np.random.default_rng(2)
+    t = DT * np.arange(STEPS + 1)
     command = np.repeat(rng.uniform(-1.0, 1.0, (STEPS // 20, 2)), 20, axis=0)
     late = np.roll(command, round(DELAY / DT), axis=0)
-    poses, states = np.zeros((1, STEPS + 1, 3)), np.zeros((1, STEPS + 1, 3))
+    poses = np.zeros((1, STEPS + 1, 3))
+    states = np.zeros((1, STEPS + 1, 3))
     rollout(poses, states, late[None], term_arrays(car), SERIES, DT)
     q = np.concatenate([poses[0], states[0]], axis=1)
     x = np.concatenate([states[0, :-1], command], axis=1)
@@ -84,7 +89,9 @@ def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
         back_emf=np.outer([0.5, 0.0, 0.0], [1.0, 0.0]),
     )
     first, steps = problem.starts()
-    first, steps = first[::-1][:41], steps[::-1][:41]  # the last have shorter horizons
+    # the last have shorter horizons
+    first = first[::-1][:41]
+    steps = steps[::-1][:41]
     free = (car.coefficients != 0.0) & (np.arange(6) >= 3)[:, None]
     end, slope = problem.predict(car, np.array([DELAY]), first, steps, free)
     assert np.array_equal(end, problem.predict(car, np.array([DELAY]), first, steps)[0])

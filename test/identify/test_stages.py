@@ -60,7 +60,8 @@ def disturbed(car) -> Drive:
     recording = drive(
         locked, duration=21.0, latency=0.05, rotation=0.4, noise=(5e-4, 1e-3)
     )
-    command, pose = recording.command.values.copy(), recording.pose
+    command = recording.command.values.copy()
+    pose = recording.pose
     command[:, 1] = -0.4
     twice = np.sort(np.append(np.arange(len(pose.t)), 700))
     repeated = replace(pose, t=pose.t[twice], values=pose.values[twice])

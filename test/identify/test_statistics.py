@@ -73,10 +73,13 @@ def noisy_samples(spec, seed, alike=0.9, size=0.05):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(KNOWN))
 def test_known_coefficients_lie_within_three_standard_errors(name):
-    spec, inside, short = load_robot(name), [], []
+    spec = load_robot(name)
+    inside = []
+    short = []
     for seed in range(40):
         result = fit(noisy_samples(spec, seed), spec, order=1, noisy=True)
-        terms, errors = result.model.named.terms, result.model.named_errors
+        terms = result.model.named.terms
+        errors = result.model.named_errors
         for dof, row in KNOWN[name].items():
             if dof == "wz" and name == "ackermann":
                 continue
@@ -92,7 +95,8 @@ def test_known_coefficients_lie_within_three_standard_errors(name):
 
 @pytest.mark.slow
 def test_the_known_product_of_a_car_lies_within_three_standard_errors():
-    spec, inside = load_robot("ackermann"), []
+    spec = load_robot("ackermann")
+    inside = []
     for seed in range(30):
         model = fit(noisy_samples(spec, seed), spec, noisy=True, alpha=0.9).model
         value = model.named.terms["wz"]["speed*steering"]
@@ -136,7 +140,8 @@ def test_the_knee_is_where_further_terms_gain_nothing():
 
 def test_cross_validation_is_that_of_separate_fits():
     rng = np.random.default_rng(3)
-    chi, target = rng.normal(size=(100, 3)), rng.normal(size=100)
+    chi = rng.normal(size=(100, 3))
+    target = rng.normal(size=100)
     squares = cross_validated(chi, target)
     for block, rows in enumerate(np.array_split(np.arange(100), 5)):
         others = np.setdiff1d(np.arange(100), rows)

@@ -14,10 +14,14 @@ from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 ROBOTS = Path(__file__).resolve().parent / "robots"
-DT, FINE, HOLD = 0.02, 20, 25
+DT = 0.02
+FINE = 20
+HOLD = 25
 LAG = 0.15
 WHEELBASE = 0.55
-RADIUS, TRACK, SLIP = 0.1, 0.4, 1.6
+RADIUS = 0.1
+TRACK = 0.4
+SLIP = 1.6
 
 
 def robot(name: str) -> RobotSpec:
@@ -33,7 +37,8 @@ def recorded(spec, target, twist, noise=(0.0, 0.0), latency=0.0, seconds=60.0, s
     )
     commands = np.repeat(held, HOLD, axis=0)
     decay = np.exp(-np.arange(FINE)[:, None] * DT / FINE / LAG)
-    state, states = np.zeros(target(commands[:1]).shape[1]), []
+    state = np.zeros(target(commands[:1]).shape[1])
+    states = []
     for goal in target(commands):
         states.append(goal + (state - goal) * decay)
         state = goal + (state - goal) * np.exp(-DT / LAG)
@@ -59,10 +64,8 @@ def car_twist(state):
 
 def skid_twist(state):
     right, left = state.T
-    forward, turn = (
-        RADIUS * (right + left) / 2,
-        RADIUS * (right - left) / (TRACK * SLIP),
-    )
+    forward = RADIUS * (right + left) / 2
+    turn = RADIUS * (right - left) / (TRACK * SLIP)
     return np.stack([forward, 0.0 * forward, turn], axis=1)
 
 
@@ -180,6 +183,7 @@ def test_the_order_of_state_and_command_is_that_of_the_file():
         state=replace(recording.state, values=recording.state.values[:, ::-1]),
         command=replace(recording.command, values=recording.command.values[:, ::-1]),
     )
-    a, b = terms(identify(recording, spec)), terms(identify(other, turned))
+    a = terms(identify(recording, spec))
+    b = terms(identify(other, turned))
     for dof in a:
         assert b[dof] == pytest.approx(a[dof], rel=1e-6)

@@ -38,16 +38,15 @@ def coarse(spec: RobotSpec, every: int, duration: float = 60.0) -> Recording:
 
 def held_up(recording: Recording, start: float, end: float) -> Recording:
     """The robot stands between two times, whatever it is told, and then drives on from there."""
-    t, pose, state = (
-        recording.pose.t,
-        recording.pose.values.copy(),
-        recording.state.values.copy(),
-    )
+    t = recording.pose.t
+    pose = recording.pose.values.copy()
+    state = recording.state.values.copy()
     first, after = np.searchsorted(t, (start, end))
     pose[after:] = geometry.compose(
         pose[first], geometry.between(pose[after], pose[after:])
     )
-    pose[first:after], state[first:after] = pose[first], 0.0
+    pose[first:after] = pose[first]
+    state[first:after] = 0.0
     return replace(
         recording,
         pose=replace(recording.pose, values=pose),

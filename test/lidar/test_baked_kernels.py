@@ -16,15 +16,16 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(
     rng = np.random.default_rng(corners)
     hull = convex_hull(make(rng, corners).outline)
     twice = np.concatenate([hull, hull])
-    count, radius = len(hull), np.hypot(*hull.T).max()
+    count = len(hull)
+    radius = np.hypot(*hull.T).max()
     for _ in range(100):
         distance = radius * (1.0 + 10.0 ** rng.uniform(-6.0, 1.0))
-        turn, skip = rng.uniform(-np.pi, np.pi), int(rng.integers(count + 1))
-        first, stride = (
-            int(rng.integers(count)),
-            int(2 ** rng.integers(np.log2(count) + 1)),
-        )
-        cos, sin = distance * np.cos(turn), distance * np.sin(turn)
+        turn = rng.uniform(-np.pi, np.pi)
+        skip = int(rng.integers(count + 1))
+        first = int(rng.integers(count))
+        stride = int(2 ** rng.integers(np.log2(count) + 1))
+        cos = distance * np.cos(turn)
+        sin = distance * np.sin(turn)
         along = distance**2 + twice[skip : skip + count] @ [cos, -sin]
         across = twice[skip : skip + count] @ [sin, cos]
         angles = np.arctan2(across, along)
@@ -38,6 +39,7 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(
 
 def test_the_fast_arc_tangent_agrees_with_the_exact_one_all_around():
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 20_000)
-    y, x = np.float32(3.0 * np.sin(angles)), np.float32(3.0 * np.cos(angles))
+    y = np.float32(3.0 * np.sin(angles))
+    x = np.float32(3.0 * np.cos(angles))
     found = np.array([kernels.arctan2_single(b, a) for b, a in zip(y, x, strict=True)])
     assert np.abs(found - np.arctan2(y, x)).max() < 5e-7

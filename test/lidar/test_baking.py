@@ -29,11 +29,13 @@ def at_the_grid(table, shape, t, d):
 @pytest.mark.parametrize("shape", [Circle(radius=0.25), SQUARE, STRIP])
 def test_on_the_grid_a_look_up_is_the_exact_scan(shape):
     table = bake(SPEC, [shape], SMALL)
-    exact, baked = Scanner(SPEC, table, "exact"), Scanner(SPEC, table, "baked")
+    exact = Scanner(SPEC, table, "exact")
+    baked = Scanner(SPEC, table, "baked")
     for t in range(5):
         for d in range(table.density.distances - 1):
             body = exact.place([shape], at_the_grid(table, shape, t, d))
-            one, other = baked.scan(HERE, body)[0], exact.scan(HERE, body)[0]
+            one = baked.scan(HERE, body)[0]
+            other = exact.scan(HERE, body)[0]
             differ = np.isfinite(one) != np.isfinite(other)
             assert (
                 differ.sum() <= 2

@@ -75,7 +75,8 @@ def test_a_sector_holds_the_nearest_return_of_its_beams(heading, angles):
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_any_shipped_lidar_sees_the_same_room(name):
-    spec, layout = load_lidar(name), LAYOUTS["front"]
+    spec = load_lidar(name)
+    layout = LAYOUTS["front"]
     origin = np.array([0.3, -0.2])
     seen = resampled(plan_of(spec, layout), room(origin + spec.mount[:2], spec.angles))
     fine = np.linspace(-layout.width / 2, layout.width / 2, 201)

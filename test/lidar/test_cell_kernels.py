@@ -24,11 +24,14 @@ def within(bodies, spot, reach):
 @pytest.mark.parametrize("count", [1, 2, 7, 60, 300])
 def test_every_body_that_comes_within_reach_is_found_once(count):
     rng = np.random.default_rng(count)
-    cells, some = kernels.body_cells(3, count), False
+    cells = kernels.body_cells(3, count)
+    some = False
     for n in rng.integers(0, 3, 40):
-        bodies, standing = bodies_at_random(rng, count), int(rng.integers(count + 1))
+        bodies = bodies_at_random(rng, count)
+        standing = int(rng.integers(count + 1))
         kernels.sort(n, bodies, standing, cells)
-        spot, reach = rng.uniform(-12.0, 12.0, 2), rng.uniform(0.0, 3.0)
+        spot = rng.uniform(-12.0, 12.0, 2)
+        reach = rng.uniform(0.0, 3.0)
         several = kernels.around(n, *spot, reach, cells)
         got = cells.found[:several].tolist()
         assert len(set(got)) == len(got)
@@ -40,9 +43,12 @@ def test_every_body_that_comes_within_reach_is_found_once(count):
 
 
 def test_bodies_that_moved_since_are_found_if_the_cells_know_how_far():
-    rng, cells, late = np.random.default_rng(0), kernels.body_cells(1, 100), 0
+    rng = np.random.default_rng(0)
+    cells = kernels.body_cells(1, 100)
+    late = 0
     for _ in range(40):
-        bodies, turn = bodies_at_random(rng, 100), rng.uniform(-np.pi, np.pi, 100)
+        bodies = bodies_at_random(rng, 100)
+        turn = rng.uniform(-np.pi, np.pi, 100)
         kernels.sort(0, bodies, 100, cells)
         bodies[:, :2] += 2.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
         spot = rng.uniform(-10.0, 10.0, 2)
@@ -73,7 +79,8 @@ def test_bodies_are_found_as_they_are_added():
 
 
 def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_move():
-    rng, cells = np.random.default_rng(2), kernels.body_cells(2, 80, ordered=True)
+    rng = np.random.default_rng(2)
+    cells = kernels.body_cells(2, 80, ordered=True)
     few = 0
     for n in (0, 1, 1, 0):
         bodies = bodies_at_random(rng, 80)

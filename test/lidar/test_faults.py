@@ -13,7 +13,8 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 
 BEAMS = 40_000
 LIMITS = (0.05, 3.0)
-POSE, TWIST = np.array([1.0, -2.0, 3.0]), np.array([0.8, -0.3, 1.2])
+POSE = np.array([1.0, -2.0, 3.0])
+TWIST = np.array([0.8, -0.3, 1.2])
 
 
 def scan_at(distance, beams=BEAMS):
@@ -21,7 +22,8 @@ def scan_at(distance, beams=BEAMS):
 
 
 def reported(ranges, noise_std=0.0, seed=1, counter=0, **faults):
-    out, row = ranges.copy(), LidarFaults(**faults).parameters(noise_std)
+    out = ranges.copy()
+    row = LidarFaults(**faults).parameters(noise_std)
     fault_kernels.distort(out, np.array(LIMITS), row, seed, counter)
     return out
 
@@ -285,7 +287,8 @@ def test_without_skew_all_slices_are_at_the_pose():
 @pytest.mark.parametrize("skew", ["counter_clockwise", "clockwise"])
 def test_a_skewed_scan_sees_a_wall_from_where_each_beam_was_measured(skew):
     spec = lidar(beams=180, angle_min=-1.0, angle_max=1.0, range_max=9.0, rate=5.0)
-    scanner, wall = make_scanner(spec, ()), [[4.0, -50.0, 4.0, 50.0]]
+    scanner = make_scanner(spec, ())
+    wall = [[4.0, -50.0, 4.0, 50.0]]
 
     def render(pose):
         return scanner.scan(pose, np.zeros((1, 0, 3)), wall)[0]

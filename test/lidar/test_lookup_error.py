@@ -92,7 +92,8 @@ def places(shape, high, number, rng):
 )
 @pytest.mark.timeout(600)  # a cold start compiles
 def test_auto_is_right_within_a_centimetre_in_every_band_for_every_shape(name):
-    spec, rng = load_lidar(name), np.random.default_rng(11)
+    spec = load_lidar(name)
+    rng = np.random.default_rng(11)
     looked_up = 0
     for _ in range(3):
         for shape in shapes_of(rng):
@@ -116,8 +117,10 @@ def test_auto_is_right_within_a_centimetre_in_every_band_for_every_shape(name):
 
 
 def test_a_long_segment_near_the_lidar_is_scanned_exactly():
-    spec, shape = load_lidar("paper"), Segment(ends=((-1.0, 0.0), (1.0, 0.0)))
-    scanner, rng = make_scanner(spec, [shape]), np.random.default_rng(1)
+    spec = load_lidar("paper")
+    shape = Segment(ends=((-1.0, 0.0), (1.0, 0.0)))
+    scanner = make_scanner(spec, [shape])
+    rng = np.random.default_rng(1)
     _, poses = places(shape, 3.0, 2000, rng)
     found = scanner.scan(
         np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None])
@@ -133,11 +136,10 @@ def test_a_star_that_the_lidar_all_but_touches_is_right_where_few_places_err():
     star = np.where(np.arange(6) % 2, 0.176, 0.402)[:, None] * np.stack(
         [np.cos(corners), np.sin(corners)], axis=1
     )
-    spec, shape = (
-        load_lidar("turtlebot3_lds_02"),
-        Polygon(points=tuple(map(tuple, star))),
-    )
-    scanner, rng = make_scanner(spec, [shape]), np.random.default_rng(2)
+    spec = load_lidar("turtlebot3_lds_02")
+    shape = Polygon(points=tuple(map(tuple, star)))
+    scanner = make_scanner(spec, [shape])
+    rng = np.random.default_rng(2)
     away = shape.radius + rng.uniform(0.001, 0.008, 4000)
     bearing, heading = rng.uniform(-np.pi, np.pi, (2, len(away)))
     poses = np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=1)

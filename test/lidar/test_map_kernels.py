@@ -23,7 +23,8 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     """A scan (B,) from x, y, heading."""
     rays = directions() if rays is None else np.asarray(rays, dtype=np.float64)
     out = np.full(len(rays), before, np.float32)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
+    c = np.cos(pose[2])
+    s = np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
     beams = beams_of(
         np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True
@@ -60,8 +61,10 @@ def by_shapely(grid, pose):
     Plane geometry in the frame of the map; this says nothing of the kernels' own arithmetic.
     """
     x, y, heading = grid.origin
-    c, s = np.cos(heading), np.sin(heading)
-    dx, dy = pose[0] - x, pose[1] - y
+    c = np.cos(heading)
+    s = np.sin(heading)
+    dx = pose[0] - x
+    dy = pose[1] - y
     here = np.array([c * dx + s * dy, c * dy - s * dx])
     turn = pose[2] - heading
     angles = turn + np.arctan2(*directions().T[::-1])
@@ -74,7 +77,8 @@ def by_shapely(grid, pose):
         lines.append([(column, row - 1), (column, row)])
     for row, column in np.argwhere(solid[1:] != solid[:-1]):
         lines.append([(column - 1, row), (column, row)])
-    ranges, clear = np.full(BEAMS, np.inf), np.ones(BEAMS, bool)
+    ranges = np.full(BEAMS, np.inf)
+    clear = np.ones(BEAMS, bool)
     if not len(low):
         return ranges, clear
     rays = shapely.linestrings([[here, end] for end in ends])
@@ -91,7 +95,9 @@ def by_shapely(grid, pose):
 @pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
-    seen, solid, outside = 0, 0, 0
+    seen = 0
+    solid = 0
+    outside = 0
     for seed in range(400):
         grid, rng = random_map(seed)
         pose = random_pose(grid, rng)
@@ -186,7 +192,8 @@ def test_no_map_leaves_the_scan_alone(kernel):
 
 def square(solid, row, column, quadrant, side):
     """The cells of a square that begins at a cell and opens towards a quadrant."""
-    right, up = 1 - 2 * (quadrant & 1), 1 - (quadrant & 2)
+    right = 1 - 2 * (quadrant & 1)
+    up = 1 - (quadrant & 2)
     rows = sorted((row, row + up * (side - 1)))
     columns = sorted((column, column + right * (side - 1)))
     return solid[rows[0] : rows[1] + 1, columns[0] : columns[1] + 1]

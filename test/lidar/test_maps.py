@@ -134,7 +134,8 @@ def test_16_bit_png_is_read(save):
 @pytest.mark.parametrize("kind", ["16 bit", "RGBA", "palette", "grey"])
 def test_no_kind_of_image_takes_many_bytes_for_a_pixel(save, tmp_path, kind):
     """A few kilobytes of PNG hold millions of pixels."""
-    side, modes = 3000, {"RGBA": "RGBA", "palette": "P", "grey": "L"}
+    side = 3000
+    modes = {"RGBA": "RGBA", "palette": "P", "grey": "L"}
     path = save(name="map.png")
     if kind == "16 bit":
         image = Image.fromarray(np.full((side, side), 65535, np.uint16))

@@ -73,7 +73,8 @@ def looked_up(view: float, ahead: float, bearing: float) -> bool:
     turned = bearing + 0.7  # as the lidar is
     body = scanner.place([disc], [[np.cos(turned), np.sin(turned), 0.0]])
     here = LidarPose(0.0, 0.0, np.cos(0.7), np.sin(0.7))
-    lanes, near = scan_kernels.scan_lanes(), np.zeros(1, int)
+    lanes = scan_kernels.scan_lanes()
+    near = np.zeros(1, int)
     found, computed = scan_kernels.select(
         0, near, body, -1, here, 0.7, 0, scanner.arguments, lanes
     )

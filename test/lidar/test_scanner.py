@@ -61,7 +61,8 @@ def finite(ranges, spec):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SOME)
 def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
-    spec, compared = SENSORS[name], 0
+    spec = SENSORS[name]
+    compared = 0
     for seed in range(20 if spec.beams > 1000 else 120):
         if seed % 20 == 0:
             shapes = random_shapes(seed)
@@ -78,12 +79,14 @@ def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says(renderer):
-    spec, compared = lidar(beams=90, range_min=0.0), 0
+    spec = lidar(beams=90, range_min=0.0)
+    compared = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
         shape = (*random_shapes(seed), ring(rng, 40))[seed % 12]
         scanner = Scanner(spec, bake(spec, [shape], COARSE), renderer)
-        angle, part = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 0.999)
+        angle = rng.uniform(-np.pi, np.pi)
+        part = rng.uniform(0.0, 0.999)
         away = part * shape.radius * np.array([np.cos(angle), np.sin(angle)])
         pose = np.array([*away, rng.uniform(-np.pi, np.pi)])
         scene = Scene(
@@ -105,13 +108,17 @@ def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
         spec = lidar(
             beams=720
         )  # beams as narrow as these show the same, and bake sooner
-    errors, returns, wrong = [], 0, 0
+    errors = []
+    returns = 0
+    wrong = 0
     for seed in range(40):
         if seed % 20 == 0:
             table = bake(spec, random_shapes(seed), Density())
-            baked, exact = Scanner(spec, table, "baked"), Scanner(spec, table, "exact")
+            baked = Scanner(spec, table, "baked")
+            exact = Scanner(spec, table, "exact")
         scene = random_scene(seed, table.shapes)
-        looked_up, computed = scan(baked, scene), scan(exact, scene)
+        looked_up = scan(baked, scene)
+        computed = scan(exact, scene)
         assert not np.isnan(looked_up).any()
         errors.append(finite(looked_up, spec) - finite(computed, spec))
         returns += np.isfinite(computed).sum()
@@ -156,9 +163,11 @@ def test_silhouettes_of_any_polygon_are_exact_at_any_density(make, corners, dens
 
 
 def test_the_papers_scenes_are_off_by_less_than_3_mm():
-    spec, rng = lidar(beams=720), np.random.default_rng(0)
+    spec = lidar(beams=720)
+    rng = np.random.default_rng(0)
     table = bake(spec, (Circle(radius=0.15), SQUARE, STRIP))
-    baked, exact = Scanner(spec, table, "baked"), Scanner(spec, table, "exact")
+    baked = Scanner(spec, table, "baked")
+    exact = Scanner(spec, table, "exact")
     for shapes in ([Circle(radius=0.15)] * 10, [SQUARE] * 10, [STRIP] * 10):
         poses = rng.uniform(-1.0, 1.0, (200, 10, 3)) * [3.0, 3.0, np.pi]
         bodies = exact.place(shapes, poses)
@@ -187,7 +196,8 @@ def test_a_lidar_inside_a_circle_sees_its_far_side(renderer):
     ranges = scanner.scan(HERE, scanner.place(scanner.table.shapes, [(0.1, 0.0, 0.0)]))[
         0
     ]
-    c, s = np.cos(spec.angles), np.sin(spec.angles)
+    c = np.cos(spec.angles)
+    s = np.sin(spec.angles)
     assert ranges == pytest.approx(
         0.1 * c + np.sqrt(0.25**2 - (0.1 * s) ** 2), abs=1e-5
     )
@@ -206,10 +216,8 @@ def test_an_outline_that_crosses_itself_is_seen_from_anywhere(part):
         for angle in np.linspace(0.1, 6.2, 20):
             robot = [part * 0.5 * np.cos(angle), part * 0.5 * np.sin(angle), angle]
             bodies = scanner.place([shape], [(0.0, 0.0, 0.0)])
-            seen, walls = (
-                scanner.scan(robot, bodies)[0],
-                scanner.scan(robot, [], ends)[0],
-            )
+            seen = scanner.scan(robot, bodies)[0]
+            walls = scanner.scan(robot, [], ends)[0]
             assert np.array_equal(np.isinf(seen), np.isinf(walls))
             assert finite(seen, scanner.spec) == pytest.approx(
                 finite(walls, scanner.spec)
@@ -235,12 +243,11 @@ def test_a_wall_in_line_with_the_lidar_but_for_rounding_hides_nothing():
 
 @pytest.mark.parametrize("beams", [40, 360, 1100])
 def test_a_wall_met_at_a_flat_angle_is_as_exact_as_another(beams):
-    scanner, rng = (
-        make_scanner(lidar(beams=beams, range_max=25.0), ()),
-        np.random.default_rng(1),
-    )
+    scanner = make_scanner(lidar(beams=beams, range_max=25.0), ())
+    rng = np.random.default_rng(1)
     for beam in range(beams):
-        along, off = rng.uniform(-3.0, 3.0), rng.uniform(0.01, 0.2)
+        along = rng.uniform(-3.0, 3.0)
+        off = rng.uniform(0.01, 0.2)
         heading = along + np.arcsin(off / 20.0) - scanner.spec.angles[beam]
         ends = np.array([[-50.0, off], [50.0, off]]) @ [
             [np.cos(along), np.sin(along)],
@@ -292,7 +299,8 @@ def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
     scanner = make_scanner(spec, random_shapes(3), renderer)
     scenes = [random_scene(seed, scanner.table.shapes) for seed in range(40)]
     bodies = np.stack([scanner.place(scene.shapes, scene.poses) for scene in scenes])
-    robots, walls = np.stack([scene.robot for scene in scenes]), scenes[0].walls
+    robots = np.stack([scene.robot for scene in scenes])
+    walls = scenes[0].walls
     batch = scanner.scan(robots, bodies, walls)
     for n in range(40):
         assert np.array_equal(batch[n], scanner.scan(robots[n], bodies[n], walls)[0])
@@ -315,15 +323,19 @@ def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
     spec = lidar(
         beams=beams, angle_min=-0.5 * view, angle_max=0.5 * view, range_max=6.0
     )
-    scanner, rng = make_scanner(spec, ()), np.random.default_rng(beams)
+    scanner = make_scanner(spec, ())
+    rng = np.random.default_rng(beams)
     for count in (1, 7, 8, 9, 20):
-        robot, walls = rng.uniform(-1.0, 1.0, 3), rng.uniform(-5.0, 5.0, (count, 4))
+        robot = rng.uniform(-1.0, 1.0, 3)
+        walls = rng.uniform(-5.0, 5.0, (count, 4))
         seen = scanner.scan(robot, np.zeros((1, 0, 3)), walls)[0]
         angles = spec.angles + robot[2]
         ahead = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]
-        start, along = walls[:, :2] - robot[:2], walls[:, 2:] - walls[:, :2]
+        start = walls[:, :2] - robot[:2]
+        along = walls[:, 2:] - walls[:, :2]
         across = cross(ahead, along)
-        share, expected = cross(start, ahead) / across, cross(start, along) / across
+        share = cross(start, ahead) / across
+        expected = cross(start, along) / across
         expected[(share < 0.0) | (share > 1.0) | (expected < 0.0)] = np.inf
         expected = expected.min(axis=1)
         doubtful = (np.abs(share) < 1e-5) | (np.abs(share - 1.0) < 1e-5)
@@ -340,8 +352,10 @@ def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bi
     beams,
 ):
     scanner = make_scanner(lidar(beams=beams), random_shapes(5), "baked")
-    rng, shapes = np.random.default_rng(beams), scanner.table.shapes
-    count, worlds = 2 * LANES + 5, 3
+    rng = np.random.default_rng(beams)
+    shapes = scanner.table.shapes
+    count = 2 * LANES + 5
+    worlds = 3
     poses = rng.uniform(-1.0, 1.0, (worlds, count, 3)) * [4.0, 4.0, np.pi]
     bodies = scanner.place([shapes[k % len(shapes)] for k in range(count)], poses)
     robots = rng.uniform(-1.0, 1.0, (worlds, 3))
@@ -356,11 +370,13 @@ def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bi
 @pytest.mark.parametrize("beams", [72, 720])
 def test_many_looked_up_at_once_are_each_looked_up_alone_to_the_bit(beams):
     scanner = make_scanner(lidar(beams=beams), random_shapes(5), "baked")
-    rng, shapes = np.random.default_rng(beams), scanner.table.shapes
+    rng = np.random.default_rng(beams)
+    shapes = scanner.table.shapes
     poses = rng.uniform(-1.0, 1.0, (20, 9, 3)) * [4.0, 4.0, np.pi]
     bodies = scanner.place([shapes[k % len(shapes)] for k in range(9)], poses)
     robots = rng.uniform(-1.0, 1.0, (20, 3))
-    walls, alone = np.array([[-3.0, -2.0, 3.0, -2.5]]), np.empty(beams, np.float32)
+    walls = np.array([[-3.0, -2.0, 3.0, -2.5]])
+    alone = np.empty(beams, np.float32)
     together = scanner.scan(robots, bodies, walls)
     for robot, around, scan in zip(robots, bodies, together, strict=True):
         scan_robot(alone, robot, around, -1, walls, scanner.arguments)
@@ -449,10 +465,8 @@ def test_auto_looks_up_all_but_huge_shapes_and_those_with_notches():
 
 
 def test_two_lidars_in_one_process_use_their_own_tables():
-    wide, narrow = (
-        lidar(beams=90),
-        lidar(beams=30, angle_min=-1.0, angle_max=1.0, range_max=2.0),
-    )
+    wide = lidar(beams=90)
+    narrow = lidar(beams=30, angle_min=-1.0, angle_max=1.0, range_max=2.0)
     scanners = [make_scanner(wide, (SQUARE, STRIP)), make_scanner(narrow, (STRIP,))]
     for scanner in (*scanners, *scanners):
         exact = Scanner(scanner.spec, scanner.table, "exact")
@@ -533,7 +547,8 @@ def test_an_unknown_renderer_is_refused_with_the_nearest():
 
 def rmse(spec, table):
     """Of ranges among ten obstacles spread evenly over what the lidar sees."""
-    exact, baked = Scanner(spec, table, "exact"), Scanner(spec, table, "baked")
+    exact = Scanner(spec, table, "exact")
+    baked = Scanner(spec, table, "baked")
     rng = np.random.default_rng(0)
     radius = table.outlines.radii[0]
     away = np.sqrt(rng.uniform(radius**2, (spec.range_max + radius) ** 2, (400, 10)))
@@ -595,7 +610,8 @@ def test_auto_looks_up_a_concave_shape_of_any_corners_where_that_errs_little(mou
     for shape, looked_up in ((star_of(40, 0.5), False), (star_of(40, 0.01), True)):
         auto = make_scanner(spec, [shape])
         poses = rng.uniform(-1.0, 1.0, (300, 1, 3)) * [2.5, 2.5, np.pi]
-        bodies, robots = auto.place([shape], poses), np.zeros((300, 3))
+        bodies = auto.place([shape], poses)
+        robots = np.zeros((300, 3))
         scans = {
             way: Scanner(spec, auto.table, way).scan(robots, bodies)
             for way in RENDERERS
@@ -619,7 +635,8 @@ def test_auto_looks_up_a_concave_shape_of_any_corners_where_that_errs_little(mou
 )
 def test_auto_computes_the_rays_of_few_and_wide_beams(beams, same):
     spec = lidar(beams=beams)
-    auto, disc = make_scanner(spec, [STRIP, Circle(radius=0.1)]), Circle(radius=0.1)
+    auto = make_scanner(spec, [STRIP, Circle(radius=0.1)])
+    disc = Circle(radius=0.1)
     poses = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 1, 3)) * [2.0, 2.0, np.pi]
     scans = {
         way: Scanner(spec, auto.table, way).scan(
@@ -661,7 +678,8 @@ def test_a_full_circle_of_the_most_beams_can_be_looked_up():
     density = Density(distances=60, rotations=96, phases=1)
     table = bake(spec, [SQUARE], density)
     assert table.widths.max() > 2**15
-    baked, exact = Scanner(spec, table, "baked"), Scanner(spec, table, "exact")
+    baked = Scanner(spec, table, "baked")
+    exact = Scanner(spec, table, "exact")
     rng = np.random.default_rng(0)
     away, (bearing, heading) = (
         rng.uniform(0.213, 0.6, 10),

@@ -122,10 +122,8 @@ def test_its_noise_is_its_own_and_the_same_in_any_batch(model):
         replace(model, sensors=(rear(), rear()))
     other = FurtherLidar(name="other", lidar=rear(noise_std=0.05, frame="other").lidar)
     noisy = replace(model, sensors=(rear(noise_std=0.05), other))
-    one, many = (
-        FastSimulator(noisy, field(6.0, 5)),
-        FastSimulator(noisy, field(6.0, 5), 3),
-    )
+    one = FastSimulator(noisy, field(6.0, 5))
+    many = FastSimulator(noisy, field(6.0, 5), 3)
     one.reset([7])
     many.reset([5, 6, 7])
     assert np.array_equal(one.readings["rear"][0], many.readings["rear"][2])
@@ -184,7 +182,8 @@ def test_a_kind_in_a_file_of_a_users_own_is_simulated_and_observed(sonar, tmp_pa
     )
     observation, _ = env.reset(seed=1)
     simulator = env._backend.simulator
-    bodies, pose = simulator.obstacles[0], simulator.data.pose[0, 0]
+    bodies = simulator.obstacles[0]
+    pose = simulator.data.pose[0, 0]
     gap = (np.hypot(*(bodies[:, :2] - pose[:2]).T) - bodies[:, 5])[
         bodies[:, 5] > 0.0
     ].min()

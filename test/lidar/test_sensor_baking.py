@@ -53,7 +53,8 @@ def test_a_dark_surface_returns_from_near_and_a_bright_one_from_afar():
 
 
 def test_two_models_together_lose_what_either_loses():
-    grazing, dim = IncidenceDropout(greatest_incidence=0.6), Intensity(threshold=0.1)
+    grazing = IncidenceDropout(greatest_incidence=0.6)
+    dim = Intensity(threshold=0.1)
     rows = [
         bake(SPEC, [SQUARE], SMALL, model).rows
         for model in ((), (grazing,), (dim,), (grazing, dim))

@@ -81,7 +81,8 @@ def test_a_shipped_lidar_is_that_of_its_data_sheet(name):
 
 
 def test_the_jackals_lidar_is_a_hokuyo_ahead_of_its_middle():
-    jackal, hokuyo = load_lidar("jackal_hokuyo"), load_lidar("hokuyo_ust_10lx")
+    jackal = load_lidar("jackal_hokuyo")
+    hokuyo = load_lidar("hokuyo_ust_10lx")
     own = {"name": jackal.name, "beams": 720, "mount": (0.12, 0.0, 0.0)}
     assert jackal == hokuyo.model_copy(update=own)
 
@@ -172,5 +173,6 @@ def test_a_lidar_that_cant_be_is_refused_in_one_sentence(changes, sentence):
 
 
 def test_two_lidars_keep_their_own_beams():
-    one, other = lidar(beams=10), lidar(beams=20)
+    one = lidar(beams=10)
+    other = lidar(beams=20)
     assert (len(one.angles), len(other.angles), len(one.angles)) == (10, 20, 10)

@@ -95,7 +95,8 @@ def test_a_table_without_shapes_reads_back(tmp_path):
 
 
 def test_a_loaded_table_is_mapped_and_writing_to_it_leaves_the_files(folder):
-    before, back = contents(folder), LidarTable.load(folder)
+    before = contents(folder)
+    back = LidarTable.load(folder)
     for name in ARRAYS:
         array = getattr(back, name)
         assert array.ctypes.data % 64 == 0
@@ -149,7 +150,8 @@ def test_every_change_of_an_array_changes_the_fingerprint(table, array):
 
 @pytest.mark.parametrize("name", [*TABLE_FILES, SUMS])
 def test_every_flipped_bit_and_every_cut_is_refused(folder, name):
-    path, rng = folder / name, np.random.default_rng(0)
+    path = folder / name
+    rng = np.random.default_rng(0)
     content = path.read_bytes()
     for trial in range(60):
         damaged = bytearray(content)

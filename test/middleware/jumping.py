@@ -66,12 +66,16 @@ def errors_after(model, simulator, seed, setting, seconds=12.0):
 
     Odometry counts at its stamp, so it is compared with the truth of that moment.
     """
-    rng, middleware = np.random.default_rng(seed), Middleware(model)
+    rng = np.random.default_rng(seed)
+    middleware = Middleware(model)
     start = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     simulator.reset([seed], starts=start[None, None])
     middleware.reset(0, start)
     when = int(rng.integers(20, 40))
-    truth, underway, errors, nees = [start], [], [], []
+    truth = [start]
+    underway = []
+    errors = []
+    nees = []
     command = full_speed(model, rng)
     for k in range(1, round(seconds * 10)):
         if k % 8 == 0:
@@ -101,7 +105,8 @@ def errors_after(model, simulator, seed, setting, seconds=12.0):
 def campaign(robot, drives, settings, seed=0):
     """First and last errors and NEES after each drive's jump: (D, 3), (D,), (D, 3), (D,)."""
     model = noisy_model(robot)
-    simulator, rows = FastSimulator(model, field(200.0)), []
+    simulator = FastSimulator(model, field(200.0))
+    rows = []
     for k in range(drives):
         errors, nees, _ = errors_after(
             model, simulator, seed + k, settings[k % len(settings)]

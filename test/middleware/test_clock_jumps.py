@@ -20,7 +20,8 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 
 CHI2_999 = 16.27
 """99.9 % of chi-squared with three degrees of freedom lie below."""
-FAR, SMALL = (-3600.0, -30.0, 2.0, 3600.0), (-2.0, -1.5, -0.5, -0.3, 0.3, 0.5, 0.9)
+FAR = (-3600.0, -30.0, 2.0, 3600.0)
+SMALL = (-2.0, -1.5, -0.5, -0.3, 0.3, 0.5, 0.9)
 ROBOTS = ("ackermann", "differential", "mecanum")
 
 
@@ -126,9 +127,12 @@ def test_the_first_command_after_a_jump_need_not_be_waited_for():
 
 @pytest.mark.parametrize("jump_s", [-500.0, -0.3, 0.3, 3600.0])
 def test_the_robot_follows_the_command_that_came_last_whatever_its_stamp(jump_s):
-    middleware, shift, x = started(), round(jump_s * SECOND), 0.0
+    middleware = started()
+    shift = round(jump_s * SECOND)
+    x = 0.0
     for k in range(1, 42):
-        now, speed = SECOND + k * PERIOD, 1.0 if k <= 24 else 0.5
+        now = SECOND + k * PERIOD
+        speed = 1.0 if k <= 24 else 0.5
         moved = shift if k > 20 else 0
         middleware.command(now - PERIOD + moved, [speed, 0.0, 0.0])
         x += speed * 0.1
@@ -151,7 +155,8 @@ def test_scans_of_the_new_clock_are_taken_and_those_of_the_old_one_forgotten():
 
 
 def test_data_that_come_late_or_after_a_gap_or_in_a_burst_are_no_jump():
-    middleware, rng = started(), np.random.default_rng(0)
+    middleware = started()
+    rng = np.random.default_rng(0)
     for k in range(1, 200):
         if rng.random() < 0.2:
             continue  # lost

@@ -32,7 +32,8 @@ PERIOD = SECOND // 10
 def numerical_jacobian(function, x, step=1e-6):
     columns = []
     for i in range(len(x)):
-        ahead, behind = x.copy(), x.copy()
+        ahead = x.copy()
+        behind = x.copy()
         ahead[i] += step
         behind[i] -= step
         columns.append((function(ahead) - function(behind)) / (2.0 * step))
@@ -50,7 +51,8 @@ def random_command(model, rng):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_derivative_of_the_rates_is_the_numerical_one(robot):
-    model, rng = builtin_model(robot), np.random.default_rng(0)
+    model = builtin_model(robot)
+    rng = np.random.default_rng(0)
     terms = term_arrays(model.kinematics)
     for _ in range(10):
         x, dq = scratch(model.kinematics)
@@ -68,21 +70,26 @@ def test_the_derivative_of_the_rates_is_the_numerical_one(robot):
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize(("dt", "steps"), [(0.01, 1), (0.01, 10), (0.003, 1)])
 def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, steps):
-    model, rng = builtin_model(robot), np.random.default_rng(1)
+    model = builtin_model(robot)
+    rng = np.random.default_rng(1)
     motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
-        mean, command = random_mean(model, rng), random_command(model, rng)
+        mean = random_mean(model, rng)
+        command = random_command(model, rng)
         size = len(mean)
 
         def of(given, command=command, size=size):
-            end, error = given[:size].copy(), given[size:]  # of the state's rates
+            # of the state's rates
+            end = given[:size].copy()
+            error = given[size:]
             for _ in range(steps):
                 kernels.predict(end, kernels.unmoved(size, 0.0), command, dt, 1, motion)
                 end[3:] += error * dt
             end[2] = given[2] + geometry.wrap_angle(end[2] - given[2])
             return end
 
-        derivative, moved = kernels.unmoved(len(mean), 0.0), mean.copy()
+        derivative = kernels.unmoved(len(mean), 0.0)
+        moved = mean.copy()
         kernels.predict(moved, derivative, command, dt, steps, motion)
         start = np.append(mean, np.zeros(len(mean) - 3))
         assert derivative == pytest.approx(numerical_jacobian(of, start), abs=2e-5)
@@ -90,10 +97,12 @@ def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, ste
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_expected_twist_has_the_numerical_derivative(robot):
-    model, rng = builtin_model(robot), np.random.default_rng(2)
+    model = builtin_model(robot)
+    rng = np.random.default_rng(2)
     motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
-        mean, command = random_mean(model, rng), random_command(model, rng)
+        mean = random_mean(model, rng)
+        command = random_command(model, rng)
         log = Log(np.zeros(1, np.int64), command[None])
         twist, derivative = kernels.expect(mean, 0, motion, log)
         x = np.concatenate([mean[3:], command])
@@ -110,7 +119,8 @@ def test_the_prediction_is_the_motion_of_the_model():
     estimator.reset(0, [1.0, 2.0, 3.0])
     estimator.command(0, [0.6, 1.5])
     estimator.predict(SECOND)
-    pose, state = np.array([1.0, 2.0, 3.0]), np.zeros(2)
+    pose = np.array([1.0, 2.0, 3.0])
+    state = np.zeros(2)
     for _ in range(100):
         pose, state = model.kinematics.step(pose, state, [0.6, 1.5])
     found, _ = estimator.at(SECOND)
@@ -170,12 +180,15 @@ def test_a_heading_is_corrected_the_short_way_round(believed, measured):
 
 def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
     """Errors (T, 3) of the estimate, of the odometry, and covariances, all in the robot's frame."""
-    simulator, estimator = FastSimulator(model, field(60.0)), Estimator(model)
+    simulator = FastSimulator(model, field(60.0))
+    estimator = Estimator(model)
     rng = np.random.default_rng(seed)
     start = np.array([0.0, 0.0, 3.0])
     simulator.reset([seed], starts=start[None, None])
     estimator.reset(0, start)
-    errors, drifts, covariances = [], [], []
+    errors = []
+    drifts = []
+    covariances = []
     command = random_command(model, rng)
     for step in range(seconds * 10):
         if step % 5 == 0:
@@ -235,7 +248,8 @@ def test_a_wrong_belief_about_the_pose_is_mended_by_measurements():
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ackermann", "mecanum"])
 def test_the_covariance_stays_positive_definite_over_thousands_of_random_steps(robot):
-    model, rng = builtin_model(robot), np.random.default_rng(3)
+    model = builtin_model(robot)
+    rng = np.random.default_rng(3)
     estimator = Estimator(model)
     now = 0
     estimator.reset(now, np.zeros(3))
@@ -298,7 +312,8 @@ REST = [
 )
 def test_the_estimate_is_as_uncertain_as_it_claims(robot, pose_std):
     """The mean NEES of many drives lies within the 95 % band of chi-squared."""
-    model, nees = noisy_model(robot), []
+    model = noisy_model(robot)
+    nees = []
     for seed in range(RUNS):
         errors, _, covariances = simulated_drive(model, 8, seed, pose_std)
         nees.append(errors[-1] @ np.linalg.solve(covariances[-1], errors[-1]))
@@ -313,7 +328,8 @@ def test_a_model_that_is_a_little_wrong_does_not_lead_the_estimate_astray(robot)
     backend = SimBackend(
         model, load_world("empty"), estimator=True, randomisation=wrong
     )
-    start, command = np.array([0.0, -1.0, 0.0]), np.zeros(len(model.robot.command))
+    start = np.array([0.0, -1.0, 0.0])
+    command = np.zeros(len(model.robot.command))
     command[0], command[-1] = 0.5, 0.3 if model.robot.steers else 0.5
     for seed in range(3):
         backend.reset(Start(seed, start))
@@ -325,7 +341,8 @@ def test_a_model_that_is_a_little_wrong_does_not_lead_the_estimate_astray(robot)
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_wrong_model_leaves_the_estimate_where_odometry_is(robot):
-    model, rng = builtin_model(robot), np.random.default_rng(7)
+    model = builtin_model(robot)
+    rng = np.random.default_rng(7)
     wrong = Randomisation(
         name="wrong", kinematics={"scale": [0.95, 1.05]}, action_latency=(0.5, 0.5)
     )
@@ -341,7 +358,8 @@ def test_a_wrong_model_leaves_the_estimate_where_odometry_is(robot):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_odometry_of_four_times_the_noise_that_was_told_is_followed(robot):
-    model, rng = builtin_model(robot), np.random.default_rng(7)
+    model = builtin_model(robot)
+    rng = np.random.default_rng(7)
     told = zip(("odom_linear", "odom_angular"), model.noise.odometry, strict=True)
     rough = Randomisation(
         name="rough", odometry={name: (4.0 * std, 4.0 * std) for name, std in told}
@@ -360,11 +378,9 @@ def test_odometry_of_four_times_the_noise_that_was_told_is_followed(robot):
 @pytest.mark.parametrize("glitch", [0.2, 1.0, 1e9])
 def test_odometry_with_glitches_is_not_given_up_for_a_wrong_model(glitch):
     """The robot is slower than its model; each twentieth twist is off to the side."""
-    estimator, odom, twist = (
-        Estimator(builtin_model("differential")),
-        np.zeros(3),
-        np.zeros(3),
-    )
+    estimator = Estimator(builtin_model("differential"))
+    odom = np.zeros(3)
+    twist = np.zeros(3)
     estimator.reset(0, odom)
     rng = np.random.default_rng(0)
     for k in range(1, 300):
@@ -379,7 +395,8 @@ def test_odometry_with_glitches_is_not_given_up_for_a_wrong_model(glitch):
 
 @pytest.mark.slow
 def test_poses_of_four_times_the_noise_that_was_told_still_mend_the_estimate():
-    model, told = builtin_model("differential"), 0.02
+    model = builtin_model("differential")
+    told = 0.02
     errors, _, _ = simulated_drive(model, 60, 1, told, noise=4.0)
     assert np.sqrt((errors[100:, :2] ** 2).mean()) < 2.0 * told
 
@@ -485,16 +502,20 @@ def test_the_noise_of_the_pose_is_that_of_the_model():
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_to_foresee_changes_no_bit_whatever_comes_instead(robot):
     model = builtin_model(robot)
-    plain, foreseeing = Estimator(model), Estimator(model)
+    plain = Estimator(model)
+    foreseeing = Estimator(model)
     rng = np.random.default_rng(4)
     times = np.cumsum(rng.integers(1, 2 * PERIOD, 400))
     outcomes = set()
     for time, then in itertools.pairwise(times.tolist()):
         foreseeing.foresee(then if rng.random() < 0.7 else then + PERIOD)
-        command, twist = random_command(model, rng), 0.3 * rng.normal(size=3)
+        command = random_command(model, rng)
+        twist = 0.3 * rng.normal(size=3)
         stamp = time + int(rng.integers(-PERIOD, PERIOD))
         moment = then if rng.random() < 0.8 else (time + then) // 2
-        pose, event, spreads = rng.normal(size=3), rng.random(), []
+        pose = rng.normal(size=3)
+        event = rng.random()
+        spreads = []
         for one in (plain, foreseeing):
             if event < 0.3:
                 one.command(stamp, command, 0)
@@ -641,7 +662,8 @@ def test_absurd_commands_leave_the_filter_sound(robot, value):
 
 def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     estimator = driven()
-    before, far = estimator.belief, [30.0, 2.0, -3.0]
+    before = estimator.belief
+    far = [30.0, 2.0, -3.0]
     for _ in range(4):
         assert (
             estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.OUTLIER
@@ -670,7 +692,8 @@ def test_a_heading_beyond_the_seam_is_near_and_no_outlier(believed, measured):
 
 def test_outliers_are_counted_in_a_row_only():
     estimator = driven()
-    good, far = estimator.at(estimator.time_ns)[0], [30.0, 2.0, 1.0]
+    good = estimator.at(estimator.time_ns)[0]
+    far = [30.0, 2.0, 1.0]
     for _ in range(5):
         for _ in range(4):
             assert (
@@ -695,7 +718,9 @@ def test_a_yaw_rate_moves_nothing_by_itself_and_is_refused_beyond_the_robots_rea
 
 @pytest.mark.slow
 def test_a_gate_refuses_one_good_measurement_in_a_thousand():
-    estimator, rng, refused = driven(), np.random.default_rng(0), 0
+    estimator = driven()
+    rng = np.random.default_rng(0)
+    refused = 0
     belief = estimator.belief
     spread = np.linalg.cholesky(belief.covariance[:3, :3] + np.eye(3) * 0.05**2)
     for _ in range(20_000):
@@ -720,7 +745,8 @@ def test_an_unknown_start_is_mended_by_the_first_pose():
 
 
 def test_a_covariance_that_rounding_made_indefinite_is_mended():
-    low, high = np.full(2, -1.0), np.full(2, 1.0)
+    low = np.full(2, -1.0)
+    high = np.full(2, 1.0)
     mean = np.array([0.0, 0.0, 4.0, 5.0, -0.5])
     covariance = np.ones((5, 5)) - 1e-13 * np.eye(5)
     covariance[0, 4] += 1e-12

@@ -96,7 +96,8 @@ def test_after_bad_data_good_ones_count_in_full(middleware):
     clean.reset(SECOND, [1.0, 2.0, 0.5])
     rng = np.random.default_rng(0)
     for step in range(1, 60):
-        twist, now = rng.normal(size=3), SECOND + step * PERIOD
+        twist = rng.normal(size=3)
+        now = SECOND + step * PERIOD
         middleware.odometry(now, 0, np.zeros(3), np.full(3, np.nan))
         for one in (clean, middleware):
             one.command(now - PERIOD, twist)
@@ -310,7 +311,8 @@ def test_a_stamp_that_is_no_whole_number_is_refused(middleware, kind, stamp):
 def test_data_from_the_future_never_enter(middleware, kind):
     middleware.odometry(SECOND, 50 * SECOND, *STILL)
     before = state(middleware)
-    late, due = 3 * SECOND + 1, 3 * SECOND
+    late = 3 * SECOND + 1
+    due = 3 * SECOND
     for stamp, used in ((late, False), (due, True)):
         if kind == "scan":
             given = middleware.scan(stamp, 51 * SECOND, RANGES)
@@ -411,7 +413,8 @@ def test_age_counts_from_the_stamp_and_is_infinite_without_data():
 
 
 def test_two_caches_share_nothing():
-    one, other = TopicCache(), TopicCache()
+    one = TopicCache()
+    other = TopicCache()
     one.put("scan", 1, 1, None)
     one.reject("reason")
     assert not other.newest

@@ -51,7 +51,8 @@ def messages(model, rng, seconds=6.0, latest_ns=HISTORY_NS):
             rng.random(len(ticks)) < 0.3
         )
         stamps[topic] = [int(ms) * MILLISECOND for ms in moved]
-    truth, made = Estimator(model), []
+    truth = Estimator(model)
+    made = []
     truth.reset(0, START)
     for stamp in stamps["cmd_vel"]:
         command = rng.uniform(model.robot.command_low, model.robot.command_high)
@@ -69,7 +70,8 @@ def messages(model, rng, seconds=6.0, latest_ns=HISTORY_NS):
 
 def feed(middleware, message):
     """Hands a message to the middleware, all at one moment of the receiver's clock."""
-    stamp, value = message.stamp_ns, message.value
+    stamp = message.stamp_ns
+    value = message.value
     if message.topic == "cmd_vel":
         return middleware.command(stamp, value, stamp)
     arrival = stamp + message.underway_ns
@@ -103,15 +105,18 @@ def numbers(middleware):
 def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(
     robot, seed
 ):
-    model, rng = builtin_model(robot), np.random.default_rng(seed)
+    model = builtin_model(robot)
+    rng = np.random.default_rng(seed)
     drive = messages(model, rng)
     late = sorted(drive, key=lambda m: m.stamp_ns + m.underway_ns)
     assert late != drive
-    ordered, shuffled = fed(model, drive), fed(model, late)
+    ordered = fed(model, drive)
+    shuffled = fed(model, late)
     (expected_ns, expected), (found_ns, found) = numbers(ordered), numbers(shuffled)
     assert found_ns == expected_ns
     assert found == pytest.approx(expected, abs=1e-9)
-    one, other = ordered.health(0), shuffled.health(0)
+    one = ordered.health(0)
+    other = shuffled.health(0)
     assert (one.rejected, one.noticed) == (other.rejected, other.noticed)
     assert all(
         one.rejected[f"{topic}: outlier"] >= 2 for topic in ("odom", "imu", "pose")
@@ -125,7 +130,8 @@ def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
-    model, rng = builtin_model("ackermann"), np.random.default_rng(100 + seed)
+    model = builtin_model("ackermann")
+    rng = np.random.default_rng(100 + seed)
     drive = messages(model, rng, seconds=0.9)
     _, expected = numbers(fed(model, drive))
     shuffled = [drive[k] for k in rng.permutation(len(drive))]
@@ -133,7 +139,8 @@ def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
 
 
 def test_of_equal_stamps_the_order_of_arrival_does_not_matter():
-    model, rng = builtin_model("differential"), np.random.default_rng(7)
+    model = builtin_model("differential")
+    rng = np.random.default_rng(7)
     at_once = [
         Message("pose", SECOND, rng.normal(size=3) * 0.05, 0),
         Message("imu", SECOND, np.array([0.2]), 0),
@@ -161,7 +168,8 @@ def test_a_late_command_counts_from_when_it_was_sent(latency):
 
 
 def test_copies_change_nothing_even_late_ones():
-    model, rng = builtin_model("mecanum"), np.random.default_rng(2)
+    model = builtin_model("mecanum")
+    rng = np.random.default_rng(2)
     drive = messages(model, rng, seconds=2.0, latest_ns=1)
     middleware = fed(model, drive)
     before = numbers(middleware)
@@ -278,7 +286,8 @@ def test_the_first_stamp_shows_how_the_clocks_lie(offset):
 
 @pytest.mark.parametrize("elapsed", [0, 1, SECOND, 60 * SECOND])
 def test_a_stamp_may_be_ahead_of_what_is_due_by_the_tolerance(elapsed):
-    stamps, due = heard(), 100 * SECOND + elapsed + FUTURE_NS
+    stamps = heard()
+    due = 100 * SECOND + elapsed + FUTURE_NS
     assert stamps.fault(due, 7 * SECOND + elapsed) == ""
     assert stamps.fault(due + 1, 7 * SECOND + elapsed) == "more than 1 s in the future"
 

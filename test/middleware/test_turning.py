@@ -31,7 +31,8 @@ def believed(
     events += [(t, 1, k) for k, t in enumerate(drive.odom_t[::5])]
     if rates is not False:
         events += [(t, 2, k) for k, t in enumerate(drive.t[: len(rates) : every])]
-    poses, truths = [], []
+    poses = []
+    truths = []
     for t, what, k in sorted(events):
         now = round(t * NS)
         if what == 0:

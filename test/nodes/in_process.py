@@ -45,8 +45,11 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
         for old, new in (remap or {}).items():
             self.arguments += ["-r", f"{old}:={new}"]
         self.arguments += words
-        self.node, self.domain_id, self.lines = node, domain_id, []
-        self.handler, self.returncode = None, None
+        self.node = node
+        self.domain_id = domain_id
+        self.lines = []
+        self.handler = None
+        self.returncode = None
         self.log = self._process = self  # what tests ask of a process and of its log
         self._thread = threading.Thread(target=self._run, daemon=True, name=node)
         self._thread.start()
@@ -106,7 +109,8 @@ class _Proxy:
     """A module, some of whose attributes depend on the thread."""
 
     def __init__(self, module: Any, **own: Any) -> None:
-        self._module, self._own = module, own
+        self._module = module
+        self._own = own
 
     def __getattr__(self, name: str) -> Any:
         return self._own[name]() if name in self._own else getattr(self._module, name)
@@ -137,7 +141,8 @@ def _set_handler() -> Any:
 
 
 def _log() -> Any:
-    node, log = RUNNING.get(threading.get_ident()), LIBRARY.rclpy_logging_rcutils_log
+    node = RUNNING.get(threading.get_ident())
+    log = LIBRARY.rclpy_logging_rcutils_log
     if node is None:
         return log
 
@@ -153,7 +158,8 @@ def _open_context(args: Any = None, domain_id: int | None = None) -> Any:
     return OPEN_CONTEXT(args, domain_id if node is None else node.domain_id)
 
 
-LIBRARY, OPEN_CONTEXT = rcutils_logger._rclpy, runner.open_context
+LIBRARY = rcutils_logger._rclpy
+OPEN_CONTEXT = runner.open_context
 rcutils_logger._rclpy = _Proxy(LIBRARY, rclpy_logging_rcutils_log=_log)
 runner.open_context = _open_context
 runner.signal = _Proxy(signal, signal=_set_handler)

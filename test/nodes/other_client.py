@@ -19,8 +19,10 @@ DEFINITIONS = {
     "float32 scan_time\nfloat32 range_min\nfloat32 range_max\n"
     "float32[] ranges\nfloat32[] intensities\n",
 }
-PATIENCE_S, SPEED = 20.0, 0.3
-NEARER_M, FAR_M = 0.5, 99.0
+PATIENCE_S = 20.0
+SPEED = 0.3
+NEARER_M = 0.5
+FAR_M = 99.0
 CYCLONE = """<CycloneDDS><Domain><General><Interfaces>
 <NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast>
 </General><Discovery><Peers><Peer address="127.0.0.1"/></Peers>

@@ -136,7 +136,8 @@ def complaint(backend):
 
 def test_it_gives_the_numbers_of_the_simulator_in_process(simulator, model, arena):
     options = {"domain_id": simulator[0], "truth": True, "timeout_s": TIMEOUT_S}
-    seeds, steps = (7, 8, 7, 2**31 - 1), 30
+    seeds = (7, 8, 7, 2**31 - 1)
+    steps = 30
     here = BridgeEnv("sim", model, arena, estimator=True)
     there = BridgeEnv("dds", model, arena, backend_options=options)
     try:
@@ -181,10 +182,8 @@ def test_every_episode_over_topics_is_in_its_world_of_a_set(
     world = tmp_path / "mixed.yaml"
     world.write_text("name: mixed\nworlds: [crowd, room, corridor]\n")
     launch("simulator_node", domain_id, mode="lockstep", world=str(world))
-    options, seeds = (
-        {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S},
-        (0, 1, 2, 3),
-    )
+    options = {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S}
+    seeds = (0, 1, 2, 3)
     here = BridgeEnv("sim", model, str(world), estimator=True)
     there = BridgeEnv("dds", model, str(world), backend_options=options)
     assert {member_of(here.world, seed) for seed in seeds} == {0, 1, 2}
@@ -228,7 +227,8 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(
     drive(backend)
     whole = backend.step(np.array([0.5, 0.1]))
     drive(backend)
-    put, lost = backend._mail.put, []
+    put = backend._mail.put
+    lost = []
 
     def lossy(kind, message):
         if kind == topic and not lost:
@@ -247,7 +247,9 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(
 def test_a_lost_asking_is_made_again(connect, monkeypatch):
     backend = connect()
     drive(backend)
-    put, ask, lost = backend._mail.put, backend._episodes._repeat.call_async, []
+    put = backend._mail.put
+    ask = backend._episodes._repeat.call_async
+    lost = []
 
     def lossy(kind, message):
         if kind == "scan" and "scan" not in lost:
@@ -292,7 +294,8 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
         message.header.stamp.sec = second
         return serialize_message(message)
 
-    worked, got = [], []
+    worked = []
+    got = []
     mail = _Mailbox(
         ("odom", "scan"), lambda stamp, *_: worked.append(stamp), slack_ns=0
     )
@@ -440,7 +443,8 @@ def test_a_simulator_that_hangs_serves_again_when_it_wakes_and_its_death_is_noti
     backend, process, _ = own_simulator
     drive(backend)
     process._process.send_signal(signal.SIGSTOP)
-    backend.timeout_s, hung_ns = 0.5, backend._now_ns
+    backend.timeout_s = 0.5
+    hung_ns = backend._now_ns
     with pytest.raises(StaleDataError):
         backend.step(np.array([0.5, 0.0]))
     process._process.send_signal(signal.SIGCONT)
@@ -485,10 +489,8 @@ def test_a_car_that_takes_turn_rates_moves_over_dds_as_in_process(
     )
     launch("simulator_node", domain_id, mode="lockstep", model=str(file))
     kart = open_model(file)
-    there, alone = (
-        connect(model=kart, domain_id=domain_id),
-        SimBackend(kart, arena, estimator=True),
-    )
+    there = connect(model=kart, domain_id=domain_id)
+    alone = SimBackend(kart, arena, estimator=True)
     for backend in (there, alone):
         backend.reset(START)
     for command in ([0.9, 0.5], [0.9, -0.2], [-0.4, 0.3], [0.0, 0.5], [0.5, 0.1]):

@@ -79,7 +79,8 @@ class Robot:
     """Says what the test wants to be recorded."""
 
     def __init__(self, peer):
-        self.peer, self.sent = peer, 0
+        self.peer = peer
+        self.sent = 0
         self.odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR)
         self.command = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
 

@@ -46,7 +46,9 @@ GIVEN = [
 
 SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
-PERIOD_S, START_NS, MOST_S = 0.1, 10**18, 1.0
+PERIOD_S = 0.1
+START_NS = 10**18
+MOST_S = 1.0
 MOST_ARMINGS = 3
 CORRIDOR_M = 1.5  # from the middle of it, on which the robot drives, to either wall
 WRITTEN_S = 5.0
@@ -66,8 +68,13 @@ class Robot:
     kind = TwistStamped
 
     def __init__(self, peer, lidar):
-        self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, START_NS, 0.0
-        self.silent, self.wish, self.stamped = set(), (0.5, 0.0, 0.0), None
+        self.peer = peer
+        self.lidar = lidar
+        self.stamp_ns = START_NS
+        self.x = 0.0
+        self.silent = set()
+        self.wish = (0.5, 0.0, 0.0)
+        self.stamped = None
         # Along a corridor without an end nothing moves, however late a pose or a scan may be.
         bearings = lidar.angles + lidar.mount[2]
         self.walls = CORRIDOR_M / np.maximum(np.abs(np.sin(bearings)), 1e-9)
@@ -85,7 +92,8 @@ class Robot:
     def sends(self):
         """What arrives in a period."""
         speed = self.passed[-1].linear.x if self.passed else 0.0
-        before, self.stamp_ns = self.stamp_ns, START_NS + time.monotonic_ns()
+        before = self.stamp_ns
+        self.stamp_ns = START_NS + time.monotonic_ns()
         # A busy machine leaves out some periods; the robot drives on all the same.
         self.x += speed * min((self.stamp_ns - before) / NS_PER_S, MOST_S)
         odometry = conversions.odometry_to_ros(
@@ -141,7 +149,8 @@ class Robot:
 
         A busy machine may let the gate stop in between, and stay so; once is enough.
         """
-        self.silent, self.stamped = set(), None
+        self.silent = set()
+        self.stamped = None
         wish = wish or (0.5, 0.0, 0.0)
         deadline = time.monotonic() + DEADLINE_S
         for _ in range(MOST_ARMINGS):
@@ -241,7 +250,8 @@ def test_a_motion_that_was_decided_on_before_a_freeze_is_never_published(
 ):
     given = ["node", "--ros-args", "-p", f"black_box:={tmp_path}"]
     node = command_gate.CommandGate(open_context(given, domain_id))
-    said, clock = [], [100.0]
+    said = []
+    clock = [100.0]
     decide = command_gate.decide
 
     def frozen(config, state, event, now):
@@ -266,7 +276,8 @@ def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(
     domain_id, tmp_path, monkeypatch
 ):
     """Whatever `safety` decides: here it is made to decide on NaN."""
-    sent, wrong = [], np.array([0.5, math.nan, 0.1])
+    sent = []
+    wrong = np.array([0.5, math.nan, 0.1])
     context = open_context([*GIVEN, f"black_box:={tmp_path}"], domain_id)
     node = command_gate.CommandGate(context)
     try:
@@ -431,7 +442,8 @@ def test_a_body_that_is_held_while_odometry_moves_is_stopped(robot):
     bearings = robot.lidar.angles
     across = np.abs(np.sin(bearings)) / 1.2
     along = np.abs(np.cos(bearings)) / 2.0
-    free, robot.walls = robot.walls, 1.0 / np.maximum(across, along)
+    free = robot.walls
+    robot.walls = 1.0 / np.maximum(across, along)
     try:
         robot.says("body_held: topic=scan")
         robot.stops()
@@ -480,7 +492,8 @@ def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
         # A busy machine may freeze the gate; then that is the stop which is written.
         assert time.monotonic() < deadline, "no file"
         robot.drives()
-        robot.silent, robot.stamped = {"scan"}, robot.stamp_ns
+        robot.silent = {"scan"}
+        robot.stamped = robot.stamp_ns
         robot.stops()
         robot.peer.within(WRITTEN_S, lambda: list(black_box.glob("*scan_silent.jsonl")))
     again = replay(files[-1])

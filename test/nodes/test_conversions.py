@@ -53,7 +53,10 @@ def test_headings_come_back(heading):
 
 def test_a_heading_is_the_yaw_of_a_tilted_quaternion_too():
     # Yaw 0.7 after pitch 0.3, as an IMU on a slope would say.
-    cy, sy, cp, sp = math.cos(0.35), math.sin(0.35), math.cos(0.15), math.sin(0.15)
+    cy = math.cos(0.35)
+    sy = math.sin(0.35)
+    cp = math.cos(0.15)
+    sp = math.sin(0.15)
     tilted = Quaternion(x=-sy * sp, y=cy * sp, z=sy * cp, w=cy * cp)
     assert yaw(tilted) == pytest.approx(0.7)
 

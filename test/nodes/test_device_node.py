@@ -109,7 +109,8 @@ def test_robots_of_a_fleet_see_each_other(fleet, model):
 
 def test_the_frames_of_a_fleet_begin_with_the_namespace_of_each_robot(fleet):
     for name in NAMES:
-        scan, odom = fleet.scans[name][-1], fleet.odoms[name][-1]
+        scan = fleet.scans[name][-1]
+        odom = fleet.odoms[name][-1]
         assert scan.header.frame_id == f"{name}/laser"
         assert (odom.header.frame_id, odom.child_frame_id) == (
             f"{name}/odom",
@@ -193,7 +194,8 @@ def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_meas
 ):
     known = len(stamped.stamps("scan"))
     stamped.peer.until(lambda: len(stamped.stamps("scan")) > known + 5, "scans")
-    clock, late = 0, []
+    clock = 0
+    late = []
     for topic, stamp in list(stamped.order):
         if topic == "clock":
             clock = stamp

@@ -298,7 +298,8 @@ def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
         if raising:
             raise ValueError("of the user")
 
-    mode, raising = "realtime", []
+    mode = "realtime"
+    raising = []
     told = {"say": say, "vehicle": True, "start": "present"}
     peer, heard = listeners[mode]
     options = {

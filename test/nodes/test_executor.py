@@ -43,7 +43,9 @@ def spin_until(executor, done, what):
 
 
 def test_entities_that_come_and_go_are_noticed(node, executor):
-    publisher, one, two = node.create_publisher(Int32, "count", 10), [], []
+    publisher = node.create_publisher(Int32, "count", 10)
+    one = []
+    two = []
     first = node.create_subscription(Int32, "count", one.append, 10)
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
     publisher.publish(Int32(data=1))
@@ -63,7 +65,8 @@ def test_services_clients_timers_and_guard_conditions_are_served_beside(node, ex
         response.success = True
         return response
 
-    ticks, triggered = [], []
+    ticks = []
+    triggered = []
     node.create_service(Trigger, "ask", answer)
     client = node.create_client(Trigger, "ask")
     node.create_timer(0.01, lambda: ticks.append(1))
@@ -95,7 +98,8 @@ def test_a_context_that_is_shut_down_ends_the_spin(node, executor):
 
 
 def test_a_callback_that_asks_for_it_is_told_about_the_message(node, executor):
-    publisher, told = node.create_publisher(Int32, "count", 10), []
+    publisher = node.create_publisher(Int32, "count", 10)
+    told = []
     node.create_subscription(
         Int32, "count", lambda data, info: told.append((data, info)), 10, raw=True
     )
@@ -110,10 +114,12 @@ def test_a_callback_that_asks_for_it_is_told_about_the_message(node, executor):
 def test_it_rests_too_when_the_message_that_counts_came_while_another_was_handled(
     node, executor, monkeypatch
 ):
-    rests, late = [], [(lambda _: HANDED_OVER, (Int32(),))]
+    rests = []
+    late = [(lambda _: HANDED_OVER, (Int32(),))]
     monkeypatch.setattr(executor_module.time, "sleep", rests.append)
     monkeypatch.setattr(executor_module._Entities, "come", lambda _: late)
-    publisher, heard = node.create_publisher(Int32, "count", 10), []
+    publisher = node.create_publisher(Int32, "count", 10)
+    heard = []
     node.create_subscription(Int32, "count", heard.append, 10)
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
     assert not rests
@@ -125,7 +131,8 @@ def test_it_rests_too_when_the_message_that_counts_came_while_another_was_handle
 def test_it_rests_for_a_part_of_the_time_since_it_last_did_but_no_longer_than_a_limit(
     executor, monkeypatch
 ):
-    now_s, rests = [0.0], []
+    now_s = [0.0]
+    rests = []
     monkeypatch.setattr(executor_module.time, "sleep", rests.append)
     monkeypatch.setattr(executor_module.time, "monotonic", lambda: now_s[0])
     for now_s[0] in (1.0, 1.001, 2.0):
@@ -137,7 +144,9 @@ def test_it_rests_for_a_part_of_the_time_since_it_last_did_but_no_longer_than_a_
 def test_it_rests_after_a_callback_that_woke_another_thread_and_after_no_other(
     node, executor, monkeypatch
 ):
-    answers, rests, heard = [None, True, HANDED_OVER], [], []
+    answers = [None, True, HANDED_OVER]
+    rests = []
+    heard = []
 
     def hear(message):
         heard.append(message.data)
@@ -164,7 +173,9 @@ def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(
         def __getattr__(self, name):
             raise AttributeError(f"no {name}")
 
-    publisher, heard, ticks = node.create_publisher(Int32, "count", 10), [], []
+    publisher = node.create_publisher(Int32, "count", 10)
+    heard = []
+    ticks = []
     node.create_subscription(Int32, "count", heard.append, 10)
     node.create_timer(0.01, lambda: ticks.append(1))
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
@@ -190,7 +201,9 @@ def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(
 
 
 def test_a_timer_ticks_as_often_as_it_is_due_beside_messages(node, executor):
-    publisher, heard, ticks = node.create_publisher(Int32, "count", 10), [], []
+    publisher = node.create_publisher(Int32, "count", 10)
+    heard = []
+    ticks = []
 
     def tick():
         ticks.append(1)
@@ -207,7 +220,8 @@ def test_a_timer_ticks_as_often_as_it_is_due_beside_messages(node, executor):
 def test_a_timer_that_is_cancelled_or_destroyed_by_another_does_not_tick(
     node, executor
 ):
-    ticks, others = [], []
+    ticks = []
+    others = []
 
     def first():
         ticks.append(1)
@@ -222,7 +236,8 @@ def test_a_timer_that_is_cancelled_or_destroyed_by_another_does_not_tick(
 
 
 def test_a_timer_that_destroys_itself_ticks_once(node, executor):
-    ticks, beats = [], []
+    ticks = []
+    beats = []
 
     def once():
         ticks.append(1)

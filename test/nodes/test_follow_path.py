@@ -31,7 +31,9 @@ from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import open_context, unknown
 
 pytestmark = pytest.mark.ros
-SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+SUCCEEDED = 4
+CANCELED = 5
+ABORTED = 6
 ARCHIVE = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
 CODES = FollowPath.Result
 
@@ -40,7 +42,8 @@ class Tree:
     """The test's end of the actions, which relays the commands to a simulator in lock-step."""
 
     def __init__(self, peer):
-        self.peer, self.feedback = peer, []
+        self.peer = peer
+        self.feedback = []
         self.truths = peer.listen(Odometry, "ground_truth")
         self.raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
         self.commands = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
@@ -72,7 +75,8 @@ class Tree:
 
     def tells_where_it_is(self):
         """Lets the policy know the robot's true pose: odometry has drifted over all the drives."""
-        message, told = PoseWithCovarianceStamped(), "the robot is at"
+        message = PoseWithCovarianceStamped()
+        told = "the robot is at"
         message.header.frame_id = "map"
         message.pose.pose = conversions.pose_to_ros(self.pose, 0, "map").pose
         known = self.policy.log.read_text().count(told)
@@ -230,7 +234,9 @@ def test_a_robot_that_stands_is_given_up_although_its_path_is_planned_again(tree
 
     tree.limits.publish(SpeedLimit(percentage=True, speed_limit=1.0))
     tree.peer.within(0.5, lambda: False)
-    way, since_s, codes = path(tree.pose[:2].tolist(), (-2.0, 2.0)), now_s(), []
+    way = path(tree.pose[:2].tolist(), (-2.0, 2.0))
+    since_s = now_s()
+    codes = []
     while not codes and now_s() - since_s < 30.0:
         future, sent_s = tree.send(way).get_result_async(), now_s()
         tree.until(
@@ -249,7 +255,8 @@ def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(tree):
     assert (
         result.result.error_code == NavigateToPose.Result.FAILED_TO_LOAD_BEHAVIOR_TREE
     )
-    goal.behavior_tree, goal.pose.pose.position.x = "", -1.5
+    goal.behavior_tree = ""
+    goal.pose.pose.position.x = -1.5
     tree.feedback.clear()
     tree.tells_where_it_is()
     result = tree.ended(goal)
@@ -275,10 +282,8 @@ def test_navigate_to_pose_is_left_to_another_node_that_serves_it(tree):
 @pytest.mark.parametrize("driven", [NAVIGATE, FOLLOW])
 def test_a_goal_that_is_driven_to_keeps_its_server_until_its_end(driven):
     dropped, run = [], SimpleNamespace(goal=SimpleNamespace(name=driven))
-    server, logger = (
-        SimpleNamespace(destroy=lambda: dropped.append(1)),
-        SimpleNamespace(info=str),
-    )
+    server = SimpleNamespace(destroy=lambda: dropped.append(1))
+    logger = SimpleNamespace(info=str)
     actions = SimpleNamespace(
         _servers={NAVIGATE: server},
         led=True,

@@ -43,7 +43,8 @@ def graph(launch, meet, module_domain_id):
     peer = meet(module_domain_id)
     names = "simulator_node", "middleware_node", "policy_node", "command_gate"
     nodes = [launch(name, module_domain_id) for name in names]
-    wanted, served = shown() - FOREIGN, {"/command_gate/arm", "/simulator_node/reset"}
+    wanted = shown() - FOREIGN
+    served = {"/command_gate/arm", "/simulator_node/reset"}
 
     def topics():
         return dict(peer.node.get_topic_names_and_types())

@@ -45,7 +45,8 @@ class Operator:
     """A gate in a process of its own, and a button that the test presses."""
 
     def __init__(self, gate, peer, beside):
-        self.gate, self.peer = gate, peer
+        self.gate = gate
+        self.peer = peer
         self.button = peer.speak(Bool, "e_stop", quality=qos.COMMAND)
         self.beside = (
             peer.speak(Bool, "e_stop", quality=qos.COMMAND) if beside else None

@@ -31,15 +31,19 @@ from nics_drl_bridge.nodes.gate_log import BURST_S, LINE_S, BoxWriter, GateLog
 
 DEADLINE_S = 20.0
 LONG_S = 60.0
-MOTION, NONSENSE = [0.5, 0.0, 0.1], [np.nan, 0.0, 0.0]
+MOTION = [0.5, 0.0, 0.1]
+NONSENSE = [np.nan, 0.0, 0.0]
 
 
 class Logger:
     """Keeps the lines, by level."""
 
     def __init__(self):
-        self.info_lines, self.warnings, self.errors = [], [], []
-        self.info, self.warning = self.info_lines.append, self.warnings.append
+        self.info_lines = []
+        self.warnings = []
+        self.errors = []
+        self.info = self.info_lines.append
+        self.warning = self.warnings.append
         self.error = self.errors.append
 
 
@@ -48,10 +52,12 @@ class Recorded(Rig):
 
     def __init__(self, log=None):
         super().__init__()
-        self.entries, self.log = [], log
+        self.entries = []
+        self.log = log
 
     def give(self, event, now=None):
-        before, now = self.state, self.now if now is None else now
+        before = self.state
+        now = self.now if now is None else now
         decision = super().give(event, now)
         self.entries.append(Entry(now, event, before, decision))
         if self.log is not None:
@@ -392,7 +398,8 @@ def test_an_error_is_told_by_its_sentence_and_the_next_file_is_written(
 ):
     (tmp_path / "file").touch()
     disk = Disk(answers)
-    bad, good = str(tmp_path / "file" / "1.jsonl"), str(tmp_path / "2.jsonl")
+    bad = str(tmp_path / "file" / "1.jsonl")
+    good = str(tmp_path / "2.jsonl")
     disk.write(bad, [], [b"line\n"])
     disk.write(good, [], [b"line\n"])
     assert disk.finish(DEADLINE_S)

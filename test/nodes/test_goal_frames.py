@@ -29,11 +29,9 @@ class Topics:
     """Of a robot that drives at 1 m/s, whose odometry has another origin than the map."""
 
     def __init__(self):
-        self.frames, self.located, self.newest_ns = (
-            ("bot/odom", "bot/base"),
-            True,
-            200_000_000,
-        )
+        self.frames = ("bot/odom", "bot/base")
+        self.located = True
+        self.newest_ns = 200_000_000
         self.reported = geometry.compose(REPORTED, [0.1, 0.0, 0.0])
 
     def in_odom(self):

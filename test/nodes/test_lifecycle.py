@@ -67,7 +67,8 @@ def test_a_deactivated_policy_says_zero_once_and_nothing_after(managed):
     managed.until(lambda: raw and raw[-1].twist.linear.x > 0.1, "driving")
     assert lead(managed, "policy_node", "deactivate")
     managed.until(lambda: raw[-1].twist.linear.x == 0.0, "a zero command")
-    known, heard = len(raw), len(odom)
+    known = len(raw)
+    heard = len(odom)
     managed.until(lambda: len(odom) >= heard + 10, "10 periods")
     assert len(raw) == known
     assert [message.twist.linear.x == 0.0 for message in raw[-2:]] == [False, True]

@@ -19,7 +19,8 @@ pytestmark = pytest.mark.ros
 @pytest.fixture
 def opened(monkeypatch):
     """The contexts and nodes that links have opened."""
-    contexts, nodes = [], []
+    contexts = []
+    nodes = []
 
     def open_context(**options):
         contexts.append(OPEN(**options))

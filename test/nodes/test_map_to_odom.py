@@ -24,7 +24,8 @@ needs_tf2_msgs = pytest.mark.skipif(TFS is None, reason="tf2_msgs is not install
 
 
 def test_odom_lies_in_the_map_so_that_both_tell_of_the_same_robot():
-    in_map, in_odom = np.array([1.0, 2.0, 0.7]), np.array([-3.0, 0.5, -2.0])
+    in_map = np.array([1.0, 2.0, 0.7])
+    in_odom = np.array([-3.0, 0.5, -2.0])
     home = odom_in_map(in_map, in_odom)
     assert geometry.compose(home, in_odom) == pytest.approx(in_map)
 
@@ -42,7 +43,8 @@ def placed(launch, meet, domain_id):
     def drive(x):
         """An odometry at x [m], every tenth of a second at 0.2 m/s, and the estimate after it."""
         stamp = next(numbers) * 100_000_000
-        pose, twist = [x, 0.0, 0.0], [0.2, 0.0, 0.0]
+        pose = [x, 0.0, 0.0]
+        twist = [0.2, 0.0, 0.0]
         odom.publish(
             conversions.odometry_to_ros(
                 pose, twist, stamp, ("odom", "base_link"), (1e-4,) * 4

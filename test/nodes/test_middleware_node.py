@@ -421,7 +421,8 @@ def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
         "scan: shape (7,), not (720,)": 40,
         "scans: other": 9,
     }
-    expected, heard = ("scan", "odom"), TopicHealth(1, 10.0, 0.1)
+    expected = ("scan", "odom")
+    heard = TopicHealth(1, 10.0, 0.1)
     told = "scan: 41 refused, the last: shape (7,), not (720,)"
     first = Health({}, counts)
     assert silence(first, expected, {}) == f"nothing on odom yet; {told}"

@@ -65,7 +65,8 @@ def options(domain_id):
 
 
 def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robot):
-    model, world = robot[0], load_world("arena")
+    model = robot[0]
+    world = load_world("arena")
     arguments = {"model": model, "world": world}
     there = gymnasium.make(
         NAVIGATION, backend="dds", backend_options=options(node), **arguments

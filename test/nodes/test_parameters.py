@@ -56,7 +56,8 @@ def test_help_tells_the_parameters_of_a_node(node):
 
 def test_help_tells_the_topics_and_services_of_a_node(node):
     name, made = node
-    facts, place = NODES[name](), (made.get_name(), "/")
+    facts = NODES[name]()
+    place = (made.get_name(), "/")
     for told, there in (
         (facts.publishes, made.get_publisher_names_and_types_by_node(*place)),
         (facts.subscribes, made.get_subscriber_names_and_types_by_node(*place)),

@@ -157,7 +157,8 @@ def test_scans_of_another_lidar_give_the_same_command(
 def test_it_acts_no_faster_than_its_control_period(driving, model):
     robot, _ = driving
     robot.hears(scan_of(model.lidar.angles))
-    known, began = len(robot.raw), time.monotonic()
+    known = len(robot.raw)
+    began = time.monotonic()
     robot.hears(scan_of(model.lidar.angles), count=10)
     periods = (time.monotonic() - began) / model.control_period
     assert len(robot.raw) - known <= periods + 3
@@ -197,7 +198,8 @@ def test_a_fallback_commands_over_dds_what_it_does_in_process_and_is_counted(
     given = {"policy": "straight", "fallback": "dynamic_window", "goal": [1.5, 0.0]}
     launch("policy_node", domain_id, **given, deadline=5.0)
     robot, scan = Robot(meet(domain_id)), scan_of(model.lidar.angles)
-    angles, ranges = model.lidar.angles, np.full(model.lidar.beams, 2.9, np.float32)
+    angles = model.lidar.angles
+    ranges = np.full(model.lidar.beams, 2.9, np.float32)
     ranges[np.abs(angles) < 0.3] = model.robot.footprint_radius + 0.06
     scan.ranges = array.array("f", ranges.tobytes())
     view = RobotView(np.zeros(3), np.zeros(3), ranges, 0.0, 0.0, 0.0)

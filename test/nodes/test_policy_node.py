@@ -161,7 +161,8 @@ def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(
 def test_it_goes_on_after_a_simulation_has_set_the_clock_back(
     launch, meet, domain_id, model
 ):
-    policy, peer = launch("policy_node", domain_id, rate=0.0), meet(domain_id)
+    policy = launch("policy_node", domain_id, rate=0.0)
+    peer = meet(domain_id)
     commands = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
     odom, scans = peer.speak(Odometry, "odom"), peer.speak(LaserScan, "scan")
     goals = peer.speak(PoseStamped, "goal_pose")
@@ -172,7 +173,8 @@ def test_it_goes_on_after_a_simulation_has_set_the_clock_back(
     def drives():
         """A tenth of a second of a robot that stands; True once it is commanded to drive."""
         stamp = next(tenths) * NS_PER_S // 10
-        frames, spread = ("odom", "base_link"), (1e-4,) * 4
+        frames = ("odom", "base_link")
+        spread = (1e-4,) * 4
         odom.publish(
             conversions.odometry_to_ros(np.zeros(3), np.zeros(3), stamp, frames, spread)
         )

@@ -67,7 +67,8 @@ def vehicle(meet, domain_id, model):
     def stand(pose, twist=(0.0, 0.0, 0.0), stamp=None, scans=True):
         stamp = next(stamps) if stamp is None else stamp
         ranges = np.full(model.lidar.beams, 2.0, np.float32)
-        frames, variance = ("odom", "base_link"), (1e-4,) * 4
+        frames = ("odom", "base_link")
+        variance = (1e-4,) * 4
         odom.publish(conversions.odometry_to_ros(pose, twist, stamp, frames, variance))
         if scans:
             scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))

@@ -22,10 +22,12 @@ from nics_drl_bridge.robot.spec import load_robot
 
 pytestmark = pytest.mark.ros
 
-CAR, WHEELED = load_robot("ackermann"), load_robot("differential")
+CAR = load_robot("ackermann")
+WHEELED = load_robot("differential")
 START_NS = 1_795_000_000 * NS_PER_S
 PERIOD_NS = NS_PER_S // 10
-FRAMES, VARIANCE = ("odom", "base_link"), (0.0,) * 4
+FRAMES = ("odom", "base_link")
+VARIANCE = (0.0,) * 4
 
 
 class Drive:
@@ -89,7 +91,8 @@ def test_the_pose_of_motion_capture_and_the_imu_are_taken():
     drive = Drive()
     for k in range(20):
         drive.goes(k, k + 1)
-        pose, imu = PoseStamped(), Imu()
+        pose = PoseStamped()
+        imu = Imu()
         for message in (pose, imu):
             message.header.stamp = conversions.stamp_to_ros(START_NS + k * PERIOD_NS)
         pose.pose.position.y = 0.2 * k

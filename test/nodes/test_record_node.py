@@ -28,7 +28,8 @@ from nodes.peer import DEADLINE_S
 pytestmark = pytest.mark.ros
 
 CAR = load_robot("ackermann")
-FRAMES, VARIANCE = ("odom", "base_link"), (0.0,) * 4
+FRAMES = ("odom", "base_link")
+VARIANCE = (0.0,) * 4
 LONG_S = 180.0
 FAST = ("--duration", 40, "--use-sim-time", "--namespace", "bot")
 SHARE_OF_PATH = 0.1
@@ -41,7 +42,8 @@ class FakeRobot:
         self.peer = peer
         self.heard = peer.listen(kind, "cmd_vel", qos.COMMAND)
         self.odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-        self.pose, self.sent = [3.0, -2.0, 0.0], 0.0
+        self.pose = [3.0, -2.0, 0.0]
+        self.sent = 0.0
 
     def until(self, condition, what, deadline_s=DEADLINE_S):
         """Publishes its pose 50 times a second until something is the case."""
@@ -85,7 +87,8 @@ def seconds(path):
 def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(
     launch_process, meet, domain_id, tmp_path
 ):
-    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    robot = FakeRobot(meet(domain_id))
+    out = tmp_path / "drive.npz"
     node = launch_process("record_node", domain_id, out=str(out))
     robot.until(lambda: robot.driven, "it drives")
     node._process.send_signal(signal.SIGINT)
@@ -100,7 +103,8 @@ def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(
 
 
 def test_sigterm_and_stamped_commands_in_a_namespace(launch, meet, domain_id, tmp_path):
-    robot, out = FakeRobot(meet(domain_id, "bot"), TwistStamped), tmp_path / "drive.npz"
+    robot = FakeRobot(meet(domain_id, "bot"), TwistStamped)
+    out = tmp_path / "drive.npz"
     node = launch("record_node", domain_id, "bot", out=str(out), stamped=True)
     robot.until(lambda: robot.heard and robot.heard[-1].twist != Twist(), "it drives")
     assert conversions.stamp_from_ros(robot.heard[-1].header.stamp) > 0
@@ -111,7 +115,8 @@ def test_sigterm_and_stamped_commands_in_a_namespace(launch, meet, domain_id, tm
 
 
 def test_silence_of_odometry_stops_the_robot(launch, meet, domain_id, tmp_path):
-    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    robot = FakeRobot(meet(domain_id))
+    out = tmp_path / "drive.npz"
     node = launch("record_node", domain_id, out=str(out))
     robot.until(lambda: robot.driven, "it drives")
     robot.peer.until(lambda: code_of(node) is not None, "it ends without odometry")
@@ -127,7 +132,8 @@ def test_silence_of_odometry_stops_the_robot(launch, meet, domain_id, tmp_path):
 def test_odometry_that_only_repeats_itself_is_silence(
     launch, meet, domain_id, tmp_path
 ):
-    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    robot = FakeRobot(meet(domain_id))
+    out = tmp_path / "drive.npz"
     node = launch("record_node", domain_id, out=str(out))
     robot.until(lambda: robot.driven, "it drives")
     frozen = conversions.odometry_to_ros(robot.pose, np.zeros(3), 1, FRAMES, VARIANCE)
@@ -139,7 +145,8 @@ def test_odometry_that_only_repeats_itself_is_silence(
 
 
 def test_leaving_the_bound_stops_the_robot(launch, meet, domain_id, tmp_path):
-    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    robot = FakeRobot(meet(domain_id))
+    out = tmp_path / "drive.npz"
     node = launch("record_node", domain_id, out=str(out), bound=1.5)
     robot.until(lambda: robot.driven, "it drives")
     robot.pose = [3.0, -2.0 + 1.2, 0.0]  # still inside with its radius of 0.26 m

@@ -46,7 +46,8 @@ class Watched:
     """A simulator node and all that it says."""
 
     def __init__(self, peer, ready_s):
-        self.peer, self.ready_s = peer, ready_s
+        self.peer = peer
+        self.ready_s = ready_s
         self.said = {topic: peer.listen(kind, topic) for topic, kind in TOPICS.items()}
         self.clock = peer.listen(Clock, "/clock")
         self.commands = peer.speak(Twist, "cmd_vel")
@@ -94,12 +95,14 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def lockstep(launch, meet, module_domain_id):
-    peer, began = meet(module_domain_id), time.monotonic()
+    peer = meet(module_domain_id)
+    began = time.monotonic()
     process = launch(
         "simulator_node", module_domain_id, mode="lockstep", renderer="exact", **FRAMES
     )
     watched = Watched(peer, 0.0)
-    watched.ready_s, watched.log = time.monotonic() - began, process.log
+    watched.ready_s = time.monotonic() - began
+    watched.log = process.log
     watched.reset()
     yield watched
     process.check()
@@ -307,7 +310,8 @@ def test_a_command_beyond_what_its_model_was_fitted_to_is_said_in_its_log(lockst
 
 def test_the_header_of_its_scan_equals_the_lidar(lockstep, model):
     lockstep.reset()
-    scan, lidar = lockstep.said["scan"][-1], model.lidar
+    scan = lockstep.said["scan"][-1]
+    lidar = model.lidar
     assert len(scan.ranges) == lidar.beams
     assert scan.angle_min == pytest.approx(lidar.angles[0])
     assert scan.angle_max == pytest.approx(lidar.angles[-1])
@@ -426,7 +430,8 @@ def test_in_real_time_the_next_data_come_anyway(realtime):
 
 
 def test_in_real_time_it_stops_the_robot_when_commands_end(realtime):
-    odom, speed = realtime.said["odom"], 0.0
+    odom = realtime.said["odom"]
+    speed = 0.0
     while speed < 0.3:
         realtime.command(0.5)
         speed = realtime.peer.another(odom, "odometry").twist.twist.linear.x
@@ -463,7 +468,8 @@ def test_as_fast_as_possible_it_outruns_the_clock(launch, meet, domain_id):
     peer = meet(domain_id)
     scans = peer.listen(LaserScan, "scan")
     peer.until(lambda: scans, "a scan")
-    began, first = time.monotonic(), stamp_ns(scans[-1])
+    began = time.monotonic()
+    first = stamp_ns(scans[-1])
     peer.until(lambda: stamp_ns(scans[-1]) - first > 20 * NS_PER_S, "20 simulated s")
     factor = 20.0 / (time.monotonic() - began)
     print(f"{factor:.0f} times faster than the clock")
@@ -615,7 +621,8 @@ class Sender:
 
 
 def test_what_waits_for_the_robots_that_stay_is_published_where_another_leaves():
-    stays, leaves = Sender(), Sender()
+    stays = Sender()
+    leaves = Sender()
     outbox = simulator_node.Outbox()
     for publisher in (leaves, stays):
         outbox.send(publisher, b"data", 0, (10, 0))

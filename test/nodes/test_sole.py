@@ -68,7 +68,8 @@ def test_a_second_node_in_the_same_namespace_refuses_to_start(
 def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(
     launch, launch_process, meet, domain_id
 ):
-    first, peer = launch_process("command_gate", domain_id), meet(domain_id)
+    first = launch_process("command_gate", domain_id)
+    peer = meet(domain_id)
 
     def gates():
         return peer.node.get_node_names().count("command_gate")

@@ -98,7 +98,8 @@ def test_profiles_in_the_working_directory_are_a_choice(tmp_path, monkeypatch):
 
 def is_apart(process: NodeProcess, domain_id: int) -> bool:
     """Whether a node has neither shared memory of Fast DDS nor the multicast of its domain."""
-    maps, ports = Path(f"/proc/{process.pid}/maps").read_bytes(), ports_of(process.pid)
+    maps = Path(f"/proc/{process.pid}/maps").read_bytes()
+    ports = ports_of(process.pid)
     assert ports
     shares = any(segment in maps for segment in SEGMENTS)
     return not shares and multicast_port(domain_id) not in ports
@@ -107,7 +108,8 @@ def is_apart(process: NodeProcess, domain_id: int) -> bool:
 @pytest.mark.parametrize("node", NODES)
 @pytest.mark.process
 def test_nodes_have_udp_on_this_machine_alone(launch_process, meet, domain_id, node):
-    process, peer = launch_process(node, domain_id), meet(domain_id)
+    process = launch_process(node, domain_id)
+    peer = meet(domain_id)
     peer.be_known_to(f"/{node}")
     assert is_apart(process, domain_id)
 

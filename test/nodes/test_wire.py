@@ -16,7 +16,8 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, wire
 
 STAMP_NS = 1_763_000_000_123_456_789
-POSE, TWIST = np.array([1.25, -3.5, 2.0]), np.array([0.5, -0.25, 0.125])
+POSE = np.array([1.25, -3.5, 2.0])
+TWIST = np.array([0.5, -0.25, 0.125])
 COVARIANCE = np.array([[4.0, 0.5, 0.25], [0.5, 3.0, 0.125], [0.25, 0.125, 2.0]])
 TEXTS = ["", "a", "map", "odom", "car_1/odom", "a frame with a long name"]
 """Of lengths that leave the numbers behind them at every place they can stand."""
@@ -77,7 +78,8 @@ def test_what_was_written_before_stays_as_it_was_when_the_next_is_written():
 def scan(frame, beams):
     message = LaserScan(angle_min=-1.5, angle_max=1.5, range_max=6.0)
     message.header.frame_id, message.scan_time = frame, 0.125
-    message.ranges, message.intensities = [1.0] * beams, [0.5] * 3
+    message.ranges = [1.0] * beams
+    message.intensities = [0.5] * 3
     return message
 
 
@@ -102,7 +104,8 @@ def test_a_scan_is_written_and_read_as_by_rclpy(frame, beams):
 
 
 def test_a_twist_is_written_so_that_rclpy_reads_it_and_read_as_rclpy_writes_it():
-    content, message = wire.twist_to_bytes(TWIST), conversions.twist_to_ros(TWIST)
+    content = wire.twist_to_bytes(TWIST)
+    message = conversions.twist_to_ros(TWIST)
     assert deserialize_message(content, Twist) == message
 
     message.linear.z, message.angular.x, message.angular.y = 7.0, 8.0, 9.0

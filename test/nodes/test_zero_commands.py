@@ -75,8 +75,10 @@ def robot(meet, domain_id, model):
 
     def tell():
         stamp = next(stamps)
-        frames, variance = ("odom", "base_link"), (1e-4,) * 4
-        pose, twist = np.array([5.0, 5.0, 0.0]), np.zeros(3)
+        frames = ("odom", "base_link")
+        variance = (1e-4,) * 4
+        pose = np.array([5.0, 5.0, 0.0])
+        twist = np.zeros(3)
         odom.publish(conversions.odometry_to_ros(pose, twist, stamp, frames, variance))
         scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
         return False

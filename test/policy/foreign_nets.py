@@ -39,7 +39,9 @@ def three():
     """Scan (n, 1, S), goal (n, 2) and velocity (n, 2): turns to the goal, the slower the more."""
     towards = np.zeros((SECTORS + 4, 1), np.float32)
     towards[:SECTORS, 0] = 0.02 * np.sin(np.arange(SECTORS))
-    towards[SECTORS + 1], towards[SECTORS + 3] = 4.0, -0.1  # by bearing and turn rate
+    # by bearing and turn rate
+    towards[SECTORS + 1] = 4.0
+    towards[SECTORS + 3] = -0.1
     weights = {
         "shape": np.int64([-1, SECTORS]),
         "towards": towards,

@@ -97,6 +97,8 @@ def export_remembering(path: Path, kind: str, model=None, **options):
 
 def sequence(task, steps: int, *lead: int, seed: int = 1):
     """Observations (T, ..., O) within their limits."""
-    space, rng = task.observation_space, np.random.default_rng(seed)
-    low, high = np.maximum(space.low, -2.0), np.minimum(space.high, 2.0)
+    space = task.observation_space
+    rng = np.random.default_rng(seed)
+    low = np.maximum(space.low, -2.0)
+    high = np.minimum(space.high, 2.0)
     return rng.uniform(low, high, (steps, *lead, len(low))).astype(np.float32)

@@ -35,7 +35,8 @@ from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.stateful import Stateful
 
 LIMIT = 40
-MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=6)
+MODEL = direct_model(odometry=(0.02, 0.02))
+WORLD = field(count=6)
 
 
 class Constant:
@@ -126,7 +127,8 @@ class Believing(gymnasium.Env):
     """Ends at once; the robot believes to be at its goal, the truth is what it is given."""
 
     def __init__(self, task, **truth):
-        self.task, self.truth = task, truth
+        self.task = task
+        self.truth = truth
 
     def reset(self, *, seed=None, options=None):
         return None, {
@@ -141,7 +143,8 @@ class Believing(gymnasium.Env):
         return None, 10.0, True, False, told | self.truth
 
 
-HOME, GOAL = np.zeros(3), np.array([3.0, 0.0])
+HOME = np.zeros(3)
+GOAL = np.array([3.0, 0.0])
 TASK = Navigation(direct_model().robot, direct_model().lidar)
 
 
@@ -378,7 +381,8 @@ def test_nothing_observed_leaves_everything_open():
 @pytest.mark.parametrize("arrived", [0, 1, 2])
 def test_a_summary_shows_neither_nan_nor_inf_and_is_json_that_others_read(arrived):
     train = pytest.importorskip("nics_drl_bridge.policy.train")
-    success, steps = np.arange(3) < arrived, np.full(3, 7)
+    success = np.arange(3) < arrived
+    steps = np.full(3, 7)
     figures = steps, steps * 0.1, steps * 1.0
     told = summarise(
         Outcomes(np.arange(3), success, np.zeros(3, bool), *figures, success), 0.1

@@ -68,7 +68,8 @@ def before_a_wall(task, *distances, speed=0.0):
 
 
 def backed(robot, planner="mppi", policy=None, **options):
-    task, model = task_of(robot, **options), builtin_model(robot)
+    task = task_of(robot, **options)
+    model = builtin_model(robot)
     behind = make_policy(planner, task, model)
     return Fallback(policy or FullAhead(task), behind, task, model), behind, task
 
@@ -127,7 +128,8 @@ def test_rows_that_are_admissible_keep_the_policys_bits_and_the_others_get_the_p
         .astype(np.float32)
     )
     policy._policy = type("Told", (), {"act": lambda _, rows: own[: len(rows)]})()
-    actions, planned = policy.act(seen), behind.act(seen)
+    actions = policy.act(seen)
+    planned = behind.act(seen)
     kept = (actions == own).all(axis=1)
     assert 5 < kept.sum() < 35
     assert (np.diff(kept.astype(int)) >= 0).sum() >= 38  # far walls, not near ones
@@ -140,16 +142,19 @@ def test_rows_that_are_admissible_keep_the_policys_bits_and_the_others_get_the_p
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_an_action_is_admissible_as_long_as_its_stop_ends_before_the_margin(robot):
-    task, model = task_of(robot), builtin_model(robot)
+    task = task_of(robot)
+    model = builtin_model(robot)
     judge = Mppi(task, model, samples=1, clearance=KEPT)
     command = task.command(FullAhead(task).act(np.zeros((1, 1), np.float32)))[0]
     kinematics = model.kinematics
-    pose, state = np.zeros(3), np.zeros(kinematics.state_size)
+    pose = np.zeros(3)
+    state = np.zeros(kinematics.state_size)
     for _ in range(300):  # until its twist is that of the command
         before, (pose, state) = pose, kinematics.step(pose, state, command)
     speed = np.linalg.norm((pose - before)[:2]) / kinematics.dt
     latency = model.calibration.command_latency_s
-    start, waited = pose, speed * (latency + model.kinematics.delays.max(initial=0.0))
+    start = pose
+    waited = speed * (latency + model.kinematics.delays.max(initial=0.0))
     for given, time_s in ((command, model.control_period), (0.0 * command, 3.0)):
         for _ in range(round(time_s / kinematics.dt)):
             pose, state = kinematics.step(pose, state, given)
@@ -167,7 +172,8 @@ def test_an_action_is_admissible_as_long_as_its_stop_ends_before_the_margin(robo
 
 
 def test_within_the_margin_a_policy_may_still_drive_away():
-    task, model = task_of("mecanum"), builtin_model("mecanum")
+    task = task_of("mecanum")
+    model = builtin_model("mecanum")
     judge = Mppi(task, model, samples=1, clearance=KEPT)
     seen = before_a_wall(task, front_of(task.robot) + 0.5 * KEPT.margin)
     ahead, back = (np.array([[speed, 0.0, 0.0]]) for speed in (0.3, -0.3))
@@ -193,7 +199,8 @@ def test_a_state_goes_on_while_the_planner_acts_and_begins_anew_with_the_episode
         return np.array([1.0, 0.0], np.float32), state + 1.0
 
     policy, _, task = backed("differential", policy=Stateful(step, 1, 0.0, 0.5))
-    near, far = before_a_wall(task, 0.22)[0], before_a_wall(task, 2.9)[0]
+    near = before_a_wall(task, 0.22)[0]
+    far = before_a_wall(task, 2.9)[0]
     for seen in (far, near, near, far):
         policy.act(seen)
     assert policy.acted == 2
@@ -208,7 +215,8 @@ def test_a_state_goes_on_while_the_planner_acts_and_begins_anew_with_the_episode
 
 
 def test_the_share_of_its_actions_is_told_by_an_evaluation():
-    model, runs = builtin_model("differential"), {}
+    model = builtin_model("differential")
+    runs = {}
     for fallback in ("", "dynamic_window"):
         policy, task = open_policy("straight", model, fallback)
         env = TimeLimit(BridgeEnv(model=model, world="circles", task=task), 60)
@@ -218,10 +226,8 @@ def test_the_share_of_its_actions_is_told_by_an_evaluation():
             {"fast": episodes},
             tallies({"fast": episodes}, model.control_period),
         )
-    episodes, tally = (
-        runs["dynamic_window"].runs["fast"],
-        runs["dynamic_window"].tallies["fast"],
-    )
+    episodes = runs["dynamic_window"].runs["fast"]
+    tally = runs["dynamic_window"].tallies["fast"]
     counts = [episode.planned for episode in episodes]
     assert sum(counts) > 0
     assert counts[0] == episodes[0].plain()["fallback_actions"]

@@ -74,7 +74,8 @@ def test_a_path_of_one_pose_is_its_own_end():
 
 
 def arrive(checker, *poses):
-    path, turn = PlannedPath(CORNER), None
+    path = PlannedPath(CORNER)
+    turn = None
     for pose in ((1.0, 0.0, 0.0), (2.0, 0.5, 0.0), *poses):
         turn = checker.turn_left(
             path.locate(np.array(pose), 1.0), np.array(pose), path.end
@@ -103,7 +104,8 @@ def test_a_loop_does_not_end_where_it_begins():
     loop = np.array(
         [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (2.0, 2.0, 0.0), (0.0, 0.1, 0.0)]
     )
-    path, checker = PlannedPath(loop), GoalChecker(GoalCheck(), turns=False)
+    path = PlannedPath(loop)
+    checker = GoalChecker(GoalCheck(), turns=False)
     assert (
         checker.turn_left(path.locate(np.zeros(3), 1.0), np.zeros(3), path.end) is None
     )

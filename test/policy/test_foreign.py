@@ -35,10 +35,8 @@ def session(folder):
 def seen(steps: int = 8):
     """Observations (T, O) of a robot somewhere: shares of a scan, goal, velocity."""
     rng = np.random.default_rng(1)
-    shares, bearing = (
-        rng.uniform(0.0, 1.0, (steps, SECTORS)),
-        rng.uniform(-3.1, 3.1, steps),
-    )
+    shares = rng.uniform(0.0, 1.0, (steps, SECTORS))
+    bearing = rng.uniform(-3.1, 3.1, steps)
     distance = rng.uniform(0.1, 8.0, steps)
     velocity = rng.uniform(-0.5, 0.5, (steps, 3))
     goal = np.stack([distance, np.cos(bearing), np.sin(bearing)], axis=-1)
@@ -49,7 +47,9 @@ def seen(steps: int = 8):
 def commands_of(path, robot, rows):
     """What the policy commands in SI, observation after observation of an episode."""
     policy = load_any(path, robot)
-    kept, state, commands = policy.contract.state, None, []
+    kept = policy.contract.state
+    state = None
+    commands = []
     if kept is not None:
         state = np.full(kept.size, kept.start, np.float32)
     for row in rows:
@@ -131,10 +131,12 @@ def test_a_flat_vector_has_its_own_order_numbers_and_history(tmp_path, robot):
     rows, bearing = seen()
     found = commands_of(write(tmp_path, "flat"), robot, rows)
     net, (mean, std) = session(tmp_path), foreign_nets.flat_numbers()
-    before, turn = None, 0.0
+    before = None
+    turn = 0.0
     for row, angle, command in zip(rows, bearing, found, strict=True):
         scan = np.clip(FAR * row[:SECTORS][::-1], 0.3, 2.5)
-        x, y = row[SECTORS] * np.cos(angle), row[SECTORS] * np.sin(angle)
+        x = row[SECTORS] * np.cos(angle)
+        y = row[SECTORS] * np.sin(angle)
         before = scan if before is None else before
         flat = np.concatenate([[turn, y, x], scan, before, [row[SECTORS + 5], 0.25]])
         logits = net.run(None, {"obs": np.clip((flat - mean) / std, -4.0, 4.0)[None]})[
@@ -142,14 +144,16 @@ def test_a_flat_vector_has_its_own_order_numbers_and_history(tmp_path, robot):
         ]
         wanted = TWISTS[logits.argmax()]
         assert command == pytest.approx(wanted, abs=1e-6)
-        before, turn = scan, wanted[1]
+        before = scan
+        turn = wanted[1]
     assert len({tuple(command) for command in found.round(3)}) > 1
 
 
 def test_a_recurrent_network_keeps_its_state_and_its_last_output(tmp_path, robot):
     rows, _ = seen()
     found = commands_of(write(tmp_path, "gru"), robot, rows)
-    net, hidden = session(tmp_path), np.full((1, 1, UNITS), 0.5, np.float32)
+    net = session(tmp_path)
+    hidden = np.full((1, 1, UNITS), 0.5, np.float32)
     last = np.zeros(2, np.float32)
     for row, command in zip(rows, found, strict=True):
         goal = row[SECTORS : SECTORS + 3]
@@ -223,7 +227,8 @@ def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
         of_goal(tmp_path, nodes, {"action": "half"}, weights, turn),
         seen(),
     )
-    x, y = rows[:, SECTORS] * np.cos(bearing), rows[:, SECTORS] * np.sin(bearing)
+    x = rows[:, SECTORS] * np.cos(bearing)
+    y = rows[:, SECTORS] * np.sin(bearing)
     wanted = [
         np.clip(0.1 * x + 0.3 * y, 0.0, 0.4),
         np.clip(0.1 * y - 0.1 * x, -0.5, 0.5),
@@ -239,7 +244,8 @@ def test_an_output_may_be_an_input_as_it_is(tmp_path, robot):
         of_goal(tmp_path, nodes, {"action": 2, "goal": 2}, {}, turn),
         seen(),
     )
-    x, y = rows[:, SECTORS] * np.cos(bearing), rows[:, SECTORS] * np.sin(bearing)
+    x = rows[:, SECTORS] * np.cos(bearing)
+    y = rows[:, SECTORS] * np.sin(bearing)
     wanted = [np.clip(-x, 0.0, 0.4), np.clip(y, -0.5, 0.5)]
     found = commands_of(path, robot, rows)
     assert found == pytest.approx(np.stack(wanted, axis=-1), abs=1e-5)
@@ -271,7 +277,8 @@ def test_many_worlds_are_driven_as_one_after_the_other(tmp_path, robot, name):
 
 def test_it_becomes_a_policy_file(tmp_path, robot):
     rows, _ = seen()
-    path, file = write(tmp_path, "gru"), tmp_path / "ours.onnx"
+    path = write(tmp_path, "gru")
+    file = tmp_path / "ours.onnx"
     write_bytes(file, import_policy(path, robot))
     assert (
         commands_of(file, None, rows).tolist()
@@ -372,7 +379,8 @@ def test_what_does_not_fit_is_refused_in_one_sentence(tmp_path, robot, name):
 def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(
     tmp_path, robot
 ):
-    path, whole = write(tmp_path, "three"), foreign_nets.three()
+    path = write(tmp_path, "three")
+    whole = foreign_nets.three()
     for node, words in (
         (onnx.helper.make_node("Log", ["bent"], ["left"]), "gives NaN or inf"),
         (onnx.helper.make_node("Tanh", ["bent"], ["left"], domain="evil"), "evil.Tanh"),
@@ -386,7 +394,8 @@ def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(
 
 
 def test_a_domain_that_no_operator_is_of_is_no_hindrance(tmp_path, robot):
-    path, network = write(tmp_path, "three"), foreign_nets.three()
+    path = write(tmp_path, "three")
+    network = foreign_nets.three()
     network.opset_import.append(onnx.helper.make_opsetid("ai.onnx.ml", 2))
     write_bytes(tmp_path / "net.onnx", network.SerializeToString())
     policy = load_any(path, robot)
@@ -400,7 +409,8 @@ def test_a_domain_that_no_operator_is_of_is_no_hindrance(tmp_path, robot):
 
 
 def test_weights_in_another_file_are_refused_with_the_fix(tmp_path, robot):
-    path, file = write(tmp_path, "three"), tmp_path / "net.onnx"
+    path = write(tmp_path, "three")
+    file = tmp_path / "net.onnx"
     given = {
         "location": "net.onnx.data",
         "size_threshold": 0,

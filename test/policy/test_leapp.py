@@ -39,7 +39,8 @@ def made(folder, kind):
 def by_name(row, parts):
     """The inputs of a bundle for an observation."""
     zero = np.zeros(1, np.float32)
-    goal, velocity = row[parts : parts + 3], row[parts + 3 :]
+    goal = row[parts : parts + 3]
+    velocity = row[parts + 3 :]
     return {
         "scan": row[:parts],
         "goal": goal,
@@ -69,7 +70,8 @@ def test_the_runner_of_leapp_takes_it_and_gives_the_same(tmp_path, kind):
     assert manager.inputs == [
         f"policy/{name}" for name in by_name(np.zeros(30), SECTORS)
     ]
-    kept, state = policy.contract.state, None
+    kept = policy.contract.state
+    state = None
     for _ in range(2):  # the second time after a reset
         if kept is not None:
             state = np.full((1, kept.size), kept.start, np.float32)
@@ -86,7 +88,8 @@ def test_the_runner_of_leapp_takes_it_and_gives_the_same(tmp_path, kind):
 def test_the_bundle_says_what_it_needs(tmp_path):
     policy, task = made(tmp_path, "gru")
     data = described(export_bundle(policy, tmp_path / "bundle"))
-    node, pipeline = data["models"]["policy"], data["pipeline"]
+    node = data["models"]["policy"]
+    pipeline = data["pipeline"]
     scan, *_, state = node["inputs"]
     assert scan["kind"] == "state/lidar/sectors"
     assert scan["scan"] == task.scan.model_dump(mode="json") | {"viewpoint": [0.0, 0.0]}
@@ -174,7 +177,8 @@ def parts():
     way = tensor("way", [1, 2], "command/goal", ["goal.x", "goal.y"])
     linear = tensor("linear", [1, 3], "state/body/linear_velocity")
     angular = tensor("angular", [1, 3], "state/body/angular_velocity", ["x", "y", "z"])
-    features, hidden = tensor("features", [1, SECTORS + 8]), [1, 4]
+    features = tensor("features", [1, SECTORS + 8])
+    hidden = [1, 4]
     return {
         "models": {
             "scaling": {"inputs": [scan, way, linear, angular], "outputs": [features]},
@@ -267,7 +271,8 @@ def test_a_bundle_of_others_becomes_a_policy_file_by_its_kinds(kind, names, tmp_
             "element_names": [names],
         }
 
-    bundle, model = write_foreign(tmp_path, goal), direct_model()
+    bundle = write_foreign(tmp_path, goal)
+    model = direct_model()
     policy = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
     task = policy.make_task(model)
     manager = leapp.InferenceManager(str(bundle))
@@ -288,7 +293,8 @@ class Walker(torch.nn.Module):
     def __init__(self):
         super().__init__()
         torch.manual_seed(0)
-        self.cell, self.head = torch.nn.GRUCell(SECTORS + 2, 5), torch.nn.Linear(5, 3)
+        self.cell = torch.nn.GRUCell(SECTORS + 2, 5)
+        self.head = torch.nn.Linear(5, 3)
 
     def forward(self, scan, goal, hidden):
         seen = torch.cat([scan / 3.0, goal], dim=-1)
@@ -299,7 +305,8 @@ class Walker(torch.nn.Module):
 @pytest.mark.slow
 def test_what_leapp_itself_traces_becomes_a_policy_file(tmp_path):
     leapp = pytest.importorskip("leapp", reason="needs the extra 'leapp'")
-    annotate, means = leapp.annotate, leapp.TensorSemantics
+    annotate = leapp.annotate
+    means = leapp.TensorSemantics
     layout = {"sectors": SECTORS, "range_max": 3.0}
     scan = means(
         "scan", torch.rand(SECTORS), kind="state/lidar/sectors", extra={"scan": layout}
@@ -332,7 +339,8 @@ def test_what_leapp_itself_traces_becomes_a_policy_file(tmp_path):
 
 
 def test_nodes_may_share_the_names_of_inputs_and_outputs(tmp_path):
-    bundle, model = write_foreign(tmp_path, made=alike), direct_model()
+    bundle = write_foreign(tmp_path, made=alike)
+    model = direct_model()
     policy = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
     (row,) = sequence(policy.make_task(model), 1)
     linear, angular = (
@@ -343,7 +351,8 @@ def test_nodes_may_share_the_names_of_inputs_and_outputs(tmp_path):
 
 
 def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path):
-    bundle, model = write_foreign(tmp_path), direct_model()
+    bundle = write_foreign(tmp_path)
+    model = direct_model()
     mapping = {
         "kind": "foreign policy",
         "network": bundle.name,
@@ -375,7 +384,8 @@ def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path):
     write_text(path, dump_yaml(mapping))
     mine = load_any(path, model)
     theirs = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
-    rows, state = sequence(mine.make_task(model), 1)[0], np.zeros(5, np.float32)
+    rows = sequence(mine.make_task(model), 1)[0]
+    state = np.zeros(5, np.float32)
     assert mine.run(rows, state)[1] == pytest.approx(
         theirs.run(rows, state)[1], abs=1e-7
     )

@@ -60,7 +60,8 @@ def test_depths_are_distances_to_the_border_and_negative_outside():
         [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 0.4], [0.0, 1.0]]
     )  # not convex
     points = np.random.default_rng(0).uniform(-1.0, 3.0, (300, 2))
-    exact, inside = Polygon(shape).exterior, prep(Polygon(shape))
+    exact = Polygon(shape).exterior
+    inside = prep(Polygon(shape))
     for point, depth in zip(points, depths(points, shape), strict=True):
         assert abs(depth) == pytest.approx(exact.distance(Point(point)))
         assert (depth > 0.0) == inside.contains(Point(point))
@@ -68,10 +69,12 @@ def test_depths_are_distances_to_the_border_and_negative_outside():
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_room_is_the_distance_from_the_outline_up_to_a_cell(robot):
-    rng, shape = np.random.default_rng(1), footprint(robot)
+    rng = np.random.default_rng(1)
+    shape = footprint(robot)
     for _ in range(200):
         x, y, heading = rng.uniform([-0.5, -0.5, -3.0], [0.5, 0.5, 3.0])
-        c, s = math.cos(heading), math.sin(heading)
+        c = math.cos(heading)
+        s = math.sin(heading)
         ahead, left = rng.uniform(-0.5, 0.5, 2)
         hit = np.array([[x + c * ahead - s * left, y + s * ahead + c * left]])
         if np.linalg.norm(hit) < 1e-3:
@@ -89,7 +92,8 @@ def test_room_is_the_distance_from_the_outline_up_to_a_cell(robot):
 
 def box(length, width):
     """A robot with a rectangular footprint."""
-    x, y = length / 2.0, width / 2.0
+    x = length / 2.0
+    y = width / 2.0
     corners = [[x, y], [-x, y], [-x, -y], [x, -y]]
     return robot_from({"name": "box", "kind": "differential", "footprint": corners})
 
@@ -127,7 +131,8 @@ def test_a_robot_that_is_too_near_already_may_only_move_away():
 
 
 def test_the_way_in_the_open_is_straight_and_leads_around_a_wall():
-    free, blocked = seen([[0.0, 9.0]]), seen(wall(1.5, -1.2, 1.2))
+    free = seen([[0.0, 9.0]])
+    blocked = seen(wall(1.5, -1.2, 1.2))
     assert way_at(0.0, 0.0, free) == pytest.approx(3.0, rel=0.05)
     around = 2.0 * math.hypot(1.5, 1.2 + 0.215)
     assert around < way_at(0.0, 0.0, blocked) < 2.0 * around

@@ -25,9 +25,11 @@ def planner(robot="differential", **changes):
 
 
 def observe(policy, count=40):
-    rng, task = np.random.default_rng(0), policy.task
+    rng = np.random.default_rng(0)
+    task = policy.task
     ranges = rng.uniform(0.5, 3.0, (count, 90)).astype(np.float32)
-    twist, pose = np.zeros((count, 3)), rng.uniform(-1.0, 1.0, (count, 3))
+    twist = np.zeros((count, 3))
+    pose = rng.uniform(-1.0, 1.0, (count, 3))
     view = RobotView(pose, twist, ranges, 0.0, 0.0, 0.0)
     return task.observation(view, {"goal": rng.uniform(-3.0, 3.0, (count, 2))})
 
@@ -57,9 +59,11 @@ def test_offers_span_the_range_begin_with_rest_and_half_of_them_hold_one_action(
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_command_behind_a_twist_is_that_which_led_to_it(robot):
     policy = planner(robot)
-    spec, model = policy.task.robot, policy.model.kinematics
+    spec = policy.task.robot
+    model = policy.model.kinematics
     command = 0.6 * spec.command_high
-    pose, state = np.zeros(3), np.zeros(model.state_size)
+    pose = np.zeros(3)
+    state = np.zeros(model.state_size)
     for _ in range(300):
         before, (pose, state) = pose, model.step(pose, state, command)
     moved = np.linalg.norm((pose - before)[:2]) / model.dt

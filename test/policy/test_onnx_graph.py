@@ -27,7 +27,8 @@ from policy.policy_rig import (
     with_contract,
 )
 
-make_node, from_array = onnx.helper.make_node, onnx.numpy_helper.from_array
+make_node = onnx.helper.make_node
+from_array = onnx.numpy_helper.from_array
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,8 @@ def outer(proto):
 
 def heavy(proto):
     """Little memory, but one large array multiplied by again and again."""
-    whole, names = np.zeros((2048, 2048), np.float32), [f"h{k}" for k in range(9)]
+    whole = np.zeros((2048, 2048), np.float32)
+    names = [f"h{k}" for k in range(9)]
     first = make_node("MatMul", ["observation", "begin"], ["h0"])
     return add(
         proto,
@@ -127,7 +129,8 @@ def sparse(proto):
 
 def divided(proto):
     """A quotient that no 64 bits hold; the processor's answer to it ends the process."""
-    least, minus = np.array([-(2**63)], np.int64), np.array([-1], np.int64)
+    least = np.array([-(2**63)], np.int64)
+    minus = np.array([-1], np.int64)
     return add(
         proto, make_node("Div", ["least", "minus"], ["none"]), least=least, minus=minus
     )
@@ -283,9 +286,11 @@ GRAPH, NODE, ATTRIBUTE, SUBGRAPH = 7, 1, 5, 6
 
 
 def field(number: int, content: bytes) -> bytes:
-    size, length = len(content), b""
+    size = len(content)
+    length = b""
     while size >= 0x80:
-        length, size = length + bytes([size & 0x7F | 0x80]), size >> 7
+        length = length + bytes([size & 0x7F | 0x80])
+        size = size >> 7
     return bytes([number << 3 | 2]) + length + bytes([size]) + content
 
 

@@ -23,12 +23,15 @@ def test_jitter_of_the_data_does_not_slow_it_down():
     rng = np.random.default_rng(0)
     polled = np.arange(0.0, 20.0, 0.01)
     arrivals = 0.1 * np.arange(200) + rng.uniform(0.0, 0.03, 200)
-    pace, done, used = ActionPace(0.1), 0, -1
+    pace = ActionPace(0.1)
+    done = 0
+    used = -1
     for now in polled:
         newest = int(np.searchsorted(arrivals, now, side="right")) - 1
         if newest > used and pace.due(now):
             pace.acted(now)
-            done, used = done + 1, newest
+            done = done + 1
+            used = newest
     assert done >= 190
 
 

@@ -56,7 +56,8 @@ def twist_of(task, action):
 @pytest.mark.parametrize("name", sorted(POLICIES))
 def test_any_observation_gives_an_action_of_the_space_alone_as_among_many(robot, name):
     task = task_of(robot, mount=(0.05, 0.0, 0.1))
-    alone, among = make_policy(name, task), make_policy(name, task)
+    alone = make_policy(name, task)
+    among = make_policy(name, task)
     rng = np.random.default_rng(0)
     seen = []
     for _ in range(20):
@@ -236,7 +237,8 @@ def counting(longest_gap=0.5):
 
 
 def test_a_state_goes_on_from_step_to_step_and_begins_anew_where_it_is_reset():
-    policy, seen = counting(), np.zeros((2, 5), np.float32)
+    policy = counting()
+    seen = np.zeros((2, 5), np.float32)
     assert [policy.act(seen).tolist() for _ in range(2)] == [[1, 1], [2, 2]]
     policy.reset(np.array([False, True]))
     assert policy.act(seen).tolist() == [3, 1]
@@ -255,8 +257,10 @@ def test_other_worlds_than_before_are_refused_unless_an_episode_begins():
 
 
 def test_after_a_gap_a_state_begins_anew_and_one_sentence_says_so():
-    policy, seen = counting(), np.zeros(5, np.float32)
-    told, acted = [], []
+    policy = counting()
+    seen = np.zeros(5, np.float32)
+    told = []
+    acted = []
     for time_s in (10.0, 10.4, 10.9, 11.5, 12.0):
         told.append(resume(policy, time_s))
         acted.append(float(policy.act(seen)))

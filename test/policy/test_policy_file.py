@@ -127,7 +127,8 @@ def elsewhere(location):
         tensor.ClearField("raw_data")
         tensor.data_location = onnx.TensorProto.EXTERNAL
         entry = tensor.external_data.add()
-        entry.key, entry.value = "location", location
+        entry.key = "location"
+        entry.value = location
         return bytes_of(signed(proto))
 
     return spoil
@@ -217,7 +218,8 @@ def torch_file(_):
 
 def two_contracts(proto):
     entry = proto.metadata_props.add()
-    entry.key, entry.value = onnx_graph.KEY, "{}"
+    entry.key = onnx_graph.KEY
+    entry.value = "{}"
     return bytes_of(proto)
 
 
@@ -320,7 +322,8 @@ def test_a_file_cut_anywhere_is_refused(file, tmp_path, share):
 
 @pytest.mark.slow
 def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
-    whole, rng = file.read_bytes(), np.random.default_rng(4)
+    whole = file.read_bytes()
+    rng = np.random.default_rng(4)
     path = tmp_path / "flipped.onnx"
     last = len(
         onnx_graph.sealed(b"")
@@ -469,7 +472,8 @@ def test_a_policy_without_a_state_says_nothing_of_one(file):
 def test_an_observation_without_the_state_that_a_policy_needs_is_refused(
     remembering, file
 ):
-    policy, seen = load_policy(remembering), np.zeros((3, SECTORS + 6), np.float32)
+    policy = load_policy(remembering)
+    seen = np.zeros((3, SECTORS + 6), np.float32)
     size = policy.contract.state.size
     with pytest.raises(PolicyError, match=rf"field 'state'.*\(3, {size}\), not None"):
         policy.act(seen)
@@ -571,7 +575,8 @@ def test_it_loads_where_nothing_of_training_is_installed(file):
 
 
 def test_a_scan_of_another_lidar_gives_the_same_command(file):
-    policy, commands = load_policy(file), []
+    policy = load_policy(file)
+    commands = []
     for spec in (
         lidar(beams=1440),
         lidar(beams=720, angle_min=0.0, angle_max=2.0 * np.pi),

@@ -8,7 +8,9 @@ from nics_drl_bridge.policy.route import route
 from nics_drl_bridge.sim.occupancy import occupancy
 from nics_drl_bridge.sim.world_set import load_worlds
 
-START, GOAL, RADIUS = (-2.0, -3.0), (5.5, 3.0), 0.2
+START = (-2.0, -3.0)
+GOAL = (5.5, 3.0)
+RADIUS = 0.2
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,10 @@ from nics_drl_bridge.robot.spec import load_robot
 from policy.policy_rig import MEMORIES, export_remembering
 
 pytestmark = pytest.mark.slow
-LIDAR, ROBOT = load_lidar("paper"), load_robot("ackermann")
-SEED, PERIOD = 4, 0.1
+LIDAR = load_lidar("paper")
+ROBOT = load_robot("ackermann")
+SEED = 4
+PERIOD = 0.1
 LATE = {"/odom": 0.005, "/scan": 0.01, "/cmd_vel": 0.02}
 
 
@@ -51,9 +53,12 @@ def driven_by(name):
     env = BridgeEnv(model="ackermann", world="circles", estimator=True)
     policy = make_policy(name, env.task)
     observation, info = env.reset(seed=SEED)
-    topics, ended, k = {topic: [] for topic in LATE}, False, 1
+    topics = {topic: [] for topic in LATE}
+    ended = False
+    k = 1
     while not ended and k < 60:
-        t, data = PERIOD * k, env._backend.simulator.data
+        t = PERIOD * k
+        data = env._backend.simulator.data
         action = policy.act(observation)
         twist = ROBOT.to_cmd_vel(env.task.command(action))
         told = {

@@ -15,7 +15,8 @@ from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, evaluate, run, 
 from nics_drl_bridge.policy.train_checkpoint import FORMAT, read_checkpoint
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=2)
+MODEL = direct_model(odometry=(0.02, 0.02))
+WORLD = field(count=2)
 
 
 class BrokenOffError(Exception):

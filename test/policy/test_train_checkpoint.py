@@ -31,14 +31,16 @@ def actions(count, steps):
 def test_an_env_that_is_given_the_state_of_another_goes_on_with_the_same_bits(
     arguments,
 ):
-    one, other = vector(**arguments), vector(**arguments)
+    one = vector(**arguments)
+    other = vector(**arguments)
     one.reset(seed=3)
     for chosen in actions(5, 30):
         one.step(chosen)
     kept = snapshot(one)
     restore(other, kept)
     for chosen in actions(5, 40):
-        mine, theirs = one.step(chosen), other.step(chosen)
+        mine = one.step(chosen)
+        theirs = other.step(chosen)
         for a, b in zip(mine[:4], theirs[:4], strict=True):
             assert np.array_equal(a, b)
 
@@ -54,7 +56,8 @@ def test_a_snapshot_does_not_change_with_the_env():
 
 
 def test_the_state_of_another_env_is_refused():
-    one, other = vector(5), vector(6)
+    one = vector(5)
+    other = vector(6)
     one.reset(seed=0)
     with pytest.raises(
         ConfigError, match=r"of shape .5, .*, this env's is .* of shape .6, "

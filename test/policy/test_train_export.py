@@ -62,7 +62,8 @@ def test_the_file_of_a_sac_acts_as_it_predicts(tmp_path):
 
 def test_the_normaliser_is_inside_the_graph(tmp_path):
     rng = np.random.default_rng(6)
-    mean, std = rng.normal(size=SECTORS + 6), rng.uniform(0.5, 2.0, SECTORS + 6)
+    mean = rng.normal(size=SECTORS + 6)
+    std = rng.uniform(0.5, 2.0, SECTORS + 6)
     policy, _ = export(tmp_path / "one.onnx", normaliser=(mean, std, 1.5))
     seen = rng.normal(size=(7, SECTORS + 6)).astype(np.float32)
     cut = np.clip((seen - mean) / std, -1.5, 1.5).astype(np.float32)
@@ -110,7 +111,8 @@ def test_what_the_graph_computes_lies_within_the_limits_of_the_robot():
     assert (command <= high).all()
 
 
-DIRECT_LOW, DIRECT_HIGH = model_of().robot.command_low, model_of().robot.command_high
+DIRECT_LOW = model_of().robot.command_low
+DIRECT_HIGH = model_of().robot.command_high
 
 
 @pytest.mark.parametrize("kind", MEMORIES)
@@ -137,7 +139,8 @@ def test_a_file_with_a_state_acts_as_the_module_step_by_step(tmp_path, kind, act
 @pytest.mark.parametrize("kind", MEMORIES)
 def test_what_a_policy_with_a_state_does_depends_on_what_it_saw_before(tmp_path, kind):
     policy, task, _ = export_remembering(tmp_path / "one.onnx", kind)
-    rows, acting = sequence(task, 2), make_policy(str(policy.path), task)
+    rows = sequence(task, 2)
+    acting = make_policy(str(policy.path), task)
     first = acting.act(rows[0])
     second = acting.act(rows[1])
     acting.reset()

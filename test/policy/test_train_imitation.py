@@ -16,7 +16,8 @@ from nics_drl_bridge.policy.train_ppo import LeanPpo
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-WORLDS, LIMIT = 6, 5
+WORLDS = 6
+LIMIT = 5
 IMITATION = {"expert": "straight", "steps": 120, "epochs": 300}
 
 
@@ -54,8 +55,10 @@ def begun(seed=0):
 
 
 def test_the_actor_comes_to_do_what_the_expert_does_and_its_steps_count():
-    env, made = worlds(), begun()
-    seen, expert = env.reset(), expert_of(settings(), env)
+    env = worlds()
+    made = begun()
+    seen = env.reset()
+    expert = expert_of(settings(), env)
     with torch.no_grad():
         mine = made.policy.best(torch.from_numpy(seen)).numpy()
         fresh = training(worlds()).policy.best(torch.from_numpy(seen)).numpy()
@@ -65,8 +68,11 @@ def test_the_actor_comes_to_do_what_the_expert_does_and_its_steps_count():
 
 
 def test_what_drives_next_has_the_weights_that_were_fitted_and_the_same_seed_gives_the_same():
-    made, again, other = begun(), begun(), begun(1)
-    ours, driving = made.networks.state_dict(), made.collector.networks.state_dict()
+    made = begun()
+    again = begun()
+    other = begun(1)
+    ours = made.networks.state_dict()
+    driving = made.collector.networks.state_dict()
     assert all(torch.equal(driving[name], each) for name, each in ours.items())
     assert all(
         torch.equal(again.networks.state_dict()[name], each)
@@ -78,7 +84,8 @@ def test_what_drives_next_has_the_weights_that_were_fitted_and_the_same_seed_giv
 
 def test_returns_are_discounted_to_the_end_of_an_episode_and_unknown_without_one():
     env = worlds()
-    rng, first = np.random.default_rng(0), env.reset()
+    rng = np.random.default_rng(0)
+    first = env.reset()
     shown, last = drive(env, expert_of(settings(), env), first, 2 * LIMIT - 1, 0.5, rng)
     returns = shown.returns.reshape(-1, WORLDS)
     assert last.shape == first.shape
@@ -87,7 +94,8 @@ def test_returns_are_discounted_to_the_end_of_an_episode_and_unknown_without_one
     assert returns.isnan().any()
     again = worlds()
     seen = again.reset()
-    noise, total = np.random.default_rng(0), np.zeros(WORLDS)
+    noise = np.random.default_rng(0)
+    total = np.zeros(WORLDS)
     going = np.ones(WORLDS)
     for t in range(LIMIT):
         action = expert_of(settings(), again).act(seen)

@@ -15,14 +15,16 @@ def test_outputs_and_gradients_of_layers_are_those_of_autograd(widths):
     parts: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
         parts += [torch.nn.Linear(ins, outs), torch.nn.ReLU()]
-    layers, rows = torch.nn.Sequential(*parts[:-1]), 9
+    layers = torch.nn.Sequential(*parts[:-1])
+    rows = 9
     weights = torch.nn.utils.parameters_to_vector(layers.parameters()).detach().numpy()
     size = rows * max(widths)
     memory = (
         np.full((count, size), np.nan, np.float32) for count in (len(widths) - 1, 2)
     )
     net = Net(weights, np.full_like(weights, np.nan), np.array(widths), *memory)
-    seen, pull = torch.randn(rows, widths[0]), torch.randn(rows, widths[-1])
+    seen = torch.randn(rows, widths[0])
+    pull = torch.randn(rows, widths[-1])
     wanted = layers(seen)
     wanted.backward(pull)
     assert forward(net, seen.numpy()) == pytest.approx(

@@ -7,7 +7,8 @@ from nics_drl_bridge.policy.train_algorithms import LIMIT
 from nics_drl_bridge.policy.train_memory import UNSET, memory_of
 from nics_drl_bridge.policy.training_settings import GruMemory, StackMemory
 
-PARTS, INPUTS = 2, 5
+PARTS = 2
+INPUTS = 5
 STACK = StackMemory(kind="stack", scans=3, every=2)
 
 
@@ -22,7 +23,8 @@ def seen(t):
 
 
 def test_a_stack_shows_the_present_scan_and_earlier_ones_so_many_steps_apart():
-    stack, found = memory(), []
+    stack = memory()
+    found = []
     state = stack.begin(1)
     for t in range(6):
         features, state = stack(seen(t / 2), state)
@@ -34,7 +36,8 @@ def test_a_stack_shows_the_present_scan_and_earlier_ones_so_many_steps_apart():
 
 
 def test_scans_before_the_first_are_like_the_first():
-    stack, found = memory(), []
+    stack = memory()
+    found = []
     state = stack.begin(1)
     for t in (3, 4, 5):
         features, state = stack(seen(t), state)
@@ -51,7 +54,8 @@ def test_a_gru_is_that_of_torch():
         torch.nn.init.normal_(ours.bias)
         getattr(cell, f"weight_{theirs}").data.copy_(ours.weight)
         getattr(cell, f"bias_{theirs}").data.copy_(ours.bias)
-    given, state = torch.randn(3, INPUTS), torch.randn(3, 4)
+    given = torch.randn(3, INPUTS)
+    state = torch.randn(3, 4)
     features, following = gru(given, state)
     assert torch.allclose(following, cell(given, state), atol=1e-6)
     assert torch.equal(features, torch.cat([given, following], 1))
@@ -62,7 +66,8 @@ def test_steps_at_once_are_those_one_after_the_other_with_a_fresh_state_in_each_
     settings,
 ):
     one = memory(settings)
-    given, done = torch.rand(5, 3, INPUTS), torch.zeros(5, 3)
+    given = torch.rand(5, 3, INPUTS)
+    done = torch.zeros(5, 3)
     done[1, 2] = done[3, 0] = 1.0
     first = one.begin(3)
     found = one.unroll(given, first, done)

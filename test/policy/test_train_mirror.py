@@ -17,7 +17,8 @@ from nics_drl_bridge.policy.train_ppo import LeanPpo, Transitions
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-STEPS, WORLDS = 12, 6
+STEPS = 12
+WORLDS = 6
 MODEL = direct_model()
 STACK = {"kind": "stack", "scans": 3, "every": 2}
 
@@ -34,7 +35,8 @@ def engine(mirror=True, actions="continuous", memory=None):
     settings = TrainingSettings.model_validate(
         {"hidden": [16, 8], "ppo": ppo, "memory": memory}
     )
-    size, rng = env.observation_space.shape[0], np.random.default_rng(0)
+    size = env.observation_space.shape[0]
+    rng = np.random.default_rng(0)
     normaliser = rng.uniform(0.0, 0.5, size), rng.uniform(0.2, 1.0, size)
     lean = LeanPpo(settings, env, 0, normaliser)
     torch.manual_seed(5)
@@ -54,10 +56,8 @@ def test_each_transition_is_followed_by_its_mirror_image(actions, memory):
     both, driven = (
         one.learner.judge(one.collector.collect()[0]) for one in (lean, plain)
     )
-    reflection, count = (
-        Reflection(mirror, lean.networks.actor.memory.extra, 72),
-        STEPS * WORLDS,
-    )
+    reflection = Reflection(mirror, lean.networks.actor.memory.extra, 72)
+    count = STEPS * WORLDS
     for one, other in zip(both[:5], driven[:5], strict=True):
         assert len(one) == 2 * count
         assert torch.equal(one[:count], other)

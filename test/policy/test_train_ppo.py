@@ -20,8 +20,12 @@ from nics_drl_bridge.policy.train_ppo import LeanPpo, Transitions, advantages_of
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-STEPS, WORLDS, LIMIT = 12, 6, 5  # fewer steps in an episode than in a rollout
-MODEL, WORLD = direct_model(), field(count=2)
+# fewer steps in an episode than in a rollout
+STEPS = 12
+WORLDS = 6
+LIMIT = 5
+MODEL = direct_model()
+WORLD = field(count=2)
 
 
 def pair(actions="continuous", log_std=-0.5, clip=0.2, entropy=0.01):
@@ -112,10 +116,8 @@ def their_weights(ppo):
 def test_advantages_are_those_of_stable_baselines3():
     _, theirs = pair()
     rng = np.random.default_rng(1)
-    rewards, values = (
-        rng.normal(size=(STEPS, WORLDS)),
-        rng.normal(size=(STEPS + 1, WORLDS)),
-    )
+    rewards = rng.normal(size=(STEPS, WORLDS))
+    values = rng.normal(size=(STEPS + 1, WORLDS))
     done = rng.random((STEPS, WORLDS)) < 0.3
     buffer = RolloutBuffer(
         STEPS, theirs.observation_space, theirs.action_space, "cpu", 0.9, 0.97, WORLDS
@@ -262,7 +264,8 @@ def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_l
 
 def test_what_is_learnt_through_time_is_what_was_driven():
     lean, rollouts = remembering({"kind": "gru", "units": 5})
-    actor, networks = lean.networks.actor, lean.networks
+    actor = lean.networks.actor
+    networks = lean.networks
     for rollout in rollouts:
         assert rollout.done.sum() >= WORLDS
         seen = rollout.seen[:, : actor.normaliser.features_dim].unflatten(
@@ -293,7 +296,8 @@ def test_a_batch_through_time_holds_whole_worlds_and_all_batches_together_hold_e
 
 def test_gradients_through_time_reach_the_memory_by_the_actor_alone():
     lean, (rollout, *_) = remembering({"kind": "gru", "units": 5})
-    memory, critic = lean.networks.actor.memory, lean.networks.critic
+    memory = lean.networks.actor.memory
+    critic = lean.networks.critic
     lean.learner.differentiate(rollout)
     assert all(each.grad.abs().max() > 0.0 for each in memory.parameters())
     still = rollout._replace(advantages=torch.zeros_like(rollout.advantages))

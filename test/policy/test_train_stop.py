@@ -21,7 +21,8 @@ GIVEN = StopSettings(success=0.9, every=100, episodes=10)
 @pytest.fixture
 def told(monkeypatch):
     """The stop of two worlds, the success that is told of each in turn, and the seeds driven."""
-    rates, seeds = [], []
+    rates = []
+    seeds = []
 
     class Told:
         def __init__(self, success):

@@ -50,20 +50,24 @@ def test_it_feeds_what_a_vec_env_of_single_envs_feeds():
             world=field(count=3),
         )
 
-    ours, theirs = TrainVecEnv(vector(2)), DummyVecEnv([alone, alone])
+    ours = TrainVecEnv(vector(2))
+    theirs = DummyVecEnv([alone, alone])
     ours.seed(3)
     theirs.seed(3)
     assert np.array_equal(ours.reset(), theirs.reset())
-    rng, ended = np.random.default_rng(0), 0
+    rng = np.random.default_rng(0)
+    ended = 0
     for _ in range(100):
         actions = rng.uniform(-1.0, 1.0, (2, 3)).astype(np.float32)
-        one, another = ours.step(actions), theirs.step(actions)
+        one = ours.step(actions)
+        another = theirs.step(actions)
         for a, b in zip(one[:3], another[:3], strict=True):
             assert a.dtype == b.dtype
             assert np.array_equal(a, b)
         for n in np.flatnonzero(one[2]):
             ended += 1
-            mine, other = one[3][n], another[3][n]
+            mine = one[3][n]
+            other = another[3][n]
             assert np.array_equal(
                 mine["terminal_observation"], other["terminal_observation"]
             )
@@ -115,7 +119,8 @@ def test_pictures_of_all_worlds_are_tiled():
 
 
 def test_who_watches_is_called_after_each_step_of_all_worlds():
-    env, seen = TrainVecEnv(vector(2), vector(3)), []
+    env = TrainVecEnv(vector(2), vector(3))
+    seen = []
     env.on_step = lambda: seen.append(
         [one.simulator.data.steps.max() for one in env.envs]
     )

@@ -15,7 +15,8 @@ from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot, robot_from
 
-CAR, CART = load_robot("ackermann"), load_robot("differential")
+CAR = load_robot("ackermann")
+CART = load_robot("differential")
 PLACES = np.array([bags.place_at(t) for t in bags.times()])
 NAMES = ["rear_left_wheel_joint", "front_left_steering_joint"]
 
@@ -306,7 +307,8 @@ def test_angles_are_positions_and_speeds_are_velocities_unless_the_mapping_says_
 
 
 def test_messages_about_other_joints_are_left_out():
-    arm, both = (("elbow",), (0.0,), (1.0,)), ("left_wheel", "right_wheel")
+    arm = (("elbow",), (0.0,), (1.0,))
+    both = ("left_wheel", "right_wheel")
     joints = table(arm, (both, (), (1.0, 2.0)), arm, (both, (), (np.nan, 2.0)))
     state = state_of(joints, CART, roles(), "drive")
     assert state.values.tolist() == [[1.0, 2.0]]
@@ -362,7 +364,8 @@ def test_names_that_are_not_there_come_with_the_nearest():
         wheels_of(joints, roles(wheels=["left", "wheel_r"]), "drive")
 
 
-LEAST_S, JITTER_S = 0.012, 0.010
+LEAST_S = 0.012
+JITTER_S = 0.010
 
 
 def delays(count, seed=0):

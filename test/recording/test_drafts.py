@@ -17,7 +17,8 @@ from nics_drl_bridge.robot.spec import load_robot
 
 from .tables import write
 
-COUNT, STEP = 1200, 0.05
+COUNT = 1200
+STEP = 0.05
 
 
 def motion() -> dict[str, np.ndarray]:
@@ -26,7 +27,8 @@ def motion() -> dict[str, np.ndarray]:
     t = np.arange(COUNT) * STEP
     v = np.repeat(rng.uniform(0.2, 1.0, COUNT // 20), 20)
     w = np.repeat(rng.uniform(-0.8, 0.8, COUNT // 20), 20)
-    speed, rate = np.zeros(COUNT), np.zeros(COUNT)
+    speed = np.zeros(COUNT)
+    rate = np.zeros(COUNT)
     for k in range(1, COUNT):
         speed[k] = speed[k - 1] + 0.25 * (v[k - 1] - speed[k - 1])
         rate[k] = rate[k - 1] + 0.25 * (w[k - 1] - rate[k - 1])
@@ -63,7 +65,8 @@ XYZ = {
     "qz": "qz",
     "qw": "qw",
 }
-LAT, LON = 47.5 + M["y"] * 9e-6, 8.7 + M["x"] * 13e-6
+LAT = 47.5 + M["y"] * 9e-6
+LON = 8.7 + M["x"] * 13e-6
 # Columns: by the name of a signal of `motion`, or as they are. Then the columns that are to be
 # guessed for x, for the heading or quaternion, and as commands; None and {} for a blank.
 TABLES: dict[str, tuple[dict[str, Any], str | None, Any, dict[str, str]]] = {

@@ -57,7 +57,8 @@ def test_a_folder_of_the_shipped_form_needs_no_mapping_and_is_as_its_files_say(
 ):
     path = shared_recordings / "xtark_ackermann" / drive
     tables = {file.stem: np.loadtxt(file, delimiter=",") for file in path.glob("*.csv")}
-    found, mapped = read_recording(path), read_recording(path, mapping=SHIPPED)
+    found = read_recording(path)
+    mapped = read_recording(path, mapping=SHIPPED)
     assert (found.variables, found.robot, found.repairs) == ((), None, ())
     assert np.array_equal(found.command.values, tables["cmd"][:, :2])
     assert np.array_equal(found.command.t, tables["cmd"][:, 2])
@@ -99,7 +100,8 @@ def test_ticks_are_wheels_that_turn_the_robot_as_its_calibration_says(
 ):
     """Radius / base is 0.284 by the mean of the published radii and bases."""
     _, drive = imported(shared_recordings, "differential_ticks", k)
-    t, pose = drive.command.t, drive.pose
+    t = drive.command.t
+    pose = drive.pose
     turned = np.cumsum(drive.command.values[:-1] * np.diff(t)[:, None], axis=0)
     grid = np.arange(2.0, t[-1] - 1.0)
     wheels = np.diff([np.interp(grid, t[1:], each) for each in turned.T], axis=1)

@@ -114,11 +114,14 @@ def drive_another(robot, really, gain, seed):
     """Greatest distance of a robot that moves otherwise than expected, and is watched."""
     drive = DrivePlan(robot, bound=2.0, duration=60.0, seed=seed).begin()
     motion = expected_motion(really)
-    pose, state, away = np.zeros((1, 3)), np.zeros((1, motion.size)), 0.0
+    pose = np.zeros((1, 3))
+    state = np.zeros((1, motion.size))
+    away = 0.0
     while not drive.done:
         command = gain * drive.next()
         poses, states = motion.roll(pose, state, command[None, None], PERIOD_S)
-        pose, state = poses[:, -1], states[:, -1]
+        pose = poses[:, -1]
+        state = states[:, -1]
         drive.see(pose[0])
         away = max(away, float(np.hypot(*pose[0, :2])))
     return away + robot.footprint_radius
@@ -237,7 +240,8 @@ def test_it_is_the_textbook_but_for_a_centimetre(name):
     rng = np.random.default_rng(0)
     held = rng.uniform(spec.command_low, spec.command_high, (3, 10, len(spec.command)))
     command = np.repeat(held, 8, axis=1)
-    pose, state = np.zeros((3, 3)), np.zeros((3, len(spec.state)))
+    pose = np.zeros((3, 3))
+    state = np.zeros((3, len(spec.state)))
     poses, states = expected_motion(spec).roll(pose, state, command, PERIOD_S)
     assert poses.shape == (3, 81, 3)
     for n in range(80):

@@ -16,8 +16,10 @@ from nics_drl_bridge.robot.spec import load_robot
 
 def mounted(t, rate, axis, sign):
     """Returns a message of an IMU of which an axis points up (1) or down (-1)."""
-    turn, acceleration = np.zeros(3), np.array([0.3, -0.2, 0.1])
-    turn[axis], acceleration[axis] = sign * rate, sign * 9.81
+    turn = np.zeros(3)
+    acceleration = np.array([0.3, -0.2, 0.1])
+    turn[axis] = sign * rate
+    acceleration[axis] = sign * 9.81
     return bags.new(
         IMU,
         bags.header(t),

@@ -344,7 +344,8 @@ STEERED = {
 
 def test_a_robots_file_is_the_same_robot_however_it_is_named(tmp_path, columns):
     (tmp_path / "lorry.yaml").write_text(LORRY)
-    path, robot = write(tmp_path / "log.csv", columns), str(tmp_path / "lorry.yaml")
+    path = write(tmp_path / "log.csv", columns)
+    robot = str(tmp_path / "lorry.yaml")
     given = MAP | {"command": STEERED}
     one, other = (
         Mapping.model_validate(given | {"robot": each}) for each in ("car", robot)

@@ -28,7 +28,8 @@ from nics_drl_bridge.recording.mcap import (
     unpack_file,
 )
 
-TWIST, COUNT = "geometry_msgs/msg/Twist", 200
+TWIST = "geometry_msgs/msg/Twist"
+COUNT = 200
 DATA = b"\x00\x01\x00\x00" + struct.pack("<6d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.5)
 FORMS = {
     "zstd": {"compression": CompressionType.ZSTD},

@@ -14,7 +14,8 @@ T = np.arange(3000) * 0.02
 
 def pose(speed=0.6, turn=0.5):
     """A drive that speeds up and slows down, and turns both ways."""
-    v, w = speed * (1.0 + 0.5 * np.sin(T)), turn * np.sin(0.3 * T) + 0.2 * turn
+    v = speed * (1.0 + 0.5 * np.sin(T))
+    w = turn * np.sin(0.3 * T) + 0.2 * turn
     heading = np.cumsum(w) * 0.02
     step = v[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1) * 0.02
     return np.column_stack([np.cumsum(step, axis=0), heading])

@@ -17,7 +17,8 @@ def folder(tmp_path):
     """Ten seconds of a drive that turns left by 0.1 rad a sample."""
     t = np.arange(100) * 0.1
     write(tmp_path / "cmd.csv", np.stack([t * 0.1, t * 0.0 - 0.5, t + 0.2], axis=1))
-    yaw, zero = np.arange(100) * 0.1, np.zeros(100)
+    yaw = np.arange(100) * 0.1
+    zero = np.zeros(100)
     pose = [
         t,
         -t,

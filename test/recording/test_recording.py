@@ -55,11 +55,13 @@ def spoilt(recording, name, row, value):
 
 def test_the_rates_of_samples_are_the_twist_of_the_exact_arc():
     rng = np.random.default_rng(1)
-    dt, twists = 0.05, rng.normal(size=(40, 3)) * [1.0, 1.0, 20.0]
+    dt = 0.05
+    twists = rng.normal(size=(40, 3)) * [1.0, 1.0, 20.0]
     poses = [np.array([1.0, 2.0, 3.0])]
     for twist in twists:
         poses.append(geometry.compose(poses[-1], geometry.exp(twist * dt)))
-    t, state = np.arange(41) * dt, rng.normal(size=(41, 1))
+    t = np.arange(41) * dt
+    state = rng.normal(size=(41, 1))
     command = rng.normal(size=(41, 2))
     samples = samples_on_one_clock(t, np.array(poses), state, command)
     assert samples.dt == pytest.approx(dt)
@@ -290,7 +292,9 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path):
 @pytest.mark.parametrize("unknown", [0.0, np.nan, np.inf])
 def test_a_row_weighs_by_its_variance_and_as_usual_where_that_is_unknown(unknown):
     sigma = np.full((6, 3), 0.02)
-    sigma[1], sigma[2], sigma[3:, 2] = 0.04, unknown, unknown
+    sigma[1] = 0.04
+    sigma[2] = unknown
+    sigma[3:, 2] = unknown
     stream = Stream(np.arange(6.0), np.zeros((6, 3)), sigma=sigma)
     expected = np.ones((6, 3))
     expected[1] = 0.25, 0.25, (0.03 / 0.04) ** 2  # of the heading two rows are known

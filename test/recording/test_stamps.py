@@ -64,7 +64,8 @@ def test_a_clock_that_was_set_ahead_by_years_goes_on():
 
 
 def test_rows_that_repeat_stamp_and_values_are_left_out():
-    t, values = np.array([0.0, 0.0, 0.0, 1.0]), np.array([[1.0], [1.0], [2.0], [2.0]])
+    t = np.array([0.0, 0.0, 0.0, 1.0])
+    values = np.array([[1.0], [1.0], [2.0], [2.0]])
     keep, note = stamping.not_repeated(t, values, "pose")
     assert keep.tolist() == [True, False, True, True]
     assert "1 of 4 rows repeat" in note
@@ -79,7 +80,8 @@ def test_the_unit_of_stamps_that_are_no_seconds_is_named(step, unit):
 
 @pytest.mark.parametrize(("bits", "low"), [(16, 0.0), (32, 0.0), (16, -(2.0**15))])
 def test_a_counter_that_overflows_is_continued(bits, low):
-    size, steps = 2.0**bits, np.tile([5.0, 9.0, 0.0, -3.0], 500) * 2.0 ** (bits - 12)
+    size = 2.0**bits
+    steps = np.tile([5.0, 9.0, 0.0, -3.0], 500) * 2.0 ** (bits - 12)
     raw = np.cumsum(steps)
     wrapped = (raw - low) % size + low
     found = stamping.overflow(wrapped, (1.0,), stamping.BITS)

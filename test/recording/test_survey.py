@@ -53,7 +53,8 @@ def test_guesses_reach_over_files_split_stamps_and_quaternions(tmp_path):
     columns = drive()
     ns = np.round((1.7e9 + columns["t"]) * 1e9).astype(np.int64)
     split = {"": np.arange(200), "s": ns // 10**9, "ns": ns % 10**9}
-    half, zero = columns["yaw"] / 2.0, np.zeros(200)
+    half = columns["yaw"] / 2.0
+    zero = np.zeros(200)
     turned = {"q.x": zero, "q.y": zero, "q.z": np.sin(half), "q.w": np.cos(half)}
     write(
         tmp_path / "pose.csv", split | {"x": columns["x"], "y": columns["y"]} | turned

@@ -22,7 +22,8 @@ def steady(spec, command):
 @pytest.mark.slow
 def test_a_car_on_a_constant_steer_drives_a_circle_of_the_textbook_radius():
     car = load_robot("ackermann")
-    book, command = textbook(car), np.array([0.8, 0.3])
+    book = textbook(car)
+    command = np.array([0.8, 0.3])
     radius = car.parameters["wheelbase"] / np.tan(0.3)
     for time in (0.5, 1.7, 4.0):
         pose, _ = integrate(book, np.zeros(3), steady(car, command), command, time)
@@ -88,7 +89,8 @@ def test_the_motion_solves_the_differential_equation(name):
 
     def derivative(_, y):
         vx, vy, wz = book.twist(y[3:])
-        c, s = np.cos(y[2]), np.sin(y[2])
+        c = np.cos(y[2])
+        s = np.sin(y[2])
         rates = (book.target(command) - y[3:]) / book.lag
         return [c * vx - s * vy, s * vx + c * vy, wz, *rates]
 

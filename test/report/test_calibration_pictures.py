@@ -155,8 +155,10 @@ def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
     state = spec.state[0].name
     size = len(spec.state)
     curve = InputCurve(command=name, dead=0.12, least=-0.5, most=0.8, back=0.6)
-    friction, limits = np.zeros(size), np.tile([-np.inf, np.inf], (size, 1))
-    friction[0], limits[0] = 0.2, (-3.0, 2.0)
+    friction = np.zeros(size)
+    limits = np.tile([-np.inf, np.inf], (size, 1))
+    friction[0] = 0.2
+    limits[0] = (-3.0, 2.0)
     model = replace(found.model, inputs=(curve,), friction=friction, limits=limits)
     sigma = {f"{name}.dead": 0.004}
     calibration = replace(found.calibration, uncertainty=sigma)

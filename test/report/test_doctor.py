@@ -24,7 +24,8 @@ from nics_drl_bridge.report.doctor_facts import (
 from nics_drl_bridge.robot.spec import load_robot
 
 SECONDS = 8.0
-RELIABLE, BEST_EFFORT = Offer(), Offer(reliable=False)
+RELIABLE = Offer()
+BEST_EFFORT = Offer(reliable=False)
 LIDAR = load_lidar("paper")
 EXPECTED = Expected(load_robot("ackermann"), LIDAR, 0.1)
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -34,7 +35,8 @@ def scan(t, **changed):
     header = LIDAR.header._asdict() | {"time_increment": 0.0}
     ranges = np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf)
     values = header | {"ranges": ranges, "frame": LIDAR.frame} | changed
-    frame, ranges = values.pop("frame"), np.asarray(values.pop("ranges"), np.float32)
+    frame = values.pop("frame")
+    ranges = np.asarray(values.pop("ranges"), np.float32)
     return bags.new(
         "sensor_msgs/msg/LaserScan",
         bags.header(t, frame),
@@ -355,7 +357,8 @@ def test_a_missing_topic_is_named_with_one_of_its_type():
     facts = heard()
     facts.topics["/front/scan"] = facts.topics.pop("/scan")
     del facts.heard["scan"]
-    facts.layouts, facts.ranges = [], []
+    facts.layouts = []
+    facts.ranges = []
     finding = only(facts)
     assert finding.what == "there is no such topic"
     assert "/front/scan is of its type: remap it" in finding.fix
@@ -363,7 +366,8 @@ def test_a_missing_topic_is_named_with_one_of_its_type():
 
 def with_gyro(rate, noise=0.003, seconds=SECONDS):
     """Facts of a robot on a circle, beside a gyro that measures a rate."""
-    facts, rng = heard(), np.random.default_rng(0)
+    facts = heard()
+    rng = np.random.default_rng(0)
     for t in bags.times(0.01, seconds):
         message = bags.imu(t, 0.0, 0.0, rate + rng.normal(0.0, noise))
         facts.take("imu", bags.ns(t + 0.002), message)

@@ -121,7 +121,8 @@ def test_the_picture_of_an_open_field_is_as_wide_and_deep_as_its_bounds():
     robot, goal = (
         one[one[:, 0] > 60].mean(axis=0) for one in (robot, goal)
     )  # below the legend
-    up, right = robot[0] - goal[0], goal[1] - robot[1]
+    up = robot[0] - goal[0]
+    right = goal[1] - robot[1]
     assert up / right == pytest.approx(6.0 / 0.8, rel=0.03)
 
 
@@ -149,17 +150,16 @@ def drawn(world, bodies):
     rows, columns = image.shape[:2]
 
     def dark(x, y):
-        row, column = (y2 - y) / (y2 - y1) * rows, (x - x1) / (x2 - x1) * columns
+        row = (y2 - y) / (y2 - y1) * rows
+        column = (x - x1) / (x2 - x1) * columns
         return image[int(row), int(column)].max() < 230
 
     return dark
 
 
 def test_every_shape_is_drawn_where_it_stands():
-    poses, radii = (
-        [[1.0, 1.0, 0.0], [-1.0, 0.0, np.pi / 2], [0.0, -2.0, 0.0]],
-        [0.25, 0.0, 0.5],
-    )
+    poses = [[1.0, 1.0, 0.0], [-1.0, 0.0, np.pi / 2], [0.0, -2.0, 0.0]]
+    radii = [0.25, 0.0, 0.5]
     radii[1] = WORLD.shapes[1].radius
     dark = drawn(WORLD, place(poses, radii, [0, 1, 2]))
     for x, y in ((1.2, 1.0), (-1.0, 0.28), (-1.13, 0.0), (0.45, -2.0), (-0.45, -2.0)):
@@ -198,7 +198,8 @@ def test_a_training_is_drawn_from_its_first_rollout_on(points):
 
 
 def test_success_under_each_perturbation_is_drawn_as_low_as_it_is():
-    best, worst = rate(500, 500), rate(10, 500)
+    best = rate(500, 500)
+    worst = rate(10, 500)
     drawn = robustness({"as it is": best, "action_latency": worst})
     assert drawn.startswith(b"\x89PNG")
     assert drawn != robustness({"as it is": best, "action_latency": best})

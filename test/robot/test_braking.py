@@ -376,7 +376,8 @@ def test_a_bound_is_computed_once_for_each_model(monkeypatch):
 
 
 def test_many_commands_are_tried_alone_and_in_pairs():
-    low, high = np.full(12, -1.0), np.full(12, 2.0)
+    low = np.full(12, -1.0)
+    high = np.full(12, 2.0)
     tried = motions(low, high)
     assert len(tried) < 2000
     assert {tuple(row) for row in 2.0 * np.eye(12)} <= {tuple(row) for row in tried}

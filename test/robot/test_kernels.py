@@ -69,7 +69,8 @@ def test_the_compiled_heading_stays_in_its_interval():
 def test_robots_side_by_side_move_as_the_model_steps_each(order):
     model = random_model(2, 2, order, seed=7)
     rng = np.random.default_rng(3)
-    start, inputs = rng.uniform(-3.0, 3.0, (37, 3)), rng.uniform(-1.0, 1.0, (37, 4))
+    start = rng.uniform(-3.0, 3.0, (37, 3))
+    inputs = rng.uniform(-1.0, 1.0, (37, 4))
     pose = np.zeros((6, 37))
     pose[0], pose[1], pose[4] = start.T
     pose[2], pose[3] = np.cos(start[:, 2]), np.sin(start[:, 2])
@@ -78,7 +79,8 @@ def test_robots_side_by_side_move_as_the_model_steps_each(order):
     terms = term_arrays(model)
     lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], 37))
     run(pose, x, np.zeros((5, 37)), lanes, SERIES, model.dt, 10)
-    moved, state = start, inputs[:, :2]
+    moved = start
+    state = inputs[:, :2]
     for _ in range(10):
         moved, state = model.step(moved, state, inputs[:, 2:])
     assert np.allclose(x[:2].T, state, rtol=0.0, atol=1e-11)

@@ -101,7 +101,8 @@ def test_the_spec_tells_what_its_commands_mean(name, steers, moves_sideways, tur
 @pytest.mark.parametrize("name", [*SHIPPED, "jackal"])
 def test_a_held_command_leads_to_its_steady_twist(name):
     robot = load_robot(name)
-    book, command = textbook(robot), 0.6 * robot.command_high
+    book = textbook(robot)
+    command = 0.6 * robot.command_high
     _, state = integrate(book, np.zeros(3), np.zeros(len(robot.state)), command, 5.0)
     assert steady_twist(robot, command) == pytest.approx(book.twist(state), abs=1e-9)
 
@@ -128,7 +129,8 @@ def test_the_command_for_a_twist_leads_to_it(kind):
 @pytest.mark.parametrize("kind", KNOWN)
 def test_a_robot_known_by_its_twist_comes_to_that_of_its_actuators(kind):
     robot = made(kind)
-    command, start = 0.6 * robot.command_high, np.zeros(len(textbook(robot).lag))
+    command = 0.6 * robot.command_high
+    start = np.zeros(len(textbook(robot).lag))
     _, state = integrate(textbook(robot), np.zeros(3), start, command, 5.0)
     assert textbook(robot).twist(state) == pytest.approx(
         steady_twist(robot, command), abs=1e-3
@@ -296,10 +298,8 @@ def test_it_records_and_its_model_moves_as_it_does(model):
     robot = model.robot
     drive = record(robot, np.random.default_rng(1), duration=20.0)
     x = np.concatenate([drive.state.values, drive.command.values], axis=1)
-    twist, found = (
-        textbook(robot).twist(drive.state.values),
-        model.kinematics.rates(x)[:, :3],
-    )
+    twist = textbook(robot).twist(drive.state.values)
+    found = model.kinematics.rates(x)[:, :3]
     off, size = (np.sqrt((each**2).mean(axis=0)) for each in (found - twist, twist))
     assert (
         off <= 0.1 * size

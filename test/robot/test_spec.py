@@ -72,7 +72,8 @@ def car(kind="ackermann", **changes):
 
 
 def test_a_car_takes_a_turn_rate_unless_its_file_says_steering():
-    robot, turn = car(), 0.5 * np.tan(0.3) / 0.2
+    robot = car()
+    turn = 0.5 * np.tan(0.3) / 0.2
     assert robot.to_cmd_vel([0.5, 0.3]) == pytest.approx([0.5, 0.0, turn])
     assert robot.from_cmd_vel([0.5, 9.0, turn]) == pytest.approx([0.5, 0.3])
     assert robot.from_cmd_vel([-0.5, 0.0, turn]) == pytest.approx([-0.5, -0.3])
@@ -207,10 +208,8 @@ def test_a_robot_that_cant_be_is_refused_in_one_sentence(changes, sentence):
 
 def test_a_steering_in_degrees_is_refused_where_the_robot_is_read_but_not_one_that_was_recorded():
     kind = {"kind": "ackermann", "footprint_radius": 0.2}
-    speed, angle = (
-        {"name": "speed_command"},
-        {"name": "steering_command", "min": -24, "max": 22},
-    )
+    speed = {"name": "speed_command"}
+    angle = {"name": "steering_command", "min": -24, "max": 22}
     with pytest.raises(
         ConfigError, match=r"steering_command reaches -24 rad, .* are in radians"
     ):

@@ -12,7 +12,9 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
-STEPS, STRETCHES, WARM_UP = 100, 20, 20
+STEPS = 100
+STRETCHES = 20
+WARM_UP = 20
 BOOKKEEPING = 20_000
 """Python's own objects that a step makes and drops, whatever the number of worlds [bytes]."""
 GROWTH = 2500
@@ -45,7 +47,8 @@ def taken(step, steps=STEPS, bookkeeping=BOOKKEEPING):
     """
     for _ in range(WARM_UP):
         step()
-    grown, most = [], []
+    grown = []
+    most = []
     tracemalloc.start()
     try:
         step()
@@ -95,7 +98,8 @@ def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(
     model = noisy_model()
     simulator = FastSimulator(model, world(), worlds, robots)
     simulator.reset(range(worlds))
-    low, high = model.robot.command_low, model.robot.command_high
+    low = model.robot.command_low
+    high = model.robot.command_high
     commands = np.random.default_rng(0).uniform(low, high, (worlds, robots, len(low)))
     grown, most = taken(lambda: simulator.step(commands))
     assert compiled(lambda: simulator.step(commands)) < FEW

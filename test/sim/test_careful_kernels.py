@@ -15,7 +15,8 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 
 DT = 0.01
 OVERLAP = 1e-6
-FASTEST, TURNS = 50.0, 100.0
+FASTEST = 50.0
+TURNS = 100.0
 BAR = ((0.3, 0.05), (-0.3, 0.05), (-0.3, -0.05), (0.3, -0.05))
 DART = ((0.2, 0.0), (-0.1, 0.12), (0.0, 0.0), (-0.1, -0.12))
 SEGMENT = {"kind": "segment", "ends": [[-0.3, 0.0], [0.4, 0.1]]}
@@ -38,7 +39,8 @@ def fast_model(footprint):
     """A robot with a radius, or an outline, that is told its twist 100 times a second."""
     about = DIRECT.model_dump(exclude={"footprint_radius", "footprint"})
     for command, most in zip(about["command"], (FASTEST, FASTEST, TURNS), strict=True):
-        command["min"], command["max"] = -most, most
+        command["min"] = -most
+        command["max"] = most
     about |= (
         {"footprint_radius": footprint}
         if isinstance(footprint, float)
@@ -66,7 +68,8 @@ def edges_of(shape, pose):
 
 def points_from(p, q):
     """(..., P, Q) distance of points (..., P, 2) from segments (..., Q, 4)."""
-    p, q = p[..., :, None, :], q[..., None, :, :]
+    p = p[..., :, None, :]
+    q = q[..., None, :, :]
     along = q[..., 2:] - q[..., :2]
     length = np.maximum((along**2).sum(axis=-1), 1e-300)
     share = np.clip(((p - q[..., :2]) * along).sum(axis=-1) / length, 0.0, 1.0)
@@ -89,8 +92,12 @@ def between(p, q):
             b[..., 1] - a[..., 1]
         ) * (c[..., 0] - a[..., 0])
 
-    p, q = p[..., :, None, :], q[..., None, :, :]
-    a, b, c, d = p[..., :2], p[..., 2:], q[..., :2], q[..., 2:]
+    p = p[..., :, None, :]
+    q = q[..., None, :, :]
+    a = p[..., :2]
+    b = p[..., 2:]
+    c = q[..., :2]
+    d = q[..., 2:]
     crossing = (side(a, b, c) * side(a, b, d) < 0.0) & (
         side(c, d, a) * side(c, d, b) < 0.0
     )
@@ -101,7 +108,10 @@ class Mover:
     """Edges with a radius, which move by a body twist from a pose, or by a velocity in the map."""
 
     def __init__(self, edges, radius, pose, twist, in_map=False):
-        self.edges, self.radius, self.pose, self.in_map = edges, radius, pose, in_map
+        self.edges = edges
+        self.radius = radius
+        self.pose = pose
+        self.in_map = in_map
         self.twist = np.asarray(twist)
         reach = np.linalg.norm(edges.reshape(-1, 2), axis=-1).max()
         self.speed = np.hypot(*self.twist[:2]) + abs(self.twist[2]) * reach
@@ -128,10 +138,12 @@ def first_touch(one, others):
     Each stretch of time in which the clearance can't fall below zero at their speeds is left; the
     rest is looked at ten times as finely.
     """
-    touch, least = np.inf, np.inf
+    touch = np.inf
+    least = np.inf
     for other in others:
         speed = one.speed + other.speed
-        spans, step = np.array([0.0]), DT
+        spans = np.array([0.0])
+        step = DT
         for _ in range(9):
             edges = np.linspace(0.0, step, 11)
             times = (spans[:, None] + edges).ravel()
@@ -144,7 +156,8 @@ def first_touch(one, others):
             chosen = np.sort(begin[(low <= max(0.0, least)) & (begin < touch)])[:40]
             if len(chosen) == 0:
                 break
-            spans, step = chosen, step / 10.0
+            spans = chosen
+            step = step / 10.0
     return touch, least
 
 
@@ -162,7 +175,8 @@ def still(edges, radius=0.0):
 
 def random_walls(rng, count, size):
     ends = rng.uniform(-size, size, (count, 2))
-    angle, length = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.1, 2.0, count)
+    angle = rng.uniform(-np.pi, np.pi, count)
+    length = rng.uniform(0.1, 2.0, count)
     away = length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.clip(np.concatenate([ends, ends + away], axis=1), -size, size)
 
@@ -197,7 +211,8 @@ FOOTPRINTS = [
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # a cold start compiles
 def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprint):
-    number, rng = 160, np.random.default_rng(5)
+    number = 160
+    rng = np.random.default_rng(5)
     walls = random_walls(rng, 8, 3.4)
     groups = [{"shapes": [shape], "count": 1} for shape in SHAPES]
     world = field(7.0, obstacles=groups, walls=[tuple(wall) for wall in walls])
@@ -257,7 +272,8 @@ def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
     "shape", [CIRCLE, PLATE, HOOK], ids=["circle", "plate", "hook"]
 )
 def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
-    number, rng = 100, np.random.default_rng(7)
+    number = 100
+    rng = np.random.default_rng(7)
     world = field(10.0, obstacles=[{"shapes": [shape], "count": 1}])
     simulator = FastSimulator(fast_model(0.05), world, number, tell=silent)
     simulator.reset(range(number), starts=np.tile([0.0, 0.0, 0.3], (number, 1, 1)))
@@ -286,7 +302,8 @@ def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
     )
     simulator.data.velocity[:, 0] = velocity
     simulator.step(twists[:, None])
-    touched, edges = 0, edges_of(outline, np.zeros(3))
+    touched = 0
+    edges = edges_of(outline, np.zeros(3))
     for n in range(number):
         robot = footprint_mover(0.05, np.array([0.0, 0.0, 0.3]), twists[n])
         other = Mover(*edges, before[n], velocity[n], in_map=True)
@@ -303,7 +320,8 @@ def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
 
 @pytest.mark.slow
 def test_robots_that_run_into_each_other_stop_there_and_are_marked():
-    number, rng = 200, np.random.default_rng(9)
+    number = 200
+    rng = np.random.default_rng(9)
     simulator = FastSimulator(fast_model(0.03), field(10.0), number, 2, tell=silent)
     starts = np.zeros((number, 2, 3))
     starts[:, 1, :2] = rng.uniform(-0.05, 0.05, (number, 2)) + np.array([0.0, 0.2])
@@ -348,7 +366,8 @@ def test_a_robot_that_is_run_into_from_behind_drives_on():
 
 @pytest.mark.parametrize("deviation", [0.0, 0.3])
 def test_nothing_overlaps_in_a_long_drive_of_fast_robots(deviation):
-    model, robots = fast_model(0.04), 4
+    model = fast_model(0.04)
+    robots = 4
     groups = [
         {"shapes": [CIRCLE], "count": 3},
         {
@@ -397,14 +416,13 @@ def test_a_robot_that_is_placed_in_something_may_leave_it_and_gets_no_deeper():
 
 def turned_by(simulator, twist, steps):
     """Drives one robot by a twist; returns how far it turned [rad]."""
-    turned, before = 0.0, simulator.data.pose[0, 0, 2]
+    turned = 0.0
+    before = simulator.data.pose[0, 0, 2]
     for _ in range(steps):
         simulator.step([[twist]])
         after = simulator.data.pose[0, 0, 2]
-        turned, before = (
-            turned + (after - before + np.pi) % (2.0 * np.pi) - np.pi,
-            after,
-        )
+        turned = turned + (after - before + np.pi) % (2.0 * np.pi) - np.pi
+        before = after
     return turned
 
 
@@ -479,12 +497,14 @@ def test_a_robot_in_a_narrow_corner_stands_still_and_comes_out_again():
 
 @pytest.mark.parametrize("footprint", [BAR, DART], ids=["bar", "dart"])
 def test_nothing_overlaps_where_robots_with_corners_push_and_slide(footprint):
-    rng, number = np.random.default_rng(3), 24
+    rng = np.random.default_rng(3)
+    number = 24
     groups = [{"shapes": [CIRCLE, PLATE], "count": 4}]
     world = field(3.0, obstacles=groups, walls=[(0.0, 0.0, 1.0, 0.4)])
     simulator = FastSimulator(fast_model(footprint), world, number, 2, tell=silent)
     drawn = simulator.reset(range(number))
-    shapes, moved = simulator.sampler.shapes, 0.0
+    shapes = simulator.sampler.shapes
+    moved = 0.0
     scenes = [
         [still(world.all_walls())]
         + [still(*edges_of(shapes[int(body[6])], body[:3])) for body in bodies]

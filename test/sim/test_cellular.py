@@ -59,10 +59,8 @@ def test_a_disc_as_wide_as_the_passage_can_get_to_the_goal(number):
         for w in world.walls
     ]
     free = shapely.box(x1, y1, x2, y2) - shapely.union_all(solid)
-    start, goal = (
-        shapely.Point(world.starts.at[0][:2]),
-        shapely.Point(world.goals.at[0]),
-    )
+    start = shapely.Point(world.starts.at[0][:2])
+    goal = shapely.Point(world.goals.at[0])
     assert any(
         area.contains(start) and area.contains(goal) for area in shapely.get_parts(free)
     )

@@ -102,9 +102,11 @@ def test_the_clearance_of_two_bodies_is_that_of_shapely(one, other):
 def test_who_comes_in_gets_deeper_and_who_leaves_gets_less_deep(one, other):
     rng = np.random.default_rng(one)
     for _ in range(60):
-        a, heading = rng.uniform(-3.0, 3.0, 3), rng.uniform(-np.pi, np.pi)
+        a = rng.uniform(-3.0, 3.0, 3)
+        heading = rng.uniform(-np.pi, np.pi)
         way = np.array([np.cos(heading), np.sin(heading), 0.0])
-        far, near = 3.0, 0.0
+        far = 3.0
+        near = 0.0
         for _ in range(50):  # where it begins to touch
             middle = 0.5 * (far + near)
             apart = gap(body(one, middle * way), body(other, [0.0, 0.0, a[2]])) > 0.0
@@ -119,7 +121,8 @@ def test_who_comes_in_gets_deeper_and_who_leaves_gets_less_deep(one, other):
 
 
 def test_bodies_that_share_the_lines_of_their_edges_overlap():
-    one, other = body(1, [0.0, 0.0, 0.0]), body(1, [0.5, 0.0, 0.0])
+    one = body(1, [0.0, 0.0, 0.0])
+    other = body(1, [0.5, 0.0, 0.0])
     assert gap(one, other) < -0.01
     assert gap(one, body(1, [0.6 + 1e-6, 0.0, 0.0])) > 0.0
 
@@ -128,10 +131,8 @@ def test_bodies_that_share_the_lines_of_their_edges_overlap():
 def test_the_clearance_to_a_straight_wall_is_that_of_shapely(index):
     rng = np.random.default_rng(index)
     for _ in range(150):
-        pose, wall = (
-            rng.uniform(-0.8, 0.8, 3) * [1.0, 1.0, 4.0],
-            rng.uniform(-1.0, 1.0, 4),
-        )
+        pose = rng.uniform(-0.8, 0.8, 3) * [1.0, 1.0, 4.0]
+        wall = rng.uniform(-1.0, 1.0, 4)
         line = geometry.LineString([wall[:2], wall[2:]])
         expected = solid(SHAPES[index], pose).distance(line) - radius(SHAPES[index])
         found = kernels.wall_gap(body(index, pose), wall, ARRAYS, np.inf, SPARE)
@@ -148,9 +149,11 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
     grid = GridMap(cells, 0.3, (-1.0, -2.0, 0.4))
     squares = []
     for row, column in np.argwhere(cells > 0):
-        x, y = 0.3 * column, 0.3 * row
+        x = 0.3 * column
+        y = 0.3 * row
         corners = np.array([(x, y), (x + 0.3, y), (x + 0.3, y + 0.3), (x, y + 0.3)])
-        c, s = np.cos(0.4), np.sin(0.4)
+        c = np.cos(0.4)
+        s = np.sin(0.4)
         squares.append(geometry.Polygon(corners @ [[c, s], [-s, c]] + (-1.0, -2.0)))
     known = map_field(grid)
     overlaps = 0

@@ -29,8 +29,10 @@ LATE = Randomisation(
 
 def end_of(fast: FastSimulator) -> tuple[np.ndarray, ...]:
     """What robots did that move as the fast simulator's, and whose wheels never slip."""
-    data, row = fast.data, fast.data.steps[0] % fast.data.past.shape[2]
-    pose, twist = data.pose[0].copy(), data.past[0, :, row, 3:6].copy()
+    data = fast.data
+    row = fast.data.steps[0] % fast.data.past.shape[2]
+    pose = data.pose[0].copy()
+    twist = data.past[0, :, row, 3:6].copy()
     return pose, twist, data.state[0].copy(), pose, twist, data.collided[0] == 1
 
 
@@ -43,7 +45,8 @@ def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(
 ):
     sensor = lidar(noise_std=0.01, faults={"skew": skew})
     model = direct_model(odometry=(0.05, 0.03), sensor=sensor)
-    world, rng = load_world(name), np.random.default_rng(1)
+    world = load_world(name)
+    rng = np.random.default_rng(1)
     fast = FastSimulator(model, world, robots=2, randomisation=drawn)
     driven = DrivenSimulator(model, world, robots=2, randomisation=drawn)
     for seed in (3, 4):
@@ -66,7 +69,8 @@ def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(
 
 
 def test_commands_are_in_force_as_late_as_is_drawn_and_without_the_latency_of_the_model():
-    model, world = direct_model(latency=0.07), load_world("empty")
+    model = direct_model(latency=0.07)
+    world = load_world("empty")
     late = Randomisation(name="late", action_latency=(1.3, 1.3))
     driven = DrivenSimulator(model, world, randomisation=late)
     driven.reset([0])
@@ -87,7 +91,8 @@ def test_commands_are_in_force_as_late_as_is_drawn_and_without_the_latency_of_th
 
 def test_odometry_is_what_the_wheels_count_and_the_scan_is_of_where_the_robot_is():
     model = direct_model(odometry=(0.0, 0.0))
-    world, start = load_world("empty"), np.array([[[0.5, 0.0, 0.0]]])
+    world = load_world("empty")
+    start = np.array([[[0.5, 0.0, 0.0]]])
     driven = DrivenSimulator(model, world)
     driven.reset([0], starts=start)
     before = driven.data.ranges.copy()
@@ -106,12 +111,14 @@ def test_odometry_is_what_the_wheels_count_and_the_scan_is_of_where_the_robot_is
 
 
 def test_the_covariance_of_odometry_is_that_of_the_errors_of_many_drives():
-    worlds, steps = 400, 80
+    worlds = 400
+    steps = 80
     model = builtin_model("mecanum")
     simulator = FastSimulator(model, load_world("empty"), worlds=worlds)
     simulator.reset(range(worlds), starts=np.zeros((worlds, 1, 3)))
     added = step_covariance(model.noise.odometry, model.control_period)
-    covariance, data = np.tile(added, (worlds, 1, 1)), simulator.data
+    covariance = np.tile(added, (worlds, 1, 1))
+    data = simulator.data
     for k in range(steps):
         before = data.odom[:, 0].copy()
         simulator.step(np.tile([0.3 * np.sin(k / 9.0), 0.2, 0.4], (worlds, 1, 1)))
@@ -140,7 +147,8 @@ def test_odometry_without_noise_is_not_said_to_be_unknown():
 
 
 def test_an_episode_that_would_begin_outside_the_world_is_refused_and_the_one_at_hand_goes_on():
-    model, world = direct_model(), load_world("empty")
+    model = direct_model()
+    world = load_world("empty")
     device = DeviceWorld(FastSimulator(model, world), model, 1)
     device.begin(3, np.array([1.0, -1.0, 0.5]))
     with pytest.raises(

@@ -18,7 +18,8 @@ from nics_drl_bridge.sim.obstacles import FASTEST
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import load_worlds
 
-DISC, START = Circle(radius=0.2), np.array([1.0, 1.0, 0.0])
+DISC = Circle(radius=0.2)
+START = np.array([1.0, 1.0, 0.0])
 HERE = ((DISC, (0.0, 0.0, 0.0)),)
 
 
@@ -57,7 +58,8 @@ def test_the_obstacles_of_a_world_and_its_robots_have_names(staged):
 
 
 def test_the_episode_goes_on_when_something_is_spawned(staged):
-    entities, other = staged("arena"), staged("arena")
+    entities = staged("arena")
+    other = staged("arena")
     for each in (entities, other):
         each.device.commands[0] = 0.4, 0.1
         for _ in range(5):
@@ -66,7 +68,8 @@ def test_the_episode_goes_on_when_something_is_spawned(staged):
     for each in (entities, other):
         for _ in range(5):
             each.device.advance()
-    mine, theirs = entities.device.sensed(0), other.device.sensed(0)
+    mine = entities.device.sensed(0)
+    theirs = other.device.sensed(0)
     assert mine.pose == pytest.approx(theirs.pose, abs=1e-12)
     assert mine.odom == pytest.approx(theirs.odom, abs=1e-12)
 
@@ -169,7 +172,8 @@ def test_room_for_what_was_spawned_is_given_back(staged):
 
 def test_only_what_moves_takes_a_twist(staged):
     entities = staged("arena")
-    car, still = entities.find("car"), entities.find("obstacle_0")
+    car = entities.find("car")
+    still = entities.find("obstacle_0")
     entities.move(car, np.array([0.0, 0.0, np.pi / 2]), np.array([0.0, 0.3, 0.0]))
     assert entities.twist(car) == pytest.approx([0.0, 0.3, 0.0], abs=1e-9)
     with pytest.raises(StillError, match="stands still"):
@@ -182,7 +186,8 @@ def test_only_what_moves_takes_a_twist(staged):
 def test_a_robot_takes_no_twist_beyond_its_reach(staged, value):
     entities = staged("empty")
     car = entities.find("car")
-    at, twist = entities.pose(car), entities.twist(car)
+    at = entities.pose(car)
+    twist = entities.twist(car)
     with pytest.raises(
         ConfigError, match="more than 10 times what 'ackermann' can be commanded"
     ):

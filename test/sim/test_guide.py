@@ -55,7 +55,8 @@ def test_a_tight_gap_costs_more_than_a_wide_one_but_less_than_a_long_way_round()
         return found
 
     (around,), _ = lengths_of(walled((0.0, -4.5, 0.0, 2.0)))
-    wide, tight = through(1.2), through(radius + 0.1)
+    wide = through(1.2)
+    tight = through(radius + 0.1)
     assert wide == pytest.approx(6.0, abs=0.1)
     assert wide + 0.1 < tight < around
 

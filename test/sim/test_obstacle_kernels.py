@@ -28,7 +28,8 @@ from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
-WANDER, WALKER = Wander(speed=(0.3, 0.8)), Pedestrian()
+WANDER = Wander(speed=(0.3, 0.8))
+WALKER = Pedestrian()
 SQUARE = Patrol(
     waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7
 )
@@ -83,7 +84,8 @@ def test_two_that_move_do_not_touch_within_a_period_either(motions):
 def test_what_moves_stays_within_open_bounds_wherever_they_lie_and_uses_all_of_them(
     motion,
 ):
-    low, high = np.array([10.0, -2.0]), np.array([13.0, 1.0])
+    low = np.array([10.0, -2.0])
+    high = np.array([13.0, 1.0])
     group = circles(4) | {"motion": {"kind": motion, "speed": [0.5, 0.9]}}
     world = {"name": "open", "bounds": [*low, *high], "goal_distance": [0.5, 2.0]}
     world = World.model_validate(world | {"obstacles": [group], "clearance": 0.05})
@@ -110,7 +112,8 @@ def test_speeds_stay_within_their_bounds():
     seen = watch(
         MIXED, scattered([0.2] * 6, (3.0, 3.0), np.random.default_rng(0)), [0.2] * 6
     )
-    drawn, fastest = seen.marks[-1, :, at.SPEED], seen.speeds.max(axis=0)
+    drawn = seen.marks[-1, :, at.SPEED]
+    fastest = seen.speeds.max(axis=0)
     for k, motion in enumerate(MIXED):
         if motion is not None:
             low, high = np.broadcast_to(motion.speed, 2)
@@ -152,7 +155,9 @@ def test_wandering_obstacles_turn_away_before_they_touch_and_never_get_stuck():
 
 def on_path(corners, speed, pause, times):
     """Where a patrol is that was at the first corner at time 0, by interpolation in time."""
-    when, where, now = [0.0], [corners[0]], 0.0
+    when = [0.0]
+    where = [corners[0]]
+    now = 0.0
     for one, other in pairwise(corners):
         for spent, stop in (
             (pause, one),
@@ -211,7 +216,8 @@ def arrivals(seen, k):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_walkers_reach_their_goals_and_keep_apart(seed):
-    count, radii = 5, [0.2] * 6
+    count = 5
+    radii = [0.2] * 6
     places = scattered(radii, (4.0, 4.0), np.random.default_rng(seed))
     seen = watch([WALKER] * count, places, radii, half=(4.0, 4.0), seed=seed)
     new, reached = np.sum([arrivals(seen, k) for k in range(count)], axis=0)
@@ -239,12 +245,12 @@ def walk_on(marks, places, radii, half, seed, steps=120):
     """The way (T, 2) of one walker with given marks, until it is at its goal."""
     poses = np.concatenate([places, np.zeros((2, 1))], axis=1)[None]
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, 2)))
-    marks, velocity, track = marks[None].copy(), np.zeros((1, 1, 3)), []
+    marks = marks[None].copy()
+    velocity = np.zeros((1, 1, 3))
+    track = []
     scene = surroundings_of([WALKER], half, sides(half))
-    state, goal = (
-        state_of(bodies, marks, velocity, [seed]),
-        marks[0, 0, at.GOAL_X].copy(),
-    )
+    state = state_of(bodies, marks, velocity, [seed])
+    goal = marks[0, 0, at.GOAL_X].copy()
     for t in range(steps):
         state.steps[0] = t + 1
         kernels.steer(0, state, scene, PERIOD, np.zeros((1, 2)))
@@ -264,18 +270,19 @@ def test_a_walker_alone_takes_up_its_speed_as_the_model_says():
 
 
 def in_batch(seeds, motions=tuple(MIXED), steps=200):
-    count, worlds = len(motions), len(seeds)
-    radii, half = np.full((worlds, count + 1), 0.2), np.array([3.0, 3.0])
+    count = len(motions)
+    worlds = len(seeds)
+    radii = np.full((worlds, count + 1), 0.2)
+    half = np.array([3.0, 3.0])
     places = scattered([0.2] * (count + 1), half, np.random.default_rng(0))
     poses = np.tile(
         np.concatenate([places, np.zeros((count + 1, 1))], 1), (worlds, 1, 1)
     )
     bodies = place(poses, radii, np.zeros_like(radii))
-    marks, velocity = (
-        np.full((worlds, count, MARK), 7.0),
-        np.full((worlds, count, 3), 9.0),
-    )
-    scene, still = surroundings_of(motions, half, sides(half)), np.zeros((1, 2))
+    marks = np.full((worlds, count, MARK), 7.0)
+    velocity = np.full((worlds, count, 3), 9.0)
+    scene = surroundings_of(motions, half, sides(half))
+    still = np.zeros((1, 2))
     state = state_of(bodies, marks, velocity, seeds)
     for n in range(worlds):
         kernels.begin(n, state, scene.movers.plans)
@@ -298,15 +305,21 @@ def test_a_seed_gives_the_same_motion_in_any_batch():
 @pytest.mark.parametrize("motion", [WANDER, WALKER], ids=["wander", "walk"])
 def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
     cells = np.zeros((120, 120), np.int8)
-    cells[40:50, 20:70], cells[70:100, 80:84], cells[20:23, 90:93] = 100, 100, 100
+    cells[40:50, 20:70] = 100
+    cells[70:100, 80:84] = 100
+    cells[20:23, 90:93] = 100
     grid = GridMap(cells, 0.05, (-2.5, -3.0, heading))
     corners = np.stack(np.nonzero(grid.blocked), axis=1)
     squares = [
         box(j * 0.05, i * 0.05, (j + 1) * 0.05, (i + 1) * 0.05) for i, j in corners
     ]
     solid, (x, y, _) = unary_union(squares), grid.origin
-    c, s = np.cos(heading), np.sin(heading)
-    radius, count, rng, places = 0.2, 4, np.random.default_rng(0), []
+    c = np.cos(heading)
+    s = np.sin(heading)
+    radius = 0.2
+    count = 4
+    rng = np.random.default_rng(0)
+    places = []
     while len(places) < count:
         spot = scattered([radius], (2.5, 2.5), rng)[0]
         row, column = grid.world_to_cell(spot)
@@ -381,7 +394,8 @@ def test_plans_hold_the_waypoints_of_all_patrols_one_after_the_other():
     assert [part.shape for part in plan_arrays([])] == [(0, 16), (0, 2)]
 
 
-STRENGTH, REACH = 2.1, 0.3
+STRENGTH = 2.1
+REACH = 0.3
 
 
 def potential(r, v, foresight):
@@ -393,9 +407,11 @@ def potential(r, v, foresight):
 
 @pytest.mark.parametrize("foresight", [0.0, 0.4, 2.0])
 def test_the_force_is_the_downhill_slope_of_the_potential(foresight):
-    rng, delta = np.random.default_rng(0), 1e-6
+    rng = np.random.default_rng(0)
+    delta = 1e-6
     for _ in range(300):
-        r, v = rng.uniform(-1.0, 1.0, 2), rng.uniform(-1.5, 1.5, 2)
+        r = rng.uniform(-1.0, 1.0, 2)
+        v = rng.uniform(-1.5, 1.5, 2)
         slope = [
             (potential(r + d, v, foresight) - potential(r - d, v, foresight))
             / (2.0 * delta)
@@ -411,9 +427,11 @@ def test_the_force_is_the_downhill_slope_of_the_potential(foresight):
 def test_the_force_is_that_of_the_library_socialforce():
     potentials = pytest.importorskip("socialforce.potentials")
     torch = pytest.importorskip("torch")
-    rng, count = np.random.default_rng(1), 6
+    rng = np.random.default_rng(1)
+    count = 6
     model = potentials.PedPedPotential(v0=STRENGTH, sigma=REACH)
-    places, v = rng.uniform(-1.0, 1.0, (count, 2)), rng.uniform(-1.5, 1.5, (count, 2))
+    places = rng.uniform(-1.0, 1.0, (count, 2))
+    v = rng.uniform(-1.5, 1.5, (count, 2))
     state = np.concatenate([places, v, 0.0 * v, places + 10.0 * v], axis=1)
     expected = -model.grad_r_ab(torch.tensor(state)).detach().numpy()
     for a in range(count):

@@ -41,7 +41,8 @@ def agreement(name, seed, spare=()):
     bodies = np.tile(exact.place(shapes, at), (len(poses), 1, 1))
     true = exact.scan(poses, bodies, world.all_walls())
     around = np.stack([np.roll(true, k, axis=1) for k in (-1, 0, 1)])
-    seen, slack = mapped.scan(poses, []), 1.5 * grid.resolution
+    seen = mapped.scan(poses, [])
+    slack = 1.5 * grid.resolution
     return np.mean(
         (seen >= around.min(axis=0) - slack) & (seen <= around.max(axis=0) + slack)
     )

@@ -80,7 +80,8 @@ def test_the_shipped_ranges_fit_every_shipped_robot(name, robot):
 
 def test_a_seed_gives_the_same_bits_in_any_batch_and_among_any_robots():
     ranges = load_randomisation("strong")
-    many, one = Sampler(ranges, model(), 3), Sampler(ranges, model(), 1)
+    many = Sampler(ranges, model(), 3)
+    one = Sampler(ranges, model(), 1)
     together = many.draw([9, 2, 2**63 - 1])
     for row, seed in enumerate([9, 2, 2**63 - 1]):
         alone = many.draw([seed])
@@ -139,15 +140,14 @@ def test_each_coefficient_is_scaled_evenly_and_on_its_own():
 def test_a_slower_response_scales_all_time_constants_alike_and_leads_to_the_same_state(
     robot,
 ):
-    nominal, command = (
-        builtin_model(robot).kinematics,
-        builtin_model(robot).robot.command_high,
-    )
+    nominal = builtin_model(robot).kinematics
+    command = builtin_model(robot).robot.command_high
     sampler = Sampler(
         given(kinematics={"response": [1.0, 3.0]}), builtin_model(robot), 2
     )
     drawn = sampler.draw(SEEDS[:50])
-    kept, size = np.nonzero(nominal.coefficients), nominal.state_size
+    kept = np.nonzero(nominal.coefficients)
+    size = nominal.state_size
     factor = term_arrays(nominal).coefficient / drawn.coefficient
     assert np.allclose(factor[..., kept[0] < 3], 1.0)
     assert np.allclose(
@@ -179,7 +179,8 @@ def test_a_rate_and_a_term_may_have_ranges_of_their_own():
     nominal = builtin_model("ackermann").kinematics
     named = drawn.named()
     assert "kinematics.wz.speed*steering_command" not in named  # always twice as much
-    d, k = nominal.dofs.index("wz"), nominal.term_names.index("speed*steering")
+    d = nominal.dofs.index("wz")
+    k = nominal.term_names.index("speed*steering")
     factor = named["kinematics.wz.speed*steering"][:, 0] / nominal.coefficients[d, k]
     assert_even(factor, 3.0, 4.0)
     factor = named["kinematics.vx.speed"][:, 0]

@@ -59,7 +59,8 @@ def check_obstacles(world, sampler, scene, static):
     field_ = shapely.box(*world.extent)
     groups = [group for group in world.obstacles for _ in range(group.counts[1])]
     for i, (k, body) in enumerate(there):
-        thick, one = thickness(sampler, body), solid(sampler, body)
+        thick = thickness(sampler, body)
+        one = solid(sampler, body)
         assert sampler.shapes[int(body[SHAPE])] in groups[k].shapes
         assert field_.covers(one)
         if not groups[k].at:
@@ -287,7 +288,8 @@ def test_an_obstacle_never_shuts_the_only_door():
         starts={"regions": [[-1.9, -1.9, -0.3, 1.9]]},
         goals={"regions": [[0.3, -1.9, 1.9, 1.9]]},
     )
-    sampler, static = SceneSampler(world, ROBOT), static_of(world)
+    sampler = SceneSampler(world, ROBOT)
+    static = static_of(world)
     for scene in sampler.draw(range(8)):
         there, groups = check_obstacles(world, sampler, scene, static)
         check_way(world, sampler, scene, static, there, groups)

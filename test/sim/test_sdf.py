@@ -80,7 +80,8 @@ def rows():
 @pytest.mark.parametrize("number", [1, 2, 50, 151, 200, 299])
 def test_every_cylinder_of_a_published_world_is_found_where_it_stands(rows, number):
     (group,) = read_sdf(BARN / "gazebo" / f"world_{number}.world", HEIGHT).obstacles
-    found, expected = np.array(group.at)[:, :2], rows[rows[:, 0] == number, 1:]
+    found = np.array(group.at)[:, :2]
+    expected = rows[rows[:, 0] == number, 1:]
     found, expected = (one[np.lexsort(np.round(one, 3).T)] for one in (found, expected))
     assert found == pytest.approx(expected, abs=1e-3)
     assert group.shapes == (Circle(radius=0.075),)

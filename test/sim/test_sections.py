@@ -93,7 +93,8 @@ def test_a_capsule_is_round_and_narrower_at_its_ends():
 def test_a_box_on_any_of_its_sides_is_a_rectangle(turn, size):
     placed = section(Box((1.0, 2.0, 3.0)), at(5.0, 1.0, 0.2, **turn), 0.1)
     assert isinstance(placed[0], Rectangle)
-    x, y = size[0] / 2.0, size[1] / 2.0
+    x = size[0] / 2.0
+    y = size[1] / 2.0
     expected = affinity.rotate(
         shapely.box(-x, -y, x, y), turn.get("yaw", 0.0), (0, 0), use_radians=True
     )
@@ -104,7 +105,8 @@ def test_a_box_that_leans_is_the_polygon_that_the_height_cuts():
     rng = np.random.default_rng(0)
     cut = 0
     for _ in range(20):
-        size, height = rng.uniform(0.5, 2.0, 3), rng.uniform(-0.5, 0.5)
+        size = rng.uniform(0.5, 2.0, 3)
+        height = rng.uniform(-0.5, 0.5)
         pose = at(1.0, -2.0, 0.0, *rng.uniform(-3.0, 3.0, 3))
         placed = section(Box(tuple(size)), pose, height)
         # Points of the plane, and whether they lie in the box.
@@ -150,7 +152,8 @@ def test_a_thousandth_of_a_radian_is_upright():
 
 
 def test_equal_shapes_are_one_group_and_the_bounds_hold_all_and_room_around_places():
-    disc, bar = Circle(radius=0.5), Rectangle(size=(2.0, 0.2))
+    disc = Circle(radius=0.5)
+    bar = Rectangle(size=(2.0, 0.2))
     placed = (
         (disc, (0.0, 0.0, 0.0)),
         (bar, (4.0, 0.0, math.pi / 2.0)),

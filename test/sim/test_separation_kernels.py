@@ -47,7 +47,8 @@ def test_whatever_all_of_them_wish_nothing_touches_at_any_time_of_the_period(ben
     solid = MultiLineString([wall.reshape(2, 2) for wall in WALLS])
     for seed in range(100):
         rng, bodies = crowd(seed)
-        kinds, radii = rng.integers(0, 4, 5), bodies[:, 5]
+        kinds = rng.integers(0, 4, 5)
+        radii = bodies[:, 5]
         around = traffic(bodies, kinds, rng.uniform(-0.3, 0.3, (2, 2)))
         wishes = rng.normal(0.0, 0.4, (5, 2)) * (kinds != at.STILL)[:, None]
         moved = np.zeros((7, 2))
@@ -83,7 +84,8 @@ def test_nobody_runs_into_a_robot_that_keeps_its_velocity():
 
 def test_a_wish_that_nothing_hinders_is_granted_to_the_bit():
     _, bodies = crowd(0, count=1, robots=0)
-    bodies[0, :2], bodies[0, 5] = 0.0, 0.1
+    bodies[0, :2] = 0.0
+    bodies[0, 5] = 0.1
     wish = 0.0123, -0.0456
     around = traffic(bodies, [at.WANDER], walls=sides(HALF))
     for bends in (True, False):
@@ -92,7 +94,8 @@ def test_a_wish_that_nothing_hinders_is_granted_to_the_bit():
 
 def test_one_bends_along_a_wall_where_the_other_stops():
     _, bodies = crowd(0, count=1, robots=0)
-    bodies[0, :2], bodies[0, 5] = (0.0, 0.9), 0.1
+    bodies[0, :2] = (0.0, 0.9)
+    bodies[0, 5] = 0.1
     around = traffic(bodies, [at.WANDER], walls=sides(HALF))
     x, y = restrain(0.05, 0.05, 0, around, True)
     assert x == pytest.approx(0.05)
@@ -120,7 +123,8 @@ def test_nobody_jumps_through_a_thin_wall_of_a_map(bends, way):
     cells = np.zeros((60, 60), np.int8)
     cells[:, 40] = 100  # 5 cm thick, from x = 0.5 m
     _, bodies = crowd(0, count=1, robots=0)
-    bodies[0, :2], bodies[0, 5] = 0.0, 0.2
+    bodies[0, :2] = 0.0
+    bodies[0, 5] = 0.2
     thin = map_field(GridMap(cells, 0.05, (-1.5, -1.5, 0.0)))
     around = traffic(
         bodies, [at.WANDER], walls=WALLS[:0], half=np.full(2, 5.0), grid=thin
@@ -134,7 +138,8 @@ def test_nobody_jumps_through_a_thin_wall_of_a_map(bends, way):
 
 def test_what_overlaps_already_may_leave_but_get_no_deeper():
     _, bodies = crowd(0, count=2, robots=0)
-    bodies[:, :2], bodies[:, 5] = [(0.0, 0.0), (0.15, 0.0)], 0.1
+    bodies[:, :2] = [(0.0, 0.0), (0.15, 0.0)]
+    bodies[:, 5] = 0.1
     around = traffic(bodies, [at.WANDER, at.STILL], walls=WALLS[:0])
     assert restrain(-0.05, 0.01, 0, around, True) == (-0.05, 0.01)
     x, y = restrain(0.05, 0.01, 0, around, True)

@@ -48,7 +48,8 @@ def drive(simulator, seeds, commands, starts=None):
 
 def random_commands(model, steps, worlds, robots, seed=0):
     rng = np.random.default_rng(seed)
-    low, high = model.robot.command_low, model.robot.command_high
+    low = model.robot.command_low
+    high = model.robot.command_high
     return rng.uniform(low, high, (steps, worlds, robots, len(low)))
 
 
@@ -63,7 +64,8 @@ ALL = State._fields
 
 @pytest.mark.parametrize("renderer", ["baked", "exact"])
 def test_the_same_seeds_give_the_same_bits_in_another_simulator(renderer):
-    model, world = noisy_model(), field(5.0, count=4)
+    model = noisy_model()
+    world = field(5.0, count=4)
     commands = random_commands(model, 15, 3, 2)
     one, other = (
         drive(FastSimulator(model, world, 3, 2, renderer), [4, 5, 6], commands)
@@ -92,7 +94,8 @@ def test_a_world_gives_the_same_bits_in_a_batch_of_any_size(robot, batch):
 
 
 def test_beginning_one_world_anew_leaves_the_others_alone():
-    model, world = noisy_model(), field(5.0, count=3)
+    model = noisy_model()
+    world = field(5.0, count=3)
     commands = random_commands(model, 10, 3, 1)
     plain = drive(FastSimulator(model, world, 3), [1, 2, 3], commands)
     simulator = FastSimulator(model, world, 3)
@@ -146,7 +149,8 @@ def test_robots_move_as_the_readable_model_does():
     model = builtin_model("differential")
     commands = random_commands(model, 20, 1, 1) * [0.3, 1.0]
     history = drive(FastSimulator(model, load_world("empty")), [0], commands, ORIGIN)
-    pose, state = np.zeros(3), np.zeros(len(model.robot.state))
+    pose = np.zeros(3)
+    state = np.zeros(len(model.robot.state))
     for command, data in zip(commands, history, strict=True):
         for _ in range(model.timing[1]):
             pose, state = model.kinematics.step(pose, state, command[0, 0])
@@ -173,7 +177,8 @@ def test_a_robot_stops_at_a_wall_and_is_marked():
 
 
 def test_no_robot_ever_enters_anything():
-    model, world = direct_model(), field(4.0, count=3)
+    model = direct_model()
+    world = field(4.0, count=3)
     simulator = FastSimulator(model, world, 32, 3)
     scenes = simulator.reset(range(32))
     for command in random_commands(model, 40, 32, 3):
@@ -206,7 +211,8 @@ def test_robots_see_each_other_and_not_themselves(renderer):
     simulator = FastSimulator(direct_model(), field(8.0), 1, 2, renderer)
     simulator.reset([0], starts=starts)
     for expected in (1.0, 0.9, 0.8):
-        ahead, behind = simulator.data.ranges[0, 0, 36], simulator.data.ranges[0, 1, 0]
+        ahead = simulator.data.ranges[0, 0, 36]
+        behind = simulator.data.ranges[0, 1, 0]
         assert ahead == pytest.approx(expected - FOOTPRINT, abs=1e-3)
         assert behind == pytest.approx(expected - FOOTPRINT, abs=1e-3)
         assert np.isinf(simulator.data.ranges[0, 0, 0])
@@ -217,7 +223,8 @@ def test_robots_see_each_other_and_not_themselves(renderer):
 @pytest.mark.parametrize("skew", ["counter_clockwise", "clockwise"])
 def test_a_skewed_scan_is_put_together_from_where_the_robot_was(skew, renderer):
     spec = lidar(beams=180, rate=10.0, mount=(0.1, 0.0, 0.3), faults={"skew": skew})
-    model, world = direct_model(sensor=spec), field(6.0, 4)
+    model = direct_model(sensor=spec)
+    world = field(6.0, 4)
     simulator = FastSimulator(model, world, 2, 2, renderer)
     simulator.reset([3, 4])
     command = np.array(
@@ -253,10 +260,8 @@ def test_robots_that_touch_are_both_marked():
 
 
 def test_a_robot_that_touched_a_wall_may_leave_it_again():
-    there, back = (
-        np.tile([1.0, 0.0, 0.0], (10, 1, 1, 1)),
-        np.tile([-1.0, 0.0, 0.0], (5, 1, 1, 1)),
-    )
+    there = np.tile([1.0, 0.0, 0.0], (10, 1, 1, 1))
+    back = np.tile([-1.0, 0.0, 0.0], (5, 1, 1, 1))
     simulator = FastSimulator(direct_model(), field(2.0))
     history = drive(simulator, [0], np.concatenate([there, back]), ORIGIN)
     assert history[9]["collided"].all()
@@ -276,7 +281,10 @@ def test_without_noise_odometry_is_the_truth():
 
 
 def test_odometry_drifts_with_the_configured_deviation():
-    worlds, steps, linear, angular = 3000, 25, 0.05, 0.03
+    worlds = 3000
+    steps = 25
+    linear = 0.05
+    angular = 0.03
     model = direct_model(odometry=(linear, angular))
     simulator = FastSimulator(model, field(), worlds)
     starts = np.zeros((worlds, 1, 3))
@@ -306,7 +314,8 @@ def test_ranges_have_the_configured_noise_within_their_limits():
     noisy, true = (FastSimulator(m, field(4.0), worlds) for m in (model, clean))
     for simulator in (noisy, true):
         simulator.reset(range(worlds), starts=starts)
-    expected, seen = true.data.ranges, noisy.data.ranges
+    expected = true.data.ranges
+    seen = noisy.data.ranges
     inside = np.isfinite(expected) & (expected < 2.4)
     difference = seen[inside] - expected[inside]
     assert difference.std() == pytest.approx(std, rel=0.02)

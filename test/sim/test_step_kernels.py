@@ -21,7 +21,8 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
 ORIGIN = np.zeros((1, 1, 3))
-SUBSTEPS, PERIOD = 10, 0.1
+SUBSTEPS = 10
+PERIOD = 0.1
 OVERLAP = 1e-6
 """So deep may a robot be in what it touches [m]."""
 
@@ -99,7 +100,8 @@ def test_what_a_robot_is_told_is_of_its_age(age):
     late.data.age[:] = age
     for simulator in (late, now):
         simulator.reset([3])
-    poses, twists = [now.data.pose[0].copy()], [np.zeros((2, 3))]
+    poses = [now.data.pose[0].copy()]
+    twists = [np.zeros((2, 3))]
     command = np.array([[[0.5, 0.1, 0.4], [0.2, -0.3, -0.7]]])
     for step in range(1, 8):
         late.step(command)
@@ -110,7 +112,8 @@ def test_what_a_robot_is_told_is_of_its_age(age):
         low = int(told)
         high = min(low + 1, step)
         for m in range(2):
-            a, b = poses[low][m], poses[high][m]
+            a = poses[low][m]
+            b = poses[high][m]
             expected = a + (told - low) * np.array(
                 [*(b - a)[:2], geometry.wrap_angle(b[2] - a[2])]
             )
@@ -120,7 +123,8 @@ def test_what_a_robot_is_told_is_of_its_age(age):
             assert late.data.twist[0, m] == pytest.approx(speed)
         bodies = now.data.bodies.copy()
         for m in range(2):
-            a, b = poses[low][m], poses[high][m]
+            a = poses[low][m]
+            b = poses[high][m]
             turn = geometry.wrap_angle(b[2] - a[2])
             bodies[0, 4 + m, :3] = a + (told - low) * np.array([*(b - a)[:2], turn])
         for m in range(2):
@@ -399,7 +403,9 @@ def drive_among(world, worlds=3, threads=1, steps=200):
     """All that each world comes to among many obstacles that stand, reset in between."""
     longest = {"longest_delay": 25, "longest_age": 25}
     simulator = FastSimulator(model(), world, worlds, 2, threads=threads, **longest)
-    rng, found, touched = np.random.default_rng(3), [], 0
+    rng = np.random.default_rng(3)
+    found = []
+    touched = 0
     simulator.data.age[:1] = 7  # a scan of where the robot was
     for t in range(steps):
         if t % 50 == 0:
@@ -423,7 +429,8 @@ def drive_among(world, worlds=3, threads=1, steps=200):
 def test_obstacles_in_cells_are_seen_and_touched_like_those_that_are_all_looked_at(
     monkeypatch,
 ):
-    world, made = field(12.0, count=40), []
+    world = field(12.0, count=40)
+    made = []
     monkeypatch.setattr(
         sizes, "body_cells", lambda n, *rest: made.append(n) or body_cells(n, *rest)
     )

@@ -18,11 +18,13 @@ MODEL = direct_model(odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01))
 MIXED = WorldSet(
     "mixed", tuple(load_world(n) for n in ("crowd", "room", "doorway", "circles"))
 )
-STEPS, PERIOD = 12, 0.1
+STEPS = 12
+PERIOD = 0.1
 
 
 def commands(worlds, robots=1):
-    low, high = MODEL.robot.command_low, MODEL.robot.command_high
+    low = MODEL.robot.command_low
+    high = MODEL.robot.command_high
     shape = STEPS, worlds, robots, len(low)
     return np.random.default_rng(0).uniform(low, high, shape)
 
@@ -163,7 +165,8 @@ def test_the_maps_of_worlds_in_a_folder_are_no_members(folder):
 
 
 def test_sets_of_equal_worlds_share_a_fingerprint_and_others_do_not(folder):
-    once, again = load_worlds(str(folder)), load_worlds(str(folder))
+    once = load_worlds(str(folder))
+    again = load_worlds(str(folder))
     assert once.fingerprint == again.fingerprint
     (folder / "d.yaml").write_text((folder / "a.yaml").read_text())
     assert load_worlds(str(folder)).fingerprint != once.fingerprint

@@ -14,7 +14,8 @@ from typing import Any
 import psutil
 
 PACKAGE = "nics_drl_bridge"
-COMPILED_S, POLL_S = 280.0, 0.05
+COMPILED_S = 280.0
+POLL_S = 0.05
 SEVERED = ("SIGTERM", "SIGKILL", "process has died", "Traceback", "Segmentation")
 """What a log tells of nodes that did not end by Ctrl-C alone."""
 
@@ -30,7 +31,8 @@ class Launched(AbstractContextManager["Launched", None]):
             "ROS_DOMAIN_ID": str(domain_id),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         }
-        self.domain_id, self.log = domain_id, folder / "launch.log"
+        self.domain_id = domain_id
+        self.log = folder / "launch.log"
         env = (
             os.environ | chosen | {"ROS_LOG_DIR": str(folder), "ROS_HOME": str(folder)}
         )

@@ -40,7 +40,8 @@ FILES = [
     if nodes
     for suffix in SUFFIXES
 ]
-TIMES, MOMENTS_S = 10, 4.0
+TIMES = 10
+MOMENTS_S = 4.0
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ from nics_drl_bridge.watch.bag import BagSource
 from nics_drl_bridge.watch.server import Request
 
 MODEL = direct_model()
-DURATION_S, STEP_S = 4.0, 0.05
+DURATION_S = 4.0
+STEP_S = 0.05
 
 
 def odometry(t):

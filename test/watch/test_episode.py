@@ -85,7 +85,8 @@ def test_an_obstacle_is_added_while_all_else_stays_where_it_is(driven, shape):
     driven.take(Request(kind="goal", x=1.25, y=-0.5))
     driven.advance()
     x, y = free_spot(driven)
-    before, stood = bodies(driven), pose(driven)
+    before = bodies(driven)
+    stood = pose(driven)
     assert driven.take(Request(kind="obstacle", x=x, y=y, shape=shape))
     after = bodies(driven)
     assert len(after) == len(before) + 1

@@ -158,7 +158,8 @@ def test_a_page_that_reads_nothing_does_not_hold_up_the_end(server):
 def test_a_page_that_falls_asleep_or_errs_is_no_traceback(monkeypatch):
     import websockets.sync.server as library
 
-    handler, heard = logging.Handler(), []
+    handler = logging.Handler()
+    heard = []
     handler.emit = heard.append
     monkeypatch.setattr(logging.root, "handlers", [handler])
     quick = partial(library.serve, ping_interval=0.05, ping_timeout=0.05)

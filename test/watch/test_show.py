@@ -18,7 +18,8 @@ class Counter:
     period_s = 0.005
 
     def __init__(self, fails=0):
-        self.count, self.fails = 0, fails
+        self.count = 0
+        self.fails = fails
 
     def stage(self):
         return STAGE

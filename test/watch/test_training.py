@@ -64,7 +64,8 @@ def test_nothing_is_drawn_or_sent_while_nobody_looks(server, monkeypatch):
 
 
 def test_frames_are_far_enough_apart_not_to_slow_the_training(server, monkeypatch):
-    envs, sent = Envs(2), []
+    envs = Envs(2)
+    sent = []
     view = TrainingView(server, envs)
     clock = [10.0]
     monkeypatch.setattr(

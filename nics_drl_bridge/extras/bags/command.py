@@ -46,7 +46,8 @@ def record(
     kind = _storage(storage)
     with needs_ros("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
-    names, say = tuple(topics or ()), partial(typer.echo, err=True)
+    names = tuple(topics or ())
+    say = partial(typer.echo, err=True)
     order = BagOrder(
         out, names, everything, namespace_of(namespace), duration, kind, use_sim_time
     )
@@ -67,7 +68,8 @@ def info(
 
     with intact(path, salvage) as whole:
         told = bag_info(whole)
-    span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
+    span = f"{told.duration_s:.3f} s"
+    size = f"{told.size_bytes / 1e6:.2f} MB"
     line = f"{path}: {told.messages} messages in {span}, {size}"
     heads = (
         "topic",
@@ -139,7 +141,8 @@ def replay(
             )
             if out is not None:
                 playback.write_estimate(made, out)
-            rejected, number = dict(sorted(made.rejected.items())), len(made.stamp_ns)
+            rejected = dict(sorted(made.rejected.items()))
+            number = len(made.stamp_ns)
             x, y, heading = last = made.pose[-1].tolist()
             lines = [
                 f"not used: {count} of {reason}" for reason, count in rejected.items()
@@ -214,7 +217,8 @@ def export(
                 "nothing to write; say --lerobot FOLDER or --mcap FOLDER."
             )
         known = None if model is None else open_model(model)
-        lines, told = [], dict[str, Any]()
+        lines = []
+        told = dict[str, Any]()
         if lerobot is not None:
             from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
 
@@ -230,7 +234,8 @@ def export(
             from nics_drl_bridge.extras.bags.frames import frames_of
 
             frames = frames_of(whole, console.roles_of(topic or []), known, fps, gap)
-            episodes, total = len(frames.lengths), int(frames.lengths.sum())
+            episodes = len(frames.lengths)
+            total = int(frames.lengths.sum())
             reached = _numbers(succeeded, episodes)
             write_dataset(
                 frames, lerobot, task, known.robot.name if known else None, reached

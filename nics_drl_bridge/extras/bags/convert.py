@@ -14,7 +14,8 @@ from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import FRAMES, bag_sink
 
-MOVING, FIXED = "/tf", "/tf_static"
+MOVING = "/tf"
+FIXED = "/tf_static"
 OFFERS = {FIXED: (Offer(1, transient_local=True),)}
 Row = tuple[str, int, bytes]
 """Topic, time of receipt [ns] and bytes of a message."""

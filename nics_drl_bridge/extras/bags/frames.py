@@ -20,7 +20,9 @@ from nics_drl_bridge.middleware.playback import played
 from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording.bag_file import Message
 
-STATE, RANGES, ACTION = "observation.state", "observation.scan", "action"
+STATE = "observation.state"
+RANGES = "observation.scan"
+ACTION = "action"
 STATE_NAMES = ("x", "y", "heading", "vx", "vy", "wz")
 TWIST_NAMES = ("linear.x", "linear.y", "angular.z")
 DRIVE_NAMES = ("speed", "steering_angle")  # of an AckermannDrive
@@ -28,7 +30,10 @@ LEAST_FRAMES = 2  # of an episode: one frame alone leads nowhere
 MOST_FRAMES = 50_000_000
 # A pose that is farther from the one before than this many times the way that the speed explains,
 # and a margin [m, rad], was set anew; so was a clock that runs back by more than data come late.
-EXPLAINED, MARGIN_M, MARGIN_RAD, BACK_NS = 3.0, 0.2, 0.5, NS_PER_S
+EXPLAINED = 3.0
+MARGIN_M = 0.2
+MARGIN_RAD = 0.5
+BACK_NS = NS_PER_S
 ANY_LIDAR = LidarSpec(
     beams=2, angle_min=0.0, angle_max=1.0, range_min=0.0, range_max=1.0, rate=1.0
 )
@@ -132,7 +137,8 @@ def resets(odometry: Sequence[Message]) -> Indices:
     twist = np.array([msgs.twist_row(m.content) for m in odometry])
     seconds = np.diff(_received(odometry)) * S_PER_NS
     back = np.diff(np.array([msgs.stamp(m.content) for m in odometry])) < -BACK_NS
-    speed, turn = np.hypot(twist[:, 0], twist[:, 1]), np.abs(twist[:, 2])
+    speed = np.hypot(twist[:, 0], twist[:, 1])
+    turn = np.abs(twist[:, 2])
     way = EXPLAINED * np.maximum(speed[1:], speed[:-1]) * seconds + MARGIN_M
     turned = EXPLAINED * np.maximum(turn[1:], turn[:-1]) * seconds + MARGIN_RAD
     far = np.hypot(*np.diff(pose[:, :2], axis=0).T) > way
@@ -213,7 +219,8 @@ def _scans(
     reader = (reader_of if model is None else reader_beside)(header, beams, like)
     table = np.array([np.asarray(m.content.ranges, np.float32) for m in scans])
     ranges = from_device(reader.ordered(table), reader.lidar)
-    low, high = np.float32(reader.lidar.range_min), np.float32(reader.lidar.range_max)
+    low = np.float32(reader.lidar.range_min)
+    high = np.float32(reader.lidar.range_max)
     ranges = np.where(
         np.isneginf(ranges), low, np.where(np.isfinite(ranges), ranges, high)
     )

@@ -10,8 +10,12 @@ from nics_drl_bridge.recording.bag_file import BagFile, opened, times_of
 from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S, Nanoseconds
 
 GAP = 3.0  # a silence longer than this many usual periods is a gap
-NO_HEADER, UNSTAMPED, UNKNOWN = "no header", "never stamped", "unknown type"
-RECORDER, FOREIGN, SEVERAL = "recorder's", "another", "several"
+NO_HEADER = "no header"
+UNSTAMPED = "never stamped"
+UNKNOWN = "unknown type"
+RECORDER = "recorder's"
+FOREIGN = "another"
+SEVERAL = "several"
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,8 @@ def bag_info(path: str | Path) -> BagInfo:
     with opened(path) as bag:
         received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
         times = np.concatenate([ns for ns, _ in received.values()])
-        start, end = int(times.min()), int(times.max())
+        start = int(times.min())
+        end = int(times.max())
         topics = tuple(
             _topic(t, bag.types[t], ns - start, s) for t, (ns, s) in received.items()
         )
@@ -79,15 +84,14 @@ def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]
 def _topic(
     topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str
 ) -> BagTopic:
-    clock, delay, jitter, backwards = (
-        delays if isinstance(delays, str) else "",
-        None,
-        None,
-        0,
-    )
+    clock = delays if isinstance(delays, str) else ""
+    delay = None
+    jitter = None
+    backwards = 0
     if not isinstance(delays, str):
         low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
-        delay, jitter = float(middle), float(high - low)
+        delay = float(middle)
+        jitter = float(high - low)
         backwards = int((np.diff(since - delays) < 0).sum())
         near = SAME_CLOCK_S[0] <= delay <= SAME_CLOCK_S[1]
         clock = SEVERAL if jitter > MAX_WANDER_S else RECORDER if near else FOREIGN

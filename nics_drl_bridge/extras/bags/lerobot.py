@@ -17,14 +17,16 @@ if TYPE_CHECKING:
     from pyarrow import Table
 
 VERSION = "v3.0"
-INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
+INFO = "meta/info.json"
+STATS = "meta/stats.json"
+TASKS = "meta/tasks.parquet"
 NUMBERED = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-DATA, EPISODES = f"data/{NUMBERED}", f"meta/episodes/{NUMBERED}"
-CHUNK_FILES, FILE_MB, VIDEO_MB = (
-    1000,
-    100,
-    200,
-)  # files of a folder, and their greatest sizes
+DATA = f"data/{NUMBERED}"
+EPISODES = f"meta/episodes/{NUMBERED}"
+# files of a folder, and their greatest sizes
+CHUNK_FILES = 1000
+FILE_MB = 100
+VIDEO_MB = 200
 SUCCESS = "next.success"
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 INDEX = "__index_level_0__"  # as pandas names the column of an index without a name
@@ -69,7 +71,8 @@ def write_dataset(
             )
         for number in dict.fromkeys(files):
             inside = [k for k, each in enumerate(files) if each == number]
-            begin, end = ends[inside[0]] - frames.lengths[inside[0]], ends[inside[-1]]
+            begin = ends[inside[0]] - frames.lengths[inside[0]]
+            end = ends[inside[-1]]
             some = {name: column[begin:end] for name, column in columns.items()}
             _write(_table(some), root / _numbered(DATA, number))
         _write(pyarrow.Table.from_pylist(rows), root / _numbered(EPISODES, 0))
@@ -88,7 +91,8 @@ def _is_of_a_dataset(name: str) -> bool:
 
 def _columns(frames: BagFrames, succeeded: Collection[int] | None) -> Columns:
     """The columns of all frames: features (T, D), and flags and indices (T,)."""
-    lengths, total = frames.lengths, int(frames.lengths.sum())
+    lengths = frames.lengths
+    total = int(frames.lengths.sum())
     episode = np.repeat(np.arange(len(lengths)), lengths)
     frame = np.arange(total) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     columns: Columns = {
@@ -115,11 +119,14 @@ def _files(frames: BagFrames) -> list[int]:
     width = (
         sum(4 * feature.values.shape[1] for feature in frames.features.values()) + 40
     )
-    numbers, number, filled = [], 0, 0
+    numbers = []
+    number = 0
+    filled = 0
     for length in frames.lengths:
         size = width * int(length)
         if filled and filled + size > FILE_MB * 2**20:
-            number, filled = number + 1, 0
+            number = number + 1
+            filled = 0
         numbers.append(number)
         filled += size
     return numbers

@@ -107,7 +107,9 @@ class BagRecorder(QosWatch):
             parameter_overrides=given,
             start_parameter_services=False,
         )
-        self._order, self._sink, self._say = order, sink, say
+        self._order = order
+        self._sink = sink
+        self._say = say
         self.skipped: dict[str, str] = {}  # a sentence by topic
         self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
         self._began = self._flushed = time.monotonic()
@@ -152,7 +154,8 @@ class BagRecorder(QosWatch):
             self._say(f"{topic} ({kinds[0]})")
         else:
             self.destroy_subscription(known[1])
-        take, profile = partial(self._take, topic), profile_of(wanted)
+        take = partial(self._take, topic)
+        profile = profile_of(wanted)
         self._heard[topic] = (
             wanted,
             self.create_subscription(kind, topic, take, profile, raw=True),
@@ -195,8 +198,11 @@ class _Player:
         namespace: str,
         lockstep: str | None,
     ) -> None:
-        self._node, self._stopping, self._rate = node, stopping, rate
-        self._lockstep, self._space = lockstep, namespace_of(namespace)
+        self._node = node
+        self._stopping = stopping
+        self._rate = rate
+        self._lockstep = lockstep
+        self._space = namespace_of(namespace)
         self.publishers: dict[str, Publisher] = {}
         self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if clock else None
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -224,7 +230,8 @@ class _Player:
         return True
 
     def ready(self) -> None:
-        publishers, known = self.publishers.values(), self._node.count_subscribers
+        publishers = self.publishers.values()
+        known = self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
         self._wait(
             lambda: any(each.get_subscription_count() for each in publishers), ALONE_S
@@ -248,7 +255,8 @@ class _Player:
 
     def play(self, messages: list[Timed]) -> int:
         now = first = messages[0][0]
-        began, rate = time.monotonic_ns(), self._rate
+        began = time.monotonic_ns()
+        rate = self._rate
         for sent, (due, topic, data) in enumerate(messages):
             while self._lockstep is None and now < due and not self._stopping.is_set():
                 now = min(due, now + round(CLOCK_PERIOD_NS * rate))

@@ -59,10 +59,8 @@ class Salvage:
 
     def lines(self) -> tuple[str, ...]:
         """Returns one line for the whole bag and one per topic."""
-        promised, lost = (
-            self.promised or {},
-            "; how many there were, nothing in the bag tells",
-        )
+        promised = self.promised or {}
+        lost = "; how many there were, nothing in the bag tells"
         if self.lost is not None:
             total = sum(promised.values())
             share = 100.0 * self.lost / max(total, 1)
@@ -90,7 +88,8 @@ class _Found:
 
 def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Salvage:
     """Writes a bag's intact messages to a new bag; RecordingError if none is, or `out` exists."""
-    path, found = Path(path), _Found()
+    path = Path(path)
+    found = _Found()
     for file in _files(path):
         (_read_database if file.suffix == DATABASE else _read_mcap)(file, found)
     messages = sorted(_decodable(found), key=lambda message: message[1])
@@ -171,14 +170,17 @@ def _promised(path: Path) -> dict[str, int] | None:
 
 
 def _read_mcap(file: Path, found: _Found) -> None:
-    told, waiting, promised = mcap.McapSummary(), list[mcap.Record](), dict[int, int]()
+    told = mcap.McapSummary()
+    waiting = list[mcap.Record]()
+    promised = dict[int, int]()
     data = mcap.mapped(file) if file.stat().st_size else memoryview(b"")
     place = len(mcap.MAGIC)
     while place < len(data):
         whole = False
         try:
             record = next(mcap.records(data, place))
-            whole, end = isinstance(record.content, Chunk), record.end
+            whole = isinstance(record.content, Chunk)
+            end = record.end
             if whole:
                 span = (
                     record.content.message_start_time,
@@ -220,7 +222,8 @@ def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
     first, last, size, crc, letters = struct.unpack_from(
         "<QQQII", data, place + mcap.PREFIX
     )
-    content, compressed = data[start : start + size], letters > 0
+    content = data[start : start + size]
+    compressed = letters > 0
     if compressed or (len(content) == size and crc and crc32(content) != crc):
         return []
     return list(_until_damage(content, (first, last)))
@@ -245,7 +248,8 @@ def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.R
 
 
 def _next_chunk(data: memoryview, start: int, end: int) -> int:
-    file, place = data.obj, start - 1
+    file = data.obj
+    place = start - 1
     while (
         isinstance(file, mmap) and (place := file.find(CHUNK_OP, place + 1, end)) >= 0
     ):
@@ -312,7 +316,8 @@ def _drop_cut_page(copy: Path) -> None:
 
 def _rows(base: sqlite3.Connection, bound: int) -> list[tuple[Any, ...]]:
     ask = "SELECT topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ?"
-    rows, waiting = list[tuple[Any, ...]](), [(1, bound)]
+    rows = list[tuple[Any, ...]]()
+    waiting = [(1, bound)]
     with suppress(sqlite3.Error):
         waiting = [base.execute("SELECT MIN(id), MAX(id) FROM messages").fetchone()]
     for _ in range(2 * bound):  # damaged numbers can promise rows without end

@@ -195,7 +195,8 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     rotor = ROTOR * 0.5 * physics.mass * radius**2
     inertia = (total + 2 * physics.wheel_mass) * radius**2 + 2 * rotor
     engine = _motor('tendon="axle"', inertia, p["speed_lag"], radius, step, physics)
-    centre, size = (0.45 * wheelbase, 0.0, 0.0), (1.3 * wheelbase, 0.7 * track, 0.04)
+    centre = (0.45 * wheelbase, 0.0, 0.0)
+    size = (1.3 * wheelbase, 0.7 * track, 0.04)
     wheels = _car_wheels(wheelbase, track, radius, p["steering_lag"], physics, rotor)
     robot = _chassis(physics.mass, centre, size) + wheels
     half_ratio = 0.5 * track / wheelbase
@@ -207,7 +208,8 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
         t = np.tan(
             steering
         )  # of a virtual wheel in the middle; both turn about one centre
-        left, right = t / (1.0 - half_ratio * t), t / (1.0 + half_ratio * t)
+        left = t / (1.0 - half_ratio * t)
+        right = t / (1.0 + half_ratio * t)
         return np.array([speed / radius, np.arctan(left), np.arctan(right)])
 
     def measured(position: Array, speed: Array) -> Array:
@@ -277,8 +279,10 @@ def _car_actuators(engine: str) -> str:
 
 
 def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
-    radius, track = p["wheel_radius"], p["track"]
-    behind, ball = -0.5 * track, 0.4 * radius
+    radius = p["wheel_radius"]
+    track = p["track"]
+    behind = -0.5 * track
+    ball = 0.4 * radius
     total = physics.mass + 2 * physics.wheel_mass
     rotor = ROTOR * 0.5 * physics.mass * radius**2
     inertia = 0.5 * (total + physics.wheel_mass) * radius**2 + rotor
@@ -290,7 +294,8 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
     )
     # Low and just behind the axle: braking must not tip the robot over its wheels, and a mass far
     # behind would push it further into every turn.
-    centre, size = (-0.06 * track, 0.0, -0.55 * radius), (track, 0.7 * track, 0.03)
+    centre = (-0.06 * track, 0.0, -0.55 * radius)
+    size = (track, 0.7 * track, 0.03)
     robot = f"""{_chassis(physics.mass, centre, size)}
       <body pos="{behind:.6g} 0 {ball - radius:.6g}">
         <joint type="ball" damping="{physics.bearing}"/>
@@ -310,7 +315,8 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     total = physics.mass + 4 * physics.wheel_mass
     rotor = ROTOR * 0.25 * physics.mass * radius**2
     inertia = (0.25 * total + 0.5 * physics.wheel_mass) * radius**2 + rotor
-    x, y = p["half_length"], p["half_width"]
+    x = p["half_length"]
+    y = p["half_width"]
     names = ("front_left", "front_right", "rear_left", "rear_right")
     places = ((x, y, -1), (x, -y, 1), (-x, y, 1), (-x, -y, -1))
     body = _chassis(physics.mass, (0, 0, 0), (2.2 * x, 1.4 * y, 0.04))
@@ -327,7 +333,8 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
 
 def _skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
     # A point of contact for each wheel: how far a turn skids follows from where the wheels stand.
-    radius, places = p["wheel_radius"], places_of_four(p)
+    radius = p["wheel_radius"]
+    places = places_of_four(p)
     x, y = places["front_left"]
     rotor = ROTOR * 0.25 * physics.mass * radius**2
     inertia = (0.25 * physics.mass + 1.5 * physics.wheel_mass) * radius**2 + rotor
@@ -363,7 +370,8 @@ _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
 
 def roller_size(radius: float, rollers: int) -> tuple[float, float]:
     """Semi-axes [m], thickness and length, of ellipsoidal rollers that best outline a circle."""
-    a, q = THICKNESS * radius, np.pi / rollers
+    a = THICKNESS * radius
+    q = np.pi / rollers
     reach = radius - (radius - a) * np.cos(q)
     return float(a), float(np.sqrt(a**2 + 2.0 * (reach**2 - a**2) / np.sin(q) ** 2))
 
@@ -381,8 +389,10 @@ def _roller_wheel(
     hub = physics.wheel_mass - physics.rollers * ROLLER_MASS
     rows = ""
     for angle in 2.0 * np.pi * np.arange(physics.rollers) / physics.rollers:
-        s, c = np.sin(angle), np.cos(angle)
-        x, z = -(radius - a) * s, -(radius - a) * c
+        s = np.sin(angle)
+        c = np.cos(angle)
+        x = -(radius - a) * s
+        z = -(radius - a) * c
         rows += f"""
         <body pos="{x:.8g} 0 {z:.8g}" zaxis="{c:.8g} {lean} {-s:.8g}">
           <joint axis="0 0 1" damping="{physics.bearing}" armature="2e-7"/>

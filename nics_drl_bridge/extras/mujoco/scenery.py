@@ -18,7 +18,8 @@ HEIGHT = 0.5  # height of walls and obstacles [m]
 THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
 BUMPER = 4  # bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers
 BUMPER_FRICTION = 0.3
-BUMPER_NAME, OBSTACLE_NAME = "bumper_", "obstacle_"
+BUMPER_NAME = "bumper_"
+OBSTACLE_NAME = "obstacle_"
 SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
 
 
@@ -72,30 +73,32 @@ def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
 
 class _Maker:
     def __init__(self, mujoco: Any, spec: Any, physics: Physics) -> None:
-        self._kinds, self._spec = mujoco.mjtGeom, spec
+        self._kinds = mujoco.mjtGeom
+        self._spec = spec
         self._solref = [physics.softness, 1.0]
 
     def bumper(self, base: Any, footprint: Shape) -> None:
         # Without mass, which belongs to the chassis.
-        half, own = 0.5 * float(base.pos[2]), {"contype": BUMPER, "mass": 0.0}
+        half = 0.5 * float(base.pos[2])
+        own = {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
             # Its round edge touches a wall in one point, at the height of the axles.
-            size, kind = (
-                [footprint.radius, footprint.radius, half],
-                self._kinds.mjGEOM_ELLIPSOID,
-            )
+            size = [footprint.radius, footprint.radius, half]
+            kind = self._kinds.mjGEOM_ELLIPSOID
             self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **own)
         else:
             for i, part in enumerate(convex_parts(footprint.outline)):
                 self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
-        middle, along = 0.5 * (start + end), end - start
+        middle = 0.5 * (start + end)
+        along = end - start
         size = [0.5 * float(np.hypot(*along)), 0.5 * THICKNESS, 0.5 * HEIGHT]
         self._box(body, middle, float(np.arctan2(along[1], along[0])), size)
 
     def map(self, grid: GridMap) -> None:
-        heading, side = grid.origin[2], grid.resolution
+        heading = grid.origin[2]
+        side = grid.resolution
         for first_row, first, row, column in rectangles(grid.blocked):
             middle = grid.cell_to_world(
                 [0.5 * (first_row + row - 1), 0.5 * (first + column - 1)]
@@ -136,7 +139,8 @@ class _Maker:
     def _box(
         self, body: Any, middle: Array, heading: float, size: Sequence[float]
     ) -> None:
-        pos, turned = [middle[0], middle[1], 0.5 * HEIGHT], quaternion(heading)
+        pos = [middle[0], middle[1], 0.5 * HEIGHT]
+        turned = quaternion(heading)
         self._add(body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=turned)
 
     def _prism(
@@ -167,7 +171,8 @@ def convex_parts(outline: Array) -> list[Array]:
     """Splits an outline (V, 2) into convex ones, if need be by ear clipping (Meisters 1975)."""
     if len(convex_hull(outline)) == len(outline):
         return [outline]
-    rest, parts = list(range(len(outline))), []
+    rest = list(range(len(outline)))
+    parts = []
     least = SLIVER * float(np.ptp(outline, axis=0).max()) ** 2
     while len(rest) > 3:
         at = next((i for i in range(len(rest)) if _is_ear(outline, rest, i)), 0)
@@ -182,8 +187,12 @@ def _area(a: Array, b: Array, c: Array) -> float:
 
 
 def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
-    before, here, after = rest[i - 1], rest[i], rest[(i + 1) % len(rest)]
-    a, b, c = outline[before], outline[here], outline[after]
+    before = rest[i - 1]
+    here = rest[i]
+    after = rest[(i + 1) % len(rest)]
+    a = outline[before]
+    b = outline[here]
+    c = outline[after]
     if _area(a, b, c) <= 0.0:
         return False
     others = (outline[k] for k in rest if k not in (before, here, after))

@@ -54,11 +54,14 @@ class Rig:
     def __init__(
         self, spec: RobotSpec, machine: Machine, model: Any, number: int = 0
     ) -> None:
-        self.spec, self.machine = spec, machine
-        self._target, prefix = textbook(spec).target, scenery.prefix_of(number)
+        self.spec = spec
+        self.machine = machine
+        self._target = textbook(spec).target
+        prefix = scenery.prefix_of(number)
         base = model.joint(int(model.body(f"{prefix}base_link").jntadr[0]))
         joints = [model.joint(f"{prefix}{name}") for name in machine.joints]
-        self._place, self._drift = int(base.qposadr[0]), int(base.dofadr[0])
+        self._place = int(base.qposadr[0])
+        self._drift = int(base.dofadr[0])
         self._positions = np.array([int(joint.qposadr[0]) for joint in joints])
         self._speeds = np.array([int(joint.dofadr[0]) for joint in joints])
         count = len(machine.controls(self._target(np.zeros(len(spec.command)))))
@@ -93,7 +96,8 @@ class Rig:
 
     def command(self, data: Any, command: ArrayLike) -> None:
         """Gives the motors a command (C,), clipped to its limits. Raises BackendError for NaN."""
-        command, count = np.asarray(command, dtype=np.float64), len(self.spec.command)
+        command = np.asarray(command, dtype=np.float64)
+        count = len(self.spec.command)
         if command.shape != (count,) or not np.isfinite(command).all():
             reason = f"must be {count} finite numbers, as robot {self.spec.name!r} takes them."
             raise BackendError(f"command {command.tolist()} {reason}")
@@ -104,7 +108,8 @@ class Rig:
 
     def read(self, data: Any) -> Reading:
         """Returns the current reading."""
-        place, velocity = data.qpos[self._place :], data.qvel[self._drift :]
+        place = data.qpos[self._place :]
+        velocity = data.qvel[self._drift :]
         heading = self.heading(data)
         ahead, aside = geometry.rotate(velocity[:2], -heading)
         return Reading(
@@ -205,7 +210,8 @@ class MujocoSimulator(DrivenSimulator):
         )
         self._physics = replace(physics, timestep=timestep)
         alone = MujocoRobot(model.robot, self._physics)
-        self._machine, self._rest = alone.machine, alone.rest
+        self._machine = alone.machine
+        self._rest = alone.rest
         self._twist = textbook(model.robot).twist
         drawn: Any = {"renderer": renderer, "randomisation": randomisation}
         super().__init__(model, world, robots=robots, **drawn)
@@ -255,11 +261,9 @@ class MujocoSimulator(DrivenSimulator):
 
     def _compile(self, bodies: Array) -> None:
         """Compiles the scene with obstacles (K, 7), whose robots are then to be put."""
-        spec, robots, member = (
-            self.model.robot,
-            self.data.pose.shape[1],
-            int(self.data.member[0]),
-        )
+        spec = self.model.robot
+        robots = self.data.pose.shape[1]
+        member = int(self.data.member[0])
         compiled = self._simulation = scenery.compile_scene(
             self._mujoco,
             self._machine,
@@ -302,17 +306,14 @@ class MujocoSimulator(DrivenSimulator):
             )
 
     def _move(self) -> None:
-        rigs, data, part_s = (
-            self._rigs,
-            self._data,
-            self.model.control_period / self._subperiods,
-        )
-        wheels, counted = self.wheels.copy(), np.zeros((len(rigs), 3))
+        rigs = self._rigs
+        data = self._data
+        part_s = self.model.control_period / self._subperiods
+        wheels = self.wheels.copy()
+        counted = np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
-        turned, facing = (
-            [rig.encoders(data) for rig in rigs],
-            [rig.heading(data) for rig in rigs],
-        )
+        turned = [rig.encoders(data) for rig in rigs]
+        facing = [rig.heading(data) for rig in rigs]
         for part in range(self._subperiods):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(data, command)
@@ -323,9 +324,12 @@ class MujocoSimulator(DrivenSimulator):
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             bumped = self._bumper_of[data.contact.geom.ravel()]
             touched[bumped[bumped >= 0]] = True
-            before, turned = turned, [rig.encoders(data) for rig in rigs]
-            faced, facing = facing, [rig.heading(data) for rig in rigs]
-            both, mean = zip(before, turned, strict=True), self._machine.state
+            before = turned
+            turned = [rig.encoders(data) for rig in rigs]
+            faced = facing
+            facing = [rig.heading(data) for rig in rigs]
+            both = zip(before, turned, strict=True)
+            mean = self._machine.state
             means = [
                 mean(0.5 * (first + last), (last - first) / part_s)
                 for first, last in both
@@ -357,11 +361,13 @@ def record(
 ) -> Recording:
     """Drives at random, a new command each `hold` [s], and records each `dt` [s]; BackendError."""
     spec = robot.spec
-    per_hold, holds = round(hold / dt), int(np.ceil(duration / hold))
+    per_hold = round(hold / dt)
+    holds = int(np.ceil(duration / hold))
     held = rng.uniform(spec.command_low, spec.command_high, (holds, len(spec.command)))
     commands = np.repeat(held, per_hold, axis=0)
     reading = robot.reset(np.zeros(3))
-    poses, states = [], []
+    poses = []
+    states = []
     for command in commands:
         poses.append(reading.pose)
         states.append(reading.state)

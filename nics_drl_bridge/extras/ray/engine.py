@@ -46,10 +46,9 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
-VALUE_WEIGHT, GRADIENT_LIMIT = (
-    0.5,
-    0.5,
-)  # parameters of the loss, as in Stable-Baselines3
+# parameters of the loss, as in Stable-Baselines3
+VALUE_WEIGHT = 0.5
+GRADIENT_LIMIT = 0.5
 SILENCE_S = 600.0  # without a step from any env runner, after which a run ends; it can be resumed
 TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
 PROBE_S = (
@@ -126,12 +125,14 @@ class WorldsRunner(SingleAgentEnvRunner):
 
     def _sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
         """Runs one roll-out; its length is fixed, whatever RLlib requests."""
-        steps, busy = int(self.config.env_config["rollout"]), self.env.stepping_s
+        steps = int(self.config.env_config["rollout"])
+        busy = self.env.stepping_s
         *arrays, finals = zip(*(self._step(t) for t in range(steps)), strict=True)
         seen, actions, logits, logp, rewards = (np.stack(one) for one in arrays)
         final = {place: end for one in finals for place, end in one.items()}
         whole = np.concatenate([seen, self._seen[None]])
-        ended, count = len(final), steps * self.num_envs
+        ended = len(final)
+        count = steps * self.num_envs
         self.metrics.log_value(ENDED, ended, reduce="sum")
         self.metrics.log_value(STEPPING, self.env.stepping_s - busy, reduce="sum")
         self._log_env_steps(self._metrics_num_env_steps_sampled, count)
@@ -144,8 +145,10 @@ class WorldsRunner(SingleAgentEnvRunner):
         logits = out[Columns.ACTION_DIST_INPUTS]
         distribution = self.module.get_exploration_action_dist_cls().from_logits(logits)
         chosen = distribution.sample()
-        logp, actions = distribution.logp(chosen).numpy(), chosen.numpy()
-        space, bounded = self.env.action_space, actions
+        logp = distribution.logp(chosen).numpy()
+        actions = chosen.numpy()
+        space = self.env.action_space
+        bounded = actions
         if isinstance(space, gymnasium.spaces.Box):
             bounded = np.clip(actions, space.low, space.high)
         self._seen, rewards, done, infos = self.env.step(bounded)
@@ -166,8 +169,10 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
     def setup(self) -> None:
         """Builds the layers."""
-        chosen, seen = self.model_config, self.observation_space
-        hidden, normaliser = list(chosen["hidden"]), chosen["normaliser"]
+        chosen = self.model_config
+        seen = self.observation_space
+        hidden = list(chosen["hidden"])
+        normaliser = chosen["normaliser"]
         self.actor = train_algorithms.Actor(seen, self.action_space, hidden, normaliser)
         self.critic = train_algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
@@ -266,7 +271,8 @@ def train_on_ray(
         raise ConfigError(
             "--engine ray does not stop early; leave out --engine, or stop."
         )
-    begin, path = time.perf_counter(), folder / train.CHECKPOINT
+    begin = time.perf_counter()
+    path = folder / train.CHECKPOINT
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     content = read_checkpoint(path, FORMAT) if resumed else None
     if content is not None:
@@ -357,7 +363,8 @@ class Learning:
     def _progress(self, first: int, taken: float) -> Progress:
         ended, *counts = np.sum(list(self.recent), axis=0)
         success, collision = (float(n / ended) if ended else np.nan for n in counts)
-        speed, busy = (self.steps - first) / taken, self.stepping_s / taken
+        speed = (self.steps - first) / taken
+        busy = self.stepping_s / taken
         return Progress(
             self.seed, self.steps, self.settings.steps, success, collision, speed, busy
         )
@@ -427,7 +434,8 @@ def _config(
     normaliser: tuple[Array, Array],
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
 ) -> PPOConfig:
-    chosen, left = settings.ppo, max(settings.steps - done, 1)
+    chosen = settings.ppo
+    left = max(settings.steps - done, 1)
     rate = chosen.learning_rate
     now = rate * max(1.0 - done / settings.steps, train_algorithms.LEAST_RATE)
     network = {

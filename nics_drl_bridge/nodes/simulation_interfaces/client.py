@@ -84,14 +84,13 @@ class StandardEpisodes:
         options: StandardOptions,
         mail: Any,
     ) -> None:
-        self._link, self._model, self._world, self._options = (
-            link,
-            model,
-            world,
-            options,
-        )
+        self._link = link
+        self._model = model
+        self._world = world
+        self._options = options
         self._mail = mail  # of the data, see `backends`
-        self._types, self._messages = module("srv"), module("msg")
+        self._types = module("srv")
+        self._messages = module("msg")
         self._entity = options.entity or model.robot.name
         self._features = self._client("GetSimulatorFeatures")
         names = [name for name in NEEDED.values() if name]
@@ -102,7 +101,8 @@ class StandardEpisodes:
         self._stood: dict[
             str, Pose
         ] = {}  # of entities after a reset: heights and tilts are kept
-        self._steps, self._period_ns = 0, round(model.control_period * NS_PER_S)
+        self._steps = 0
+        self._period_ns = round(model.control_period * NS_PER_S)
         self._pending: list[Any] = []
         self._clock: list[Any] = []
         if options.step_s is None:  # before the executor runs
@@ -130,7 +130,8 @@ class StandardEpisodes:
 
     def open(self, timeout_s: float) -> None:
         """Checks the features, and measures a step. Raises BackendError naming what is missing."""
-        request, kinds = self._types.GetSimulatorFeatures.Request(), self._messages
+        request = self._types.GetSimulatorFeatures.Request()
+        kinds = self._messages
         told = self._link.call(self._features, request, timeout_s).features
         self._known = frozenset(told.features)
         for feature, service in NEEDED.items():
@@ -190,10 +191,8 @@ class StandardEpisodes:
         holds(lambda: all(each.done() for each in self._pending), timeout_s, POLL_S)
         self._pending.clear()
         self._pause(timeout_s)
-        scopes, known = (
-            self._types.ResetSimulation.Request,
-            self._messages.SimulatorFeatures,
-        )
+        scopes = self._types.ResetSimulation.Request
+        known = self._messages.SimulatorFeatures
         of_state = known.SIMULATION_RESET_STATE in self._known
         scope = scopes.SCOPE_STATE if of_state else scopes.SCOPE_ALL
         self._call("ResetSimulation", timeout_s, scope=scope)
@@ -233,7 +232,8 @@ class StandardEpisodes:
             self._stood[entity] = self._call(
                 "GetEntityState", timeout_s, entity=entity
             ).state.pose
-        state, stood = self._messages.EntityState(), self._stood[entity]
+        state = self._messages.EntityState()
+        stood = self._stood[entity]
         x, y, heading = map(float, pose)
         state.pose.position = Point(x=x, y=y, z=stood.position.z)
         state.pose.orientation = conversions.turned_to(stood.orientation, heading)

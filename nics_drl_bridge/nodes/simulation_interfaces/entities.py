@@ -49,10 +49,9 @@ BRACKET = re.compile(
     re.DOTALL,
 )
 HELD = re.compile(r"\[:(\w+):\]|[][\\&|~]")
-MOST_CHARACTERS, MOST_REPEATS = (
-    1000,
-    3,
-)  # of a filter: it is matched while the simulator waits
+# of a filter: it is matched while the simulator waits
+MOST_CHARACTERS = 1000
+MOST_REPEATS = 3
 TOO_LONG = "it repeats what repeats or branches, or more than 3 times, or has over 1000 characters"
 
 
@@ -108,7 +107,8 @@ class EntityServices:
     """Answers what the standard asks about entities."""
 
     def __init__(self, host: Host, simulation: Simulation) -> None:
-        self._host, self._simulation = host, simulation
+        self._host = host
+        self._simulation = simulation
 
     def info(self, entity: Entity) -> EntityInfo:
         """Returns what an entity is."""
@@ -133,10 +133,12 @@ class EntityServices:
             told = f"category {min(unknown)} is none of the standard"
             raise RefusalError(FAILED, f"{told}; give 0 to 5 but 3.")
         tags_match(filters.tags, ())
-        region, entities = plane.Region(filters.bounds), self._simulation.entities
+        region = plane.Region(filters.bounds)
+        entities = self._simulation.entities
         found = []
         for entity in entities:
-            info, pose = self.info(entity), entities.pose(entity)
+            info = self.info(entity)
+            pose = entities.pose(entity)
             outlines = (
                 planar.rotate(one, pose[2]) + pose[:2]
                 for one in entities.outlines(entity)
@@ -152,7 +154,8 @@ class EntityServices:
 
     def state(self, entity: Entity) -> EntityState:
         """Returns where an entity is and how it moves, in the frame of the map."""
-        entities, state = self._simulation.entities, EntityState()
+        entities = self._simulation.entities
+        state = EntityState()
         x, y, heading = entities.pose(entity).tolist()
         state.header.frame_id = self._host.map_frame
         state.header.stamp = conversions.stamp_to_ros(self._host.now_ns)
@@ -182,7 +185,8 @@ class EntityServices:
 
     def set_info(self, request: Any, _: Any) -> None:
         """Answers SetEntityInfo."""
-        name, kind = self.find(request.entity).name, request.info.category.category
+        name = self.find(request.entity).name
+        kind = request.info.category.category
         if kind not in CATEGORIES:
             told = f"category {kind} is none of the standard; give 0 to 5 but 3."
             raise RefusalError(FAILED, told)
@@ -199,8 +203,10 @@ class EntityServices:
 
     def set_state(self, request: Any, _: Any) -> None:
         """Answers SetEntityState."""
-        entity, asked = self.find(request.entity), request.state
-        entities, frames = self._simulation.entities, self._host.frames
+        entity = self.find(request.entity)
+        asked = request.state
+        entities = self._simulation.entities
+        frames = self._host.frames
         base = plane.frame_pose(asked.header.frame_id, entities, frames, INVALID_POSE)
         pose = twist = None
         if request.set_pose:

@@ -30,7 +30,8 @@ def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
 
     Raises RefusalError with a code for what is no pose in the plane; z is not looked at.
     """
-    place, turn = pose.position, pose.orientation
+    place = pose.position
+    turn = pose.orientation
     quaternion = turn.x, turn.y, turn.z, turn.w
     given = f"quaternion x {turn.x:g}, y {turn.y:g}, z {turn.z:g}, w {turn.w:g}"
     if not all(map(math.isfinite, (place.x, place.y, place.z, *quaternion))):
@@ -78,7 +79,8 @@ def twist_from_ros(twist: Any, heading: float, code: int) -> Array:
 def box_to_ros(outlines: Sequence[Array]) -> Bounds:
     """Returns the box around outlines (V, 2): its upper right corner, then its lower left one."""
     points = np.concatenate([np.zeros((0, 2)), *outlines])
-    high, low = points.max(axis=0).tolist(), points.min(axis=0).tolist()
+    high = points.max(axis=0).tolist()
+    low = points.min(axis=0).tolist()
     corners = [
         Vector3(x=high[0], y=high[1], z=HEIGHT),
         Vector3(x=low[0], y=low[1], z=0.0),
@@ -131,7 +133,8 @@ class Region:
         """True if what stands on an outline (V, 2) in `map` has a point in common with it."""
         if self.empty:
             return True
-        low, high = self._points[:, 2].min(), self._points[:, 2].max()
+        low = self._points[:, 2].min()
+        high = self._points[:, 2].max()
         if not self._sphere:
             return bool(
                 low <= HEIGHT and high >= 0.0 and overlap(self._corners, outline)

@@ -14,7 +14,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.sim.world_set import SPECIAL
 
-SDF, YAML = "sdf", "yaml"
+SDF = "sdf"
+YAML = "yaml"
 SUFFIXES = {".sdf": SDF, ".world": SDF, ".yaml": YAML, ".yml": YAML}
 MOST_BYTES = 2**24
 

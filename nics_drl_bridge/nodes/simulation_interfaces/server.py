@@ -57,13 +57,12 @@ class Server:
     """Offers the services at a device node, below its namespace, for as long as that lives."""
 
     def __init__(self, host: Any) -> None:
-        self._host, self._simulation = host, Simulation(host)
+        self._host = host
+        self._simulation = Simulation(host)
         simulation = self._simulation
         entities = EntityServices(host, simulation)
-        spawning, worlds = (
-            Spawning(host, simulation, entities),
-            Worlds(host, simulation),
-        )
+        spawning = Spawning(host, simulation, entities)
+        worlds = Worlds(host, simulation)
         handlers: dict[str, Handler] = {
             "GetSimulationState": simulation.get_state,
             "SetSimulationState": simulation.set_state,
@@ -115,7 +114,8 @@ class Server:
         told.features = [
             getattr(told, name) for name in FEATURES if hasattr(told, name)
         ]
-        told.spawn_formats, told.custom_info = FORMATS, ABOUT
+        told.spawn_formats = FORMATS
+        told.custom_info = ABOUT
         return response
 
 

@@ -40,7 +40,9 @@ class Spawning:
     def __init__(
         self, host: Host, simulation: Simulation, entities: EntityServices
     ) -> None:
-        self._host, self._simulation, self._entities = host, simulation, entities
+        self._host = host
+        self._simulation = simulation
+        self._entities = entities
         self._codes = resources.Codes.of(SpawnResult)
 
     def spawn(self, request: Any, response: Any) -> None:
@@ -50,7 +52,8 @@ class Spawning:
         wanted = request.name or ("" if model is None else model.name)
         name = self._name(wanted, request.allow_renaming)
         space = self._namespace(request.entity_namespace, name, model is None)
-        entities, code = self._simulation.entities, SpawnResult.INVALID_POSE
+        entities = self._simulation.entities
+        code = SpawnResult.INVALID_POSE
         posed = request.initial_pose
         base = plane.frame_pose(
             posed.header.frame_id, entities, self._host.frames, code
@@ -80,7 +83,8 @@ class Spawning:
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""
-        codes, found = self._codes, resources.find(request.entity_resource, self._codes)
+        codes = self._codes
+        found = resources.find(request.entity_resource, self._codes)
         if not found.form:
             if found.source == self._host.model.robot.name:
                 return None
@@ -132,7 +136,8 @@ class Spawning:
     def _namespace(self, given: str, name: str, robot: bool) -> str:
         """The given one, or a robot's by its name, which no other may have. RefusalError."""
         host: Any = self._host
-        space, code = given or re.sub(r"\W", "_", name), SpawnResult.NAMESPACE_INVALID
+        space = given or re.sub(r"\W", "_", name)
+        code = SpawnResult.NAMESPACE_INVALID
         if (robot or given) and not NAMESPACE.fullmatch(space):
             told = (
                 f"entity_namespace {given!r} is"
@@ -169,7 +174,8 @@ class Spawning:
 
     def list_spawnables(self, request: Any, response: Any) -> None:
         """Answers GetSpawnables."""
-        robot, unknown = self._host.model.robot, list[str]()
+        robot = self._host.model.robot
+        unknown = list[str]()
         hull = hull_of(self._simulation.entities.simulator.footprint)
         response.spawnables.append(
             _spawnable(robot.name, f"another robot {robot.name}", [hull])

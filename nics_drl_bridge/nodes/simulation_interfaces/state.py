@@ -17,12 +17,11 @@ from nics_drl_bridge.nodes.simulation_interfaces.host import (
 )
 from nics_drl_bridge.sim.entities import Entities
 
-STOPPED, PLAYING, PAUSED = (
-    SimulationState.STATE_STOPPED,
-    SimulationState.STATE_PLAYING,
-    SimulationState.STATE_PAUSED,
-)
-QUITTING, WITHOUT_WORLD = SimulationState.STATE_QUITTING, SimulationState.STATE_NO_WORLD
+STOPPED = SimulationState.STATE_STOPPED
+PLAYING = SimulationState.STATE_PLAYING
+PAUSED = SimulationState.STATE_PAUSED
+QUITTING = SimulationState.STATE_QUITTING
+WITHOUT_WORLD = SimulationState.STATE_NO_WORLD
 NAMES = {STOPPED: "stopped", PLAYING: "playing", PAUSED: "paused", QUITTING: "quitting"}
 MOST_STEPS = 100_000  # of one call of a service, which answers nothing else meanwhile
 GOODBYE_S = 0.2  # until the answer to who ended the simulation has left
@@ -41,7 +40,8 @@ class Simulation:
     """The state of a device node's simulation, and the services around it."""
 
     def __init__(self, host: Host) -> None:
-        self._host, self._stepping = host, False
+        self._host = host
+        self._stepping = False
         self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
         self._halted = (
             STOPPED  # or paused, or without a world, while the host is paused
@@ -67,7 +67,8 @@ class Simulation:
     def halt(self, state: int) -> None:
         """Holds the simulation in a state other than playing."""
         self._host.pause(True)
-        self._halted, self._stepping = state, False
+        self._halted = state
+        self._stepping = False
 
     def require_world(self) -> None:
         """Raises RefusalError if no world is loaded."""
@@ -80,11 +81,9 @@ class Simulation:
 
     def set_state(self, request: Any, _: Any) -> None:
         """Answers SetSimulationState."""
-        codes, wanted, state = (
-            SetSimulationState.Response,
-            request.state.state,
-            self.state,
-        )
+        codes = SetSimulationState.Response
+        wanted = request.state.state
+        state = self.state
         if wanted == state:
             already = (
                 f"the simulation is {NAMES.get(state, 'without a world')} already."
@@ -142,7 +141,8 @@ class Simulation:
 
     async def simulate(self, goal: Any) -> Any:
         """Executes SimulateSteps: one step at a turn, so that all else is answered meanwhile."""
-        steps, result = goal.request.steps, SimulateSteps.Result()
+        steps = goal.request.steps
+        result = SimulateSteps.Result()
         result.result.result = Result.RESULT_OPERATION_FAILED
         try:
             self.require_paused(steps)
@@ -150,7 +150,9 @@ class Simulation:
             result.result.error_message = str(error)
             goal.abort()
             return result
-        self._stepping, done, why = True, 0, ""
+        self._stepping = True
+        done = 0
+        why = ""
         try:
             while done < steps and not (
                 why := why or outcome(self._host.step, self._host)[1]

@@ -28,15 +28,15 @@ from nics_drl_bridge.sim.world import Region, World, check_places
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
 
 CODES = LoadWorld.Response
-CLEARANCE, NEAREST = 0.1, 2.0  # of worlds of SDF, as with `nics world import` [m]
+# of worlds of SDF, as with `nics world import` [m]
+CLEARANCE = 0.1
+NEAREST = 2.0
 EMPTY = (
     (-4.0, -4.0),
     (4.0, 4.0),
 )  # places in the field of a world without walls around it [m]
-CELL, MOST_OPEN = (
-    0.05,
-    0.5,
-)  # [m]; share of what is free in a field that may be open to all around
+CELL = 0.05  # [m]
+MOST_OPEN = 0.5  # share of what is free in a field that may be open to all around
 # Tags of SDF that are read, or say nothing of what stands in a plane.
 READ = {
     "sdf",
@@ -81,7 +81,8 @@ class Worlds:
     """Answers LoadWorld, UnloadWorld, GetCurrentWorld and GetAvailableWorlds."""
 
     def __init__(self, host: Any, simulation: Simulation) -> None:
-        self._host, self._simulation = host, simulation
+        self._host = host
+        self._simulation = simulation
         self._resource = Resource(uri=str(host.get_parameter("world").value))
         self._codes = resources.Codes.of(CODES)
 
@@ -108,7 +109,8 @@ class Worlds:
         found = resources.find(request.world_resource, self._codes)
         self._unload()
         world = self._read(found, request)
-        host, simulation = self._host, self._simulation
+        host = self._host
+        simulation = self._simulation
         host.use_world(world)
         simulation.renew()
         host.begin(rewind=True)
@@ -169,7 +171,9 @@ class Worlds:
     def available(self, request: Any, response: Any) -> None:
         """Answers GetAvailableWorlds."""
         tags_match(request.filter, ())
-        folder, failed, skipped = share_folder() / "config", list[str](), list[str]()
+        folder = share_folder() / "config"
+        failed = list[str]()
+        skipped = list[str]()
         names = [each.stem for each in sorted((folder / "worlds").glob("*.yaml"))]
         found = [(name, load_worlds(name)) for name in names]
         for source in request.additional_sources:
@@ -204,7 +208,8 @@ class Worlds:
 
 def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
     """Worlds of a file, or of those in a folder that can be read. Raises BridgeError, OSError."""
-    path, found = resources.local(source), list[tuple[str, AnyWorld]]()
+    path = resources.local(source)
+    found = list[tuple[str, AnyWorld]]()
     if path is None:
         raise ConfigError("is not on this machine; give a folder or file.")
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:

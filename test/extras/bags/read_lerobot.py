@@ -10,7 +10,8 @@ from types import ModuleType
 if importlib.util.find_spec("torchvision") is None:
     for name in ("torchvision", "torchvision.transforms", "torchvision.transforms.v2"):
         module = sys.modules[name] = ModuleType(name)
-        module.__spec__, module.__version__ = ModuleSpec(name, None), "0"
+        module.__spec__ = ModuleSpec(name, None)
+        module.__version__ = "0"
         above, _, own = name.rpartition(".")
         if above:
             setattr(sys.modules[above], own, module)

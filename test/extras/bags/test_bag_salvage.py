@@ -66,7 +66,8 @@ def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(
     tmp_path, storage, share
 ):
     bag = bags.write(tmp_path / "bag", bags.drive(), storage)
-    before, file = held(bag), storage_file(bag)
+    before = held(bag)
+    file = storage_file(bag)
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
     with pytest.raises(RecordingError, match="nics bag salvage"):
@@ -81,7 +82,8 @@ def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(
 
 
 def test_a_flipped_bit_costs_the_chunk_that_it_is_in(sealed, tmp_path):
-    before, file = held(sealed), storage_file(sealed)
+    before = held(sealed)
+    file = storage_file(sealed)
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
@@ -188,7 +190,8 @@ def test_an_error_of_the_storage_of_any_type_keeps_what_was_recorded(
 ):
     from rosbags.rosbag2 import Writer
 
-    working, count = getattr(Writer, method), [0]
+    working = getattr(Writer, method)
+    count = [0]
 
     def fail(self, *given):
         count[0] += 1
@@ -287,7 +290,8 @@ def test_info_tells_rates_gaps_and_clocks(tmp_path):
     poses = [row for row in bags.poses(offset=100.0) if not 2.0 < row[0] < 4.0]
     bag = bags.write(tmp_path / "bag", {"/cmd_vel": bags.commands(), "/pose": poses})
     told = {topic.topic: topic for topic in bag_info(bag).topics}
-    command, pose = told["/cmd_vel"], told["/pose"]
+    command = told["/cmd_vel"]
+    pose = told["/pose"]
     assert command.rate_hz == pytest.approx(10.0)
     assert (command.clock, command.gaps) == ("no header", 0)
     assert pose.rate_hz == pytest.approx(50.0)

@@ -94,7 +94,8 @@ def test_what_is_intact_is_saved_and_the_loss_is_told(damaged, tmp_path):
 
 @pytest.mark.slow
 def test_generate_takes_what_is_intact_when_told_to(tmp_path):
-    car, bag = load_robot("ackermann"), tmp_path / "drive"
+    car = load_robot("ackermann")
+    bag = tmp_path / "drive"
     write_bag(textbook.record(car, np.random.default_rng(0), duration=30.0), bag, car)
     words = ("--robot", "ackermann", "--salvage", "--out", tmp_path / "model")
     told = nics("generate", cut(bag, 0.8), *words)

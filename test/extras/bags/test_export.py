@@ -61,7 +61,8 @@ def newest(rows, t):
 def exported(tmp_path):
     """A drive in three episodes, as topics and as a dataset."""
     topics = drive(6.0, silent=[(1.5, 3.0)], anew_s=4.5)
-    bag, folder = bags.write(tmp_path / "bag", topics), tmp_path / "set"
+    bag = bags.write(tmp_path / "bag", topics)
+    folder = tmp_path / "set"
     words = ("--lerobot", folder, "--task", "Go round.", "--succeeded", "0,2")
     told = export(bag, *words)
     assert told.exit_code == 0, told.output
@@ -201,7 +202,9 @@ def test_without_a_word_on_success_there_is_no_such_column(tmp_path):
 def test_ranges_are_finite_and_counter_clockwise(tmp_path):
     topics = drive()
     for _, scan in topics["/scan"]:
-        scan.angle_min, scan.angle_increment = 1.0, -0.4  # clockwise
+        # clockwise
+        scan.angle_min = 1.0
+        scan.angle_increment = -0.4
         scan.ranges[:] = [0.5, np.inf, -np.inf, np.nan, 9.0, 2.5]
     frames = frames_of(bags.write(tmp_path / "bag", topics), {})
     expected = [2.5, 3.0, 3.0, 0.05, 3.0, 0.5]  # of 0.05 to 3 m
@@ -210,7 +213,8 @@ def test_ranges_are_finite_and_counter_clockwise(tmp_path):
 
 
 def test_with_a_model_actions_are_the_robots_commands(tmp_path):
-    bag, model = bags.write(tmp_path / "bag", drive(beams=720)), open_model("ackermann")
+    bag = bags.write(tmp_path / "bag", drive(beams=720))
+    model = open_model("ackermann")
     action = frames_of(bag, {}, model).features["action"]
     assert action.names == tuple(v.name for v in model.robot.command)
     twist = frames_of(bag, {}).features["action"]
@@ -276,7 +280,8 @@ def test_a_bag_without_commands_is_refused(tmp_path):
 def messages_in(folder):
     """The messages of an MCAP, decoded by what stands in the file alone, as a viewer does."""
     (file,) = folder.glob("*.mcap")
-    stores, found = {}, {}
+    stores = {}
+    found = {}
     with file.open("rb") as opened:
         for schema, channel, message in make_reader(opened).iter_messages():
             assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")

@@ -141,14 +141,14 @@ def test_the_encoders_agree_with_the_motion(robots, name):
 @pytest.mark.parametrize("name", ["ackermann", "differential"])
 def test_a_robot_that_turns_round_knows_where_it_is_by_its_encoders(robots, name):
     """Wheels keep up with the floor while they accelerate, and those that steer do not scrub."""
-    robot, pose = robots[name], np.zeros(3)
-    low, high = robot.spec.command_low, robot.spec.command_high
+    robot = robots[name]
+    pose = np.zeros(3)
+    low = robot.spec.command_low
+    high = robot.spec.command_high
     reading = robot.reset(pose)
     for step in range(200):
-        before, reading = (
-            reading,
-            robot.step(high * [1.0, 0.0] if step > 100 else low, 0.01),
-        )
+        before = reading
+        reading = robot.step(high * [1.0, 0.0] if step > 100 else low, 0.01)
         twist = textbook(robot.spec).twist(0.5 * (before.state + reading.state))
         pose = geometry.compose(pose, geometry.exp(0.01 * twist))
     off = geometry.between(reading.pose, pose)
@@ -234,7 +234,8 @@ def test_a_model_is_identified_from_a_drive(robots):
 
 
 def test_rollers_make_a_wheel_round():
-    radius, count = 0.05, 12
+    radius = 0.05
+    count = 12
     a, b = roller_size(radius, count)
     q = np.linspace(0.0, np.pi / count, 50)
     reach = (radius - a) * np.cos(q) + np.sqrt(

@@ -60,8 +60,10 @@ def with_footprint(model: SimulatorModel, corners: list[list[float]]) -> Simulat
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_an_episode_begins_as_in_the_fast_simulator(name):
-    model, world = builtin_model("differential"), load_world(name)
-    ours, theirs = MujocoSimulator(model, world), FastSimulator(model, world)
+    model = builtin_model("differential")
+    world = load_world(name)
+    ours = MujocoSimulator(model, world)
+    theirs = FastSimulator(model, world)
     ours.reset([7])
     theirs.reset([7])
     for known in ("pose", "bodies", "ranges", "odom", "steps"):
@@ -70,7 +72,8 @@ def test_an_episode_begins_as_in_the_fast_simulator(name):
 
 
 def test_a_latency_that_is_drawn_delays_the_motors_and_the_rest_is_drawn_as_elsewhere():
-    model, world = builtin_model("differential"), load_world("empty")
+    model = builtin_model("differential")
+    world = load_world("empty")
     late = Randomisation(
         name="late",
         action_latency=(1.0, 1.0),
@@ -105,14 +108,17 @@ def test_a_latency_that_is_drawn_delays_the_motors_and_the_rest_is_drawn_as_else
 @pytest.mark.parametrize("name", WORLDS)
 def test_what_the_lidar_sees_is_what_stands_in_mujoco(name):
     """MuJoCo's own rays, among the geoms that hold up a robot, know nothing of the scanner."""
-    model, world = builtin_model("differential"), load_world(name)
+    model = builtin_model("differential")
+    world = load_world(name)
     simulator = MujocoSimulator(model, world, renderer="exact")
     simulator.reset([5])
     drive(simulator, forward(model, 0.3), 3)
-    engine, data = simulator._simulation, simulator._data
+    engine = simulator._simulation
+    data = simulator._data
     mujoco.mj_forward(engine, data)
     x, y, heading = simulator.data.pose[0, 0]
-    hit, near = np.zeros(1, np.int32), 0
+    hit = np.zeros(1, np.int32)
+    near = 0
     for angle, seen in zip(
         model.lidar.angles, simulator.data.ranges[0, 0], strict=True
     ):
@@ -127,10 +133,8 @@ def test_what_the_lidar_sees_is_what_stands_in_mujoco(name):
 
 
 def test_each_episode_stands_in_its_world_of_a_set():
-    model, worlds = (
-        builtin_model("differential"),
-        load_worlds(["room", "crowd", "corridor"]),
-    )
+    model = builtin_model("differential")
+    worlds = load_worlds(["room", "crowd", "corridor"])
     both = MujocoSimulator(model, worlds), FastSimulator(model, worlds)
     seen = set()
     for seed in range(6):
@@ -151,7 +155,8 @@ def test_a_robot_that_drives_into_a_wall_stops_there(name):
     model = builtin_model(name)
     simulator = MujocoSimulator(model, load_world("empty"))
     simulator.reset([0], starts=np.array([[[2.0, 0.0, 0.0]]]))
-    robot, wall = model.robot, simulator.data
+    robot = model.robot
+    wall = simulator.data
     outline = robot.footprint or [(robot.footprint_radius, 0.0)]
     free = 3.0 - max(x for x, _ in outline)
     collided = []
@@ -180,7 +185,8 @@ def test_a_footprint_of_corners_touches_by_its_corners():
 
 
 def test_odometry_drifts_where_the_wheels_slip():
-    model, errors = builtin_model("mecanum"), {}
+    model = builtin_model("mecanum")
+    errors = {}
     for floor, physics in (("dry", Physics()), ("ice", ICE)):
         simulator = MujocoSimulator(model, load_world("empty"), physics=physics)
         simulator.reset([0], starts=np.zeros((1, 1, 3)))
@@ -198,7 +204,8 @@ def test_odometry_of_mecanum_wheels_is_calibrated_for_what_their_rollers_lose():
     model = builtin_model("mecanum")
     simulator = MujocoSimulator(model, load_world("empty"))
     simulator.reset([0], starts=np.array([[[2.0, -2.0, 0.0]]]))
-    start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
+    start = simulator.data.pose[0, 0].copy()
+    believed = simulator.wheels[0].copy()
     command = np.array([[[-0.5, 0.6, 0.0]]])
     drive(simulator, command, 50)
     driven = geometry.between(start, simulator.data.pose[0, 0])
@@ -214,7 +221,8 @@ def test_odometry_of_mecanum_wheels_knows_turns_of_a_diagonal_on_which_two_wheel
     drive(
         simulator, np.array([[[0.4, 0.2, 0.3]]]), 8
     )  # they stop beside their rollers' middles
-    start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
+    start = simulator.data.pose[0, 0].copy()
+    believed = simulator.wheels[0].copy()
     drive(simulator, np.array([[[-0.7, 0.7, 0.0]]]), 30)
     turned = geometry.between(start, simulator.data.pose[0, 0])[2]
     assert abs(turned) > 0.05
@@ -228,7 +236,8 @@ def test_odometry_of_a_robot_that_skids_turns_by_its_gyro():
     world = load_world("empty").model_copy(update={"size": (40.0, 40.0)})
     simulator = MujocoSimulator(model, world)
     simulator.reset([0], starts=np.zeros((1, 1, 3)))
-    start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
+    start = simulator.data.pose[0, 0].copy()
+    believed = simulator.wheels[0].copy()
     drive(
         simulator, np.array([[[1.8, 2.0]]]), 20
     )  # where it turns faster than its wheels tell
@@ -243,7 +252,8 @@ def test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(name):
     """The steady motion is the textbook's; motors are slower where wheels would slip."""
     model = builtin_model(name)
     world = load_world("empty").model_copy(update={"size": (40.0, 40.0)})
-    ours, theirs = MujocoSimulator(model, world), FastSimulator(model, world)
+    ours = MujocoSimulator(model, world)
+    theirs = FastSimulator(model, world)
     command = forward(model, 0.6)
     command[..., -1] = 0.4 * model.robot.command_high[-1]
     moved = []
@@ -262,8 +272,10 @@ def test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(name):
 
 
 def test_the_same_seed_and_commands_give_the_same_bits():
-    model, world = builtin_model("differential"), load_world("crowd")
-    one, other = MujocoSimulator(model, world), MujocoSimulator(model, world)
+    model = builtin_model("differential")
+    world = load_world("crowd")
+    one = MujocoSimulator(model, world)
+    other = MujocoSimulator(model, world)
     one.reset([1])
     drive(one, forward(model, 1.0), 3)
     for simulator in (one, other):
@@ -274,7 +286,8 @@ def test_the_same_seed_and_commands_give_the_same_bits():
 
 
 def test_moving_obstacles_stand_in_mujoco_where_they_are_seen():
-    model, world = builtin_model("differential"), load_world("crowd")
+    model = builtin_model("differential")
+    world = load_world("crowd")
     simulator = MujocoSimulator(model, world)
     simulator.reset([2])
     began = simulator.obstacles.copy()

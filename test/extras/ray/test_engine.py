@@ -77,7 +77,8 @@ def settings(**changes):
 
 def running_workers() -> dict[int, int]:
     """Process id -> that of its node, of the env runners below this process."""
-    parents, names = {}, {}
+    parents = {}
+    names = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
@@ -102,7 +103,8 @@ def running_workers() -> dict[int, int]:
 def test_a_training_on_two_nodes_outlives_a_killed_worker_and_writes_its_policy_file(
     cluster, tmp_path
 ):
-    killed, told = [], []
+    killed = []
+    told = []
 
     def tell(progress):
         told.append(progress)
@@ -171,7 +173,8 @@ def test_a_killed_worker_is_begun_anew_and_an_interrupted_run_goes_on_where_it_w
 def test_the_command_trains_on_a_cluster_and_leaves_what_training_on_one_machine_leaves(
     cluster, tmp_path
 ):
-    path, out = tmp_path / "settings.yaml", tmp_path / "run"
+    path = tmp_path / "settings.yaml"
+    out = tmp_path / "run"
     path.write_text(settings(steps=144).model_dump_json())
     done = nics(
         "--engine",

@@ -23,7 +23,8 @@ from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
 pytestmark = pytest.mark.ros
-STEPS, TIMEOUT_S = 8, 60.0
+STEPS = 8
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture
@@ -84,7 +85,8 @@ def test_a_simulator_that_puts_time_back_and_tells_of_it_by_steps_alone_is_drive
 ):
     fewer = tuple(name for name in server.FEATURES if name != "SIMULATION_RESET_STATE")
     monkeypatch.setattr(server, "FEATURES", fewer)
-    begin, state = DeviceNode.begin, EntityServices.state
+    begin = DeviceNode.begin
+    state = EntityServices.state
 
     def silent(self, rewind=False):
         with monkeypatch.context() as patch:
@@ -132,7 +134,8 @@ def test_steps_of_a_rounded_length_are_followed(launch, domain_id, make, monkeyp
 def test_what_stands_above_the_floor_or_tilted_stays_so(
     launch, domain_id, make, monkeypatch
 ):
-    state, put = EntityServices.state, EntityServices.set_state
+    state = EntityServices.state
+    put = EntityServices.set_state
     placed = {}
 
     def raised(self, entity):

@@ -17,10 +17,8 @@ from nics_drl_bridge.nodes.simulation_interfaces import client
 @pytest.fixture(params=["1.x", "2.0"])
 def older(request, monkeypatch):
     """Messages of another version, in place of those that may be installed."""
-    package, kinds = (
-        ModuleType("simulation_interfaces"),
-        ModuleType("simulation_interfaces.srv"),
-    )
+    package = ModuleType("simulation_interfaces")
+    kinds = ModuleType("simulation_interfaces.srv")
     package.__path__ = []
     kinds.GetSimulatorFeatures = object
     if request.param == "2.0":

@@ -25,7 +25,8 @@ from nics_drl_bridge.nodes.simulator_node import DeviceNode
 from nics_drl_bridge.sim.device import DeviceWorld
 
 pytestmark = pytest.mark.ros
-STATES, OK = msg.SimulationState, msg.Result.RESULT_OK
+STATES = msg.SimulationState
+OK = msg.Result.RESULT_OK
 
 
 MESH = (
@@ -251,7 +252,8 @@ def test_obstacles_of_the_first_episode_are_entities_and_stay_where_another_is_s
     launch, domain_id, client_of, meet
 ):
     launch("simulator_node", domain_id, world="circles")
-    client, peer = client_of(domain_id), meet(domain_id)
+    client = client_of(domain_id)
+    peer = meet(domain_id)
     client.set_state(STATES.STATE_PAUSED)
     names = client.names()
     assert len([name for name in names if name.startswith("obstacle_")]) == 10
@@ -279,7 +281,8 @@ def test_after_one_robot_is_deleted_the_others_keep_their_topics_and_starts(
         robots=["left", "right"],
         episode_start=start,
     )
-    client, peer = client_of(domain_id), meet(domain_id)
+    client = client_of(domain_id)
+    peer = meet(domain_id)
     truths = peer.listen(Odometry, "right/ground_truth")
     assert client.code("DeleteEntity", entity="left") == OK
     assert peer.call(Trigger, "simulator_node/reset").success
@@ -531,7 +534,8 @@ def test_a_reset_that_fails_leaves_the_time_where_it_is(client, monkeypatch):
 
 
 def test_steps_that_fail_abort_the_action_with_the_reason(client, monkeypatch):
-    advance, made = DeviceNode.step, []
+    advance = DeviceNode.step
+    made = []
 
     def step(node):
         if len(made) == 2:
