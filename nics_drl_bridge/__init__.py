@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.env.registry import make, make_vec
+    from nics_drl_bridge.env.make import make, make_vec
     from nics_drl_bridge.generator import generate, load_model, open_model, save_model
     from nics_drl_bridge.policy.policy_file import load_policy
     from nics_drl_bridge.recording.readers import read_recording
@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 _NAMES = {
-    "env.registry": ("make", "make_vec"),
+    "env.make": ("make", "make_vec"),
     "generator": ("generate", "load_model", "open_model", "save_model"),
     "policy.policy_file": ("load_policy",),
     "recording.readers": ("read_recording",),

@@ -88,7 +88,7 @@ def test_a_module_of_this_package_is_no_library(monkeypatch):
 
 def test_a_name_that_needs_more_says_what(monkeypatch):
     pretend(monkeypatch, gymnasium="")
-    monkeypatch.setitem(sys.modules, "nics_drl_bridge.env.registry", None)
+    monkeypatch.setitem(sys.modules, "nics_drl_bridge.env.make", None)
     monkeypatch.setitem(sys.modules, "gymnasium", None)
 
     def fails(_):

@@ -1,7 +1,6 @@
-"""Tasks by name or by the path of a user's file; the environments, for `gymnasium.make`."""
+"""Tasks by name or by the path of a user's file; the ids of environments, for Gymnasium."""
 
 from collections.abc import Iterable
-from importlib import import_module
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
@@ -9,15 +8,7 @@ from typing import Any
 import gymnasium
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.arguments import (
-    check_count,
-    check_kind,
-    check_options,
-    in_own_word,
-    keywords_of,
-    refuse_unknown,
-    shown,
-)
+from nics_drl_bridge.arguments import check_kind, check_options, shown
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
@@ -182,45 +173,3 @@ def register_envs() -> None:
 
 
 register_envs()
-
-
-OF_GYMNASIUM = (
-    "max_episode_steps",
-    "disable_env_checker",
-)  # arguments of `gymnasium.make` itself
-
-
-def make(
-    task: str | type[Task] | Task = "navigation", **arguments: Any
-) -> gymnasium.Env[Any, Any]:
-    """Makes an env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
-    single = import_module(
-        "nics_drl_bridge.env.bridge_env"
-    )  # which imports this module
-    in_own_word("make", "model", arguments)
-    refuse_unknown(
-        "make", arguments, {*keywords_of(single.BridgeEnv), "robot", *OF_GYMNASIUM}
-    )
-    single.check_render_mode(arguments.get("render_mode"), single.BridgeEnv.metadata)
-    if (most := arguments.get("max_episode_steps")) is not None:
-        check_count("make: max_episode_steps", most)
-    return gymnasium.make(TASK, task=task, **arguments)
-
-
-def make_vec(
-    task: str | type[Task] | Task = "navigation", num_envs: int = 1, **arguments: Any
-) -> Any:
-    """Makes a `BridgeVectorEnv`: a task in many worlds at once, for training."""
-    vectors = import_module(
-        "nics_drl_bridge.env.vector_env"
-    )  # which imports this module
-    first: object = task
-    if isinstance(first, int) and not isinstance(first, bool):
-        raise ConfigError(
-            f"make_vec: task={first}: the task comes first; give num_envs={first}."
-        )
-    if "vectorization_mode" in arguments:
-        mode = shown(arguments["vectorization_mode"])
-        reason = "one process steps all worlds together; leave it out, threads=2 uses two cores"
-        raise ConfigError(f"make_vec: vectorization_mode={mode}: {reason}.")
-    return vectors.BridgeVectorEnv(num_envs, task=task, **arguments)

@@ -1,0 +1,53 @@
+"""Makes environments of a task, with the arguments of their classes."""
+
+from typing import Any
+
+import gymnasium
+
+from nics_drl_bridge.arguments import (
+    check_count,
+    in_own_word,
+    keywords_of,
+    refuse_unknown,
+    shown,
+)
+from nics_drl_bridge.env.bridge_env import BridgeEnv, check_render_mode
+from nics_drl_bridge.env.registry import TASK
+from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+
+GYMNASIUM_ARGUMENTS = (
+    "max_episode_steps",
+    "disable_env_checker",
+)  # of `gymnasium.make`
+
+
+def make(
+    task: str | type[Task] | Task = "navigation", **arguments: Any
+) -> gymnasium.Env[Any, Any]:
+    """Makes an env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
+    in_own_word("make", "model", arguments)
+    known = {*keywords_of(BridgeEnv), "robot", *GYMNASIUM_ARGUMENTS}
+    refuse_unknown("make", arguments, known)
+    check_render_mode(arguments.get("render_mode"), BridgeEnv.metadata)
+    most_steps = arguments.get("max_episode_steps")
+    if most_steps is not None:
+        check_count("make: max_episode_steps", most_steps)
+    return gymnasium.make(TASK, task=task, **arguments)
+
+
+def make_vec(
+    task: str | type[Task] | Task = "navigation", num_envs: int = 1, **arguments: Any
+) -> Any:
+    """Makes a `BridgeVectorEnv`: a task in many worlds at once, for training."""
+    first: object = task
+    if isinstance(first, int) and not isinstance(first, bool):
+        raise ConfigError(
+            f"make_vec: task={first}: the task comes first; give num_envs={first}."
+        )
+    if "vectorization_mode" in arguments:
+        mode = shown(arguments["vectorization_mode"])
+        reason = "one process steps all worlds together; leave it out, threads=2 uses two cores"
+        raise ConfigError(f"make_vec: vectorization_mode={mode}: {reason}.")
+    return BridgeVectorEnv(num_envs, task=task, **arguments)
