@@ -16,11 +16,9 @@ def shortened(text: str, most: int) -> str:
     if len(text) > most:
         text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
     text = " ".join(text.split())
-    return (
-        text
-        if text.isprintable()
-        else "".join(c if c.isprintable() else "?" for c in text)
-    )
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 class BridgeError(Exception):

@@ -166,11 +166,10 @@ def _wrong() -> Iterator[tuple[str, str]]:
             found = ""
         numbers = _numbers(found)
         for sign, bound in re.findall(r"(>=|<)([\d.]+)", bounds):
-            fits = (
-                numbers >= _numbers(bound)
-                if sign == ">="
-                else numbers < _numbers(bound)
-            )
+            if sign == ">=":
+                fits = numbers >= _numbers(bound)
+            else:
+                fits = numbers < _numbers(bound)
             if not (found and fits):
                 yield needed, found
                 break

@@ -388,11 +388,10 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
             free and not any(one.endswith(line[64:]) for one in listed)
         ):
             continue
-        own = (
-            f"if you changed it yourself, remove its line from {SUMS}, otherwise "
-            if free
-            else ""
-        )
+        if free:
+            own = f"if you changed it yourself, remove its line from {SUMS}, otherwise "
+        else:
+            own = ""
         reason = f"does not match its checksum in {SUMS}; {own}generate the model anew."
         raise ModelError(f"{folder / name}: {reason}")
     for line in listed:

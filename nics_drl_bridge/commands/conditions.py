@@ -34,11 +34,9 @@ class Conditions:
     @property
     def ranges(self) -> Randomisation | None:
         """The ranges that each episode draws from. Raises ConfigError."""
-        return (
-            None
-            if self.randomisation is None
-            else load_randomisation(self.randomisation)
-        )
+        if self.randomisation is None:
+            return None
+        return load_randomisation(self.randomisation)
 
     def model(self, name: str, folder: Path) -> tuple[SimulatorModel, str]:
         """Opens a model and returns its name; with another lidar, it is saved below a folder."""

@@ -239,11 +239,9 @@ def one_sentence() -> Iterator[None]:
             raise typer.Exit(EXIT_INTERRUPTED) from None
         if not isinstance(error, Exception):
             raise
-        clause = (
-            str(error)
-            if isinstance(error, BridgeError)
-            else extensions.own_fault(error)
-        )
+        clause = extensions.own_fault(error)
+        if isinstance(error, BridgeError):
+            clause = str(error)
         if clause is None and isinstance(error, ImportError):
             clause = extensions.unmet(error)
         elif (

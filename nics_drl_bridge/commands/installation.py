@@ -46,11 +46,9 @@ class Check(NamedTuple):
 
 def checks() -> list[Check]:
     """Checks all parts; compiles nothing and starts nothing."""
-    usable = (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count()
-    )
+    usable = os.cpu_count()
+    if hasattr(os, "sched_getaffinity"):
+        usable = len(os.sched_getaffinity(0))
     cores = Check(
         "cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", ""
     )

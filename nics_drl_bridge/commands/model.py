@@ -381,9 +381,9 @@ def names_of_sources(recordings: Sequence[Path]) -> list[str]:
     if len(recordings) == 1:
         return [str(recordings[0])]
     names = [path.name for path in recordings]
-    return (
-        names if len(set(names)) == len(names) else [str(path) for path in recordings]
-    )
+    if len(set(names)) == len(names):
+        return names
+    return [str(path) for path in recordings]
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:

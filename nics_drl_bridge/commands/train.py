@@ -118,9 +118,10 @@ def train(
         from nics_drl_bridge.policy import train as train_run
 
     own_task = task if ":" in task else None
-    resumed = (
-        train_run.settings_of(out, own_task) if resume and out is not None else None
-    )
+    if resume and out is not None:
+        resumed = train_run.settings_of(out, own_task)
+    else:
+        resumed = None
     chosen = resumed or _told(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])

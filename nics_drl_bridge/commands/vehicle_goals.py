@@ -117,11 +117,10 @@ class VehicleEpisode:
     @property
     def options(self) -> dict[str, Array]:
         """Options of the env's reset."""
-        given = (
-            {}
-            if self.order.point is None and not self.order.needs_pose
-            else {"goal": self.goal}
-        )
+        if self.order.point is None and not self.order.needs_pose:
+            given = {}
+        else:
+            given = {"goal": self.goal}
         if self.order.lays_map and self.order.point is not None:
             given["start"] = self.start
         return given

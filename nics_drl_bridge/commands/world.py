@@ -241,9 +241,10 @@ def _text(file: Path, head: list[str], known: Keys, size: tuple[float, float]) -
     from nics_drl_bridge.sim.world import World, check_places
 
     far = round(math.hypot(*size), 3)
-    least = (
-        0.0 if {"starts", "goals"} <= set(known) else min(NEAREST, round(far / 4.0, 3))
-    )
+    if {"starts", "goals"} <= set(known):
+        least = 0.0
+    else:
+        least = min(NEAREST, round(far / 4.0, 3))
     known = {"goal_distance": (least, far), **known}
     lines = [f"# {' '.join(line.split())}" for line in head]
     for key in ("name", "map"):

@@ -170,9 +170,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         guard.check_reset(seed, options)
         super().reset(seed=seed)
         if seed is not None or self._episode < 0:
-            self._seed = (
-                int(self.np_random.integers(2**31)) if seed is None else int(seed)
-            )
+            if seed is None:
+                self._seed = int(self.np_random.integers(2**31))
+            else:
+                self._seed = int(seed)
             self._episode = 0
         else:
             self._episode += 1

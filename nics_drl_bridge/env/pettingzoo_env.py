@@ -135,9 +135,10 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         rest: Any = np.zeros(space.shape or (), space.dtype)
         # The env stops the robots that left, whatever their action.
         joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
-        action = (
-            joint[0] if self.env.robots == 1 else np.array(joint, space.dtype).ravel()
-        )
+        if self.env.robots == 1:
+            action = joint[0]
+        else:
+            action = np.array(joint, space.dtype).ravel()
         observation, terms, info = self.env.advance(action)
         if self.render_mode == "human":
             self.env.render()
@@ -168,9 +169,9 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
                 n: one if n in of_world else self._of(one, m)
                 for n, one in value.items()
             }
-        return (
-            value[m] if self.env.robots > 1 and isinstance(value, np.ndarray) else value
-        )
+        if self.env.robots > 1 and isinstance(value, np.ndarray):
+            return value[m]
+        return value
 
     @halts_on_error
     def render(self) -> Any:

@@ -96,11 +96,9 @@ class Teacher:
     def level(self) -> float:
         """Share of the way with which episodes begin."""
         given = self._given.curriculum
-        return (
-            1.0
-            if given is None
-            else min(given.begin + given.step * int(self._level[0]), 1.0)
-        )
+        if given is None:
+            return 1.0
+        return min(given.begin + given.step * int(self._level[0]), 1.0)
 
     def places(self, worlds: NDArray[np.intp], scenes: Scenes) -> Array:
         """Finds the ways of episodes that begin in some worlds (n,); returns starts (n, M, 3)."""
@@ -109,9 +107,9 @@ class Teacher:
             return scenes.starts
         self._guide.begin(worlds, scenes)
         level = self.level
-        return (
-            scenes.starts if level == 1.0 else self._guide.nearer(worlds, scenes, level)
-        )
+        if level == 1.0:
+            return scenes.starts
+        return self._guide.nearer(worlds, scenes, level)
 
     def begin(self, worlds: NDArray[np.intp]) -> None:
         """Begins episodes in some worlds (n,), where the robots now are."""

@@ -110,11 +110,10 @@ class BridgeVectorEnv(
         self.render_mode = render_mode
         self._limit = max_episode_steps
         self.copy = copy
-        mode = (
-            autoreset_mode.value
-            if isinstance(autoreset_mode, AutoresetMode)
-            else autoreset_mode
-        )
+        if isinstance(autoreset_mode, AutoresetMode):
+            mode = autoreset_mode.value
+        else:
+            mode = autoreset_mode
         if not isinstance(mode, str) or mode not in MODES:
             raise ConfigError(
                 f"autoreset_mode {shown(mode)}: must be one of {', '.join(MODES)}."
@@ -230,9 +229,10 @@ class BridgeVectorEnv(
             if starts is not None:
                 radius = self.model.robot.footprint_radius
                 guard.check_places("start", starts, scenes, self.world, radius)
-            moved = (
-                None if self._teacher is None else self._teacher.places(worlds, scenes)
-            )
+            if self._teacher is None:
+                moved = None
+            else:
+                moved = self._teacher.places(worlds, scenes)
             return moved if starts is None else starts
 
         scenes = self.simulator.reset(seeds, worlds, places)

@@ -468,11 +468,9 @@ def _estimator(
         return "odometry/filtered is silent, start the middleware_node"
     if doubt := estimates.unsteady(config, state, now):
         return doubt
-    return (
-        ""
-        if frozen.stands_still(config, estimate.twist)
-        else "odometry/filtered shows motion"
-    )
+    if frozen.stands_still(config, estimate.twist):
+        return ""
+    return "odometry/filtered shows motion"
 
 
 def _publishers(
@@ -544,11 +542,9 @@ def latched(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 def disarmed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The gate has not been armed."""
-    return (
-        None
-        if state.armed
-        else Cause("disarmed", "", "call ~/arm to let commands pass")
-    )
+    if state.armed:
+        return None
+    return Cause("disarmed", "", "call ~/arm to let commands pass")
 
 
 STOPS: tuple[Rule, ...] = (

@@ -299,11 +299,10 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
         0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors)
     )
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
-    late = (
-        given.latency_s
-        if given.turn is None
-        else max(given.latency_s, given.turn.reaction_s)
-    )
+    if given.turn is None:
+        late = given.latency_s
+    else:
+        late = max(given.latency_s, given.turn.reaction_s)
     since = now - old - late
     ends = [time for time, _ in state.recent[1:]]
     past = [

@@ -308,11 +308,10 @@ def _drift(
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
     """Returns nominal lags and no latency: nothing was estimated."""
-    lags = (
-        signals.nominal_lags(drive.spec)
-        if drive.recording.state is None
-        else np.zeros(0)
-    )
+    if drive.recording.state is None:
+        lags = signals.nominal_lags(drive.spec)
+    else:
+        lags = np.zeros(0)
     return TimingEstimate(offset, 0.0, {}, lags, np.full(len(lags), np.nan), False)
 
 

@@ -61,9 +61,9 @@ class Drive:
 
     def part(self, recording: Recording) -> "Drive":
         """Returns a drive of the same robot with other streams."""
-        return (
-            self if recording is self.recording else replace(self, recording=recording)
-        )
+        if recording is self.recording:
+            return self
+        return replace(self, recording=recording)
 
     def under(self, settings: Settings) -> "Drive":
         """Returns the same drive, as far as it is prepared, with other options."""
@@ -127,11 +127,10 @@ class Drive:
                 geometry.between(pose[:-coarse:coarse], pose[coarse::coarse])
             )
             far = far / (coarse * dt)
-            speed = (
-                float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean()))
-                if len(far)
-                else 0.0
-            )
+            if len(far):
+                speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean()))
+            else:
+                speed = 0.0
             turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
             both = zip(self.pose_noise or (0.0, 0.0), (speed, turn), strict=True)
             needed = max(noise / max(SLOPE_NOISE * size, 1e-9) for noise, size in both)
@@ -191,11 +190,10 @@ def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | Non
         sigma = _spread_at_rest(unwrapped(pose.values))
     else:
         rest = pose_residual(pose)
-        sigma = (
-            np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
-            if len(rest) >= DIFFERENCE
-            else None
-        )
+        if len(rest) >= DIFFERENCE:
+            sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
+        else:
+            sigma = None
     if sigma is None:
         return None
     sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)

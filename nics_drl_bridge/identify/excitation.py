@@ -70,9 +70,10 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     noise_only = spread < NOISE_ONLY * white_noise(samples.x)
     named = dict(zip(spec.variable_names, still, strict=True))
     for i, variable in enumerate(spec.state):
-        followed = (
-            [variable.follows] if variable.follows else [c.name for c in spec.command]
-        )
+        if variable.follows:
+            followed = [variable.follows]
+        else:
+            followed = [c.name for c in spec.command]
         still[i] |= noise_only[i] and all(named[name] for name in followed)
     return tuple(n for n, s in zip(spec.variable_names, still, strict=True) if s)
 
@@ -187,11 +188,9 @@ def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
     low, high = np.array([[v.min, v.max] for v in (*spec.state, *spec.command)]).T
     margin = BEYOND * (high - low)
     inside = ((x >= low - margin) & (x <= high + margin)).all(axis=1)
-    return (
-        np.asarray(inside)
-        if inside.mean() >= 1.0 - MOST
-        else np.ones(len(x), dtype=np.bool_)
-    )
+    if inside.mean() >= 1.0 - MOST:
+        return np.asarray(inside)
+    return np.ones(len(x), dtype=np.bool_)
 
 
 def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:

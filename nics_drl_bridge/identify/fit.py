@@ -71,9 +71,9 @@ class Regression:
         """Returns features (n, K) and rates (n,) of a degree of freedom without its outliers."""
         inside = self.inliers[d]
         target = self.samples.dq[:, d]
-        return (
-            (self.chi, target) if inside.all() else (self.chi[inside], target[inside])
-        )
+        if inside.all():
+            return (self.chi, target)
+        return (self.chi[inside], target[inside])
 
 
 @dataclass(frozen=True)

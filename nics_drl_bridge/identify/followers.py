@@ -127,7 +127,12 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     for v, row in zip(drive.spec.state, found.motor_sigma.tolist(), strict=True):
         keys = f"{v.name}.fall", f"{v.name}.rise", f"{v.follows}.dead"
         errors |= {key: own for key, own in zip(keys, row, strict=True) if own > 0.0}
-    latency = timing.latency if told else least if timing.separated else 0.0
+    if told:
+        latency = timing.latency
+    elif timing.separated:
+        latency = least
+    else:
+        latency = 0.0
     return replace(
         timing,
         offset=latency - least,

@@ -399,9 +399,9 @@ def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> fl
     tries, late = _delayed(drive, calibration, samples)
     left = [_left(drive.spec, samples, command) for command in late]
     found = np.isfinite(left).all()
-    return (
-        float(tries[int(np.argmin(left))]) if found else calibration.command_latency_s
-    )
+    if found:
+        return float(tries[int(np.argmin(left))])
+    return calibration.command_latency_s
 
 
 def likely_delays(
@@ -417,9 +417,9 @@ def likely_delays(
         left = [_left(drive.spec, samples, each) for each in mixed]
         if np.ptp(left) > 0.0 and np.isfinite(left).all():
             found.append((command.name, float(tries[int(np.argmin(left))])))
-    return (
-        tuple(found) if np.ptp([delay for _, delay in found] or [0.0]) > ALIKE_S else ()
-    )
+    if np.ptp([delay for _, delay in found] or [0.0]) > ALIKE_S:
+        return tuple(found)
+    return ()
 
 
 def _delayed(

@@ -129,11 +129,10 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
             f"{turning.alike:.2f}), and was not used: find out which of them is wrong."
         )
         return
-    where = (
-        f"over {turning.rest_s:.1f} s at rest"
-        if turning.rest_s > 0.0
-        else "while driving"
-    )
+    if turning.rest_s > 0.0:
+        where = f"over {turning.rest_s:.1f} s at rest"
+    else:
+        where = "while driving"
     bias = (
         f"bias of {turning.bias:.4f} +- {turning.bias_std:.2g} rad/s was found {where}"
     )

@@ -383,9 +383,10 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     book = base.found.model
 
     def refined_by(draft: hypotheses.Draft) -> tuple[shooting.Predictive, bool]:
-        found = (
-            draft.refined(book, linear.model, pull=best.pull) if best.order else None
-        )
+        if best.order:
+            found = draft.refined(book, linear.model, pull=best.pull)
+        else:
+            found = None
         if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(
             base.found
         ):
@@ -566,9 +567,9 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     linear, _ = _fitted(findings)
     spec = drive.spec
     calibration = findings.calibration
-    beaten = (
-        (findings.replaced,) if findings.replaced else shortfall(findings.judgement)
-    )
+    beaten = [findings.replaced]
+    if not findings.replaced:
+        beaten = list(shortfall(findings.judgement))
     return (
         *about_recordings(_fitted(findings)[1], calibration, findings.whole),
         *beaten,

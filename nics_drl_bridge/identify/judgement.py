@@ -74,9 +74,10 @@ def judged(
         ends = predict(model, calibration, drive, chosen)
         twist = twists_before(drive, chosen.start_t)
         kept = kept_twist(drive, chosen, twist)
-        by_textbook = (
-            None if textbook is None else textbook.predict(drive, chosen, twist)
-        )
+        if textbook is None:
+            by_textbook = None
+        else:
+            by_textbook = textbook.predict(drive, chosen, twist)
         far = distances(ends, chosen)
         band = bands.get(horizon)
         told.append(

@@ -300,9 +300,9 @@ def _by_commands(
 
 def _response(spec: RobotSpec, command: Array) -> Array:
     """Returns twists (n, 3) up to factors; the third may be a steering angle."""
-    return (
-        spec.in_fields(command) if spec.takes_cmd_vel else steady_twist(spec, command)
-    )
+    if spec.takes_cmd_vel:
+        return spec.in_fields(command)
+    return steady_twist(spec, command)
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:

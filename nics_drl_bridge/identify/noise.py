@@ -49,11 +49,10 @@ def sensor_noise(drive: Drive) -> Noise:
     blocks = map(pose.rows, np.array_split(np.arange(len(pose.t)), BLOCKS))
     parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
     known = np.array([part for part in parts if part is not None])
-    spread = (
-        known.std(axis=0, ddof=1) / np.sqrt(len(known))
-        if len(known) > 1
-        else [None, None]
-    )
+    if len(known) > 1:
+        spread = known.std(axis=0, ddof=1) / np.sqrt(len(known))
+    else:
+        spread = [None, None]
     position, heading = (
         _measured(std, unit, None if u is None else float(u))
         for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)

@@ -548,11 +548,10 @@ def check_axes(drive: Drive) -> None:
         )
         known = "as that of a compass" if "offset" in line else "counted clockwise"
         advice = f"for a heading {known} write `heading: {{from: ..., {line}}}` below `pose:`"
-        other = (
-            "exchange x and y"
-            if "offset" in line
-            else "turn x or y so, or remove such a scale"
-        )
+        if "offset" in line:
+            other = "exchange x and y"
+        else:
+            other = "turn x or y so, or remove such a scale"
         raise RecordingError(
             f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103)."
         )

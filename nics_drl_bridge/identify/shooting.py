@@ -138,9 +138,10 @@ class Shooting:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by `free` (D, K) coefficients."""
         values = values if self.fixed is None else self.fixed
         model = self.shaped(model, values)
-        free = (
-            np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
-        )
+        if free is None:
+            free = np.zeros(model.coefficients.shape, dtype=np.bool_)
+        else:
+            free = free
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
         terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))

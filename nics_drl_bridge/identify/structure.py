@@ -85,11 +85,10 @@ def _way(model: TaylorModel, degree: int, tried: int) -> str:
         way = "no order that was tried predicts better with it"
     else:
         way = "keep more terms (a higher alpha)"
-    by_terms = (
-        ""
-        if model.bounded
-        else ", and distrust what rests on its terms, as the mounting"
-    )
+    if model.bounded:
+        by_terms = ""
+    else:
+        by_terms = ", and distrust what rests on its terms, as the mounting"
     return way + by_terms
 
 

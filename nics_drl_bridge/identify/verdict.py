@@ -302,11 +302,10 @@ def unlearnt(
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
     if together := _list(excitation.together):
         units = {c.unit for c in spec.command if c.name in excitation.together}
-        shares = (
-            "all have a share of what they did"
-            if len(units) == 1
-            else "one has all of it"
-        )
+        if len(units) == 1:
+            shares = "all have a share of what they did"
+        else:
+            shares = "one has all of it"
         told = f"{shares}, and the model holds where they move so; drive each on its own to learn"
         why = "always moved together, so their effects can't be told apart"
         yield Gap(f"{together} {why}: {told}.")

@@ -58,11 +58,9 @@ class GridMap:
     @cached_property
     def blocked(self) -> NDArray[np.bool_]:
         """(rows, columns) cells that stop a beam."""
-        return (
-            ~self.free
-            if self.unknown_stops
-            else np.asarray(self.cells >= self.occupied_from)
-        )
+        if self.unknown_stops:
+            return ~self.free
+        return np.asarray(self.cells >= self.occupied_from)
 
     @cached_property
     def arrays(self) -> map_kernels.GridArrays:
@@ -240,11 +238,10 @@ def read_image(
             for file in folder.glob("*")
             if file.name.lower().endswith(endings)
         ]
-        hint = (
-            nearest(path.name, known)
-            if known
-            else f"there are no images in {str(folder)!r}."
-        )
+        if known:
+            hint = nearest(path.name, known)
+        else:
+            hint = f"there are no images in {str(folder)!r}."
         raise ConfigError(
             f"{source}: key 'image': there is no file {str(path)!r}; {hint}"
         )

@@ -212,9 +212,8 @@ def make_scanner(
     grid: GridMap | None = None,
 ) -> Scanner:
     """Returns a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""
-    table = (
-        LidarTable.without_rows(spec, shapes)
-        if renderer == "exact"
-        else bake(spec, shapes)
-    )
+    if renderer == "exact":
+        table = LidarTable.without_rows(spec, shapes)
+    else:
+        table = bake(spec, shapes)
     return Scanner(spec, table, renderer, grid)

@@ -267,8 +267,6 @@ def describe(shape: Shape) -> str:
         words = f"segment of {np.hypot(*np.subtract(*shape.ends)):.3g} m"
     else:
         words = f"polygon of {len(shape.points)} corners, radius {shape.radius:.3g} m"
-    return (
-        words
-        if shape.reflectivity is None
-        else f"{words}, reflectivity {shape.reflectivity:g}"
-    )
+    if shape.reflectivity is None:
+        return words
+    return f"{words}, reflectivity {shape.reflectivity:g}"

@@ -149,11 +149,10 @@ class LidarTable:
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         cells = np.column_stack([self.start, pairs])
         missing = max(32 - padding(self.beam_angle), 0)  # at least two blocks are read
-        rows = (
-            np.append(self.rows, np.zeros(missing, np.float32))
-            if missing
-            else self.rows
-        )
+        if missing:
+            rows = np.append(self.rows, np.zeros(missing, np.float32))
+        else:
+            rows = self.rows
         return TableArrays(shapes, distances, cells, rows, shift, outlines.hulls)
 
     @property

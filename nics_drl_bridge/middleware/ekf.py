@@ -143,11 +143,10 @@ class Estimator:
         )  # after an outlier
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
-        since = (
-            anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S))
-            if known
-            else None
-        )
+        if known:
+            since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S))
+        else:
+            since = None
         known_so = anchor.mean, covariance, (0, 0, 0), since, True, self._suddenly
         gyro = None if self._gyro is None else self._gyro.restarted()
         self.belief = Belief(time_ns, *known_so, self._roughness, self._missed, gyro)
@@ -311,9 +310,10 @@ class Estimator:
         lost = self._lost
         if lost and odom is not None:
             self._lost = False
-            seconds = (
-                0.0 if anchor is None else (self.time_ns - anchor.time_ns) / NS_PER_S
-            )
+            if anchor is None:
+                seconds = 0.0
+            else:
+                seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
             if (
                 anchor
                 and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None
@@ -454,11 +454,9 @@ class Estimator:
     @property
     def _foreseen_here(self) -> Foreseen | None:
         foreseen = self._foreseen
-        return (
-            foreseen
-            if foreseen is not None and foreseen.mean is self._filter.x
-            else None
-        )
+        if foreseen is not None and foreseen.mean is self._filter.x:
+            return foreseen
+        return None
 
     def _surprise(
         self,

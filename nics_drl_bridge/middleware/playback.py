@@ -102,9 +102,9 @@ def with_gyro(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
     """Returns topics by role with that of a gyro, if a bag has a usual one and none is named."""
     if IMU in topics:
         named = topics[IMU].strip("/") != topic_roles.NONE
-        return (
-            topics if named else {role: t for role, t in topics.items() if role != IMU}
-        )
+        if named:
+            return topics
+        return {role: t for role, t in topics.items() if role != IMU}
     with opened(path) as bag:
         for name in (f"/{name}" for name in topic_roles.IMU_NAMES):
             if bag.types.get(name) == topic_roles.IMU and name not in bag.empty:

@@ -129,9 +129,9 @@ def timed_model(
         )
     dt = model.timing[0]
     steps = round(time.step_ns / NS_PER_S / dt)
-    return (
-        model if steps == model.timing[1] else replace(model, control_period=steps * dt)
-    )
+    if steps == model.timing[1]:
+        return model
+    return replace(model, control_period=steps * dt)
 
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
@@ -153,11 +153,10 @@ def namespaces(node: Node) -> tuple[str, ...]:
         and 1 <= value <= GREATEST_FLEET
     ):
         return ("",) if value == 1 else default_namespaces(value)
-    names = (
-        tuple(value)
-        if isinstance(value, Sequence) and not isinstance(value, str)
-        else ()
-    )
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        names = tuple(value)
+    else:
+        names = ()
     valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
     if (
         not names

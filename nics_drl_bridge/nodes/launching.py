@@ -66,9 +66,10 @@ class Setup:
         self.values = values | {
             name: flag_of(name, values.get(name, "")) for name in FLAGS
         }
-        self._file = (
-            parse_yaml(read_text(file), file) if (file := self["params_file"]) else {}
-        )
+        if file := self["params_file"]:
+            self._file = parse_yaml(read_text(file), file)
+        else:
+            self._file = {}
         self.model = self["model"] or str(self._of_file("model", "") or MODEL.default)
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
         self._opened: Any = None if shipped.is_file() else opened(self.model)
@@ -100,11 +101,9 @@ class Setup:
         if self["limits"] or not self["model"]:
             return self["limits"]
         robot = self.model if self._opened is None else self._opened.robot.name
-        return (
-            robot
-            if (share_folder() / "config" / "limits" / f"{robot}.yaml").is_file()
-            else ""
-        )
+        if (share_folder() / "config" / "limits" / f"{robot}.yaml").is_file():
+            return robot
+        return ""
 
     def frame(self, node: str, robot: Robot) -> Any:
         """Returns the frame of a robot of a fleet; empty for one robot, whose file names it."""
@@ -165,9 +164,9 @@ def opened(model: str) -> Any:
 
 def value(given: str, kind: Any = str) -> Any:
     """Returns a parameter of a type, whatever its text looks like; None if it was left empty."""
-    return (
-        ParameterValue(TextSubstitution(text=given), value_type=kind) if given else None
-    )
+    if given:
+        return ParameterValue(TextSubstitution(text=given), value_type=kind)
+    return None
 
 
 def flag_of(name: str, given: str) -> str:
@@ -181,11 +180,10 @@ def flag_of(name: str, given: str) -> str:
 def names_of(robots: Any) -> tuple[str, ...]:
     """Returns the namespaces of a fleet by a count or their list; none for one robot."""
     if not isinstance(robots, str):
-        words = (
-            [str(each) for each in robots]
-            if isinstance(robots, list)
-            else [str(robots)]
-        )
+        if isinstance(robots, list):
+            words = [str(each) for each in robots]
+        else:
+            words = [str(robots)]
     else:
         words = re.findall(r"[^\s,\[\]'\"]+", robots)
     if len(words) == 1 and words[0].isdecimal():

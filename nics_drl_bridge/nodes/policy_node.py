@@ -156,11 +156,10 @@ class PolicyNode(ManagedNode):
             told = f"inference was late ({self._deadline.late} so far), its command is dropped"
             self.get_logger().warning(told, throttle_duration_sec=5.0)
         if answer is not Answer.DROP:
-            sent = (
-                twist
-                if answer is Answer.SEND and np.isfinite(twist).all()
-                else np.zeros(3)
-            )
+            if answer is Answer.SEND and np.isfinite(twist).all():
+                sent = twist
+            else:
+                sent = np.zeros(3)
             self._raw.publish(self._message(sent, scan_ns))
 
     def _look(self) -> runner.Condition:
@@ -187,11 +186,10 @@ class PolicyNode(ManagedNode):
             return np.zeros(3)
         verdict = self._task.judge(self._topics.view(), {"goal": self._goal})
         if verdict.reached or verdict.touched:
-            why = (
-                "touching something, stopped"
-                if verdict.touched
-                else self._told_reached()
-            )
+            if verdict.touched:
+                why = "touching something, stopped"
+            else:
+                why = self._told_reached()
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
         return self._toward(self._goal).twist

@@ -234,11 +234,10 @@ class QosWatch(Node):
             name, theirs = self._misfit(resolved, ours, publishing)
             own, other = (_value(profile, policy) for profile in (ours, theirs))
             offered, asked = (own, other) if publishing else (other, own)
-            cure = (
-                f"ask for {own}"
-                if publishing
-                else f"offer {own}, or put a relay between"
-            )
+            if publishing:
+                cure = f"ask for {own}"
+            else:
+                cure = f"offer {own}, or put a relay between"
             self.get_logger().warning(
                 f"{resolved}: no message passes between this node and {name}: the {policy.lower()} "
                 f"that the publisher offers ({offered}) is less than what the subscription asks "

@@ -65,9 +65,10 @@ def open_context(
         context.init(None if args is None else list(args), domain_id=domain_id)
         return context
 
-    asked = (
-        os.environ.get("ROS_DOMAIN_ID", "0") if domain_id is None else str(domain_id)
-    )
+    if domain_id is None:
+        asked = os.environ.get("ROS_DOMAIN_ID", "0")
+    else:
+        asked = str(domain_id)
     if (
         asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID
     ):  # DDS would end the process

@@ -245,9 +245,10 @@ class CommandInlet:
     def _on_bytes(self, stamped: bool, content: bytes) -> None:
         try:
             stamp_ns = wire.stamp_of(content) if stamped else 0
-            twist = (
-                wire.stamped_twist_of(content) if stamped else wire.twist_of(content)
-            )
+            if stamped:
+                twist = wire.stamped_twist_of(content)
+            else:
+                twist = wire.twist_of(content)
         except wire.UNREADABLE as error:
             self._complain(f"a message that can't be read ({error}) is ignored")
             return

@@ -53,11 +53,10 @@ def _main_of(node: str) -> Any:
 
     name = f"nics_drl_bridge.nodes.{node}"
     try:
-        main = (
-            import_module(name).main
-            if find_spec(name)
-            else extensions.load("nodes", node)
-        )
+        if find_spec(name):
+            main = import_module(name).main
+        else:
+            main = extensions.load("nodes", node)
         from rclpy.logging import get_logger
 
         from nics_drl_bridge.kernels import COMPILING

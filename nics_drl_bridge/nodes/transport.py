@@ -198,8 +198,9 @@ def domains_in_use() -> set[int]:
 
 
 def _sockets() -> list[tuple[str, int]]:
-    lines = (
-        TABLE.read_text(encoding="ascii").splitlines()[1:] if TABLE.is_file() else []
-    )
+    if TABLE.is_file():
+        lines = TABLE.read_text(encoding="ascii").splitlines()[1:]
+    else:
+        lines = []
     rows = [line.split() for line in lines]
     return [(f"socket:[{row[9]}]", int(row[1].split(":")[1], 16)) for row in rows]

@@ -98,9 +98,10 @@ class RosSource:
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.endswith(GATE):
-                self._gate = (
-                    "" if status.level in (DiagnosticStatus.OK, 0) else status.message
-                )
+                if status.level in (DiagnosticStatus.OK, 0):
+                    self._gate = ""
+                else:
+                    self._gate = status.message
 
     def stage(self) -> Stage:
         """See `show.FrameSource`."""

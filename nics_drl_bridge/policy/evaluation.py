@@ -120,9 +120,10 @@ def drive(
         believed = "success" if np.all(info.get("is_success", False)) else collided
         driven = np.array(paths), np.array(estimates), goal, bodies, total
         planned = None if before is None else (acted(policy) or 0) - before
-        uncertain = (
-            gained_uncertainty(covariances[0], covariances[-1]) if covariances else None
-        )
+        if covariances:
+            uncertain = gained_uncertainty(covariances[0], covariances[-1])
+        else:
+            uncertain = None
         if "true_pose" not in info:
             return Episode(
                 seed, believed, *driven, planned=planned, uncertain=uncertain
@@ -354,11 +355,9 @@ class Tally(Summary):
         """The tally as plain data, an interval as a list; non-finite values become null."""
         figures: dict[str, Any] = {}
         for name, value in vars(self).items():
-            ends = (
-                vars(value).values()
-                if isinstance(value, ConfidenceInterval)
-                else [value]
-            )
+            ends = [value]
+            if isinstance(value, ConfidenceInterval):
+                ends = list(vars(value).values())
             known = [each if math.isfinite(each) else None for each in ends]
             figures[name] = known if isinstance(value, ConfidenceInterval) else known[0]
         return figures

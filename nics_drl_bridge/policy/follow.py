@@ -95,11 +95,10 @@ class PlannedPath:
         )
         after = min(at + 1, len(self._points) - 1)
         direction = self._points[after] - self._points[max(after - 1, 0)]
-        heading = (
-            math.atan2(direction[1], direction[0])
-            if direction.any()
-            else float(pose[2])
-        )
+        if direction.any():
+            heading = math.atan2(direction[1], direction[0])
+        else:
+            heading = float(pose[2])
         off = pose[:2] - self._points[at]
         return Place(
             self._points[ahead],
@@ -127,9 +126,10 @@ class GoalChecker:
         self._there = here or (self._there and check.stateful)
         if not self._there:
             return None
-        turn = (
-            float(wrap_angle(end[2] - pose[2])) if self._turns and len(end) > 2 else 0.0
-        )
+        if self._turns and len(end) > 2:
+            turn = float(wrap_angle(end[2] - pose[2]))
+        else:
+            turn = 0.0
         return turn if abs(turn) > check.yaw_goal_tolerance else 0.0
 
 

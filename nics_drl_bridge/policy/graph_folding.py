@@ -61,11 +61,9 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
 
 def _shape(kind: Any) -> Shape:
     tensor = kind.tensor_type
-    return (
-        tuple(d.dim_value for d in tensor.shape.dim)
-        if tensor.HasField("shape")
-        else (0,)
-    )
+    if tensor.HasField("shape"):
+        return tuple(d.dim_value for d in tensor.shape.dim)
+    return (0,)
 
 
 def _is_small(kind: Any) -> bool:

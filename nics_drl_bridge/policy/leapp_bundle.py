@@ -170,11 +170,10 @@ class Bundle:
 
     def _states(self) -> dict[str, ForeignState]:
         pipeline = self.description.pipeline
-        start = (
-            {}
-            if pipeline.initial_values is None
-            else self._initial(pipeline.initial_values)
-        )
+        if pipeline.initial_values is None:
+            start = {}
+        else:
+            start = self._initial(pipeline.initial_values)
         return {
             self.name_of(target): ForeignState(
                 next=self.name_of(out), start=start.get(target, 0.0)
@@ -344,11 +343,10 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
     Raises PolicyError for an input whose meaning is not told.
     """
     frequency = bundle.description.pipeline.configs.get("frequency")
-    period = (
-        1.0 / frequency
-        if isinstance(frequency, int | float) and frequency > 0
-        else None
-    )
+    if isinstance(frequency, int | float) and frequency > 0:
+        period = 1.0 / frequency
+    else:
+        period = None
     data: Data = {
         "kind": "foreign policy",
         "network": bundle.path.name,
@@ -362,9 +360,10 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
         data["inputs"][name] = {"parts": _parts(bundle, name, entry, data)}
     for name, entry in bundle.outputs.items():
         _add_commands(data["outputs"], name, entry, model)
-    missing = (
-        [] if data["outputs"].keys() >= {"forward", "turn"} else ["forward", "turn"]
-    )
+    if data["outputs"].keys() >= {"forward", "turn"}:
+        missing = []
+    else:
+        missing = ["forward", "turn"]
     if missing and data["outputs"].keys() != {
         command.name for command in model.robot.command
     }:

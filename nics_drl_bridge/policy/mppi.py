@@ -119,11 +119,10 @@ class Mppi:
     def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
         robot, (_, outline, clearance) = self.task.robot, self._sense
         low, high = self.task.command_limits
-        ends = (
-            np.stack([low, high])
-            if self.task.robot.takes_cmd_vel
-            else np.zeros((1, len(low)))
-        )
+        if self.task.robot.takes_cmd_vel:
+            ends = np.stack([low, high])
+        else:
+            ends = np.zeros((1, len(low)))
         half = (
             math.hypot(*np.abs(steady_twist(robot, ends))[:, :2].max(axis=0))
             * self.horizon

@@ -211,11 +211,10 @@ class DynamicWindow:
         reach = (
             np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6
         )  # one step at least
-        late = (
-            0.0
-            if self.model is None
-            else max(0.0, self.model.calibration.command_latency_s)
-        )
+        if self.model is None:
+            late = 0.0
+        else:
+            late = max(0.0, self.model.calibration.command_latency_s)
         # A twist is held for a period and looked at a period later; then the robot reacts. Its
         # reaction is known no finer than the steps of its model.
         held = 2.0 * self.period + late

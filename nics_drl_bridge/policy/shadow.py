@@ -50,9 +50,10 @@ class Shadow:
             gap = one - other
             size = np.abs(one - other)
             signed = (np.abs(one) > band) & (np.abs(other) > band)
-            opposite = (
-                (one[signed] * other[signed] < 0.0).mean() if signed.any() else 0.0
-            )
+            if signed.any():
+                opposite = (one[signed] * other[signed] < 0.0).mean()
+            else:
+                opposite = 0.0
             found[name] = {
                 "mean": float(gap.mean()),
                 "mean_size": float(size.mean()),

@@ -127,11 +127,10 @@ class Progress:
     def line(self) -> str:
         """Success, as far as any is known, and speed, for people."""
         unknown = math.isnan(self.success)
-        known = (
-            "no episode has ended yet"
-            if unknown
-            else f"success {100 * self.success:.1f} %"
-        )
+        if unknown:
+            known = "no episode has ended yet"
+        else:
+            known = f"success {100 * self.success:.1f} %"
         return f"{known}, {self.steps_per_s:,.0f} steps/s"
 
 

@@ -99,8 +99,6 @@ def memory_of(
     """Makes the memory of settings, for observations (n, inputs) that begin with a scan."""
     if settings is None:
         return Memory()
-    return (
-        Gru(settings, inputs)
-        if isinstance(settings, GruMemory)
-        else Stack(settings, scan_parts)
-    )
+    if isinstance(settings, GruMemory):
+        return Gru(settings, inputs)
+    return Stack(settings, scan_parts)

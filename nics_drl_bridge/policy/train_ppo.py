@@ -194,9 +194,9 @@ class Learner:
         rollout = Transitions(*(each.flatten(0, 1) for each in rows))
         if networks.actor.memory.learnt:
             rollout = rollout._replace(state=driven.state, done=driven.done)
-        return (
-            rollout if self._reflection is None else self._reflection.doubled(rollout)
-        )
+        if self._reflection is None:
+            return rollout
+        return self._reflection.doubled(rollout)
 
     def learn(self, rollout: Transitions, rate: float) -> float:
         """Learns from a rollout with a learning rate; returns the loss of the last batch."""

@@ -270,11 +270,10 @@ class BagFile:
     def messages(self, topic: str) -> list[Message]:
         """Returns all messages of a topic."""
         found = []
-        decode = (
-            self._store.deserialize_ros1
-            if self._is_ros_1
-            else self._store.deserialize_cdr
-        )
+        if self._is_ros_1:
+            decode = self._store.deserialize_ros1
+        else:
+            decode = self._store.deserialize_cdr
         for k, (kind, ns, data) in enumerate(self._raw(topic)):
             try:
                 found.append(Message(ns, decode(data, kind)))

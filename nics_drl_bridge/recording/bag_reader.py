@@ -112,9 +112,10 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
             advice = "choose the robot that drove, or another topic"
             raise RecordingError(f"{fault}, but {other}; {advice}.")
     data = _table(bag, topic, msgs.command_row)
-    commands = (
-        spec.of_fields(data.values) if steered else spec.from_cmd_vel(data.values)
-    )
+    if steered:
+        commands = spec.of_fields(data.values)
+    else:
+        commands = spec.from_cmd_vel(data.values)
     return replace(data, values=commands)
 
 
@@ -222,11 +223,10 @@ def state_of(
         columns = []
         for variable, source in zip(spec.state, found, strict=True):
             usual = "position" if variable.unit in msgs.POSITION_UNITS else "velocity"
-            table = (
-                joints.position
-                if (source.field or usual) == "position"
-                else joints.velocity
-            )
+            if (source.field or usual) == "position":
+                table = joints.position
+            else:
+                table = joints.velocity
             columns.append(source.scale * table[:, joints.names.index(source.joint)])
         return _complete(
             joints, np.stack(columns, axis=1), [s.joint for s in found], place
@@ -277,7 +277,11 @@ def _alike(names: Iterable[str], wanted: str) -> str | None:
     """Returns the only joint whose name has all words of the wanted name, in any order."""
     words = set(wanted.split("_"))
     found = [name for name in names if words <= set(re.split(r"[^a-z]+", name.lower()))]
-    return wanted if wanted in found else found[0] if len(found) == 1 else None
+    if wanted in found:
+        return wanted
+    if len(found) == 1:
+        return found[0]
+    return None
 
 
 def _complete(

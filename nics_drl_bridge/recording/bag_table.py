@@ -66,24 +66,21 @@ def reader_of_field(path: str) -> Callable[[Any], Any]:
         for part in parts:
             if isinstance(message, (list, tuple, np.ndarray)):
                 labels = getattr(within, NAMES, [])
-                k = (
-                    int(part)
-                    if part.isdecimal()
-                    else labels.index(part)
-                    if part in labels
-                    else -1
-                )
+                if part.isdecimal():
+                    k = int(part)
+                elif part in labels:
+                    k = labels.index(part)
+                else:
+                    k = -1
                 if not 0 <= k < len(message):
                     return np.nan
                 message = message[k]
             else:
                 within = message
                 message = getattr(message, part)
-        return (
-            message.sec + message.nanosec * S_PER_NS
-            if hasattr(message, "nanosec")
-            else message
-        )
+        if hasattr(message, "nanosec"):
+            return message.sec + message.nanosec * S_PER_NS
+        return message
 
     return read
 
@@ -155,11 +152,9 @@ class Bag(Source):
         topics = tuple(self._used) or (topic,)
         bare = [each for each in topics if not np.any(times_of(self._of(each))[1])]
         # Beside topics without headers these are compared with the arrival, as if nobody asked.
-        stamps = (
-            "auto"
-            if which == mapped.HEADER and bare and topic not in bare
-            else STAMPS[which]
-        )
+        stamps = STAMPS[which]
+        if which == mapped.HEADER and bare and topic not in bare:
+            stamps = "auto"
         if (key := (which, stamps, *topics)) not in self._stamps:
             data = {}
             for each in topics:
@@ -174,9 +169,10 @@ class Bag(Source):
                     raise
                 fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
                 stamps = "header" if go_on_together(data.values()) else "receive"
-                by = (
-                    "headers, which go on together" if stamps == "header" else "arrival"
-                )
+                if stamps == "header":
+                    by = "headers, which go on together"
+                else:
+                    by = "arrival"
                 note = f"{fault}; all messages were stamped by their {by}."
                 self._notes.setdefault(topic, []).append(note)
                 self._stamps[key] = streams(data, stamps, self.place, robot)

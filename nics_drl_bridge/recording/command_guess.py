@@ -330,11 +330,10 @@ def _candidates_of(
         return
     of_pose = pose is not None and pose.table is table
     # The name of a file tells what it holds only beside other files, and if the pose is elsewhere.
-    context = (
-        {*words_of(table.name)}
-        if table.kind or (len(tables) > 1 and not of_pose)
-        else set()
-    )
+    if table.kind or (len(tables) > 1 and not of_pose):
+        context = {*words_of(table.name)}
+    else:
+        context = set()
     if context & (NEVER_WORDS | MEASURING) and not context & COMMANDING:
         return
     taken = {*pose.columns} if pose is not None and of_pose else set()

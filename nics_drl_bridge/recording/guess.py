@@ -53,15 +53,15 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     guess = guess_command(tables, pose)
     times = [table.time for table in tables if table.time is not None]
     common = max(times, key=times.count) if times else None
-    pose_lines = (
-        _pose_lines(pose, alone, common)
-        if pose
-        else [NO_POSE, "pose:", "  x: ", "  y: "]
-    )
+    if pose:
+        pose_lines = _pose_lines(pose, alone, common)
+    else:
+        pose_lines = [NO_POSE, "pose:", "  x: ", "  y: "]
     values = _pose_values(pose, pose_lines) if pose else None
-    switch = (
-        guess_switch(tables, values) if guess.commands or guess.candidates else None
-    )
+    if guess.commands or guess.candidates:
+        switch = guess_switch(tables, values)
+    else:
+        switch = None
     lines = [f"{DOUBT} {doubt}" for doubt in doubts_of_commands(guess, values)]
     if not guess.commands and not guess.candidates:
         lines.append(f"{DOUBT} {NO_COMMAND}")

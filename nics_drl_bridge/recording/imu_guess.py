@@ -52,9 +52,10 @@ def imu_line(
         keys.append("unit: deg/s")
     if table.time not in (common, None):
         keys.append(f"time: {table.time}")
-    value = (
-        f"{{{', '.join(keys)}}}" if len(keys) > 1 else keys[0].removeprefix("from: ")
-    )
+    if len(keys) > 1:
+        value = f"{{{', '.join(keys)}}}"
+    else:
+        value = keys[0].removeprefix("from: ")
     return f"imu: {{yaw_rate: {value}}}"
 
 

@@ -65,9 +65,9 @@ def split_at(
         )
         if len(own.pose.t) > 1:
             parts.append(own)
-    return (
-        replace(join(parts), source=recording.source) if len(parts) > 1 else recording
-    )
+    if len(parts) > 1:
+        return replace(join(parts), source=recording.source)
+    return recording
 
 
 def _on_one_clock(recording: Recording, offset: float) -> Recording:
@@ -222,15 +222,15 @@ def _end_to_end(name: str, parts: Sequence[Stream]) -> Stream:
 
 
 def _about(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
-    names = (
-        ", ".join(sources) if len(sources) <= 10 else f"{sources[0]} to {sources[-1]}"
-    )
+    if len(sources) <= 10:
+        names = ", ".join(sources)
+    else:
+        names = f"{sources[0]} to {sources[-1]}"
     held = "the last third of each was held out of the first fit"
-    held = (
-        held
-        if is_split
-        else "all were learnt from, as they are too short to hold a part out"
-    )
+    if is_split:
+        held = held
+    else:
+        held = "all were learnt from, as they are too short to hold a part out"
     return (
         f"{len(sources)} drives were joined ({names}): {held}; no prediction crosses over.",
     )

@@ -175,11 +175,10 @@ def _turn_rate_of_heading(
 def _check_units(reader: MappedReader, pose: Stream) -> None:
     """Refuses poses, as they were recorded, that only a wrong unit explains."""
     mapping = reader.mapping
-    given = (
-        mapping.robot.get("footprint_radius")
-        if isinstance(mapping.robot, dict)
-        else None
-    )
+    if isinstance(mapping.robot, dict):
+        given = mapping.robot.get("footprint_radius")
+    else:
+        given = None
     radius = float(given) if isinstance(given, (int, float)) else 0.0
     if fault := implausible_pose(pose.t, pose.values, radius=radius):
         time = mapping.pose.time or mapping.time

@@ -245,11 +245,10 @@ def _turned(
                 best = rank, name, ()
     if best is not None:
         return best[1], best[2]
-    z = (
-        named.get((*place[:-1], "z"))
-        if place[-1] == "x" and "position" not in place
-        else None
-    )
+    if place[-1] == "x" and "position" not in place:
+        z = named.get((*place[:-1], "z"))
+    else:
+        z = None
     low, high = next(
         ((c.low, c.high) for c in table.columns if c.name == z), (0.0, 0.0)
     )

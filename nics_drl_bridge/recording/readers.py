@@ -164,11 +164,10 @@ def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
             si = unit_of(value).si
             if si and si != variable.unit != "1":
                 turns = si.startswith("ticks") and variable.unit.startswith("rad")
-                cure = (
-                    "add `ticks_per_turn:`"
-                    if turns
-                    else "check its unit, or give `scale:`"
-                )
+                if turns:
+                    cure = "add `ticks_per_turn:`"
+                else:
+                    cure = "check its unit, or give `scale:`"
                 fault = f"{stream}.{variable.name}: is in {si}, where {variable.unit} is needed"
                 raise ConfigError(f"{fault}; {cure}.")
 

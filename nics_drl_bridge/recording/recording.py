@@ -469,9 +469,9 @@ def clockwise_line(pose: Array, least: float = MIRRORED, better: float = BETTER)
     mirrored = _course(pose, -1.0)
     if abs(mirrored) < max(least, better + led_along(pose, 1.0)):
         return ""
-    return (
-        "scale: -1" if mirrored.real > 0.0 else f"scale: -1, offset: {np.pi / 2.0:.5g}"
-    )
+    if mirrored.real > 0.0:
+        return "scale: -1"
+    return f"scale: -1, offset: {np.pi / 2.0:.5g}"
 
 
 def led_along(pose: Array, scale: float) -> float:

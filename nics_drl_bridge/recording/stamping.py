@@ -276,11 +276,9 @@ def counter(values: Array) -> str:
     usual = float(np.percentile(step, 95))
     lost = size - step[step > size / 2.0]
     calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
-    return (
-        f"overflows at {size:.10g}"
-        if calm and np.histogram(values, PARTS)[0].all()
-        else ""
-    )
+    if calm and np.histogram(values, PARTS)[0].all():
+        return f"overflows at {size:.10g}"
+    return ""
 
 
 def comes_back(values: Array) -> bool:

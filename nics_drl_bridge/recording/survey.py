@@ -165,11 +165,9 @@ class TableSurvey:
     @property
     def regularity(self) -> list[str]:
         """Sentences on rate, gaps, stamps that run backwards, repeated rows and missing values."""
-        return (
-            []
-            if self.t is None or len(self.t) < 2
-            else list(_regularity(self.t, self.data))
-        )
+        if self.t is None or len(self.t) < 2:
+            return []
+        return list(_regularity(self.t, self.data))
 
     def reference(self, column: str, alone: bool) -> str:
         """Returns how a mapping refers to a column."""

@@ -90,11 +90,10 @@ def _number(place: str, names: Sequence[str], which: str | int) -> int:
         columns = f"its columns are 0 to {len(names) - 1}"
         raise RecordingError(f"{place}: has no column {which}; {columns}.")
     named = [name for name in names if name]
-    hint = (
-        nearest(which, named)
-        if named
-        else "they have no names: give its number, from 0."
-    )
+    if named:
+        hint = nearest(which, named)
+    else:
+        hint = "they have no names: give its number, from 0."
     raise RecordingError(f"{place}: has no column {which!r}; {hint}")
 
 

@@ -168,11 +168,9 @@ class _Topics:
         fitting = self._fitting(role)
         for pattern in USUAL[role]:
             # A simulator tells the true pose as odometry; other odometry is no pose by itself.
-            never = (
-                NEVER_GUESSED.get(role, ())
-                if pattern != GROUND_TRUTH
-                else (TRANSFORMS,)
-            )
+            never: tuple[str, ...] = (TRANSFORMS,)
+            if pattern != GROUND_TRUTH:
+                never = NEVER_GUESSED.get(role, ())
             full = [topic for topic in fitting if self.types[topic] not in never]
             found = [topic for topic in full if re.search(pattern, topic)]
             if len(found) > 1:

@@ -228,9 +228,10 @@ class BagSink:
         for name, text in (texts or {}).items() if kind not in fields else ():
             if name not in fields:
                 self.store.register(get_types_from_msg(text, name))
-        given = (
-            {} if kind in fields else {"msgdef": definition or "", "rihs01": NO_HASH}
-        )
+        if kind in fields:
+            given = {}
+        else:
+            given = {"msgdef": definition or "", "rihs01": NO_HASH}
         profiles = [msgs.profile_of(offer) for offer in offers]
         with self._noting_faults():
             self._connections[topic] = self._writer.add_connection(

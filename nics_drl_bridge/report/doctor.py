@@ -107,19 +107,19 @@ def presence(facts: Facts, _: Expected) -> Findings:
                 )
                 yield error("missing topic", role, "nobody listens to it", fix)
         elif role not in facts.heard:
-            what = (
-                "there is no such topic" if there is None else "nothing was heard on it"
-            )
+            if there is None:
+                what = "there is no such topic"
+            else:
+                what = "nothing was heard on it"
             near = [
                 topic
                 for topic, ends in facts.topics.items()
                 if KINDS[role][0] in ends.types
             ]
-            hint = (
-                f"; {', '.join(near)} is of its type: remap it"
-                if near and not there
-                else ""
-            )
+            if near and not there:
+                hint = f"; {', '.join(near)} is of its type: remap it"
+            else:
+                hint = ""
             fix = f"start its driver, or correct namespace or ROS_DOMAIN_ID{hint}"
             yield error("missing topic", role, what, fix)
         if doctor_facts.TWIST_STAMPED_TYPE in types and not facts.live:

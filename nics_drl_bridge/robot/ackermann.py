@@ -60,11 +60,10 @@ def drawing(spec: RobotSpec) -> kinds.Drawing:
         ("left", 0.5 * track, ""),
         ("right", -0.5 * track, "_right"),
     ):
-        pivot = (
-            kinds.Pivot(f"{side}_knuckle", angle.name + suffix, angle)
-            if angle
-            else None
-        )
+        if angle:
+            pivot = kinds.Pivot(f"{side}_knuckle", angle.name + suffix, angle)
+        else:
+            pivot = None
         wheels.append(kinds.Wheel(f"rear_{side}_wheel", (0.0, y), radius))
         wheels.append(
             kinds.Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot)

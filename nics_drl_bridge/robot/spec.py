@@ -448,9 +448,10 @@ def robot_from(
     name, are theirs unless given. Raises ConfigError.
     """
     data = definition(given)
-    source = (
-        "robot" if isinstance(given, Mapping) else str(find_config(given, "robots"))
-    )
+    if isinstance(given, Mapping):
+        source = "robot"
+    else:
+        source = str(find_config(given, "robots"))
     if "kind" in data:
         data = _of_kind(data, ranges or {}, source)
     spec = validate(data, RobotSpec, source)

@@ -148,11 +148,10 @@ class Template:
         if own is not None and not _mappings(own):
             return own
         known = {one["name"]: one for one in usual}
-        chosen = (
-            usual
-            if own is None
-            else [{**known.get(c.get("name"), {}), **c} for c in own]
-        )
+        if own is None:
+            chosen = usual
+        else:
+            chosen = [{**known.get(c.get("name"), {}), **c} for c in own]
         return [_ranged(one, command) for one in chosen]
 
 

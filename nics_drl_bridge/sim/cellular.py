@@ -119,11 +119,10 @@ def _world(filled: NDArray[np.bool_], given: Cellular, number: int) -> World:
     long = deep + 2.0 * given.margin
     middle = wide / 2.0
     poses = [(px, py, 0.0) for px, py in np.round(np.stack([x, y], axis=1), 6).tolist()]
-    one = (
-        Obstacles(shapes=(Circle(radius=given.cell / 2.0),), at=tuple(poses))
-        if poses
-        else None
-    )
+    if poses:
+        one = Obstacles(shapes=(Circle(radius=given.cell / 2.0),), at=tuple(poses))
+    else:
+        one = None
     start = given.margin / 2.0
     goal = long - given.margin / 2.0
     return World(

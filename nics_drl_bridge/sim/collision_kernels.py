@@ -204,9 +204,9 @@ def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
     depth = max(_deepest(p, q), _deepest(q, p))
     if depth > 0.0:
         return -depth
-    return (
-        -TOUCHING if crossing and (q.end - q.begin > 2 or p.end - p.begin > 2) else 0.0
-    )
+    if crossing and (q.end - q.begin > 2 or p.end - p.begin > 2):
+        return -TOUCHING
+    return 0.0
 
 
 @kernel

@@ -105,9 +105,10 @@ class Entities:
     def _put(self, bodies: Array, entity: Entity, pose: Array | None) -> None:
         first = len(self.simulator.sampler.shapes) - len(self._spare)
         for slot, (shape, part) in zip(entity.slots, entity.parts, strict=True):
-            index = (
-                first + slot - self._own if slot >= self._own else bodies[slot, SHAPE]
-            )
+            if slot >= self._own:
+                index = first + slot - self._own
+            else:
+                index = bodies[slot, SHAPE]
             at = geometry.compose(np.asarray(pose), np.asarray(part))
             bodies[slot] = place(at, shape.radius, index)
 

@@ -261,9 +261,9 @@ def _corner(nx: float, ny: float, body: Placed, rate: float) -> tuple[float, flo
     first = _rate(nx, ny, body, edge.ax, edge.ay) == rate
     second = _rate(nx, ny, body, edge.bx, edge.by) == rate
     nearer = nx * edge.bx + ny * edge.by < nx * edge.ax + ny * edge.ay
-    return (
-        (edge.bx, edge.by) if second and (nearer or not first) else (edge.ax, edge.ay)
-    )
+    if second and (nearer or not first):
+        return (edge.bx, edge.by)
+    return (edge.ax, edge.ay)
 
 
 @kernel

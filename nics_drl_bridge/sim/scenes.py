@@ -155,14 +155,14 @@ class SceneSampler:
         """Returns seeds, numbers of obstacles (-1 for the world's own) and sizes; see `draw`."""
         numbers = checked_seeds(seeds)
         n = len(numbers)
-        wanted = (
-            np.full(n, -1)
-            if count is None
-            else np.maximum(np.asarray(count, np.int64), 0)
-        )
-        sizes = (
-            np.zeros(n, np.int64) if size is None else np.asarray(size, dtype=np.int64)
-        )
+        if count is None:
+            wanted = np.full(n, -1)
+        else:
+            wanted = np.maximum(np.asarray(count, np.int64), 0)
+        if size is None:
+            sizes = np.zeros(n, np.int64)
+        else:
+            sizes = np.asarray(size, dtype=np.int64)
         if wanted.shape != (n,) or sizes.shape != (n,):
             raise ConfigError(
                 f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
@@ -424,9 +424,10 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     nothing = np.zeros(0, np.int32)
     given = world.starts is not None and world.goals is not None
     for_robots = nothing if given else np.flatnonzero(area).astype(np.int32)
-    anywhere = (
-        np.flatnonzero(cells.distances > 0.0).astype(np.int32) if drawn else nothing
-    )
+    if drawn:
+        anywhere = np.flatnonzero(cells.distances > 0.0).astype(np.int32)
+    else:
+        anywhere = nothing
     return FreeSpace(cells, area, bounds, walls, grid, for_robots, anywhere, room)
 
 

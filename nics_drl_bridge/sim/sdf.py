@@ -258,9 +258,10 @@ class _Scope:
         where: str = "",
     ) -> Array:
         """(4, 4) of a `<pose>` in this scope; by default from `start`, or from the frame `base`."""
-        given = (
-            "" if pose is None else pose.get("relative_to") or pose.get("frame") or ""
-        )
+        if pose is None:
+            given = ""
+        else:
+            given = pose.get("relative_to") or pose.get("frame") or ""
         if start is None or given:
             start = self.frame(given or base)
         return start @ _matrix(pose, where or self.where)

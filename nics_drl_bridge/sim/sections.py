@@ -148,11 +148,9 @@ def _of_cylinder(body: Cylinder, pose: Array, up: float) -> _Cut:
     if abs(pose[2, 2]) >= math.sin(TILT):
         raise ShapelessError("a cylinder that leans")
     width2 = body.radius**2 - up**2
-    return (
-        None
-        if width2 <= 0.0
-        else _rectangle(pose, 2, (body.length, 2.0 * math.sqrt(width2)))
-    )
+    if width2 <= 0.0:
+        return None
+    return _rectangle(pose, 2, (body.length, 2.0 * math.sqrt(width2)))
 
 
 def _of_capsule(body: Capsule, pose: Array, up: float) -> _Cut:

@@ -229,11 +229,9 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
         return _hold(dx, dy, nx, ny, here, True)
     if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
         # In contact with the map it may only move to where there is no less room.
-        return (
-            (dx, dy)
-            if map_distance(x + dx, y + dy, grid) - radius >= here
-            else (0.0, 0.0)
-        )
+        if map_distance(x + dx, y + dy, grid) - radius >= here:
+            return (dx, dy)
+        return (0.0, 0.0)
     free = 0.0
     way = 0.0
     room = here

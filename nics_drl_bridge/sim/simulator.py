@@ -165,11 +165,10 @@ class EpisodeSampler:
     ) -> None:
         given = randomisation
         sizes = (1.0,) if given is None else given.sizes
-        most = (
-            None
-            if given is None or given.obstacles.count is None
-            else given.obstacles.count[1]
-        )
+        if given is None or given.obstacles.count is None:
+            most = None
+        else:
+            most = given.obstacles.count[1]
         self.scenes = SetSampler(
             world, model.robot.footprint_radius, robots, sizes, most
         )
@@ -353,11 +352,10 @@ class FastSimulator:
         call it in parallel for different parts. Raises ConfigError if seeds, starts or a scene do
         not fit.
         """
-        chosen = (
-            np.arange(len(self.data.steps))
-            if worlds is None
-            else np.asarray(worlds, np.int64)
-        )
+        if worlds is None:
+            chosen = np.arange(len(self.data.steps))
+        else:
+            chosen = np.asarray(worlds, np.int64)
         scenes, draws = self.episodes.draw(seeds)
         given = starts(scenes) if callable(starts) else starts
         begin = scenes.starts if given is None else np.asarray(given, dtype=np.float64)

@@ -118,14 +118,13 @@ def _content(path: Path, keys: tuple[str, ...]) -> dict[str, Any] | None:
     if path.suffix not in YAML or not path.is_file():
         return None
     text = read_text(path)
-    content = (
-        parse_yaml(text, str(path)) if any(f"{key}:" in text for key in keys) else None
-    )
-    return (
-        content
-        if isinstance(content, dict) and any(key in content for key in keys)
-        else None
-    )
+    if any(f"{key}:" in text for key in keys):
+        content = parse_yaml(text, str(path))
+    else:
+        content = None
+    if isinstance(content, dict) and any(key in content for key in keys):
+        return content
+    return None
 
 
 def _read_set(path: Path, file: SetFile) -> WorldSet:

@@ -46,9 +46,10 @@ class BagSource:
             Path(path),
             world or place_of(self._model, self._shots),
         )
-        self.period_s = (
-            float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.1
-        )
+        if len(self._times) > 1:
+            self.period_s = float(np.median(np.diff(self._times)))
+        else:
+            self.period_s = 0.1
         self._now = 0
 
     def stage(self) -> Stage:

@@ -91,16 +91,18 @@ class Lane:
         if self.state:
             self._over_s += self.env.model.control_period
             return False
-        action = (
-            self._driver.act(self._seen) if command is None else self._action(command)
-        )
+        if command is None:
+            action = self._driver.act(self._seen)
+        else:
+            action = self._action(command)
         self._seen, _, terminated, truncated, info = self._env.step(action)
         self.time_s += self.env.model.control_period
         self.trail.add(self.env.snapshot().poses, 1)
         if terminated or truncated:
-            touched = (
-                "collision" if np.any(info.get("collision", False)) else "time-out"
-            )
+            if np.any(info.get("collision", False)):
+                touched = "collision"
+            else:
+                touched = "time-out"
             self.state = "success" if np.all(info.get("is_success", False)) else touched
         return False
 
@@ -267,11 +269,10 @@ class EpisodeSource:
 
     def _furnish(self, lane: Lane, request: Request) -> bool:
         if request.kind == "obstacle":
-            side = 2.0 * request.size
-            round_ = request.shape == "circle"
-            shape = (
-                Circle(radius=request.size) if round_ else Rectangle(size=(side, side))
-            )
+            shape: Shape = Circle(radius=request.size)
+            if request.shape != "circle":
+                side = 2.0 * request.size
+                shape = Rectangle(size=(side, side))
             lane.add(shape, request.x, request.y)
         elif request.kind == "clear":
             lane.clear()

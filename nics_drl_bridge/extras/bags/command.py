@@ -300,15 +300,13 @@ def _numbers(given: str | None, episodes: int) -> set[int] | None:
 
 def _row(each: Any) -> tuple[str, ...]:
     span = "" if each.first_s is None else f"{each.first_s:.2f}, {each.last_s:.2f}"
-    gaps = (
-        ""
-        if each.longest_gap_s is None
-        else f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
-    )
-    delay = (
-        ""
-        if each.delay_s is None
-        else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"
-    )
+    if each.longest_gap_s is None:
+        gaps = ""
+    else:
+        gaps = f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
+    if each.delay_s is None:
+        delay = ""
+    else:
+        delay = f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"
     rate = "" if each.rate_hz is None else f"{each.rate_hz:.2f}"
     return each.topic, each.type, str(each.count), rate, span, gaps, each.clock, delay

@@ -61,11 +61,10 @@ def bag_info(path: str | Path) -> BagInfo:
         topics = tuple(
             _topic(t, bag.types[t], ns - start, s) for t, (ns, s) in received.items()
         )
-    files = (
-        [path]
-        if path.is_file()
-        else [file for file in path.iterdir() if file.is_file()]
-    )
+    if path.is_file():
+        files = [path]
+    else:
+        files = [file for file in path.iterdir() if file.is_file()]
     size = sum(file.stat().st_size for file in files)
     return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
 
@@ -94,7 +93,12 @@ def _topic(
         jitter = float(high - low)
         backwards = int((np.diff(since - delays) < 0).sum())
         near = SAME_CLOCK_S[0] <= delay <= SAME_CLOCK_S[1]
-        clock = SEVERAL if jitter > MAX_WANDER_S else RECORDER if near else FOREIGN
+        if jitter > MAX_WANDER_S:
+            clock = SEVERAL
+        elif near:
+            clock = RECORDER
+        else:
+            clock = FOREIGN
     if not len(since):
         return BagTopic(topic, kind, 0, clock=clock)
     apart = np.diff(since) * S_PER_NS

@@ -211,11 +211,9 @@ def _table(columns: Columns) -> "Table":
         # What has one element is a scalar to LeRobot, and else a list of a fixed length.
         flat = pyarrow.array(np.ascontiguousarray(column).reshape(-1))
         wide = column.ndim > 1 and column.shape[1] > 1
-        return (
-            pyarrow.FixedSizeListArray.from_arrays(flat, column.shape[1])
-            if wide
-            else flat
-        )
+        if wide:
+            return pyarrow.FixedSizeListArray.from_arrays(flat, column.shape[1])
+        return flat
 
     return pyarrow.table({name: array(column) for name, column in columns.items()})
 

@@ -216,9 +216,10 @@ class _Player:
         found = message_type(kind)
         if found is None:
             return False
-        name = (
-            topic if topic in (CLOCK, "/tf", "/tf_static") else f"{self._space}{topic}"
-        )
+        if topic in (CLOCK, "/tf", "/tf_static"):
+            name = topic
+        else:
+            name = f"{self._space}{topic}"
         best = Offer(  # matches any subscriber of one of the publishers
             max((offer.depth for offer in offers), default=USUAL_DEPTH),
             not offers or any(offer.reliable for offer in offers),

@@ -111,9 +111,10 @@ class StandardEpisodes:
             )
 
     def _client(self, name: str) -> Any:
-        prefix = (
-            f"{self._options.services.rstrip('/')}/" if self._options.services else ""
-        )
+        if self._options.services:
+            prefix = f"{self._options.services.rstrip('/')}/"
+        else:
+            prefix = ""
         kind = getattr(self._types, name)
         return self._link.node.create_client(kind, f"{prefix}{snake_case(name)}")
 
@@ -141,11 +142,10 @@ class StandardEpisodes:
             "state": kinds.SimulationState(state=kinds.SimulationState.STATE_PAUSED)
         }
         self._pause(timeout_s)
-        step_ns = (
-            self._measured(timeout_s)
-            if self._options.step_s is None
-            else round(self._options.step_s * NS_PER_S)
-        )
+        if self._options.step_s is None:
+            step_ns = self._measured(timeout_s)
+        else:
+            step_ns = round(self._options.step_s * NS_PER_S)
         self._steps = max(1, round(self._period_ns / step_ns))
         if abs(self._steps * step_ns - self._period_ns) > TOLERANCE * step_ns:
             parts = f"a control period of {self._period_ns / NS_PER_S:g} s is no whole number of"

@@ -104,11 +104,9 @@ class Spawning:
                     found.text, z if np.isfinite(z) else 0.0, found.source
                 )
             model = model_of_yaml(found.text, found.source)
-            return (
-                model
-                if found.path is None or model.name
-                else model._replace(name=found.path.stem)
-            )
+            if found.path is None or model.name:
+                return model
+            return model._replace(name=found.path.stem)
         except AssetsError as error:
             code = codes.missing_assets if error.missing else codes.unsupported_assets
             raise RefusalError(code, str(error)) from None
@@ -139,11 +137,10 @@ class Spawning:
         space = given or re.sub(r"\W", "_", name)
         code = SpawnResult.NAMESPACE_INVALID
         if (robot or given) and not NAMESPACE.fullmatch(space):
-            told = (
-                f"entity_namespace {given!r} is"
-                if given
-                else f"the name {name!r} makes"
-            )
+            if given:
+                told = f"entity_namespace {given!r} is"
+            else:
+                told = f"the name {name!r} makes"
             code = code if given else SpawnResult.NAME_INVALID
             raise RefusalError(
                 code, f"{told} no namespace of ROS; write it as in 'robot_1'."
@@ -198,18 +195,16 @@ class Spawning:
             )
 
     def _list(self, file: Path, uri: str, response: Any) -> None:
-        read = (
-            model_of_sdf
-            if resources.SUFFIXES[file.suffix.lower()] == resources.SDF
-            else None
-        )
+        if resources.SUFFIXES[file.suffix.lower()] == resources.SDF:
+            read = model_of_sdf
+        else:
+            read = None
         try:
             text = read_text(file, resources.MOST_BYTES)
-            model = (
-                model_of_yaml(text, str(file))
-                if read is None
-                else read(text, 0.0, str(file))
-            )
+            if read is None:
+                model = model_of_yaml(text, str(file))
+            else:
+                model = read(text, 0.0, str(file))
         except (BridgeError, OSError):
             return  # a world, or something else that is no entity
         hulls = [

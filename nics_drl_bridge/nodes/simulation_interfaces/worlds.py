@@ -138,11 +138,10 @@ class Worlds:
         except ConfigError as error:
             if not found.form and "unknown world" in str(error):
                 raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
-            code = (
-                codes.missing_assets
-                if "no such file" in str(error)
-                else codes.parse_error
-            )
+            if "no such file" in str(error):
+                code = codes.missing_assets
+            else:
+                code = codes.parse_error
             raise RefusalError(code, str(error)) from None
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
@@ -157,11 +156,10 @@ class Worlds:
         standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
             missing = any(ABSENT in each for each in standing.left_out)
-            code = (
-                self._codes.missing_assets
-                if missing
-                else self._codes.unsupported_assets
-            )
+            if missing:
+                code = self._codes.missing_assets
+            else:
+                code = self._codes.unsupported_assets
             told = f"{name}: {standing.left_out[0]}, which is no shape of a world"
             raise RefusalError(
                 code, f"{told}; put a box in its place, or ignore such assets."
@@ -243,9 +241,10 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     }
     x1, y1, x2, y2 = world.extent
     size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
-    told = (
-        f"{len(members)} worlds in {size}" if len(members) > 1 else f"a field of {size}"
-    )
+    if len(members) > 1:
+        told = f"{len(members)} worlds in {size}"
+    else:
+        told = f"a field of {size}"
     tags = [tag for tag, holds in about.items() if holds]
     return WorldResource(
         name=world.name, world_resource=resource, description=told, tags=tags
