@@ -5,7 +5,6 @@ import fcntl
 import json
 import os
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from nics_drl_bridge.nodes.black_box_writer import (
     STATE,
     WRITE,
 )
+from nics_drl_bridge.nodes.child_python import module_command
 from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
@@ -312,7 +312,7 @@ class BoxWriter:
             fcntl.fcntl(self._entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", black_box_writer.__name__],
+                module_command(black_box_writer.__name__),
                 stdin=source,
                 stdout=target,
                 stderr=subprocess.DEVNULL,

@@ -258,6 +258,21 @@ def test_a_file_that_can_not_be_written_is_told_of_in_the_log_and_the_diagnostic
     log.close()
 
 
+def test_the_writer_imports_nothing_from_the_working_folder(
+    tmp_path, logger, monkeypatch
+):
+    canary = tmp_path / "canary"
+    for module in ("json", "numpy", "nics_drl_bridge"):
+        (tmp_path / f"{module}.py").write_text(f"open({str(canary)!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    log = GateLog(config(), tmp_path / "stops", "car", logger)
+    rig = Recorded(log).drive()
+    rig.stop_by_nonsense()
+    written(log, tmp_path / "stops", 1)
+    log.close()
+    assert not canary.exists()
+
+
 def test_a_writer_that_was_killed_is_told_of_and_the_next_stop_is_written(
     tmp_path, log, logger, monkeypatch
 ):
