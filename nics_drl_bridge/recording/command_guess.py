@@ -315,6 +315,7 @@ def guess_command(
         kind, commands = _fitting_kind(list(_wheels_of(tables)))
         if kind is not None:
             return CommandGuess(kind, commands, {}, of_wheels=True)
+    found = found or [each for table in tables for each in _unexplained_in(table, pose)]
     kind, candidates = _fitting_kind(found)
     if kind is None:
         some = sorted(found, key=lambda each: -each.strength)[:MOST_CANDIDATES]
@@ -352,6 +353,34 @@ def _candidates_of(
         known = meaning is not None or strength >= LIKELY
         if known and not (table.kind in TWIST_KINDS and meaning is None):
             yield Candidate(table, column, meaning, strength, _rank_of(table, context))
+
+
+def _unexplained_in(table: TableSurvey, pose: PoseGuess | None) -> Iterator[Candidate]:
+    """Yields the columns of a table of no message whose names tell nothing, as in other languages.
+
+    None of them was certainly sent to the robot, but none was certainly measured either.
+    """
+    beside = (
+        {*words_of(table.name)}
+        if pose is not None and pose.table is not table
+        else set()
+    )
+    if table.kind or beside & (NEVER_WORDS | MEASURING):
+        return
+    taken = {*table.stamp_columns} | (
+        {*pose.columns} if pose and pose.table is table else set()
+    )
+    for column in table.numbers:
+        words = {*words_of(column.name)}
+        told = bool(words & (NEVER_WORDS | MEASURING | WHEEL_WORDS | {"x", "y", "z"}))
+        told = (
+            told
+            or column.name in taken
+            or column.name.isdecimal()
+            or _is_place_on_earth(column)
+        )
+        if not told and column.low < column.high:
+            yield Candidate(table, column, None, POSSIBLE)
 
 
 def _strength_of(

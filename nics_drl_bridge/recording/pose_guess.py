@@ -131,6 +131,7 @@ SENSORS = {
     "feedback",
     "model",
 }
+SOURCES = TRACKERS | LOCALISERS | SENSORS | {"ground"}
 # Types of messages that hold positions of something else, or of a goal.
 OTHER_PLACES = re.compile(
     r"^(visualization|actionlib|action|move_base|map)_msgs/"
@@ -174,7 +175,11 @@ def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
 
 def _trust(pose: PoseGuess) -> float:
     """Returns how far a pose is to be preferred to others, by what its names say."""
-    words = {*words_of(f"{pose.table.name} {pose.x}")}
+    words = {*words_of(pose.x)}
+    if (
+        pose.table.kind or not words & SOURCES
+    ):  # else the column itself says more than its file
+        words |= {*words_of(pose.table.name)}
     trust = 0.0
     if words & TRACKERS or {"ground", "truth"} <= words:
         trust += 3.0

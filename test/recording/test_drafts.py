@@ -541,6 +541,42 @@ def test_a_draft_of_a_table_is_right_or_blank(tmp_path, style):
         assert drive.variables == tuple(commands)
 
 
+def test_columns_of_a_tracker_are_taken_before_odometry_whatever_the_file_is_called(
+    tmp_path,
+):
+    given = {
+        "t": M["t"],
+        "odom_x": M["x"] * 1.1,
+        "odom_y": M["y"] * 1.1,
+        "odom_yaw": M["yaw"],
+    }
+    given |= {
+        "gt_x": M["x"],
+        "gt_y": M["y"],
+        "gt_yaw": M["yaw"],
+        "cmd_v": M["v"],
+        "cmd_w": M["w"],
+    }
+    for name in ("drive", "gt_and_odom", "vicon"):
+        text, _ = drafted(write(tmp_path / f"{name}.csv", given))
+        assert "x: gt_x" in text, (name, text)
+
+
+def test_columns_that_no_word_explains_are_candidates(tmp_path):
+    given = {
+        "t": M["t"],
+        "x": M["x"],
+        "y": M["y"],
+        "yaw": M["yaw"],
+        "imu_wz": M["rate"],
+    }
+    given |= {"vitesse_consigne": M["v"], "virage_consigne": M["w"], "still": M["zero"]}
+    text, _ = drafted(write(tmp_path / "drive.csv", given))
+    assert "no command was recorded" not in text
+    assert "#  command_0: vitesse_consigne\n#  command_1: virage_consigne\n" in text
+    assert "command_2" not in text
+
+
 def test_a_blank_lists_the_candidates_as_comments_that_can_be_uncommented(tmp_path):
     columns, *_ = TABLES["bare v and w"]
     path = write(tmp_path / "log.csv", {name: M[c] for name, c in columns.items()})
