@@ -159,6 +159,7 @@ def rate(
         return Assessment(Verdict.DO_NOT_TRAIN, ())
     (at,) = judged
     ratings = [_rate_error(at, radius), _rate_band(at), _rate_beside_twist(at)]
+    ratings.append(_rate_beside_standing(at, radius))
     if not textbook and loses_to_textbook(judgement):
         ratings.append(
             Assessment(Verdict.DO_NOT_TRAIN, tuple(shortfall_of_textbook(at)))
@@ -218,3 +219,15 @@ def _rate_beside_twist(at: HorizonErrors) -> Assessment:
     return Assessment(
         verdicts.get(outcome, Verdict.DO_NOT_TRAIN), tuple(shortfall_of_twist(at))
     )
+
+
+def _rate_beside_standing(at: HorizonErrors, radius: float) -> Assessment:
+    """Rates predictions beside a robot that never moves, which noise alone makes a path of."""
+    if at.standing is None or at.path_m <= radius:
+        return Assessment(Verdict.GOOD, ())
+    outcome = compare(at.model, at.standing, at.standing_noise_m, 0.0)
+    if outcome is Outcome.BETTER:
+        return Assessment(Verdict.GOOD, ())
+    finding = _beside("a robot that never moves", at, at.standing)
+    reason = f"{finding}: the pose does not follow these commands."
+    return Assessment(Verdict.DO_NOT_TRAIN, (reason,))

@@ -24,6 +24,7 @@ from nics_drl_bridge.identify.acceptance import shortfall
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.by_recording import about_recordings
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
+from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
 from nics_drl_bridge.identify.gyro import turned_by_gyro
@@ -829,6 +830,7 @@ class Identified:
         if unfit:
             ratings.append(acceptance.Assessment(acceptance.Verdict.DO_NOT_TRAIN, ()))
         doubtful = any(isinstance(note, verdict.Doubt) for note in self.notes)
+        doubtful |= any(doubts_of_commands(self.judgement, self.calibration))
         if self.model.assumed or doubtful:
             ratings.append(acceptance.Assessment(acceptance.Verdict.WITH_CARE, ()))
         return acceptance.combined(ratings)

@@ -94,6 +94,8 @@ def judged(
                 coverage=None if band is None else float((far <= band).mean()),
                 kept_twist_noise_m=noise_beside(ends, kept, chosen, horizon),
                 textbook_noise_m=noise_beside(ends, by_textbook, chosen, horizon),
+                standing=errors_of_ends(chosen.start, chosen),
+                standing_noise_m=noise_beside(ends, chosen.start, chosen, horizon),
             )
         )
     return tuple(told)

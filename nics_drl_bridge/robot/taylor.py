@@ -350,6 +350,10 @@ class HorizonErrors:
     # Noise of the differences between the model's errors and those of the yardsticks [m]
     kept_twist_noise_m: float | None = None
     textbook_noise_m: float | None = None
+    standing: EndErrors | None = (
+        None  # of a robot that never moves; None: an older file
+    )
+    standing_noise_m: float | None = None  # of the difference to it [m]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from identify import planted
+from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import generate, lidar_of, load_model, save_model
 from nics_drl_bridge.identify.acceptance import (
     THRESHOLDS,
@@ -38,6 +39,7 @@ def after_5_s(
     twist: float = 8.0,
     coverage: float | None = 0.95,
     noise: float = 0.0,
+    standing: float | None = None,
 ) -> tuple[HorizonErrors, ...]:
     """Returns the judgement of a model of which one horizon is known."""
     at = HorizonErrors(
@@ -51,6 +53,8 @@ def after_5_s(
         coverage=coverage,
         kept_twist_noise_m=noise,
         textbook_noise_m=noise,
+        standing=None if standing is None else errors(standing),
+        standing_noise_m=noise,
     )
     return (at,)
 
@@ -78,6 +82,10 @@ def after_5_s(
             Verdict.DO_NOT_TRAIN,
         ),  # half of the robot, on the spot
         (after_5_s(0.01, path=0.0), Verdict.GOOD),
+        (after_5_s(0.9, standing=1.0), Verdict.GOOD),
+        (after_5_s(0.9, standing=1.0, noise=0.2), Verdict.DO_NOT_TRAIN),
+        (after_5_s(0.9, standing=0.8), Verdict.DO_NOT_TRAIN),
+        (after_5_s(0.01, path=0.0, standing=0.0), Verdict.GOOD),  # it stood still
         ((), Verdict.DO_NOT_TRAIN),
     ],
 )
@@ -159,6 +167,22 @@ def test_in_one_stretch_the_noise_is_that_of_a_single_window():
 )
 def test_a_coefficient_is_printed_so_that_it_can_be_used(value, error, text):
     assert with_error(value, error) == text
+
+
+@pytest.mark.slow
+def test_a_pose_that_has_nothing_to_do_with_the_commands_is_not_trained_on():
+    """Noise makes a long path, of which the error is a small share."""
+    rng = np.random.default_rng(3)
+    spec = planted.wheeled().model_copy(update={"state": ()})
+    made = planted.wheeled_drive()
+    walk = np.cumsum(rng.normal(0.0, 0.02, made.pose.values.shape), axis=0)
+    walk[:, 2] = geometry.wrap_angle(walk[:, 2])
+    strayed = replace(made.pose, values=walk)
+    found = identify(replace(made, pose=strayed, state=None), spec)
+    assert found.verdict is Verdict.DO_NOT_TRAIN
+    assert any(
+        "a robot that never moves" in reason for reason in found.assessment.reasons
+    )
 
 
 @pytest.fixture(scope="module")
