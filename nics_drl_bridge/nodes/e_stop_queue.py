@@ -21,10 +21,12 @@ class EStopQueue:
         )  # times [s], and messages read at each
         self._ticked_s: float | None = None  # last tick of the gate
         self._ever_heard = False
+        self._since_tick = 0  # messages
 
     def hear(self, now: float, messages: int) -> None:
         """Accounts for messages that were read at a steady time [s]."""
         self._ever_heard = True
+        self._since_tick += messages
         self._heard.append((now, messages))
         while now - self._heard[0][0] > RATE_WINDOW_S:
             self._heard.popleft()
@@ -33,6 +35,14 @@ class EStopQueue:
         """Returns why the sleep since the last tick may have lost a press; else ""."""
         before = self._ticked_s
         self._ticked_s = now
+        waiting = self._since_tick
+        self._since_tick = 0
+        if (
+            waiting > QUEUE_MESSAGES
+        ):  # a publisher that began in a sleep has no rate from before
+            return (
+                f"{waiting} messages came at once, and a press among more may be lost"
+            )
         if before is None or not self._ever_heard:
             return ""
         asleep = now - before

@@ -14,7 +14,7 @@ def heard_at(rate, seconds=2.0):
     queue = EStopQueue()
     for k in range(round(rate * seconds), -1, -1):
         queue.hear(-k / rate, 1)
-    assert queue.tick(0.0) == ""
+        assert queue.tick(-k / rate) == ""
     return queue
 
 
@@ -28,6 +28,15 @@ def test_a_sleep_in_which_all_messages_fit_is_no_press(rate):
 def test_a_sleep_in_which_more_may_have_come_counts_as_a_press(rate):
     fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
     assert "the gate slept for" in heard_at(rate).tick(1.1 * fits)
+
+
+def test_more_messages_at_once_than_surely_fit_count_as_a_press():
+    """A second publisher at 1 kHz began in a short sleep, of whose rate nothing is known yet."""
+    queue = heard_at(100.0)
+    queue.hear(0.4, 250)
+    assert "250 messages came at once" in queue.tick(0.4)
+    queue.hear(0.42, 20)
+    assert queue.tick(0.42) == ""
 
 
 def test_without_a_button_a_sleep_loses_no_press():
