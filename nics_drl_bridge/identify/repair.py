@@ -44,6 +44,7 @@ MOST_JUMPS = 0.02  # of the steps: more of them are noise
 MOST = (
     0.15  # jumps in more than this share of the rows are not faults of single samples
 )
+HELD_S = 0.5  # a pose that keeps one value for longer, and then leaps, was held
 EXCESS = 0.01  # commands may exceed their limits by this share of their range
 WRONG_UNIT = (
     5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
@@ -89,7 +90,13 @@ TRAVEL_NOISE = 25.0
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
     """Drops rows, joins what jumps split, clips commands; a sentence on each kind of fault."""
     notes: list[str] = []
-    for repair in (_without_repetitions, _without_jumps, _joined, _within_limits):
+    for repair in (
+        _without_repetitions,
+        _without_held_poses,
+        _without_jumps,
+        _joined,
+        _within_limits,
+    ):
         drive = drive.part(repair(drive, notes))
     return drive, tuple(notes)
 
@@ -109,6 +116,39 @@ def _without_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording
             recording = _with_rows(recording, name, keep)
             notes.append(note)
     return recording
+
+
+def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
+    """Leaves out a pose that was held where tracking was lost, so that there is a gap instead.
+
+    A robot that stands is seen at the same place, too, but goes on from there.
+    """
+    recording = drive.recording
+    t = drive.sample_t
+    pose = drive.recording.pose.values
+    if len(t) < 2:
+        return recording
+    speeds = [abs(v) for c in drive.spec.command if not c.turns for v in (c.min, c.max)]
+    reach = REACH * max(speeds, default=0.0) * np.diff(t)
+    leap = np.hypot(*np.diff(pose[:, :2], axis=0).T) > np.maximum(reach, 1e-6)
+    same = np.concatenate([[False], (pose[1:] == pose[:-1]).all(axis=1)])
+    held = np.zeros(len(t), dtype=np.bool_)
+    for last in np.flatnonzero(same[:-1] & leap):
+        changes = np.flatnonzero(~same[: last + 1])
+        first = changes[-1]
+        if t[last] - t[first] >= HELD_S:
+            held[first + 1 : last + 1] = True
+    if not held.any():
+        return recording
+    begins = np.flatnonzero(held & ~np.concatenate([[False], held[:-1]])) - 1
+    ends = np.flatnonzero(held & ~np.concatenate([held[1:], [False]]))
+    for begin, end in zip(begins, ends, strict=True):
+        span = f"from {t[begin] - t[0]:.1f} s to {t[end] - t[0]:.1f} s"
+        leap_m = np.hypot(*(pose[end + 1] - pose[end])[:2])
+        finding = f"The pose keeps one value {span} and then leaps by {leap_m:.2f} m"
+        cause = "as where tracking was lost: these rows were left out"
+        notes.append(Gap(f"{finding}, {cause}, and what happened there is not known."))
+    return _with_rows(recording, "pose", ~held)
 
 
 def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:

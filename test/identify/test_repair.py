@@ -21,7 +21,7 @@ from nics_drl_bridge.identify.repair import (
     check_units,
     repaired,
 )
-from nics_drl_bridge.identify.verdict import Mistake
+from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.readers import robot_and_drive
 from nics_drl_bridge.recording.recording import (
@@ -105,6 +105,36 @@ def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
 def test_a_gap_in_the_poses_is_no_jump(differential):
     gappy = without(drive(differential, duration=20.0, noise=(5e-4, 1e-3)), 8.0, 11.0)
     assert repaired(Drive(gappy, differential))[1] == ()
+
+
+def held(recording: Recording, begin: float, end: float) -> Recording:
+    """The pose keeps its value of `begin` up to `end`, as of a tracker that lost the robot."""
+    t = recording.pose.t
+    values = recording.pose.values.copy()
+    lost = (t > begin) & (t < end)
+    values[lost] = values[np.flatnonzero(lost)[0] - 1]
+    return replace(recording, pose=replace(recording.pose, values=values))
+
+
+def test_a_pose_that_was_held_is_left_out_and_told(differential):
+    plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
+    mended, notes = repaired(Drive(held(plain, 8.0, 11.0), differential))
+    (told,) = notes
+    assert isinstance(told, Gap)
+    assert "keeps one value from 8.0 s to 11.0 s and then leaps by" in told
+    t = mended.recording.pose.t
+    assert np.diff(t).max() == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_robot_that_stood_and_goes_on_from_there_was_not_held(differential):
+    plain = drive(differential, duration=20.0)
+    t = plain.pose.t
+    values = plain.pose.values
+    later = np.maximum(np.minimum(t, 8.0), t - 3.0)  # it stands from 8 s to 11 s
+    stood = np.stack([np.interp(later, t, each) for each in values.T], axis=1)
+    paused = replace(plain, pose=replace(plain.pose, values=stood))
+    notes = repaired(Drive(paused, differential))[1]
+    assert not any("keeps one value" in note for note in notes)
 
 
 def test_steering_in_degrees_is_refused_though_the_limits_are_those_recorded():
