@@ -24,6 +24,9 @@ DISPLAYED_FORMULA = re.compile(r"^\$\$\n(?P<tex>.+?)\n\$\$$", re.MULTILINE | re.
 INLINE_FORMULA = re.compile(r"(?<![\w$`])\$(?P<tex>[^$`\n]+)\$(?![\w$`])")
 EQUATION_NUMBER = re.compile(r"\\tag\{(\d+)\}")
 CODE = re.compile(r"(^```.*?^```|`[^`\n]*`)", re.MULTILINE | re.DOTALL)
+TABLE_CELL = re.compile(r"<td\b.*?</td>", re.DOTALL)
+CODE_IN_HTML = re.compile(r"<code>(?P<text>[^<]*)</code>")
+JOINT = re.compile(r"(?<=[_/.:])(?=\w)")  # between two parts of a name
 LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<to>[^)#\s:]+)(?P<anchor>#[^)]*)?\)")
 
 
@@ -72,10 +75,17 @@ def with_formulas(markdown: str) -> str:
     markdown = DISPLAYED_FORMULA.sub(displayed_formula, markdown)
     parts = CODE.split(markdown)
     for index in range(0, len(parts), 2):  # every other part is code
-        parts[index] = INLINE_FORMULA.sub(
-            lambda match: convert(match["tex"]), parts[index]
-        )
+        parts[index] = INLINE_FORMULA.sub(inline_formula, parts[index])
     return "".join(parts)
+
+
+def inline_formula(match: re.Match[str]) -> str:
+    """A formula within a sentence.
+
+    Markdown takes `<math>` at the beginning of a line for a block, which would break the sentence
+    into paragraphs; `<span>` it leaves in its place.
+    """
+    return f'<span class="formula">{convert(match["tex"])}</span>'
 
 
 def displayed_formula(match: re.Match[str]) -> str:
@@ -83,12 +93,21 @@ def displayed_formula(match: re.Match[str]) -> str:
     number = EQUATION_NUMBER.search(match["tex"])
     formula = convert(EQUATION_NUMBER.sub("", match["tex"]).strip(), display="block")
     label = f'<span class="equation-number">({number[1]})</span>' if number else ""
-    return f'<div class="equation">{formula}{label}</div>\n'
+    return f'<div class="equation"><div class="equation-formula">{formula}</div>{label}</div>\n'
 
 
 def on_post_page(output: str, page: Any, config: MkDocsConfig) -> str:
-    """Lets pages on disk be searched, too."""
-    return SHIM.sub(lambda _: FROM_DISK, output)
+    """Lets pages on disk be searched, too, and names in tables be broken at their joints."""
+    return with_break_points(SHIM.sub(lambda _: FROM_DISK, output))
+
+
+def with_break_points(html: str) -> str:
+    """Lets a browser break names in table cells behind `_`, `/`, `.` and `:`, and only there."""
+
+    def within_code(code: re.Match[str]) -> str:
+        return f"<code>{JOINT.sub('<wbr>', code['text'])}</code>"
+
+    return TABLE_CELL.sub(lambda cell: CODE_IN_HTML.sub(within_code, cell[0]), html)
 
 
 def on_post_template(
