@@ -40,11 +40,10 @@ def drawn(
     for k, pose in enumerate(episode.path):
         env.reset(seed=episode.seed, options={"start": pose})
         shot = picture.draw(env.snapshot(), [episode.path[: k + 1, :2]])
-        image = Image.new("RGB", (SIDE, SIDE + HEAD), "white")
-        image.paste(
-            Image.fromarray(shot).resize((SIDE, SIDE), Image.Resampling.LANCZOS),
-            (0, HEAD),
-        )
+        height = round(SIDE * shot.shape[0] / shot.shape[1])
+        image = Image.new("RGB", (SIDE, height + HEAD), "white")
+        scaled = Image.fromarray(shot).resize((SIDE, height), Image.Resampling.LANCZOS)
+        image.paste(scaled, (0, HEAD))
         end = f": {episode.result}" if k == len(episode.path) - 1 else ""
         title = f"{LABELS[place]}{end}"
         ImageDraw.Draw(image).text((SIDE / 2, 5), title, "#17202a", font, anchor="ma")

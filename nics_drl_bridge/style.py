@@ -1,10 +1,10 @@
 """One style of all pictures: type, and colours of Okabe and Ito, which every eye tells apart."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from textwrap import fill
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
 from cycler import cycler
@@ -57,6 +57,22 @@ RC: dict[Any, Any] = {
     "ytick.labelsize": 9.0,
 }
 LETTERS_PER_IN = 10.5  # of a title
+LINE_IN = 0.19  # height of a line of a title or a legend [inch]
+# around a panel of a fixed size [inch]: ticks and label of y
+LEFT_IN = 0.85
+RIGHT_IN = 0.2
+BELOW_IN = 0.55  # the same: ticks and label of x
+ABOVE_IN = 0.14  # between the title and the panel
+TITLE_LINES = 2  # for which there is room above a panel of a fixed size
+LegendPlace = Literal["outside upper center", "upper center"]
+
+
+class Panel(NamedTuple):
+    """Size of axes without what is written around them [inch]."""
+
+    width: float
+    height: float
+    left: float = LEFT_IN  # room for the ticks and the label of y
 
 
 @contextmanager
@@ -68,21 +84,58 @@ def styled() -> Iterator[None]:
 
 @styled()
 def panels(
-    rows: int, columns: int, size: tuple[float, float], **options: Any
+    rows: int, columns: int, size: tuple[float, float] | None = None, **options: Any
 ) -> tuple[Figure, list[Axes]]:
-    """Returns a figure of a size [inch], and its axes in rows."""
+    """Returns a figure of a size [inch], and its axes in rows.
+
+    Without a size, `png` gives it that of its panels.
+    """
     figure = Figure(figsize=size, layout="constrained")
     return figure, list(
         figure.subplots(rows, columns, squeeze=False, **options).ravel()
     )
 
 
+def legend_columns(labels: Sequence[str], width: float) -> int:
+    """Returns the number of columns of a legend that fits into a width [inch]."""
+    room = LETTERS_PER_IN * width
+    each = [len(label) + 5 for label in labels]
+    return len(labels) if sum(each) <= room else max(1, int(room / max(each)))
+
+
+def legend_rows(labels: Sequence[str], width: float) -> int:
+    """Returns the number of rows of a legend that fits into a width [inch]."""
+    return -(-len(labels) // legend_columns(labels, width)) if labels else 0
+
+
+def width_of(panel: Panel, columns: int = 1) -> float:
+    """Returns the width of a figure of panels of a fixed size [inch]."""
+    return columns * (panel.left + panel.width + RIGHT_IN)
+
+
 @styled()
-def png(figure: Figure, legend: Axes | None = None) -> bytes:
+def png(
+    figure: Figure,
+    legend: Axes | None = None,
+    panel: Panel | None = None,
+    least_rows: int = 0,
+) -> bytes:
     """Renders a figure as a PNG, without empty axes, with the legend of one of them above.
 
     Titles are broken into lines that fit above their axes.
+
+    Args:
+        figure: the figure.
+        legend: axes whose legend is shown.
+        panel: size of each of the axes in a grid [inch], whatever is written around them; the size
+            of the figure follows. By default the axes fill the figure.
+        least_rows: number of rows of a legend for which there is room beside such panels, even if
+            the figure has fewer: it keeps figures side by side alike.
     """
+    if panel is not None:
+        _, columns = _grid_of(figure)
+        figure.set_layout_engine(None)
+        figure.set_figwidth(width_of(panel, columns))
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_axis_off()
@@ -95,10 +148,43 @@ def png(figure: Figure, legend: Axes | None = None) -> bytes:
             axes.set_title("\n".join(title))
     if legend is not None:
         handles, labels = legend.get_legend_handles_labels()
-        room = LETTERS_PER_IN * figure.get_figwidth()
-        each = [len(label) + 5 for label in labels]
-        columns = len(labels) if sum(each) <= room else max(1, int(room / max(each)))
-        figure.legend(handles, labels, loc="outside upper center", ncols=columns)
+        width = figure.get_figwidth()
+        fills = panel is None  # then the axes make way for the legend
+        place: LegendPlace = "outside upper center" if fills else "upper center"
+        if labels:
+            figure.legend(
+                handles, labels, loc=place, ncols=legend_columns(labels, width)
+            )
+        least_rows = max(least_rows, legend_rows(labels, width))
+    if panel is not None:
+        _place_panels(figure, panel, least_rows)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
+
+
+def _grid_of(figure: Figure) -> tuple[int, int]:
+    """Returns the numbers of rows and columns of a figure's grid."""
+    cells = [axes.get_subplotspec() for axes in figure.axes]
+    (grid,) = {cell.get_gridspec() for cell in cells if cell is not None}
+    rows, columns = grid.get_geometry()
+    return rows, columns
+
+
+def _place_panels(figure: Figure, panel: Panel, rows_of_legend: int) -> None:
+    """Gives a figure its height, and each of its axes the size of a panel [inch]."""
+    rows, columns = _grid_of(figure)
+    lines = [len(axes.get_title().splitlines()) for axes in figure.axes]
+    above = ABOVE_IN + LINE_IN * max(TITLE_LINES, *lines)
+    legend = LINE_IN * (rows_of_legend + 0.5)
+    width = width_of(panel, columns)
+    height = legend + rows * (above + panel.height + BELOW_IN)
+    figure.set_size_inches(width, height)
+    figure.subplots_adjust(
+        left=panel.left / width,
+        right=1.0 - RIGHT_IN / width,
+        bottom=BELOW_IN / height,
+        top=1.0 - (legend + above) / height,
+        wspace=(panel.left + RIGHT_IN) / panel.width,
+        hspace=(above + BELOW_IN) / panel.height,
+    )

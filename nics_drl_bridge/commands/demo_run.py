@@ -49,6 +49,7 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 RECORDING_SEED = 1
 TRAINING_SEED = 0
@@ -464,6 +465,15 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
     ]
 
 
+def _paths_gallery(
+    shown: Sequence[Mapping[str, Episode]], world: AnyWorld, radius: float
+) -> str:
+    """Draws the paths of each seed, with panels of the same size."""
+    return html.gallery(
+        [(png, "") for png in pictures.trajectory_gallery(shown, world, radius)]
+    )
+
+
 def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[str]:
     here = of.here
     there = of.there
@@ -474,11 +484,8 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     radius = model.robot.footprint_radius
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
-        shown = [
-            (pictures.trajectories({both[0]: [a]}, world, radius), "")
-            for a in here[:PANELS]
-        ]
-        return [html.paragraph(text), html.gallery(shown)]
+        alone = [{both[0]: episode} for episode in here[:PANELS]]
+        return [html.paragraph(text), _paths_gallery(alone, world, radius)]
     rows = [
         (
             f"{a.seed}",
@@ -492,12 +499,12 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
         )
         for a, b in zip(here, there, strict=True)
     ]
-    drawn = []
+    shown = []
     for a, b in list(zip(here, there, strict=True))[:PANELS]:
-        runs = {both[0]: [a], both[1]: [b]}
+        runs = {both[0]: a, both[1]: b}
         if a.seed == live.seed:
-            runs["deployed"] = [live]
-        drawn.append((pictures.trajectories(runs, world, radius), ""))
+            runs["deployed"] = live
+        shown.append(runs)
     text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Then simulator_node in real "
@@ -509,6 +516,6 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     table = html.table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows)
     return [
         html.paragraph(text),
-        html.gallery(drawn),
+        _paths_gallery(shown, world, radius),
         html.details("Episode by episode", [html.paragraph(about), table]),
     ]

@@ -23,6 +23,7 @@ from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
 SIZE_IN = 5.0
 DPI = 100
 MARGIN = 0.05
+LEAST_SIDE_IN = 1.0  # of the picture of a long and narrow world
 WALL = DARK
 STANDING = OTHER
 SCAN = VERMILION
@@ -36,9 +37,11 @@ class WorldPicture:
         self._model = model
         self._world = world
         low, high = np.array(world.extent).reshape(2, 2)
-        width, depth = (SIZE_IN * (high - low) / (high - low).max()).tolist()
-        self._low = low - MARGIN * (high - low)
-        self._high = high + MARGIN * (high - low)
+        metre_in = SIZE_IN / (high - low).max()
+        width, depth = np.maximum(metre_in * (high - low), LEAST_SIDE_IN).tolist()
+        shown = np.array([width, depth]) / metre_in * (1.0 + 2.0 * MARGIN)
+        self._low = (low + high - shown) / 2.0
+        self._high = (low + high + shown) / 2.0
         figure = Figure(figsize=(width, depth), dpi=DPI)
         self._canvas: Any = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

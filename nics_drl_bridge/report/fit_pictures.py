@@ -31,12 +31,22 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import delays as delays_of
 from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.style import DARK, MARKERS, MEASURED, MODEL, OTHER, panels, png
+from nics_drl_bridge.style import (
+    DARK,
+    MARKERS,
+    MEASURED,
+    MODEL,
+    OTHER,
+    Panel,
+    panels,
+    png,
+)
 from nics_drl_bridge.threads import one_blas_thread
 
 SHOWN_S = 8.0
 PATHS = 6
 POINTS = 40
+UNSEEN_PANEL = Panel(3.4, 3.4)  # of one of them on a page
 SETTLED_S = 1.0
 LEAST_SHARE = 1e-12
 LEAST_RATE = 1e-6
@@ -137,9 +147,9 @@ def unseen_paths(identified: Identified, most: int) -> list[bytes]:
     """Draws some of the panels of `held_out_paths`, each as a PNG of its own."""
     drawn = []
     for path in _unseen_paths(identified)[:most]:
-        figure, (axes,) = panels(1, 1, (4.0, 4.2))
+        figure, (axes,) = panels(1, 1)
         _unseen_path(axes, path)
-        drawn.append(png(figure, axes))
+        drawn.append(png(figure, axes, UNSEEN_PANEL))
     return drawn
 
 

@@ -19,6 +19,7 @@ h1 { margin: 0; line-height: 1.2 } h2 { margin: 2.4rem 0 .8rem; line-height: 1.2
 .tiles, .gallery { display: grid; gap: 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 14rem), 1fr)) }
 .gallery { grid-template-columns: repeat(auto-fill, minmax(min(100%, 19rem), 1fr)) }
+.gallery.wide { grid-template-columns: 1fr }
 .tile { background: var(--card); border-left: .3rem solid var(--good); border-radius: .4rem;
   padding: .8rem 1rem; break-inside: avoid }
 .tile b { display: block; font-size: 1.9rem; line-height: 1.2; color: var(--good) }
@@ -34,7 +35,7 @@ figure { margin: 1rem 0; break-inside: avoid } .gallery figure { margin: 0 }
 img { max-width: 100%; height: auto }
 @media (max-width: 40rem) { figure.wide img { max-width: none; width: 44rem } }
 @media print { body { margin: 0; max-width: none }
-  .gallery { grid-template-columns: repeat(3, 1fr) }
+  .gallery { grid-template-columns: repeat(3, 1fr) } .gallery.wide { grid-template-columns: 1fr }
   pre { white-space: pre-wrap; font-size: 8pt } th, td { padding: .2rem .5rem }
   details::details-content { content-visibility: visible; height: auto; display: block }
   figure.wide img { max-width: 100%; width: auto } h2 { break-after: avoid } }
@@ -84,16 +85,23 @@ def picture(png: bytes, caption: str) -> str:
     """A PNG with its caption."""
     data = base64.b64encode(png).decode()
     caption = escape(caption)
-    kind = ' class="wide"' if int.from_bytes(png[16:20], "big") > WIDE else ""
+    kind = ' class="wide"' if _width(png) > WIDE else ""
     return (
         f'<figure{kind}><img src="data:image/png;base64,{data}" alt="{caption}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
 
+def _width(png: bytes) -> int:
+    """Returns the width of a PNG [pixels]."""
+    return int.from_bytes(png[16:20], "big")
+
+
 def gallery(pictures: Sequence[tuple[bytes, str]]) -> str:
-    """Pictures with captions side by side, and below each other on a phone."""
-    return f'<div class="gallery">{"".join(picture(*each) for each in pictures)}</div>'
+    """Pictures with captions side by side; below each other on a phone, or where they are wide."""
+    wide = any(_width(png) > WIDE for png, _ in pictures)
+    kind = "gallery wide" if wide else "gallery"
+    return f'<div class="{kind}">{"".join(picture(*each) for each in pictures)}</div>'
 
 
 def details(summary: str, blocks: Sequence[str]) -> str:

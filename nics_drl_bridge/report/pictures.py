@@ -1,7 +1,9 @@
 """Pictures of trajectories, drives, trainings, policies and worlds, each a PNG."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple
+from itertools import chain, zip_longest
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from nics_drl_bridge.env.rendering import draw_robot, draw_world
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode
 from nics_drl_bridge.policy.shadow import Shadow
@@ -26,9 +29,12 @@ from nics_drl_bridge.style import (
     MEASURED,
     MODEL,
     OTHER,
+    Panel,
+    legend_rows,
     panels,
     png,
     styled,
+    width_of,
 )
 
 LINES: tuple[dict[str, Any], ...] = (
@@ -36,29 +42,101 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": MODEL, "linewidth": 1.4, "linestyle": "--"},
     {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
 )
-# of the pictures of a world, and of an episode [inch]
-LEAST_WIDTH = 5.5
-LEAST_PANEL = 4.6
-WORLD_SIDE = 7.5  # the longer side of a world's picture [inch]
+# of the pictures of a square world, and of an episode [inch]
+WORLD_SIDE = 7.0
+EPISODE_SIDE = 4.0
+# of the picture of any world [inch]
+LEAST_WIDTH = 2.4
+GREATEST_WIDTH = 12.5
+LEAST_HEIGHT = 1.2
+GREATEST_HEIGHT = 9.0
+WORLD_MARGIN = 0.03  # around a world, as a share of its longer side
+CURVE_PANEL = Panel(4.0, 3.0, left=1.1)  # of the curves on the page of a demo
+NAME_LETTERS = 11  # of a line of the name of what was perturbed
+
+
+class View(NamedTuple):
+    """The part of a plane that a panel shows, and the size of the panel."""
+
+    low: Array  # (2,) least x and y [m]
+    high: Array  # (2,) greatest x and y [m]
+    panel: Panel  # of the same proportion
+
+    def show(self, axes: Axes) -> None:
+        """Shows this part in axes, with equal scales."""
+        axes.set(xlim=(self.low[0], self.high[0]), ylim=(self.low[1], self.high[1]))
+        axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+
+
+def view_of(low: Array, high: Array, side: float) -> View:
+    """Returns the view of a field between two corners (2,) [m].
+
+    The panel has the proportion of the field and the area of a square of a side [inch], so that a
+    corridor is flat and a shaft is tall. Where that would exceed the bounds of a picture, the panel
+    is smaller; and where it would then be too thin, it shows more than the field.
+    """
+    margin = WORLD_MARGIN * (high - low).max()
+    size = high - low + 2.0 * margin
+    proportion = np.sqrt(size[0] / size[1])
+    wished = side * np.array([proportion, 1.0 / proportion])
+    wished *= min(1.0, GREATEST_WIDTH / wished[0], GREATEST_HEIGHT / wished[1])
+    panel = np.maximum(wished, [LEAST_WIDTH, LEAST_HEIGHT])
+    shown = panel * (size / wished).max()
+    centre = (low + high) / 2.0
+    return View(centre - shown / 2.0, centre + shown / 2.0, Panel(*panel.tolist()))
+
+
+def _view_of_episodes(world: AnyWorld, episodes: Iterable[Episode]) -> View:
+    """Returns the view of a world that holds the paths of some episodes, too."""
+    corners = np.reshape(world.extent, (2, 2))
+    paths = [episode.path[:, :2] for episode in episodes]
+    points = np.concatenate([corners, *paths])
+    return view_of(np.nanmin(points, axis=0), np.nanmax(points, axis=0), EPISODE_SIDE)
 
 
 def trajectories(
     runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footprint: float
 ) -> bytes:
     """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
-    count = max(len(episodes) for episodes in runs.values())
-    columns = min(count, 3)
-    rows = -(-count // 3)
-    figure, grid = panels(
-        rows, columns, (max(4.2 * columns, LEAST_PANEL), 4.2 * rows + 0.5)
+    view = _view_of_episodes(world, chain.from_iterable(runs.values()))
+    by_seed = [
+        {
+            name: episode
+            for name, episode in zip(runs, some, strict=True)
+            if episode is not None
+        }
+        for some in zip_longest(*runs.values())
+    ]
+    columns = min(len(by_seed), max(1, int(GREATEST_WIDTH / view.panel.width)))
+    figure, grid = panels(-(-len(by_seed) // columns), columns)
+    for axes, episodes in zip(grid, by_seed, strict=False):
+        _panel(axes, episodes, world, footprint, view)
+    return png(figure, grid[0], view.panel)
+
+
+def trajectory_gallery(
+    shown: Sequence[Mapping[str, Episode]], world: AnyWorld, footprint: float
+) -> list[bytes]:
+    """Draws a picture per seed with the path of each run, all with panels of the same size."""
+    view = _view_of_episodes(
+        world, [each for episodes in shown for each in episodes.values()]
     )
-    for axes, *episodes in zip(grid, *runs.values(), strict=False):
-        _panel(axes, dict(zip(runs, episodes, strict=True)), world, footprint)
-    return png(figure, grid[0])
+    runs = dict.fromkeys(name for episodes in shown for name in episodes)
+    rows = legend_rows(["goal", "start", *runs], width_of(view.panel))
+    drawn = []
+    for episodes in shown:
+        figure, (axes,) = panels(1, 1)
+        _panel(axes, episodes, world, footprint, view)
+        drawn.append(png(figure, axes, view.panel, rows))
+    return drawn
 
 
 def _panel(
-    axes: Axes, episodes: Mapping[str, Episode], world: AnyWorld, footprint: float
+    axes: Axes,
+    episodes: Mapping[str, Episode],
+    world: AnyWorld,
+    footprint: float,
+    view: View,
 ) -> None:
     first = next(iter(episodes.values()))
     draw_world(axes, world, first.bodies, member_of(world, first.seed))
@@ -71,7 +149,7 @@ def _panel(
         axes.plot(episode.path[:, 0], episode.path[:, 1], label=name, **line)
     results = ", ".join(dict.fromkeys(episode.result for episode in episodes.values()))
     axes.set_title(f"seed {first.seed}: {results}")
-    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    view.show(axes)
 
 
 @styled()
@@ -119,7 +197,7 @@ class Point(NamedTuple):
 
 def training_curve(points: Sequence[Point]) -> bytes:
     """Draws success and collisions [%] over the environment steps."""
-    figure, (axes,) = panels(1, 1, (5.2, 3.6))
+    figure, (axes,) = panels(1, 1)
     steps, *shares = np.array(points, np.float64).T
     for name, share, line in zip(
         ("success", "collision"), shares, ("-", "--"), strict=True
@@ -131,19 +209,19 @@ def training_curve(points: Sequence[Point]) -> bytes:
     axes.set_ylim(0.0, 100.0)
     axes.set_xlim(left=0.0)
     axes.legend()
-    return png(figure)
+    return png(figure, panel=CURVE_PANEL)
 
 
 def robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
     """Draws success [%] with its interval, by what was perturbed."""
-    figure, (axes,) = panels(1, 1, (5.2, 3.6))
+    figure, (axes,) = panels(1, 1)
     value, low, high = 100.0 * np.array([astuple(share) for share in shares.values()]).T
-    names = [name.replace("_", " ") for name in shares]
-    ends = (value - low, high - value)
+    names = [fill(name.replace("_", " "), NAME_LETTERS) for name in shares]
+    ends = value - low, high - value
     axes.errorbar(value, names, xerr=ends, fmt="o", color=MODEL, capsize=3.0)
     axes.invert_yaxis()
     axes.set(xlabel="success [%]", xlim=(min(90.0, low.min() - 2.0), 100.5))
-    return png(figure)
+    return png(figure, panel=CURVE_PANEL)
 
 
 def shadow_picture(shadow: Shadow) -> bytes:
@@ -197,10 +275,8 @@ def world_picture(
     scene = sampler.draw([seed])[0]
     low, high = np.array(world.extent).reshape(2, 2)
     size = high - low
-    width, depth = WORLD_SIDE * size / size.max()
-    figure, (axes,) = panels(
-        1, 1, (max(width, LEAST_WIDTH) + 0.8, max(depth, 1.6) + 1.3)
-    )
+    view = view_of(low, high, WORLD_SIDE)
+    figure, (axes,) = panels(1, 1)
     draw_world(axes, world, scene.bodies)
     for kind, places, colour in (
         ("starts", world.starts, GREEN),
@@ -228,16 +304,11 @@ def world_picture(
         "markeredgecolor": DARK,
     }
     axes.plot(*scene.goals[0], linestyle="none", zorder=5, label="goal", **goal)
-    margin = 0.03 * size.max()
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axes.set(
-        xlim=(low[0] - margin, high[0] + margin),
-        ylim=(low[1] - margin, high[1] + margin),
-    )
+    view.show(axes)
     count = np.count_nonzero(scene.bodies[:, RADIUS])
     about = f"{size[0]:.3g} m x {size[1]:.3g} m, {count} obstacles, seed {seed}"
     axes.set_title(f"{world.name}: {about}")
-    return png(figure, axes)
+    return png(figure, axes, view.panel)
 
 
 def _movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:

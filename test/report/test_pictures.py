@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from nics_drl_bridge.report.pictures import (
     robustness,
     training_curve,
     trajectories,
+    trajectory_gallery,
     world_picture,
 )
 from nics_drl_bridge.robot.spec import load_robot
@@ -203,3 +205,114 @@ def test_success_under_each_perturbation_is_drawn_as_low_as_it_is():
     drawn = robustness({"as it is": best, "action_latency": worst})
     assert drawn.startswith(b"\x89PNG")
     assert drawn != robustness({"as it is": best, "action_latency": best})
+
+
+def field_of(width, height):
+    """An empty field with walls around it."""
+    plan = {"name": "field", "size": [width, height], "goal_distance": [0.5, 1.0]}
+    return World.model_validate(plan)
+
+
+def shape_of(png):
+    """Width and height of a picture [pixels]."""
+    return Image.open(io.BytesIO(png)).size
+
+
+def walls_in(png):
+    """Left, top, right and bottom edge of the walls in a picture [pixels]."""
+    drawn = decoded(png).astype(int)
+    dark = (np.abs(drawn - 0x33) < 12).all(axis=-1)
+    length = 100  # letters are shorter
+    rows = np.flatnonzero(dark.sum(axis=1) > length)
+    columns = np.flatnonzero(dark.sum(axis=0) > length)
+    return columns[0], rows[0], columns[-1], rows[-1]
+
+
+def short_episode(seed=0):
+    path = np.array([[0.0, 0.0, 0.0], [0.2, 0.1, 0.0]])
+    return Episode(
+        seed, "success", path, path, np.array([0.3, 0.2]), np.zeros((0, 7)), 1.0
+    )
+
+
+DRAWINGS = {
+    "world": lambda world: world_picture(world, 0.1, 0),
+    "episodes": lambda world: trajectories({"run": [short_episode()]}, world, 0.1),
+    "gallery": lambda world: trajectory_gallery([{"run": short_episode()}], world, 0.1)[
+        0
+    ],
+}
+
+
+@pytest.mark.parametrize("draw", DRAWINGS.values(), ids=DRAWINGS)
+@pytest.mark.parametrize("size", [(40.0, 4.0), (9.0, 3.0), (3.0, 9.0)])
+def test_a_picture_of_a_world_has_the_proportions_of_the_world(draw, size):
+    left, top, right, bottom = walls_in(draw(field_of(*size)))
+    assert (right - left) / (bottom - top) == pytest.approx(size[0] / size[1], rel=0.08)
+
+
+@pytest.mark.parametrize("draw", DRAWINGS.values(), ids=DRAWINGS)
+def test_a_flat_world_has_a_flat_picture_and_a_tall_one_a_tall_one(draw):
+    width, height = shape_of(draw(field_of(40.0, 4.0)))
+    assert width > 3.0 * height
+    width, height = shape_of(draw(field_of(4.0, 40.0)))
+    assert height > 2.5 * width
+
+
+@pytest.mark.parametrize("draw", DRAWINGS.values(), ids=DRAWINGS)
+@pytest.mark.parametrize("size", [(500.0, 1.0), (1.0, 500.0)])
+def test_the_picture_of_an_extreme_world_is_neither_huge_nor_a_line(draw, size):
+    width, height = shape_of(draw(field_of(*size)))
+    assert min(width, height) > 200
+    assert max(width, height) < 1600
+
+
+def test_panels_are_equal_whatever_their_titles_legends_and_paths_are():
+    far = replace(short_episode(1), path=np.array([[0.0, 0.0, 0.0], [-3.4, 0.0, 0.0]]))
+    lost = replace(
+        short_episode(2), result="left the field and was never seen there again, alas"
+    )
+    shown = [
+        {
+            "in process": short_episode(),
+            "over DDS": short_episode(),
+            "deployed": short_episode(),
+        },
+        {"in process": far, "over DDS": far},
+        {"in process": lost},
+    ]
+    drawn = trajectory_gallery(shown, field_of(6.0, 6.0), 0.1)
+    assert len({shape_of(png) for png in drawn}) == 1
+    assert len({walls_in(png) for png in drawn}) == 1
+
+
+def test_an_episode_that_only_one_run_has_is_drawn_too():
+    world = field_of(6.0, 6.0)
+    both = {"one": [short_episode(0), short_episode(1)], "two": [short_episode(0)]}
+    width, height = shape_of(trajectories(both, world, 0.1))
+    assert width > 1.5 * height
+    drawn = decoded(trajectories(both, world, 0.1))
+    second = drawn[:, width // 2 :]
+    assert len(pixels_of(second, GOAL, off=60)) > 20
+
+
+def test_the_curves_of_a_page_have_equal_panels():
+    curve = training_curve([Point(8192, 0.1, 0.9), Point(16384, 0.6, 0.4)])
+    bars = robustness(
+        {"as it is": rate(500, 500), "observation_latency": rate(10, 500)}
+    )
+    assert shape_of(curve) == shape_of(bars)
+    assert ink_at_the_edges(curve) == ink_at_the_edges(bars) == 0
+
+
+def ink_at_the_edges(png):
+    """Number of pixels at the edges of a picture that are not white: of words that are cut off."""
+    image = decoded(png)
+    edges = image[:2], image[-2:], image[:, :2], image[:, -2:]
+    return sum(int((edge < 250).any(axis=-1).sum()) for edge in edges)
+
+
+@pytest.mark.parametrize("draw", DRAWINGS.values(), ids=DRAWINGS)
+@pytest.mark.parametrize("size", [(6.0, 6.0), (200.0, 200.0), (4.0, 40.0), (40.0, 4.0)])
+def test_no_word_is_cut_off_at_the_edge_of_a_picture(draw, size):
+    assert ink_at_the_edges(draw(field_of(*size))) == 0
