@@ -122,7 +122,9 @@ def _episodes(
         )
         return driving.env_of(policy, model, world, "sim", within, **options)
 
-    return EpisodeSource(make, policy, [load_worlds(each) for each in worlds], seed)
+    return EpisodeSource(
+        make, policy, [load_worlds(each) for each in worlds], seed, name or ""
+    )
 
 
 def _bag(
@@ -131,7 +133,9 @@ def _bag(
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.watch.bag import BagSource
 
-    return BagSource(bag, open_model(name or DEFAULT_ROBOT), topics, _only(worlds))
+    return BagSource(
+        bag, open_model(name or DEFAULT_ROBOT), topics, _only(worlds), name or ""
+    )
 
 
 def _ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
@@ -139,7 +143,8 @@ def _ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
 
     with console.needs_ros("nics watch --ros"):
         from nics_drl_bridge.nodes.watching import RosSource
-    return RosSource(open_model(name or DEFAULT_ROBOT), _only(worlds), namespace)
+    model = open_model(name or DEFAULT_ROBOT)
+    return RosSource(model, _only(worlds), namespace, model_name=name or "")
 
 
 def _only(worlds: list[str] | None) -> Any:

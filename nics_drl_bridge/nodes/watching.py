@@ -42,6 +42,7 @@ class RosSource:
         world: AnyWorld | None,
         namespace: str = "",
         domain_id: int | None = None,
+        model_name: str = "",
     ) -> None:
         half = SIDE_M / 2.0
         bounds = (-half, -half, half, half)
@@ -54,6 +55,7 @@ class RosSource:
         self._model = model
         self.period_s = PERIOD_S
         self._title = namespace or "live topics"
+        self._model_name = model_name
         self._trail = Track()
         self._goal = np.zeros((0, 2))
         self._gate: str | None = None
@@ -105,7 +107,10 @@ class RosSource:
 
     def stage(self) -> Stage:
         """See `show.FrameSource`."""
-        return Stage(self._title, self._model, (self._world,), frozenset({"goal"}))
+        can = frozenset({"goal"})
+        return Stage(
+            self._title, self._model, (self._world,), can, model_name=self._model_name
+        )
 
     def frame(self) -> Frame:
         """See `show.FrameSource`."""

@@ -39,6 +39,7 @@ class BagSource:
         model: SimulatorModel,
         topics: Mapping[str, str],
         world: AnyWorld | None = None,
+        model_name: str = "",
     ) -> None:
         self._times, self._shots, lidar = _read(path, model, topics)
         self._model = replace(model, lidar=lidar)
@@ -51,11 +52,20 @@ class BagSource:
         else:
             self.period_s = 0.1
         self._now = 0
+        self._model_name = model_name
 
     def stage(self) -> Stage:
         """See `show.FrameSource`."""
         span = float(self._times[0]), float(self._times[-1])
-        return Stage(self._path.name, self._model, (self._world,), CAN, span_s=span)
+        named = self._model_name
+        return Stage(
+            self._path.name,
+            self._model,
+            (self._world,),
+            CAN,
+            span_s=span,
+            model_name=named,
+        )
 
     def frame(self) -> Frame:
         """See `show.FrameSource`."""

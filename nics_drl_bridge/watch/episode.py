@@ -171,7 +171,9 @@ class Lane:
         """The world now; `place` is that of its first member."""
         shot = self.env.snapshot()
         name = f"{self.world.name}, episode {self.seed}"
-        return WorldFrame(shot, name, place + shot.member, self.trail.ways, self.state)
+        return WorldFrame(
+            shot, name, place + shot.member, self.trail.ways, self.state, self.time_s
+        )
 
     def close(self) -> None:
         """Closes the env."""
@@ -200,8 +202,14 @@ class EpisodeSource:
     """Drives episodes in one world or several at once. Raises BridgeError."""
 
     def __init__(
-        self, make: Make, policy: str, worlds: Sequence[AnyWorld], seed: int
+        self,
+        make: Make,
+        policy: str,
+        worlds: Sequence[AnyWorld],
+        seed: int,
+        model_name: str = "",
     ) -> None:
+        self._model_name = model_name
         self._first = seed
         self._given_policy = policy
         self._given_worlds = {world.name: world for world in worlds}
@@ -232,6 +240,7 @@ class EpisodeSource:
             can,
             {"policy": list(policies), "world": list(worlds)},
             {"policy": self._policy, "world": first},
+            model_name=self._model_name,
         )
 
     def frame(self) -> Frame:

@@ -17,6 +17,7 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Shape
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
+from nics_drl_bridge.watch.motion import MotionMeter, Velocities
 
 MM = 1000.0  # lengths and angles go over the wire in thousandths, as whole numbers
 NO_RETURN = -1
@@ -39,6 +40,9 @@ class Stage:
     )  # of policies and worlds
     chosen: Mapping[str, str] = field(default_factory=dict)
     span_s: tuple[float, float] | None = None  # of a bag [s]
+    model_name: str = (
+        ""  # as whoever started the page names the model; else its robot's name
+    )
 
     def plain(self) -> dict[str, Any]:
         """The stage as plain data."""
@@ -59,6 +63,11 @@ class Stage:
             "sideways": robot.moves_sideways,
             "footprint": robot.footprint,
             "radius": robot.footprint_radius,
+            "model": {
+                "name": self.model_name or robot.name,
+                "robot": robot.name,
+                "lidar": f"{lidar.beams} beams, {lidar.range_max:g} m",
+            },
             "lidar": {
                 "mount": lidar.mount,
                 "first": lidar.angle_min,
@@ -104,11 +113,14 @@ class WorldFrame:
     place: int = 0  # in the `worlds` of the stage, member by member
     trails: tuple[Array, ...] = ()  # (T, 2) way of each robot in this episode [m]
     state: str = ""  # how the episode stands, in a word or two
+    time_s: float | None = None  # since its episode began [s]; None: that of the frame
 
-    def plain(self) -> dict[str, Any]:
-        """The world as plain data."""
+    def plain(self, velocities: Velocities | None = None) -> dict[str, Any]:
+        """The world as plain data, with the velocities in it."""
         shot = self.shot
-        there = shot.bodies[shot.bodies[:, RADIUS] > 0.0]
+        exist = shot.bodies[:, RADIUS] > 0.0
+        there = shot.bodies[exist]
+        moving = velocities or Velocities.unknown(shot)
         bodies = there[:, [X, Y, HEADING, RADIUS]]
         kinds = there[:, SHAPE].astype(int).tolist()
         ranges = np.where(np.isfinite(shot.ranges), shot.ranges, NO_RETURN / MM)
@@ -122,6 +134,8 @@ class WorldFrame:
             "bodies": thousandths(bodies),
             "kinds": kinds,
             "goals": thousandths(shot.goals),
+            "velocities": thousandths(moving.robots),
+            "body_velocities": thousandths(moving.bodies[exist]),
             "trails": [thousandths(trail) for trail in self.trails],
             "estimates": None
             if shot.estimates is None
@@ -161,15 +175,27 @@ class Frame:
     worlds: tuple[WorldFrame, ...]
     note: str = ""  # a line about all of them, as how far a training is
 
-    def plain(self) -> dict[str, Any]:
-        """The frame as plain data."""
-        worlds = [world.plain() for world in self.worlds]
+    def plain(self, meter: MotionMeter | None = None) -> dict[str, Any]:
+        """The frame as plain data, with velocities where a meter measures them."""
+        if meter is None:
+            worlds = [world.plain() for world in self.worlds]
+        else:
+            each = zip(self.worlds, self.measured_by(meter), strict=True)
+            worlds = [world.plain(moving) for world, moving in each]
         return {
             "kind": "frame",
             "time": self.time_s,
             "note": self.note,
             "worlds": worlds,
         }
+
+    def measured_by(self, meter: MotionMeter) -> list[Velocities]:
+        """Returns the velocities in each world, since the frame that a meter measured before."""
+        times_s = [
+            self.time_s if world.time_s is None else world.time_s
+            for world in self.worlds
+        ]
+        return meter.measure(times_s, [world.shot for world in self.worlds])
 
 
 class Track:

@@ -17,6 +17,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extensions import missing
 from nics_drl_bridge.seeds import GREATEST_SEED
 from nics_drl_bridge.watch.frame import Frame, Stage
+from nics_drl_bridge.watch.motion import MotionMeter
 
 HOST = "127.0.0.1"
 PORT = 8765
@@ -97,6 +98,7 @@ class PageServer:
         self._texts = ["", "", ""]
         self._numbers = [0, 0, 0]
         self._pages: set[Any] = set()
+        self._meter = MotionMeter()
         self.closed = False
         try:
             self._server = serve(
@@ -131,7 +133,13 @@ class PageServer:
 
     def publish(self, frame: Frame, **about: Any) -> None:
         """Shows a frame, and further facts beside it."""
-        self._set(2, json.dumps(frame.plain() | about, separators=(",", ":")))
+        self._set(
+            2, json.dumps(frame.plain(self._meter) | about, separators=(",", ":"))
+        )
+
+    def measure(self, frame: Frame) -> None:
+        """Lets the next frame tell the velocities since this one, which is not shown."""
+        frame.measured_by(self._meter)
 
     def tell(self, sentence: str) -> None:
         """Shows a sentence for a while."""

@@ -33,6 +33,7 @@ class TrainingView:
         self._shown_s = 0.0
         self._steps = 0
         self.note = ""
+        self._measured = 0  # the last step from which velocities can be measured
         names = ", ".join(env.world.name for env in envs)
         places = tuple(env.world for env in envs)
         server.set_stage(Stage(f"training in {names}", envs[0].model, places))
@@ -46,15 +47,24 @@ class TrainingView:
         due = now - self._shown_s >= PERIOD_S
         for env, n, _, trail in self._worlds:
             trail.add(env.simulator.data.pose[n], int(env.simulator.data.steps[n]))
-        if due:
+        if not due:
+            return
+        if self._measured == self._steps - 1:
             self._shown_s = now
             self._server.publish(self._frame())
+        else:
+            self._server.measure(
+                self._frame()
+            )  # the next step tells how fast all moves
+        self._measured = self._steps
 
     def _frame(self) -> Frame:
         worlds = []
         for env, n, first, trail in self._worlds:
             shot = env.snapshot(n)
             name = f"{env.world.name} {n}"
-            worlds.append(WorldFrame(shot, name, first + shot.member, trail.ways))
+            time_s = shot.step * env.model.control_period
+            place = first + shot.member
+            worlds.append(WorldFrame(shot, name, place, trail.ways, time_s=time_s))
         period_s = self._worlds[0][0].model.control_period
         return Frame(self._steps * period_s, tuple(worlds), self.note)

@@ -35,7 +35,14 @@ class Forward:
         return np.array([1.0, 0.0, 0.0], np.float32)
 
 
-def source(count: int = 2, seed: int = 3, model=None) -> EpisodeSource:
+def source(
+    count: int = 2,
+    seed: int = 3,
+    model=None,
+    world=None,
+    worlds: int = 1,
+    model_name: str = "",
+) -> EpisodeSource:
     """Episodes of a robot that drives straight ahead among some discs, in a field of 6 m."""
     model = model or direct_model()
 
@@ -45,7 +52,8 @@ def source(count: int = 2, seed: int = 3, model=None) -> EpisodeSource:
             raise ConfigError("policy 'broken': it does not open.")
         return env, Forward()
 
-    return EpisodeSource(make, "forward", [field(count=count)], seed)
+    places = [world or field(count=count)] * worlds
+    return EpisodeSource(make, "forward", places, seed, model_name)
 
 
 class Client:

@@ -66,6 +66,11 @@ def test_a_stage_tells_all_that_is_drawn_once():
         "a title", direct_model(), (field(count=2), load_worlds("room"))
     ).plain()
     one, room = json.loads(json.dumps(stage))["places"]
+    assert stage["model"] == {
+        "name": "direct",
+        "robot": "direct",
+        "lidar": "72 beams, 3 m",
+    }
     assert one["extent"] == [-3.0, -3.0, 3.0, 3.0]
     assert len(one["walls"]) == 4
     assert one["map"] is None

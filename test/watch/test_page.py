@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-from contextlib import closing
+from contextlib import closing, contextmanager
 
 import pytest
 from browser import Browser, needs_chromium, until
-from robots import direct_model, lidar
+from robots import circles, direct_model, field, lidar
 
 from nics_drl_bridge.watch.server import PageServer
 from nics_drl_bridge.watch.show import show
@@ -23,15 +23,21 @@ def browser(tmp_path_factory):
         yield running
 
 
-@pytest.fixture
-def page():
-    """The address of a page with 720 beams, and what it shows."""
-    made = source(model=direct_model(sensor=lidar(beams=720)))
+@contextmanager
+def served(made):
+    """A source on a page: its address, and the source."""
     with closing(made), closing(PageServer(port=0)) as server:
         thread = threading.Thread(target=show, args=(made, server), daemon=True)
         thread.start()
         yield server.url, made
     thread.join()
+
+
+@pytest.fixture
+def page():
+    """The address of a page with 720 beams, and what it shows."""
+    with served(source(model=direct_model(sensor=lidar(beams=720)))) as shown:
+        yield shown
 
 
 def at(browser, x, y):
@@ -116,6 +122,95 @@ def test_a_click_adds_an_obstacle_and_keys_drive(browser, page):
     )
     browser.call("Input.dispatchKeyEvent", type="keyUp", **key)
     until(lambda: browser.ask("nics.frame.worlds[0].commands[0][0]") == 0.0, "standing")
+
+
+def wheel(browser, amount):
+    """Turns the wheel in the middle of the picture."""
+    browser.ask(
+        "(() => { const box = canvas.getBoundingClientRect();"
+        "canvas.dispatchEvent(new WheelEvent('wheel', {"
+        "clientX: box.left + box.width / 2, clientY: box.top + box.height / 2,"
+        f"deltaY: {amount}, cancelable: true }})); }})()"
+    )
+
+
+def test_the_scale_has_a_round_length_that_fits(browser, page):
+    browser.open(page[0], *SIZES[0])
+    for pixels_per_metre, most, metres in (
+        (100.0, 160.0, 1.0),
+        (80.0, 160.0, 2.0),
+        (16.0, 160.0, 10.0),
+        (1.0, 160.0, 100.0),
+        (33.0, 160.0, 2.0),
+        (32.0, 160.0, 5.0),
+        (3000.0, 160.0, 0.05),
+        (0.1, 160.0, 1000.0),
+    ):
+        found = browser.ask(f"scaleLength({pixels_per_metre}, {most})")
+        assert found == pytest.approx(metres), pixels_per_metre
+    texts = browser.ask("[0.002, 0.05, 0.5, 1, 20, 500, 2000].map(scaleText)")
+    assert texts == ["2 mm", "5 cm", "50 cm", "1 m", "20 m", "500 m", "2 km"]
+
+
+def test_the_scale_follows_the_zoom_and_is_as_long_as_it_says(browser, page):
+    browser.open(page[0], *SIZES[0])
+    seen = []
+    for amount in (0, -1200, 2400):
+        before = browser.ask("nics.counters.draws")
+        wheel(browser, amount)
+        until(
+            lambda before=before: browser.ask("nics.counters.draws") > before + 1,
+            "a drawing",
+        )
+        bar, scale = browser.ask("[nics.tiles[0].bar, nics.tiles[0].scale]")
+        assert bar["pixels"] == pytest.approx(bar["metres"] * scale)
+        assert 60 <= bar["pixels"] <= 160
+        seen.append(bar["metres"])
+    whole, near, far = seen
+    assert near < whole < far
+
+
+def test_arrows_point_where_robot_and_obstacle_move_and_nowhere_else(browser):
+    patrol = {"kind": "patrol", "waypoints": [[-2.0, -2.0], [2.0, -2.0]], "speed": 0.5}
+    crowd = field(count=2, obstacles=[circles(1), circles(1) | {"motion": patrol}])
+    with served(source(world=crowd)) as (url, _):
+        browser.open(url, *SIZES[0])
+        arrows = "arrowsOf(nics.frame.worlds[0], nics.frame.worlds[0].poses)"
+        speeds = f"{arrows}.map((one) => Math.hypot(one.vx, one.vy))"
+        until(
+            lambda: browser.ask(f"{arrows}.length") == 2,
+            "two arrows: of robot and obstacle",
+        )
+        assert min(browser.ask(speeds)) == pytest.approx(0.5, abs=0.01)
+        browser.ask("document.querySelector('[data-layer=motion]').click()")
+        assert browser.ask("layers.motion") is False
+        assert browser.complaints == []
+
+
+def test_the_panel_says_which_world_and_which_model_it_describes(browser):
+    with served(source(worlds=3, model_name="runs/my_robot")) as (url, made):
+        browser.open(url, *SIZES[0])
+        panel = "$('facts').innerText.toLowerCase()"
+        until(lambda: "world 1 of 3" in browser.ask(panel), "the first world")
+        text = browser.ask(panel)
+        assert f"{made.lanes[0].world.name}, episode 3" in text
+        assert "runs/my_robot" in text
+        assert "direct" in text  # its robot
+        assert "72 beams, 3 m" in text
+        x, y = browser.ask(
+            "(() => { const t = nics.tiles[2], box = canvas.getBoundingClientRect();"
+            "return [box.left + t.left + t.width / 2, box.top + t.top + t.height / 2]; })()"
+        )
+        browser.mouse("Pressed", x, y)
+        browser.mouse("Released", x, y)
+        until(lambda: "world 3 of 3" in browser.ask(panel), "the third world")
+
+
+def test_the_panel_counts_no_worlds_where_there_is_one(browser, page):
+    browser.open(page[0], *SIZES[0])
+    panel = "$('facts').innerText.toLowerCase()"
+    until(lambda: "6 m \u00d7 6 m" in browser.ask(panel), "the size of the world")
+    assert " of " not in browser.ask(panel).split("model")[0]
 
 
 @pytest.mark.campaign  # a figure of this machine: others that are at work spoil it

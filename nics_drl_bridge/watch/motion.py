@@ -1,0 +1,83 @@
+"""Velocities of all that moves on the page, from the frames of any source."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.env.snapshot import Snapshot
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.exact_kernels import X, Y
+
+LONGEST_S = 1.0  # between two frames; a mean over a longer time says little about now
+FASTEST_M_S = 30.0  # what seems to be faster was put elsewhere
+
+
+class Velocities(NamedTuple):
+    """Velocities in one world, along the axes of `map`; zero where they are not known."""
+
+    robots: Array  # (M, 2) [m/s]
+    bodies: Array  # (K, 2) [m/s], of the obstacles
+
+    @staticmethod
+    def unknown(shot: Snapshot) -> "Velocities":
+        """Returns zeros for each robot and each obstacle of a shot."""
+        return Velocities(
+            np.zeros((len(shot.poses), 2)), np.zeros((len(shot.bodies), 2))
+        )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """One world as it was last seen."""
+
+    time_s: float
+    shot: Snapshot
+    velocities: Velocities
+
+
+class MotionMeter:
+    """Measures velocities as the displacement between two frames over the time between them."""
+
+    def __init__(self) -> None:
+        self._seen: list[_Seen] = []
+
+    def measure(
+        self, times_s: Sequence[float], shots: Sequence[Snapshot]
+    ) -> list[Velocities]:
+        """Returns the velocities in each world, whose times are those of its own episode [s]."""
+        if len(shots) != len(self._seen):
+            self._seen = [
+                _Seen(math.inf, shot, Velocities.unknown(shot)) for shot in shots
+            ]
+        self._seen = [
+            _Seen(time_s, shot, _velocities(before, time_s, shot))
+            for before, time_s, shot in zip(self._seen, times_s, shots, strict=True)
+        ]
+        return [seen.velocities for seen in self._seen]
+
+
+def _velocities(before: _Seen, time_s: float, shot: Snapshot) -> Velocities:
+    passed_s = time_s - before.time_s
+    last = before.shot
+    known = before.velocities
+    if shot.member != last.member or not 0.0 <= passed_s <= LONGEST_S:
+        return Velocities.unknown(shot)
+    places = [X, Y]
+    return Velocities(
+        _rates(last.poses[:, :2], shot.poses[:, :2], passed_s, known.robots),
+        _rates(last.bodies[:, places], shot.bodies[:, places], passed_s, known.bodies),
+    )
+
+
+def _rates(before: Array, now: Array, passed_s: float, known: Array) -> Array:
+    """Returns velocities (n, 2) by points (n, 2); those that are known if no time has passed."""
+    if before.shape != now.shape:
+        return np.zeros_like(now)
+    if passed_s == 0.0:
+        return known
+    rates = (now - before) / passed_s
+    possible = np.hypot(rates[:, 0], rates[:, 1]) < FASTEST_M_S  # false for NaN, too
+    return np.where(possible[:, None], rates, 0.0)
