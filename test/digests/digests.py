@@ -1,8 +1,9 @@
 """Figures of what the package computes, taken down once: a change of the house must keep them.
 
 Each digest runs a part of the package on fixed seeds and keeps a few projections of all that came
-out on fixed random signs, so that one number that changes shows. `python test/digests/digests.py
-NAME...` takes them down anew, for a change that is meant to change them.
+out on fixed random signs, so that one number that changes shows. In `test`,
+`PYTHONPATH=../benchmarks python -m digests.digests NAME...` takes them down anew, for a change that
+is meant to change them.
 """
 
 from __future__ import annotations
@@ -16,22 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from .behaviours import dynamic_window, estimates, training
+from .motion_states import motion_state_errors, motion_state_terms
+from .projection import Found, projected
+from .simulations import barn, scans, team
+
 TEST = Path(__file__).resolve().parents[1]
 FILE = Path(__file__).with_name("digests.json")
 ROBOTS = ("ackermann", "differential", "mecanum")
 WORLDS = ("arena", "clutter", "crowd", "room")
-PROJECTIONS = 3
-Found = dict[str, list[float]]
-
-
-def projected(values: Any) -> list[float]:
-    """How many numbers, and sums of them over random signs, in which each has its own part."""
-    array = np.asarray(values, np.float64).ravel()
-    array = np.nan_to_num(array, nan=1e6, posinf=1e7, neginf=-1e7)
-    rng = np.random.default_rng(len(array))
-    weights = rng.uniform(0.5, 1.5, (PROJECTIONS, len(array)))
-    signs = rng.choice([-1.0, 1.0], weights.shape)
-    return [float(len(array)), *((weights * signs) @ array).tolist()]
 
 
 def worlds() -> Found:
@@ -202,8 +196,27 @@ def decisions_into(kept: list[float]) -> Callable[[Any, float], None]:
 
 
 DIGESTS: dict[str, Callable[[], Found]] = {
-    each.__name__: each for each in (worlds, single, table_1, table_2, identified, gate)
+    each.__name__: each
+    for each in (
+        worlds,
+        single,
+        table_1,
+        table_2,
+        identified,
+        gate,
+        motion_state_errors,
+        motion_state_terms,
+        barn,
+        team,
+        scans,
+        dynamic_window,
+        training,
+        estimates,
+    )
 }
+TOLERANCES = {"motion_state_errors": 0.05, "training": 1e-4}
+"""Of digests whose bits are not those of every processor: of what numerical searches find, and of
+what matrix products in single precision give."""
 
 
 def main() -> None:

@@ -1,0 +1,42 @@
+"""Models whose state is the robot's own motion, identified from drives of other simulators."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.robot.spec import robot_from
+
+from .projection import Found
+
+SEEDS = {"throttle_car": 3, "skid_steer": 11, "ticks": 11}  # of the drives, by robot
+DURATION_S = 20.0
+
+
+@cache
+def identify_robot(name: str) -> Identified:
+    """Identifies a robot of `measuring.foreign_robots` from one short drive."""
+    from measuring.foreign_robots import ROBOTS, foreign_drive
+
+    robot = ROBOTS[name]
+    drive = foreign_drive(robot, SEEDS[name], DURATION_S)
+    spec = robot_from(robot.robot, robot.commands)
+    return identify(drive.recording(), spec)
+
+
+def motion_state_errors() -> Found:
+    """Mean position errors on data held out [m], by horizon."""
+    found: Found = {}
+    for name in SEEDS:
+        for errors in identify_robot(name).judgement:
+            found[f"{name} after {errors.horizon_s:g} s"] = [errors.model.position_m]
+    return found
+
+
+def motion_state_terms() -> Found:
+    """The terms that each model kept, by rate."""
+    found: Found = {}
+    for name in SEEDS:
+        for rate, terms in identify_robot(name).model.named.terms.items():
+            found[f"{name} {rate}"] = sorted(terms)
+    return found
