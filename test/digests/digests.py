@@ -214,7 +214,7 @@ DIGESTS: dict[str, Callable[[], Found]] = {
         estimates,
     )
 }
-TOLERANCES = {"motion_state_errors": 0.05, "training": 1e-4}
+TOLERANCES = {"motion_state_errors": 0.05, "training": 1e-5}
 """Of digests whose bits are not those of every processor: of what numerical searches find, and of
 what matrix products in single precision give."""
 
