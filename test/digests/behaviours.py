@@ -33,6 +33,8 @@ PERIOD_NS = 100_000_000
 POSE_STD = np.array([0.02, 0.02, 0.02])  # of motion capture [m, m, rad]
 GYRO_STD = 0.01  # [rad/s]
 LOST = 0.1  # share of the messages that never arrive
+DISPLACED_FROM = 100  # period from which motion capture sees the robot elsewhere
+DISPLACEMENT = np.array([1.0, -1.0, 0.2])  # by so much [m, m, rad]
 NOISE = Noise(
     odom_linear=Level(std=0.05, unit="m/s", source="measured"),
     odom_angular=Level(std=0.05, unit="rad/s", source="measured"),
@@ -120,6 +122,8 @@ def record_messages(model: SimulatorModel, seed: int) -> list[Message]:
         messages.append(Message(sent_ns, sent_ns, "command", (command,)))
         simulator.step(command[None, None])
         pose = data.pose[0, 0] + POSE_STD * rng.normal(size=3)
+        if period >= DISPLACED_FROM:
+            pose += DISPLACEMENT
         rate = data.twist[0, 0, 2] + GYRO_STD * rng.normal()
         contents = {
             "odometry": (data.odom[0, 0].copy(), data.twist[0, 0].copy()),
