@@ -80,7 +80,7 @@ def evaluate(
         ),
     ] = 4.0,
     backend: Annotated[
-        str | None, Option(help="dds, with --hardware.", metavar="dds")
+        str | None, Option(help="dds, which --hardware implies.", metavar="dds")
     ] = None,
     hardware: Annotated[
         bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
@@ -141,9 +141,9 @@ def evaluate(
         raise ConfigError(
             f"--backend {backend!r}: must be dds; simulators are chosen by --in."
         )
-    if hardware != (backend == "dds"):
-        reason = "belong together; the fast simulator over DDS is --in dds."
-        raise ConfigError(f"--hardware and --backend dds {reason}")
+    if backend == "dds" and not hardware:
+        reason = "drives the vehicle: add --hardware; the fast simulator over DDS is --in dds."
+        raise ConfigError(f"--backend dds {reason}")
     check_above(out / "evaluation.json")
     if hardware and len(policies) > 1:
         raise ConfigError(

@@ -129,7 +129,8 @@ MISTAKES = {
     # Options that do not go together.
     "train --resume": "--resume needs --out",
     "train --address auto": "belongs to --engine ray",
-    "evaluate differential --hardware": "--hardware and --backend dds belong together",
+    "evaluate differential --backend dds": "--backend dds drives the vehicle: add --hardware",
+    "evaluate differential --hardware --goal 2": "--goal",
     "evaluate differential ackermann": "evaluate them one by one",
     "doctor --model differential --policy differential": "give one of them",
     "record --out d.npz --preview --namespace 1st": "namespace '1st': must be words of letters",
