@@ -3,9 +3,8 @@
 ros2 launch nics_drl_bridge description.launch.py model:=mecanum rviz:=true
 """
 
-from nics_drl_bridge.nodes import launching
+from nics_drl_bridge.nodes.launching import LAUNCHES, describe
 
 
 def generate_launch_description():
-    arguments = [*launching.common("false"), *launching.of_description()]
-    return launching.launched([launching.description], arguments)
+    return describe(LAUNCHES["description"]())

@@ -4,8 +4,8 @@ ros2 launch nics_drl_bridge fleet.launch.py robots:='[ant, bee]'
 ros2 service call /ant/command_gate/arm std_srvs/srv/Trigger
 """
 
-from nics_drl_bridge.nodes import launching
+from nics_drl_bridge.nodes.launching import LAUNCHES, describe
 
 
 def generate_launch_description():
-    return launching.whole_simulation(robots="2")
+    return describe(LAUNCHES["fleet"]())

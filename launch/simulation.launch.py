@@ -5,8 +5,8 @@ ros2 service call /command_gate/arm std_srvs/srv/Trigger
 ros2 topic pub --once /goal_pose geometry_msgs/msg/PoseStamped '{pose: {position: {x: 1.0}}}'
 """
 
-from nics_drl_bridge.nodes import launching
+from nics_drl_bridge.nodes.launching import LAUNCHES, describe
 
 
 def generate_launch_description():
-    return launching.whole_simulation()
+    return describe(LAUNCHES["simulation"]())

@@ -3,16 +3,8 @@
 ros2 launch nics_drl_bridge simulator.launch.py model:=differential world:=corridor
 """
 
-from nics_drl_bridge.nodes import launching
+from nics_drl_bridge.nodes.launching import LAUNCHES, describe
 
 
 def generate_launch_description():
-    arguments = [
-        *launching.common("true"),
-        *launching.of_nodes(),
-        *launching.of_simulator(),
-    ]
-    return launching.launched(
-        [launching.simulator, launching.description],
-        [*arguments, *launching.of_description()],
-    )
+    return describe(LAUNCHES["simulator"]())

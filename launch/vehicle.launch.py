@@ -6,16 +6,8 @@ emergency stop that was never heard counts as pressed, whatever the file says.
 ros2 launch nics_drl_bridge vehicle.launch.py params_file:=car.yaml
 """
 
-from nics_drl_bridge.nodes import launching
+from nics_drl_bridge.nodes.launching import LAUNCHES, describe
 
 
 def generate_launch_description():
-    arguments = [
-        *launching.common("false"),
-        *launching.of_nodes(),
-        *launching.of_bridge(),
-    ]
-    return launching.launched(
-        [launching.bridge, launching.description],
-        [*arguments, *launching.of_description()],
-    )
+    return describe(LAUNCHES["vehicle"]())

@@ -1,0 +1,488 @@
+"""Which nodes `nics up` and the launch files start, and with which parameters; without ROS 2.
+
+A launch is a list of arguments and of functions, each of which yields the nodes of one part:
+`simulator`, `bridge`, `description`. An argument that is left empty leaves what the file of
+parameters says.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from nics_drl_bridge.config import (
+    PACKAGE,
+    find_config,
+    parse_yaml,
+    read_text,
+    share_folder,
+)
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, MODEL, STAMPED
+
+STATE_PUBLISHER = "robot_state_publisher"
+RVIZ = "rviz2"
+SHIPPED_LASER = "laser"  # frame of the lidar in the URDFs of the shipped robots
+TRANSFORMS = ("/tf", "/tf_static")
+# RViz names topics absolutely; here they are those of the robot's namespace.
+SHOWN = (
+    "scan",
+    "odom",
+    "odometry/filtered",
+    "ground_truth",
+    "goal_pose",
+    "robot_description",
+)
+
+FLAGS = (
+    "autostart",
+    "e_stop_required",
+    "rviz",
+    "stamped",
+    "use_robot_state_pub",
+    "use_rviz",
+    "use_sim_time",
+)
+FLAG_WORDS = {"true": "true", "1": "true", "false": "false", "0": "false", "": ""}
+Values = Mapping[str, str]  # of the arguments, by name
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument `name:=value` of a launch."""
+
+    name: str
+    default: str
+    about: str
+    choices: tuple[str, ...] = ()
+    same_as: str = ""  # another argument, whose value is the default
+
+
+@dataclass(frozen=True)
+class NodeStart:
+    """A node that is to be started."""
+
+    package: str
+    executable: str  # and name of the node
+    namespace: str
+    parameters: Mapping[str, Any]  # text, numbers, booleans, or lists of one of them
+    params_file: str = ""  # whose values `parameters` take precedence over; empty: none
+    remappings: Sequence[tuple[str, str]] = ()
+    arguments: Sequence[str] = ()  # words of the command line before those of ROS 2
+    log_level: str = ""
+
+    @property
+    def own(self) -> bool:
+        """True for a node of this package."""
+        return self.package == PACKAGE
+
+
+class Robot(NamedTuple):
+    """A robot, and where its names lie."""
+
+    namespace: str  # of its topics
+    frames: str  # put before its frames
+    transforms: str  # namespace of its `tf` and `tf_static`
+
+
+class Setup:
+    """What the arguments and the file of parameters ask for together."""
+
+    def __init__(self, values: Values) -> None:
+        flags = {name: flag_of(name, values.get(name, "")) for name in FLAGS}
+        self.values = {**values, **flags}
+        file = self["params_file"]
+        self._file = parse_yaml(read_text(file), file) if file else {}
+        self.model = self["model"] or str(self._of_file("model", "") or MODEL.default)
+        shipped = share_folder() / "urdf" / f"{self.model}.urdf"
+        self._opened: Any = None if shipped.is_file() else opened(self.model)
+        self.urdf = self["urdf"] or (str(shipped) if self._opened is None else "")
+        self.simulator = f"{self['simulator']}_node"
+        space = self["namespace"].strip("/")
+        robots = self["robots"] or self._of_file("robots", self.simulator)
+        self.fleet = names_of(robots) if robots and "robots" in values else ()
+        self.robots = [Robot(space, "", space)]
+        if self.fleet:
+            self.robots = [
+                Robot(f"{space}/{n}".strip("/"), f"{n}/", space) for n in self.fleet
+            ]
+
+    def __getitem__(self, name: str) -> str:
+        """Returns an argument; empty if it was left so, or is none of this launch."""
+        return self.values.get(name, "")
+
+    def text(self, name: str) -> str | None:
+        """Returns an argument, or None if it was left empty."""
+        return self[name] or None
+
+    def flag(self, name: str) -> bool | None:
+        """Returns an argument that is true or false, or None if it was left empty."""
+        return self[name] == "true" if self[name] else None
+
+    def _of_file(self, name: str, node: str) -> Any:
+        """Returns what the file of parameters says of one, for a node in any namespace."""
+        found = None
+        for key in ("/**", f"/**/{node}", node, f"/{node}") if node else ("/**",):
+            found = (
+                (self._file.get(key) or {}).get("ros__parameters", {}).get(name, found)
+            )
+        return found
+
+    def limits(self) -> str:
+        """Returns the gate's limits; where a model was given, those that are shipped for it."""
+        if self["limits"] or not self["model"]:
+            return self["limits"]
+        robot = self.model if self._opened is None else self._opened.robot.name
+        return (
+            robot
+            if (share_folder() / "config" / "limits" / f"{robot}.yaml").is_file()
+            else ""
+        )
+
+    def frame(self, node: str, robot: Robot) -> str | None:
+        """Returns the frame of a robot of a fleet; None for one robot, whose file names it."""
+        base = self._of_file(BASE_FRAME.name, node) or BASE_FRAME.default
+        return f"{robot.frames}{base}" if robot.frames else None
+
+    def description(self) -> str:
+        """Returns the URDF of the robot, with the frames that the file of parameters names."""
+        base = str(self._of_file(BASE_FRAME.name, self.simulator) or BASE_FRAME.default)
+        laser = str(self._of_file("laser_frame", self.simulator) or "")
+        shipped = base == BASE_FRAME.default and laser in ("", SHIPPED_LASER)
+        if self["urdf"] or (self.urdf and shipped):
+            return read_text(self.urdf)
+        from nics_drl_bridge.robot.urdf import urdf_of
+
+        model = opened(self.model) if self._opened is None else self._opened
+        further = {sensor.frame: sensor.mount for sensor in model.sensors}
+        return urdf_of(
+            model.robot, model.lidar.mount, laser or model.lidar.frame, base, further
+        )
+
+    def node(
+        self,
+        package: str,
+        executable: str,
+        robot: Robot,
+        parameters: Mapping[str, Any],
+        arguments: Sequence[str] = (),
+        remappings: Sequence[tuple[str, str]] = (),
+    ) -> NodeStart:
+        """Returns a node with the parameters that are given; those that are None are left out."""
+        # As in Nav2, transforms stay in a namespace; those of a fleet, and its map, in that of all.
+        alone = robot.transforms == robot.namespace
+        place = "" if alone else f"/{robot.transforms}/".replace("//", "/")
+        moved = TRANSFORMS if alone else (*TRANSFORMS, "map")
+        return NodeStart(
+            package=package,
+            executable=executable,
+            namespace=robot.namespace,
+            parameters={
+                name: value for name, value in parameters.items() if value is not None
+            },
+            params_file=self["params_file"] if package == PACKAGE else "",
+            remappings=[
+                *((name, f"{place}{name.strip('/')}") for name in moved),
+                *remappings,
+            ],
+            arguments=arguments,
+            log_level=self["log_level"],
+        )
+
+
+Part = Callable[[Setup], Iterator[NodeStart]]
+
+
+@dataclass(frozen=True)
+class Launch:
+    """What is started together, and by which arguments it is chosen."""
+
+    about: str
+    parts: Sequence[Part]
+    arguments: Sequence[Argument]
+    simulated: bool = False
+
+    def nodes(self, given: Values) -> list[NodeStart]:
+        """Returns the nodes for the arguments that are given. Raises BridgeError."""
+        setup = Setup(complete(self.arguments, given))
+        return [node for part in self.parts for node in part(setup)]
+
+
+def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
+    """Returns the values of all arguments. Raises ConfigError for an unknown name or choice."""
+    known = {argument.name for argument in arguments}
+    for name in given:
+        if name not in known:
+            raise ConfigError(f"unknown argument {name!r}; {nearest(name, known)}")
+    values: dict[str, str] = {}
+    for argument in arguments:  # one that is the default of another stands before it
+        default = values[argument.same_as] if argument.same_as else argument.default
+        value = given.get(argument.name, default)
+        if argument.choices and value not in argument.choices:
+            hint = nearest(value, argument.choices)
+            raise ConfigError(f"launch argument {argument.name!r} is {value!r}; {hint}")
+        values[argument.name] = value
+    return values
+
+
+def opened(model: str) -> Any:
+    """Returns an opened model; it takes seconds, so only what is not shipped is opened."""
+    from nics_drl_bridge.generator import open_model
+
+    return open_model(model)
+
+
+def flag_of(name: str, given: str) -> str:
+    """Returns `true` or `false` of an argument, or nothing if it was left empty. ConfigError."""
+    if given.lower() not in FLAG_WORDS:  # refused here, before any node is started
+        raise ConfigError(f"launch argument {name!r} is {given!r}; give true or false.")
+    return FLAG_WORDS[given.lower()]
+
+
+def names_of(robots: Any) -> tuple[str, ...]:
+    """Returns the namespaces of a fleet by a count or their list; none for one robot."""
+    if isinstance(robots, list):
+        words = [str(each) for each in robots]
+    else:
+        words = re.findall(r"[^\s,\[\]'\"]+", str(robots))
+    if len(words) == 1 and words[0].isdecimal():
+        count = int(words[0])
+        if count < 1:
+            fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
+            raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
+        return tuple(f"robot{k + 1}" for k in range(count)) if count > 1 else ()
+    twice = {word for word in words if words.count(word) > 1}
+    if twice:
+        raise ConfigError(
+            f"launch argument 'robots' names {min(twice)!r} twice; name each once."
+        )
+    return tuple(words)
+
+
+def numbers_of(start: str) -> list[float] | None:
+    """Returns the numbers x, y, heading of each robot; None if it was left empty. ConfigError."""
+    words = re.findall(r"[^\s,\[\]]+", start)
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        found = [0.0]
+    if len(found) % 3:
+        fix = (
+            "give x, y, heading [m, rad] of each robot, as in start:='[1.0, 0.0, 1.57]'"
+        )
+        raise ConfigError(f"launch argument 'start' is {start!r}; {fix}.")
+    return found or None
+
+
+def simulator(setup: Setup) -> Iterator[NodeStart]:
+    """Yields the simulator of all robots."""
+    robots: Any = None
+    if setup.fleet:
+        robots = list(setup.fleet)
+    elif setup["robots"]:
+        robots = 1
+    space = setup["namespace"].strip("/")
+    parameters = {
+        "model": setup.text("model"),
+        "world": setup.text("world"),
+        "robots": robots,
+        "episode_start": numbers_of(setup["start"]),
+        STAMPED: setup.flag("stamped"),
+    }
+    yield setup.node(PACKAGE, setup.simulator, Robot(space, "", space), parameters)
+
+
+def bridge(setup: Setup) -> Iterator[NodeStart]:
+    """Yields gate, middleware and policy of each robot."""
+    shared = {
+        "model": setup.text("model"),
+        STAMPED: setup.flag("stamped"),
+        "use_sim_time": setup.flag("use_sim_time"),
+    }
+    required = setup.flag("e_stop_required")
+    of_gate = {
+        "e_stop_required": True if required is None else required,
+        "limits": setup.limits() or None,
+    }
+    managed = {"autostart": setup.flag("autostart"), IMU: setup.text(IMU)}
+    of_policy = {"policy": setup.text("policy"), "fallback": setup.text("fallback")}
+    own: dict[str, dict[str, Any]] = {
+        "command_gate": of_gate,
+        "middleware_node": managed,
+        "policy_node": {**managed, **of_policy},
+    }
+    for robot in setup.robots:
+        for node, parameters in own.items():
+            frame = {BASE_FRAME.name: setup.frame(node, robot)}
+            yield setup.node(PACKAGE, node, robot, {**shared, **parameters, **frame})
+
+
+def description(setup: Setup) -> Iterator[NodeStart]:
+    """Yields robot_state_publisher of each robot, and RViz, where they are wanted."""
+    timed = {"use_sim_time": setup.flag("use_sim_time")}
+    drawn = setup.description()
+    if setup.flag("use_robot_state_pub"):
+        for robot in setup.robots:
+            parameters = {
+                **timed,
+                "robot_description": drawn,
+                "frame_prefix": robot.frames or None,
+            }
+            yield setup.node(STATE_PUBLISHER, STATE_PUBLISHER, robot, parameters)
+    if setup.flag("rviz"):
+        first = setup.robots[0]
+        topics = [
+            ("/map", f"/{first.transforms}/map".replace("//", "/"))
+        ]  # of all robots
+        topics += [(f"/{topic}", topic) for topic in SHOWN]
+        yield setup.node(RVIZ, RVIZ, first, timed, ("-d", setup["rviz_config"]), topics)
+
+
+def common(use_sim_time: str) -> list[Argument]:
+    """Returns the arguments of every launch."""
+    return [
+        Argument(
+            "model", "", "Shipped robot, or folder of a model; empty: of params_file"
+        ),
+        Argument("namespace", "", "Of the robot, or of the fleet"),
+        Argument("use_sim_time", use_sim_time, "Use /clock"),
+        Argument("log_level", "info", "Of all nodes"),
+    ]
+
+
+def of_nodes() -> list[Argument]:
+    """Returns the arguments of every launch that starts nodes of this package."""
+    file = str(find_config("bridge", "nodes"))
+    stamped = "cmd_vel is a TwistStamped; empty: of params_file, or as usual"
+    return [
+        Argument("params_file", file, "Parameters of all nodes"),
+        Argument("stamped", "", stamped),
+    ]
+
+
+def of_simulator(robots: str = "") -> list[Argument]:
+    """Returns the arguments of a simulator."""
+    kinds = ("simulator", "mujoco")
+    start = "x, y, heading [m, rad] of each robot; empty: drawn"
+    return [
+        Argument("simulator", kinds[0], "The fast simulator, or MuJoCo", kinds),
+        Argument("world", "", "Shipped world, or a YAML file; empty: of params_file"),
+        Argument("robots", robots, "How many, or their namespaces, as '[a, b]'"),
+        Argument("start", "", start),
+    ]
+
+
+def of_bridge() -> list[Argument]:
+    """Returns the arguments of gate, middleware and policy, but for the emergency stop."""
+    limits = "Of the gate; empty: of the model, if given, or of params_file"
+    return [
+        Argument(
+            "policy", "", "Policy file, or a policy by name; empty: of params_file"
+        ),
+        Argument("fallback", "", "Planner behind the policy; empty: of params_file"),
+        Argument("limits", "", limits),
+        Argument(
+            "autostart", "true", "Managed nodes configure and activate themselves"
+        ),
+        Argument(IMU, "", "Topic of the gyro, auto or none; empty: of params_file"),
+    ]
+
+
+def e_stop_required(default: str) -> Argument:
+    """Returns the argument for the emergency stop."""
+    return Argument(
+        "e_stop_required", default, "An e_stop that was never heard counts as pressed"
+    )
+
+
+def of_description() -> list[Argument]:
+    """Returns the arguments of the description, which draws a robot in RViz."""
+    installed = "true" if prefix_of(STATE_PUBLISHER) else "false"
+    view = str(share_folder() / "config" / "rviz" / "bridge.rviz")
+    return [
+        Argument("use_robot_state_pub", installed, "Start robot_state_publisher"),
+        Argument("urdf", "", "File of the robot; empty: of the model"),
+        Argument("use_rviz", "false", "The same as rviz, by its name in Nav2"),
+        Argument("rviz", "", "Start RViz", same_as="use_rviz"),
+        Argument("rviz_config", view, "File for RViz"),
+    ]
+
+
+def prefix_of(package: str) -> Path | None:
+    """Returns the folder that a ROS 2 package is installed in, or None."""
+    folders = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    for folder in map(Path, filter(None, folders)):
+        if (
+            folder / "share" / "ament_index" / "resource_index" / "packages" / package
+        ).is_file():
+            return folder
+    return None
+
+
+def whole_simulation(robots: str = "") -> Launch:
+    """Returns a simulator, and on its topics all that runs on a vehicle."""
+    arguments = [*common("true"), *of_nodes(), *of_simulator(robots), *of_bridge()]
+    return Launch(
+        "Several robots in one simulator, each with gate, middleware and policy."
+        if robots
+        else "A simulator, and on its topics all that runs on a vehicle.",
+        [simulator, bridge, description],
+        [*arguments, e_stop_required("false"), *of_description()],
+        simulated=True,
+    )
+
+
+def fleet() -> Launch:
+    """Returns several robots in one simulator, each with a bridge in its namespace."""
+    return whole_simulation(robots="2")
+
+
+def vehicle() -> Launch:
+    """Returns all that runs on a vehicle; an emergency stop that was never heard stops it."""
+    return Launch(
+        "Gate, middleware and policy of a vehicle, beside the drivers of its lidar and its base.",
+        [bridge, description],
+        [*common("false"), *of_nodes(), *of_bridge(), *of_description()],
+    )
+
+
+def simulator_alone() -> Launch:
+    """Returns a simulator and the description of its robots, to drive by `cmd_vel`."""
+    return Launch(
+        "A simulator alone, to drive from elsewhere by cmd_vel.",
+        [simulator, description],
+        [*common("true"), *of_nodes(), *of_simulator(), *of_description()],
+        simulated=True,
+    )
+
+
+def bridge_alone() -> Launch:
+    """Returns middleware, policy and gate on a robot's topics."""
+    return Launch(
+        "Gate, middleware and policy on a robot's topics.",
+        [bridge],
+        [*common("false"), *of_nodes(), *of_bridge(), e_stop_required("true")],
+    )
+
+
+def description_alone() -> Launch:
+    """Returns what a robot looks like: its URDF to robot_state_publisher, and RViz."""
+    return Launch(
+        "The URDF of a robot to robot_state_publisher, and RViz.",
+        [description],
+        [*common("false"), *of_description()],
+    )
+
+
+LAUNCHES: dict[str, Callable[[], Launch]] = {
+    "simulation": whole_simulation,
+    "vehicle": vehicle,
+    "fleet": fleet,
+    "simulator": simulator_alone,
+    "bridge": bridge_alone,
+    "description": description_alone,
+}
+"""Every launch by name: those of `nics up`, and of the files in `launch/`."""

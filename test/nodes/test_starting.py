@@ -1,0 +1,229 @@
+"""What the arguments of `nics up` and of the launch files come to; without ROS 2."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from nics_drl_bridge.config import find_config, share_folder
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import builtin_model, save_model
+from nics_drl_bridge.nodes import starting
+from nics_drl_bridge.nodes.starting import LAUNCHES, Robot, Setup, names_of, numbers_of
+
+
+def setup_of(**given):
+    values = {
+        "params_file": str(find_config("bridge", "nodes")),
+        "simulator": "simulator",
+    }
+    return Setup(values | given)
+
+
+@pytest.mark.parametrize(
+    ("robots", "names"),
+    [
+        ("1", ()),
+        (1, ()),
+        ("", ()),
+        ("2", ("robot1", "robot2")),
+        (3, ("robot1", "robot2", "robot3")),
+        ("[ant, bee]", ("ant", "bee")),
+        ("ant bee", ("ant", "bee")),
+        ("['ant']", ("ant",)),
+        (["ant", "bee"], ("ant", "bee")),
+    ],
+)
+def test_robots_are_a_count_or_names(robots, names):
+    assert names_of(robots) == names
+
+
+def test_no_robots_at_all_are_refused():
+    with pytest.raises(
+        ConfigError, match="launch argument 'robots' is 0; give a count from 1"
+    ):
+        names_of("0")
+
+
+def test_a_robot_that_is_named_twice_is_refused():
+    with pytest.raises(ConfigError, match="'robots' names 'ant' twice; name each once"):
+        names_of("[ant, bee, ant]")
+
+
+@pytest.mark.parametrize("name", starting.FLAGS)
+def test_a_flag_that_is_neither_true_nor_false_is_refused_before_any_node_starts(name):
+    with pytest.raises(
+        ConfigError, match=f"launch argument '{name}' is 'maybe'; give true or"
+    ):
+        setup_of(**{name: "maybe"})
+    assert [setup_of(**{name: one})[name] for one in ("True", "0", "")] == [
+        "true",
+        "false",
+        "",
+    ]
+
+
+def test_a_missing_file_of_the_robot_is_one_sentence():
+    with pytest.raises(ConfigError, match=r"^/nope\.urdf: no such file"):
+        setup_of(urdf="/nope.urdf").description()
+
+
+def test_one_robot_of_an_argument_goes_before_the_fleet_of_a_file(tmp_path):
+    file = tmp_path / "fleet.yaml"
+    file.write_text("simulator_node:\n  ros__parameters:\n    robots: [ant, bee]\n")
+
+    def robots(given):
+        (node,) = starting.simulator(setup_of(robots=given, params_file=str(file)))
+        return node.parameters.get("robots")
+
+    assert robots("1") == 1
+    assert robots("") == ["ant", "bee"]
+
+
+def test_the_policies_of_a_fleet_hear_the_map_of_all():
+    for node in starting.bridge(setup_of(namespace="hall", robots="[ant, bee]")):
+        assert ("map", "/hall/map") in node.remappings
+    for node in starting.bridge(setup_of(namespace="hall", robots="")):
+        assert "map" not in dict(node.remappings)
+
+
+@pytest.mark.parametrize("start", ["1 0 1.5", "[1, 0, 1.5]", "1.0,0.0,1.5"])
+def test_a_start_is_three_numbers_in_any_spelling(start):
+    assert numbers_of(start) == [1.0, 0.0, 1.5]
+
+
+@pytest.mark.parametrize("start", ["1", "here", "1 2 3 4", "1 2 x"])
+def test_another_start_is_refused_with_an_example(start):
+    with pytest.raises(
+        ConfigError, match=r"launch argument 'start' is .*x, y, heading"
+    ):
+        numbers_of(start)
+
+
+def test_no_start_leaves_it_to_the_seed():
+    assert numbers_of("") is None
+
+
+def test_one_robot_lies_in_the_namespace_and_a_fleet_below_it():
+    assert setup_of(namespace="/hall", robots="").robots == [Robot("hall", "", "hall")]
+    fleet = setup_of(namespace="hall", robots="[ant, bee]").robots
+    assert fleet == [
+        Robot("hall/ant", "ant/", "hall"),
+        Robot("hall/bee", "bee/", "hall"),
+    ]
+
+
+def test_the_limits_are_those_of_the_model_that_is_given():
+    assert setup_of().limits() == ""
+    assert setup_of(model="mecanum").limits() == "mecanum"
+    assert setup_of(model="mecanum", limits="own.yaml").limits() == "own.yaml"
+
+
+def test_a_generated_model_has_the_limits_and_the_looks_of_its_robot(tmp_path):
+    save_model(builtin_model("mecanum"), tmp_path / "model")
+    setup = setup_of(model=str(tmp_path / "model"))
+    assert setup.limits() == "mecanum"
+    assert '<robot name="mecanum"' in setup.description()
+
+
+def test_the_model_of_the_file_of_parameters_is_drawn_where_none_is_given(tmp_path):
+    file = tmp_path / "own.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    model: jackal\n")
+    assert '<robot name="jackal"' in setup_of(params_file=str(file)).description()
+    assert '<robot name="differential"' in setup_of().description()
+    assert '<robot name="mecanum"' in setup_of(model="mecanum").description()
+
+
+@pytest.mark.parametrize("model", ["mecanum", "own"])
+def test_the_robot_is_drawn_with_the_frames_of_the_file_of_parameters(tmp_path, model):
+    if model == "own":
+        model = str(tmp_path / "model")
+        save_model(builtin_model("mecanum"), tmp_path / "model")
+    file = tmp_path / "own.yaml"
+    file.write_text(
+        "/**:\n  ros__parameters: {base_frame: chassis, laser_frame: front_laser}\n"
+    )
+    drawn = setup_of(model=model, params_file=str(file)).description()
+    assert '<link name="chassis">' in drawn
+    assert '<link name="front_laser">' in drawn
+    assert '"base_link"' not in drawn
+
+
+def started(launch, **given):
+    """The parameters of the nodes of a launch, by their names with namespaces."""
+    nodes = LAUNCHES[launch]().nodes(given)
+    return {
+        f"{node.namespace}/{node.executable}".strip("/"): node.parameters
+        for node in nodes
+    }
+
+
+def test_a_simulation_arms_without_an_e_stop_and_a_vehicle_does_not():
+    bridge = ["command_gate", "middleware_node", "policy_node"]
+    assert list(started("simulation")) == ["simulator_node", *bridge]
+    assert list(started("vehicle")) == bridge
+    assert started("simulation")["command_gate"]["e_stop_required"] is False
+    assert started("fleet")["robot2/command_gate"]["e_stop_required"] is False
+    assert started("vehicle")["command_gate"]["e_stop_required"] is True
+    required = started("simulation", e_stop_required="true")
+    assert required["command_gate"]["e_stop_required"] is True
+
+
+def test_every_parameter_has_the_type_that_its_node_declares():
+    given = {
+        "world": "7",
+        "policy": "1e3",
+        "stamped": "0",
+        "start": "1 2 3",
+        "robots": "[ant]",
+    }
+    nodes = started("simulation", **given)
+    assert nodes["simulator_node"]["world"] == "7"
+    assert nodes["simulator_node"]["episode_start"] == [1.0, 2.0, 3.0]
+    assert nodes["simulator_node"]["robots"] == ["ant"]
+    assert nodes["simulator_node"]["enable_stamped_cmd_vel"] is False
+    assert nodes["ant/policy_node"]["policy"] == "1e3"
+    assert nodes["ant/policy_node"]["autostart"] is True
+
+
+def test_what_is_left_empty_is_no_parameter():
+    assert started("simulation")["simulator_node"] == {}
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"wrld": "arena"}, "unknown argument 'wrld'; did you mean 'world'?"),
+        (
+            {"simulator": "gazebo"},
+            "'simulator' is 'gazebo'; valid are: 'mujoco', 'simulator'",
+        ),
+        ({"stamped": "yes"}, "'stamped' is 'yes'; give true or false"),
+        ({"params_file": "none.yaml"}, "none.yaml: no such file"),
+        ({"e_stop_required": "false"}, "unknown argument 'e_stop_required'"),
+    ],
+)
+def test_an_argument_that_can_not_be_used_is_one_sentence(given, sentence):
+    launch = "vehicle" if "e_stop_required" in given else "simulation"
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        started(launch, **given)
+
+
+def test_rviz_starts_by_either_name_and_shows_the_first_robot():
+    for name in ("rviz", "use_rviz"):
+        nodes = LAUNCHES["fleet"]().nodes({name: "true"})
+        (view,) = [node for node in nodes if node.package == starting.RVIZ]
+        assert view.namespace == "robot1"
+        assert view.arguments[0] == "-d"
+        assert ("/scan", "scan") in view.remappings
+        assert not view.params_file
+
+
+def test_every_launch_file_starts_the_launch_of_its_name():
+    """Those files need `launch`, which only `make test-upstream` has."""
+    folder = share_folder() / "launch"
+    files = {file.name.partition(".")[0]: file for file in folder.glob("*.launch.py")}
+    assert files.keys() == LAUNCHES.keys()
+    for name, file in files.items():
+        assert f'describe(LAUNCHES["{name}"]())' in file.read_text(encoding="utf-8")
