@@ -499,9 +499,17 @@ def _e_stop(
     cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(
         config, state, now
     )
-    return "" if cause is None else cause.line
+    if cause is None:
+        return ""
+    if cause.rule == "e_stop_silent" and state.e_stop.heard_s is None:
+        return NEVER_HEARD
+    return cause.line
 
 
+NEVER_HEARD = (
+    "e_stop_silent: no e_stop was ever heard, which counts as pressed: publish it at 10 Hz or more, "
+    "or in a simulation start the gate with e_stop_required:=false"
+)
 UNLIMITED = "no limits are set, name their file in `limits`"
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("limits_set", lambda c, *_: UNLIMITED if c.limits is None else ""),

@@ -157,6 +157,15 @@ def test_a_pressed_e_stop_is_named_until_it_is_released_and_reset():
     assert rig.arm().granted
 
 
+def test_the_refusal_for_want_of_an_e_stop_names_the_setting_of_a_simulation():
+    never_heard = settled(without="e_stop").arm().answer
+    assert "no e_stop was ever heard" in never_heard
+    assert "in a simulation start the gate with e_stop_required:=false" in never_heard
+    pressed = settled()
+    pressed.give(EStop(True))
+    assert "e_stop_required" not in pressed.arm().answer
+
+
 def test_a_latched_stop_is_named():
     rig = settled()
     assert rig.arm().granted
