@@ -371,8 +371,20 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
     return data
 
 
-def dump_yaml(data: Any) -> str:
+class _QuotingDumper(_Dumper):
+    """Dumper that quotes every text, for readers with other rules of what looks like a number."""
+
+
+def _quoted(dumper: _QuotingDumper, text: str) -> Any:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"')
+
+
+_QuotingDumper.add_representer(str, _quoted)
+
+
+def dump_yaml(data: Any, quote_text: bool = False) -> str:
     """Writes plain data as YAML that `parse_yaml` reads back to the same numbers."""
+    dumper = _QuotingDumper if quote_text else _Dumper
     return str(
-        yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+        yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=100)
     )

@@ -507,8 +507,8 @@ def _e_stop(
 
 
 NEVER_HEARD = (
-    "e_stop_silent: no e_stop was ever heard, which counts as pressed: publish it at 10 Hz or more, "
-    "or in a simulation start the gate with e_stop_required:=false"
+    "e_stop_silent: no e_stop was ever heard, which counts as pressed: publish it at 10 Hz or "
+    "more, or in a simulation start the gate with e_stop_required:=false"
 )
 UNLIMITED = "no limits are set, name their file in `limits`"
 CHECKS: tuple[tuple[str, Check], ...] = (

@@ -1,15 +1,11 @@
 """Processes for the package's nodes, with a reliable end, and a witness of what they do."""
 
-import ctypes
 import json
 import os
 import random
-import signal
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -20,16 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
 from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, holds, open_context, spin
+from nics_drl_bridge.nodes.starting import NodeStart
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
-PR_SET_PDEATHSIG = 1
 LOG_LINES = 5
-PATIENCE_S = 5.0
 ASK_AGAIN_S = 0.2
 ANSWER_S = 2.0
 POLL_S = 0.005
@@ -49,32 +45,8 @@ def free_domain_id() -> int:
     return int(given)
 
 
-def interruptible() -> None:
-    """Lets SIGINT end a process that is about to begin, also below a shell that ignores it.
-
-    Shells start background jobs so, as in `make test &`, and children inherit it.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def _prepared() -> Callable[[], None]:
-    """Returns what a node's process does before it begins: it ends with its parent, on Linux."""
-    if sys.platform != "linux":
-        return interruptible
-    prctl = ctypes.CDLL(None).prctl
-    parent = os.getpid()
-
-    def prepare() -> None:
-        interruptible()
-        prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != parent:  # it died in between
-            os._exit(1)
-
-    return prepare
-
-
-class NodeProcess(AbstractContextManager["NodeProcess", None]):
-    """One node in its own process, which ends with `close`, and on Linux with its parent thread."""
+class NodeProcess(ChildProcess):
+    """One of the package's nodes in its own process, with its output in a file."""
 
     def __init__(
         self,
@@ -86,50 +58,22 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         remap: Mapping[str, str] | None = None,
         discovery: str = "LOCALHOST",
     ) -> None:
-        self.node = node
         folder.mkdir(parents=True, exist_ok=True)
+        self.node = node
         self.log = folder / f"{node}.log"
-        file = folder / f"{node}.yaml"
-        file.write_text(
-            dump_yaml({"/**": {"ros__parameters": dict(parameters)}}), encoding="utf-8"
+        rules = list((remap or {}).items())
+        start = NodeStart(
+            PACKAGE, node, namespace.strip("/"), parameters, remappings=rules
         )
-        space = {"__ns": f"/{namespace.strip('/')}"} if namespace else {}
-        rules = [f"{old}:={new}" for old, new in {**space, **(remap or {})}.items()]
-        command = [
-            sys.executable,
-            "-m",
-            "nics_drl_bridge.nodes.start",
-            node,
-            "--ros-args",
-        ]
-        command += [
-            "--params-file",
-            str(file),
-            *(word for rule in rules for word in ("-r", rule)),
-        ]
         chosen = {
             "ROS_DOMAIN_ID": str(domain_id),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
         }
-        chosen["PYTHONSAFEPATH"] = (
-            "1"  # no modules of the working folder, which may be a model
-        )
-        with self.log.open("wb") as log:
-            # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
-            self._process = subprocess.Popen(
-                command,
-                env=os.environ | chosen,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                preexec_fn=_prepared(),
-            )
-        self.pid = self._process.pid
+        super().__init__(node, command_of(start, folder), chosen, self.log)
 
     def check(self) -> None:
         """Raises BackendError with the end of its log if the node has ended by itself."""
-        code = self._process.poll()
+        code = self.poll()
         if code is not None:
             lines = (
                 self.log.read_text(encoding="utf-8", errors="replace")
@@ -140,19 +84,6 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
             last = " | ".join(told[-LOG_LINES:]) or "no output"
             reason = f"ended with code {code}: {last} (its log is {self.log})."
             raise BackendError(f"{self.node} {reason}")
-
-    def close(self) -> int:
-        """Ends the node: SIGINT, then SIGKILL if it does not react. Returns its exit code."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
-            try:
-                self._process.wait(PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-        return self._process.wait()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class Witness(AbstractContextManager["Witness", None]):

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes import processes
+from nics_drl_bridge.nodes import node_process
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
@@ -99,7 +99,7 @@ def test_leaving_the_block_ends_a_node_that_runs_and_one_that_hangs(
         peer.until(lambda: scans, "a scan")
         node.check()
     assert not alive(node.pid)
-    monkeypatch.setattr(processes, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(node_process, "PATIENCE_S", 0.5)
     with NodeProcess("command_gate", tmp_path / "hangs", {}, domain_id) as node:
         peer.until(lambda: "command_gate" in peer.node.get_node_names(), "the gate")
         os.kill(node.pid, signal.SIGSTOP)

@@ -1,0 +1,134 @@
+"""Nodes as processes of their own, which end with this one; needs no ROS 2 itself."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+from nics_drl_bridge.config import PACKAGE, dump_yaml
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.nodes.starting import NodeStart, prefix_of
+
+PR_SET_PDEATHSIG = 1
+PATIENCE_S = 5.0  # for which a process may take to end
+
+
+def interruptible() -> None:
+    """Lets SIGINT end a process that is about to begin, also below a shell that ignores it.
+
+    Shells start background jobs so, as in `make test &`, and children inherit it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _prepared() -> Callable[[], None]:
+    """Returns what a node's process does before it begins: it ends with its parent, on Linux."""
+    if sys.platform != "linux":
+        return interruptible
+    prctl = ctypes.CDLL(None).prctl
+    parent = os.getpid()
+
+    def prepare() -> None:
+        interruptible()
+        prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:  # it died in between
+            os._exit(1)
+
+    return prepare
+
+
+def command_of(node: NodeStart, folder: Path) -> list[str]:
+    """Returns the command line of a node, and writes its parameters to a file in a folder."""
+    place = f"/{node.namespace}/{node.executable}".replace("//", "/")
+    # The values of a file for just this node take precedence over those for many.
+    nodes = place if node.params_file else "/**"
+    file = folder / f"{place.strip('/').replace('/', '.')}.yaml"
+    parameters = {nodes: {"ros__parameters": dict(node.parameters)}}
+    file.write_text(dump_yaml(parameters, quote_text=True), encoding="utf-8")
+    words = [*program_of(node), *node.arguments, "--ros-args"]
+    if node.log_level:
+        words += ["--log-level", node.log_level]
+    rules = list(node.remappings)
+    if node.namespace:
+        rules.insert(0, ("__ns", f"/{node.namespace.strip('/')}"))
+    if not node.own:
+        rules.insert(0, ("__node", node.executable))
+    for old, new in rules:
+        words += ["-r", f"{old}:={new}"]
+    if node.params_file:
+        words += ["--params-file", node.params_file]
+    if node.parameters:
+        words += ["--params-file", str(file)]
+    return words
+
+
+def program_of(node: NodeStart) -> list[str]:
+    """Returns the words that start a node's program. Raises ConfigError if it is missing."""
+    if node.own:
+        return [sys.executable, "-m", f"{PACKAGE}.nodes.start", node.executable]
+    prefix = prefix_of(node.package)
+    if prefix is None:
+        fix = "install it with your ROS 2 distribution, or start without it"
+        raise ConfigError(
+            f"the ROS 2 package {node.package!r} is not installed here; {fix}."
+        )
+    return [str(prefix / "lib" / node.package / node.executable)]
+
+
+class ChildProcess(AbstractContextManager["ChildProcess", None]):
+    """A process that ends with `close`, and on Linux with its parent thread."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        log: Path | None = None,
+    ) -> None:
+        """Starts it; its output goes to a file, or where that of this process goes."""
+        self.name = name
+        chosen = dict(environment or {})
+        chosen["PYTHONSAFEPATH"] = (
+            "1"  # no modules of the working folder, which may be a model
+        )
+        output = None if log is None else log.open("wb")
+        try:
+            # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
+            self._process = subprocess.Popen(
+                command,
+                env={**os.environ, **chosen},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+                preexec_fn=_prepared(),
+            )
+        finally:
+            if output is not None:
+                output.close()
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        """Returns its exit code, or None while it runs."""
+        return self._process.poll()
+
+    def interrupt(self) -> None:
+        """Asks it to end, as Ctrl-C does."""
+        if self.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+
+    def close(self) -> int:
+        """Ends it: SIGINT, then SIGKILL if it does not react. Returns its exit code."""
+        self.interrupt()
+        try:
+            return self._process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        return self._process.wait()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
