@@ -205,12 +205,13 @@ test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs, ackerma
 		LD_LIBRARY_PATH="$$LD_LIBRARY_PATH" \
 		$(BIN)/python -m pytest $(MESSAGE_TESTS) $(PYTEST_ARGS)
 
-$(MESSAGES)/.ready: test/build_messages.sh constraints.txt $(wildcard test/messages/*/msg/*.msg $(UPSTREAM)/*_interfaces.tar.gz)
+$(MESSAGES)/.ready: test/build_messages.sh nics_drl_bridge/commands/message_build.py constraints.txt \
+		$(wildcard config/messages/*/msg/*.msg $(UPSTREAM)/*_interfaces.tar.gz) | $(READY)
 	@if [ "$(ROS)" != wheels ]; then \
 		echo "make test-messages: needs Linux on x86-64 and a shell without a sourced ROS 2." >&2; \
 		exit 1; fi
 	@echo "Building $(MESSAGES); the first time takes some minutes."
-	@$(CLEAN_ENV) test/build_messages.sh $(BASE) $(MESSAGES) constraints.txt $(UPSTREAM)
+	@$(CLEAN_ENV) test/build_messages.sh $(BIN)/nics $(MESSAGES) $(UPSTREAM)
 	@touch $@
 
 # The real tools over the wheels, and this package as colcon installs it.

@@ -15,6 +15,7 @@ from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
 from nics_drl_bridge.commands.examples import complete
+from nics_drl_bridge.commands.install import install
 from nics_drl_bridge.commands.listing import list_
 from nics_drl_bridge.commands.model import (
     drive,
@@ -24,9 +25,11 @@ from nics_drl_bridge.commands.model import (
     record,
     urdf,
 )
+from nics_drl_bridge.commands.operate import arm, goal, stop
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.start import EXIT_INTERRUPTED, was_interrupted
 from nics_drl_bridge.commands.train import train
+from nics_drl_bridge.commands.up import up
 from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.commands.watch import watch
 from nics_drl_bridge.commands.world import world
@@ -111,8 +114,14 @@ for command in (
     watch,
     demo,
     warmup,
+    arm,
+    stop,
+    install,
 ):
     app.command(command.__name__.rstrip("_"))(command)
+# Their arguments may begin with a minus sign.
+app.command(context_settings={"ignore_unknown_options": True})(up)
+app.command(context_settings={"ignore_unknown_options": True})(goal)
 app.add_typer(policy, name="policy")
 app.add_typer(world, name="world")
 for name, extension in extensions.known("commands").items():

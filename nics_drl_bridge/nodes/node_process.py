@@ -6,8 +6,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import TypeVar
 
 from nics_drl_bridge.config import PACKAGE, dump_yaml
 from nics_drl_bridge.errors import ConfigError
@@ -79,7 +79,10 @@ def program_of(node: NodeStart) -> list[str]:
     return [str(prefix / "lib" / node.package / node.executable)]
 
 
-class ChildProcess(AbstractContextManager["ChildProcess", None]):
+ChildT = TypeVar("ChildT", bound="ChildProcess")
+
+
+class ChildProcess:
     """A process that ends with `close`, and on Linux with its parent thread."""
 
     def __init__(
@@ -129,6 +132,9 @@ class ChildProcess(AbstractContextManager["ChildProcess", None]):
         except subprocess.TimeoutExpired:
             self._process.kill()
         return self._process.wait()
+
+    def __enter__(self: ChildT) -> ChildT:
+        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

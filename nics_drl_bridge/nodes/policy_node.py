@@ -18,6 +18,7 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.middleware.uncertainty import gained_uncertainty
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.follow_path import PathActions, Wish
+from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
@@ -41,6 +42,7 @@ class PolicyNode(ManagedNode):
         self._nav2 = ControllerParameters(self)
         self.ignores = self._nav2.ignores  # of Nav2's file for its controller server
         self._acted_ns = 0
+        self._answer: GoalAnswer | None = None  # to the newest goal
         runner.diagnose(self, "policy", self._look)
 
     def configure(self) -> None:
@@ -66,6 +68,7 @@ class PolicyNode(ManagedNode):
             period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
         )
         self._acted_ns = 0
+        self._answer = None
         self._raw = self.create_lifecycle_publisher(
             TwistStamped, "cmd_vel_raw", qos.COMMAND
         )
@@ -116,20 +119,25 @@ class PolicyNode(ManagedNode):
         self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
 
     def _on_goal(self, message: PoseStamped) -> None:
+        stamp_ns = conversions.stamp_from_ros(message.header.stamp)
         if self._actions.active or self._actions.led:
             told = "a goal_pose is not used, as an action leads the robot"
             self.get_logger().info(told, throttle_duration_sec=5.0)
+            self._answer = GoalAnswer(stamp_ns, False, told)
             return
         try:
             goal = self._frames.in_map(message)
         except ConfigError as error:
             self.get_logger().error(f"{error} The goal before it stays.")
+            self._answer = GoalAnswer(stamp_ns, False, str(error))
             return
         if not np.array_equal(goal, self._goal):
             begin(self._policy)
         self._goal = goal
         self._covariance = self._topics.middleware.estimator.covariance[:3, :3]
-        self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
+        place = f"({self._goal[0]:.2f}, {self._goal[1]:.2f}) m"
+        self._answer = GoalAnswer(stamp_ns, True, f"{place} in the map")
+        self.get_logger().info(f"new goal {place}")
 
     def _act(self, _: int = 0) -> None:
         if self.state != ACTIVE:
@@ -167,13 +175,15 @@ class PolicyNode(ManagedNode):
             return runner.Condition(self.state, warns=False, facts={})
         done = self._deadline
         longest = f"{1e3 * self._deadline.longest_s:.2f}"
-        facts = {
+        facts: dict[str, object] = {
             "answered": done.answered,
             "late": done.late,
             "longest inference [ms]": longest,
         }
         if (planned := acted(self._policy)) is not None:
             facts["by the fallback"] = planned
+        if self._answer is not None:
+            facts.update(self._answer.to_facts())
         return runner.Condition(
             f"{self.state}; {done.late} late inferences", done.late > 0, facts
         )

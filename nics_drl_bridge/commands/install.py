@@ -1,0 +1,126 @@
+"""`nics install`: message packages that ROS 2's wheels lack."""
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
+from nics_drl_bridge.nodes.message_packages import shipped_packages, wheels_here
+
+
+def install(
+    packages: Annotated[
+        list[str],
+        Argument(
+            metavar="PACKAGE...",
+            help="tf2_msgs, ackermann_msgs, or the folder of another package with its msg, srv and "
+            "action.",
+            autocompletion=lambda incomplete: [
+                name for name in shipped_packages() if name.startswith(incomplete)
+            ],
+        ),
+    ],
+    prefix: Annotated[
+        Path | None,
+        Option(
+            help="Install there, with a setup.bash to be sourced; else into this environment."
+        ),
+    ] = None,
+) -> None:
+    """Builds message packages over the wheels of ROS 2, which lack them; needs a compiler."""
+    from nics_drl_bridge.commands.message_build import (
+        Generators,
+        check_programs,
+        write_setup,
+    )
+
+    sources = [source_of(name) for name in packages]
+    if prefix is None:
+        present = [
+            source.name for source in sources if find_spec(source.name) is not None
+        ]
+        for name in present:
+            typer.echo(f"{name} is installed already")
+        sources = [source for source in sources if source.name not in present]
+    if not sources:
+        return
+    wheels = wheels_here()
+    if wheels is None:
+        if find_spec("rclpy") is None:
+            raise ConfigError(f"nics install {MISSING_ROS.format(module='rclpy')}")
+        name = sources[0].name
+        distribution = os.environ.get("ROS_DISTRO", "DISTRO")
+        debian = f"ros-{distribution}-{name.replace('_', '-')}"
+        fix = (
+            f"install {name} with your distribution, as by `sudo apt install {debian}`"
+        )
+        raise ConfigError(
+            f"nics install: the ROS 2 here does not come from wheels; {fix}."
+        )
+    place = check_prefix(prefix or Path(sys.prefix))
+    check_programs()
+    with Generators(wheels, _tell) as generators:
+        for source in sources:
+            interfaces = generators.interfaces(source)
+            for file, missing in interfaces.left_out.items():
+                _tell(
+                    f"{source.name}: {file} is left out, as there is no wheel of {missing}"
+                )
+            _tell(f"building {source.name}")
+            generators.build(interfaces, place)
+            if prefix is None:
+                check_import(source.name)
+            typer.echo(f"{source.name} is installed in {place}")
+    if prefix is not None:
+        typer.echo(f"to use what is there: source {write_setup(place)}")
+
+
+def source_of(name: str) -> Path:
+    """Returns the folder with the files of a message package. Raises ConfigError."""
+    shipped = shipped_packages()
+    if name in shipped:
+        return shipped[name]
+    folder = Path(name)
+    if folder.is_dir():
+        return folder.resolve()
+    fix = "or give the folder of a package with its msg, srv and action"
+    raise ConfigError(
+        f"unknown message package {name!r}; {nearest(name, shipped)} ({fix})."
+    )
+
+
+def check_prefix(prefix: Path) -> Path:
+    """Makes a folder to install into, and returns it. Raises ConfigError if that fails."""
+    try:
+        prefix.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"{prefix}: {error.strerror}; choose another place."
+        ) from None
+    if not os.access(prefix, os.W_OK):
+        fix = (
+            "install this package into a virtual environment of yours, or say --prefix"
+        )
+        raise ConfigError(f"{prefix}: can't be written to; {fix}.")
+    return prefix.resolve()
+
+
+def check_import(name: str) -> None:
+    """Raises ConfigError unless a new process can use the messages of a package."""
+    ask = f"import importlib as i; {name} = i.import_module('{name}.msg')\n"
+    ask += "from rclpy.type_support import check_for_type_support as check\n"
+    ask += f"[check(o) for o in vars({name}).values() if isinstance(o, type)]"
+    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True)
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
+        raise ConfigError(f"{name} was built, but it can't be imported: {reason}")
+
+
+def _tell(line: str) -> None:
+    typer.echo(line, err=True)

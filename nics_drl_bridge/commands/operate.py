@@ -1,0 +1,93 @@
+"""`nics arm`, `nics stop` and `nics goal`: a running robot without ROS 2's command line."""
+
+from functools import partial
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from nics_drl_bridge.commands import console
+from nics_drl_bridge.config import namespace_of
+
+EXIT_REFUSED = 1
+
+WaitOption = Annotated[
+    float,
+    Option(min=0.0, help="Longest time to wait for the node, and for its consent [s]."),
+]
+NamespaceOption = Annotated[str, Option(help="Namespace of the robot, as robot1.")]
+_tell = partial(typer.echo, err=True)
+
+
+def arm(
+    namespace: NamespaceOption = "",
+    reset: Annotated[
+        bool,
+        Option("--reset", help="Release a latched stop first, as that of nics stop."),
+    ] = False,
+    wait: WaitOption = 20.0,
+) -> None:
+    """Arms command_gate, so that commands reach the robot; tells why it refuses."""
+    namespace_of(namespace)
+    with console.needs_ros("nics arm"):
+        from nics_drl_bridge.nodes.operator import Operator
+    with Operator() as operator:
+        answer = operator.arm(namespace, wait, reset, _tell)
+    if not answer.granted:
+        typer.echo(f"nics: {answer.gate} refuses to arm: {answer.told}", err=True)
+        raise typer.Exit(EXIT_REFUSED)
+    typer.echo(f"{answer.gate} is armed: the robot moves when its policy has a goal")
+
+
+def stop(
+    namespace: Annotated[
+        str | None, Option(help="Of one robot; else every robot is stopped.")
+    ] = None,
+    wait: WaitOption = 5.0,
+) -> None:
+    """Presses the e-stop of command_gate; without a namespace, of every gate that is seen."""
+    namespace_of(namespace or "")
+    with console.needs_ros("nics stop"):
+        from nics_drl_bridge.nodes.operator import Operator
+    with Operator() as operator:
+        answers = operator.stop(namespace, wait)
+    for answer in answers:
+        space = answer.gate.rpartition("/")[0].strip("/")
+        again = f"nics arm --reset{f' --namespace {space}' if space else ''}"
+        if answer.granted:
+            typer.echo(
+                f"{answer.gate} has stopped its robot; `{again}` lets it drive again"
+            )
+        else:
+            typer.echo(f"nics: {answer.gate} was NOT stopped: {answer.told}", err=True)
+    if not all(answer.granted for answer in answers):
+        raise typer.Exit(EXIT_REFUSED)
+
+
+def goal(
+    x: Annotated[float, Argument(help="Ahead, along the x axis of the frame [m].")],
+    y: Annotated[float, Argument(help="To the left, along its y axis [m].")],
+    yaw: Annotated[
+        float, Option(help="Heading, which no shipped policy uses [rad].")
+    ] = 0.0,
+    frame: Annotated[
+        str,
+        Option(
+            metavar="FRAME", help="map, odom, base_link or another frame; else the map."
+        ),
+    ] = "",
+    namespace: NamespaceOption = "",
+    wait: WaitOption = 20.0,
+) -> None:
+    """Sends a goal to policy_node, and tells whether it has taken it."""
+    namespace_of(namespace)
+    with console.needs_ros("nics goal"):
+        from nics_drl_bridge.nodes.operator import GoalRequest, Operator
+    with Operator() as operator:
+        answer = operator.send_goal(
+            namespace, GoalRequest(x, y, yaw, frame), wait, _tell
+        )
+    if not answer.taken:
+        typer.echo(f"nics: policy_node does not take the goal: {answer.told}", err=True)
+        raise typer.Exit(EXIT_REFUSED)
+    typer.echo(f"policy_node drives to {answer.told}, while command_gate is armed")

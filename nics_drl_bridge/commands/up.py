@@ -1,0 +1,179 @@
+"""`nics up`: the nodes of a launch as processes, until Ctrl-C, without ROS 2's `launch`."""
+
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, NoReturn
+
+import typer
+from typer import Argument, Option
+
+from nics_drl_bridge.commands import console
+from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
+from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
+from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
+
+EXIT_NODE_ENDED = 1
+POLL_S = 0.1
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
+
+def up(
+    what: Annotated[
+        str,
+        Argument(
+            help=f"What to start: {', '.join(LAUNCHES)}.",
+            autocompletion=lambda incomplete: [
+                n for n in LAUNCHES if n.startswith(incomplete)
+            ],
+        ),
+    ],
+    arguments: Annotated[
+        list[str] | None,
+        Argument(
+            metavar="NAME:=VALUE...",
+            help="Arguments, the same as those of the launch files.",
+        ),
+    ] = None,
+    show_args: Annotated[
+        bool,
+        Option(
+            "--show-args", help="List the arguments and their defaults; start nothing."
+        ),
+    ] = False,
+) -> None:
+    """Starts the nodes of a simulation, a vehicle or a fleet; Ctrl-C ends all of them."""
+    if what not in LAUNCHES:
+        raise ConfigError(
+            f"there is nothing called {what!r} to start; {nearest(what, LAUNCHES)}"
+        )
+    launch = LAUNCHES[what]()
+    if show_args:
+        typer.echo(table_of(launch))
+        return
+    given = values_of(arguments or ())
+    complete(launch.arguments, given)
+    if find_spec("rclpy") is None:
+        raise ConfigError(f"nics up {MISSING_ROS.format(module='rclpy')}")
+    nodes = launch.nodes(given)
+    if not nodes:
+        raise ConfigError(f"nics up {what}: there is nothing to start; say rviz:=true.")
+    run(nodes)
+
+
+def values_of(words: Sequence[str]) -> dict[str, str]:
+    """Returns the values of arguments `name:=value` by name. Raises ConfigError."""
+    values: dict[str, str] = {}
+    for word in words:
+        name, sign, value = word.partition(":=")
+        if not sign:
+            raise ConfigError(
+                f"argument {word!r}: write name:=value, as in world:=corridor."
+            )
+        if name in values:
+            raise ConfigError(f"argument {name!r} is given twice; give it once.")
+        values[name] = value
+    return values
+
+
+def table_of(launch: Launch) -> str:
+    """Returns the arguments of a launch as a table."""
+    rows = []
+    for argument in launch.arguments:
+        default = (
+            f"that of {argument.same_as}" if argument.same_as else argument.default
+        )
+        about = argument.about
+        if argument.choices:
+            about = f"{about} ({' or '.join(argument.choices)})"
+        rows.append((f"{argument.name}:=", default, about))
+    return (
+        f"{launch.about}\n\n{console.table(('argument', 'default', 'meaning'), rows)}"
+    )
+
+
+def run(nodes: Sequence[NodeStart]) -> None:
+    """Runs nodes until a signal comes or one of them ends; then all of them have ended."""
+    processes: list[ChildProcess] = []
+    with TemporaryDirectory(prefix="nics_up_") as folder, ending_by_signals():
+        commands = [command_of(node, Path(folder)) for node in nodes]
+        typer.echo(
+            f"starting {', '.join(map(name_of, nodes))}; Ctrl-C ends all of them"
+        )
+        typer.echo(next_step(nodes))
+        try:
+            for node, command in zip(nodes, commands, strict=True):
+                processes.append(ChildProcess(name_of(node), command))
+            name, code = wait_for_end(nodes, processes)
+        finally:
+            end_all(processes)
+    typer.echo(
+        f"nics: {name} ended with code {code}, so everything was ended.", err=True
+    )
+    raise typer.Exit(
+        console.EXIT_BAD_INPUT if code == console.EXIT_BAD_INPUT else EXIT_NODE_ENDED
+    )
+
+
+def name_of(node: NodeStart) -> str:
+    """Returns the name of a node with its namespace, as its log lines show it."""
+    return f"{node.namespace}/{node.executable}".lstrip("/")
+
+
+def next_step(nodes: Sequence[NodeStart]) -> str:
+    """Returns what to do once the nodes run."""
+    gates = [node for node in nodes if node.executable == "command_gate"]
+    if not gates:
+        return "next: send commands on cmd_vel, or watch it with `nics watch --ros`"
+    space = f" --namespace {gates[0].namespace}" if gates[0].namespace else ""
+    step = f"`nics arm{space}`, `nics goal{space} 1 0`, and to stop it `nics stop`"
+    return f"next, in another terminal: {step}"
+
+
+def wait_for_end(
+    nodes: Sequence[NodeStart], processes: Sequence[ChildProcess]
+) -> tuple[str, int]:
+    """Waits until a node of this package has ended; returns its name and exit code.
+
+    Others, as RViz, may be closed.
+    """
+    while True:
+        for node, process in zip(nodes, processes, strict=True):
+            code = process.poll()
+            if code is not None and node.own:
+                return process.name, code
+        if all(process.poll() is not None for process in processes):
+            return processes[-1].name, processes[-1].close()
+        time.sleep(POLL_S)
+
+
+def end_all(processes: Sequence[ChildProcess]) -> None:
+    """Ends all processes, together; no further signal disturbs that."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    for process in processes:
+        process.interrupt()
+    for process in processes:
+        process.close()
+
+
+@contextmanager
+def ending_by_signals() -> Iterator[None]:
+    """Lets a lost terminal end the nodes in order, too; afterwards signals act as before."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    for number, handler in before.items():
+        if handler is signal.SIG_DFL:  # not SIGHUP if it was started by nohup
+            signal.signal(number, _leave)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _leave(number: int, _: Any) -> NoReturn:
+    raise SystemExit(128 + number)

@@ -1,0 +1,29 @@
+"""What a policy node answers to a goal, as it stands in its diagnostics; without ROS 2."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+STAMP = "stamp of the newest goal [ns]"
+TAKEN = "newest goal taken"
+TOLD = "newest goal"
+
+
+@dataclass(frozen=True)
+class GoalAnswer:
+    """Whether a goal was taken."""
+
+    stamp_ns: int  # of the goal's message
+    taken: bool
+    told: str  # where the goal is, or why it was refused
+
+    def to_facts(self) -> dict[str, object]:
+        """Returns the answer as facts of a node's diagnostics."""
+        return {STAMP: self.stamp_ns, TAKEN: self.taken, TOLD: self.told}
+
+
+def answer_from_values(values: Mapping[str, str]) -> GoalAnswer | None:
+    """Returns the answer among the values of a node's diagnostics, or None."""
+    stamp = values.get(STAMP, "")
+    if not stamp.isdecimal():
+        return None
+    return GoalAnswer(int(stamp), values.get(TAKEN) == str(True), values.get(TOLD, ""))

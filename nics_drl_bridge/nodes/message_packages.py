@@ -1,0 +1,41 @@
+"""Message packages that the wheels of ROS 2 lack, and how a user comes by them."""
+
+from collections.abc import Mapping
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import NamedTuple
+
+from nics_drl_bridge.config import share_folder
+
+
+class Wheels(NamedTuple):
+    """The wheels of ROS 2 in this environment."""
+
+    prefix: str  # of their names, as `ros-` or `ros-jazzy-`
+    versions: Mapping[str, str]  # by name
+
+
+def wheels_here() -> Wheels | None:
+    """Returns the wheels of ROS 2 that are installed; None if it comes from elsewhere, or not."""
+    versions = {}
+    for each in distributions():
+        name = str(each.metadata["Name"] or "").lower().replace("_", "-")
+        if name.startswith("ros-"):
+            versions[name] = each.version
+    for name in versions:
+        if name.endswith("-rclpy"):
+            return Wheels(name.removesuffix("rclpy"), versions)
+    return None
+
+
+def shipped_packages() -> dict[str, Path]:
+    """Returns the folders of the message packages whose files come with this package, by name."""
+    folder = share_folder() / "config" / "messages"
+    return {each.name: each for each in sorted(folder.iterdir()) if each.is_dir()}
+
+
+def how_to_install(package: str) -> str:
+    """Returns what a user does to have a message package."""
+    if package in shipped_packages() and wheels_here() is not None:
+        return f"install it by `nics install {package}`"
+    return "install it with your ROS 2 distribution"

@@ -1,0 +1,230 @@
+"""What a person does with a running robot: arm its gate, stop it, give it a goal."""
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
+from nics_drl_bridge.nodes.runner import holds, open_context, spin
+
+GATE = "command_gate"
+POLICY = ": policy"  # how the name of a policy node's status ends
+POLL_S = 0.02
+ASK_AGAIN_S = 1.0  # between two requests to a gate that refuses [s]
+SEND_AGAIN_S = 1.0  # between two goals to a policy node that refuses [s]
+ANSWER_S = 5.0  # for which a gate may take to answer [s]
+SETTLE_S = 1.0  # in which all gates are seen, once one of them is [s]
+Tell = Callable[[str], None]
+
+
+class GateAnswer(NamedTuple):
+    """Answer of one gate."""
+
+    gate: str  # its name
+    granted: bool
+    told: str
+
+
+@dataclass(frozen=True)
+class GoalRequest:
+    """A goal as a person asks for it."""
+
+    x: float  # [m]
+    y: float
+    yaw: float = 0.0  # [rad]
+    frame: str = ""  # empty: the map, whatever the policy node calls it
+
+    def to_ros(self, stamp_ns: int) -> PoseStamped:
+        """Returns the goal as a message."""
+        return conversions.pose_to_ros([self.x, self.y, self.yaw], stamp_ns, self.frame)
+
+
+class Operator(AbstractContextManager["Operator", None]):
+    """A node that calls gates and sends goals; a context manager. Raises BackendError."""
+
+    def __init__(self, domain_id: int | None = None) -> None:
+        self._policies: dict[
+            str, tuple[str, dict[str, str]]
+        ] = {}  # name: condition, values
+        self._context = open_context([], domain_id)
+        self._node = Node(
+            "nics_operator", context=self._context, start_parameter_services=False
+        )
+        self._node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS
+        )
+        self._thread = threading.Thread(
+            target=spin,
+            args=(self._node, threading.Event()),
+            daemon=True,
+            name="operator",
+        )
+        self._thread.start()
+
+    def arm(
+        self, namespace: str, seconds: float, reset: bool, tell: Tell
+    ) -> GateAnswer:
+        """Arms a gate, and asks again while it refuses; a reset before that releases its stop."""
+        deadline = time.monotonic() + seconds
+        gate = self._wait_for_gate(namespace, seconds)
+        if reset:
+            self._call(gate, "reset")
+        answer = self._call(gate, "arm")
+        if not answer.granted and time.monotonic() < deadline:
+            tell(
+                f"{gate} does not arm yet ({answer.told}), asking again for {seconds:g} s"
+            )
+        while not answer.granted and time.monotonic() < deadline:
+            time.sleep(ASK_AGAIN_S)
+            answer = self._call(gate, "arm")
+        return answer
+
+    def stop(self, namespace: str | None, seconds: float) -> list[GateAnswer]:
+        """Presses the e-stop of one gate, or of every one that is seen if no namespace is given."""
+        if namespace is not None:
+            return [self._call(self._wait_for_gate(namespace, seconds), "e_stop")]
+        answers: dict[str, GateAnswer] = {}
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            for gate in self._gates() - answers.keys():
+                if not answers:
+                    deadline = time.monotonic() + SETTLE_S
+                answers[gate] = self._call(gate, "e_stop")
+            time.sleep(POLL_S)
+        if not answers:
+            raise BackendError(f"{self._nobody(GATE, seconds)}; nothing was stopped.")
+        return list(answers.values())
+
+    def send_goal(
+        self, namespace: str, goal: GoalRequest, seconds: float, tell: Tell
+    ) -> GoalAnswer:
+        """Sends a goal, again while it is refused; returns the last answer of the policy node."""
+        space = namespace_of(namespace)
+        deadline = time.monotonic() + seconds
+        topic = self._node.create_publisher(
+            PoseStamped, f"{space}/goal_pose", qos.COMMAND
+        )
+        name = self._wait_for_policy(topic, space, seconds)
+        answer = self._send(topic, goal, name, deadline)
+        if not answer.taken and time.monotonic() < deadline:
+            tell(f"{name} does not take the goal yet ({answer.told}), sending it again")
+        while not answer.taken and time.monotonic() < deadline:
+            time.sleep(SEND_AGAIN_S)
+            answer = self._send(topic, goal, name, deadline)
+        return answer
+
+    def _send(
+        self, topic: Publisher, goal: GoalRequest, name: str, deadline: float
+    ) -> GoalAnswer:
+        stamp_ns = time.time_ns()
+        wait_s = max(ANSWER_S, deadline - time.monotonic())
+        topic.publish(goal.to_ros(stamp_ns))
+
+        def answered() -> bool:
+            answer = answer_from_values(self._policies[name][1])
+            return answer is not None and answer.stamp_ns == stamp_ns
+
+        if holds(answered, wait_s, POLL_S):
+            answer = answer_from_values(self._policies[name][1])
+            if answer is not None:
+                return answer
+        condition = self._policies[name][0]
+        return GoalAnswer(
+            stamp_ns, False, f"no answer within {wait_s:.0f} s, {condition}"
+        )
+
+    def _wait_for_policy(self, topic: Publisher, space: str, seconds: float) -> str:
+        """Waits for the policy node of a namespace, and returns its name."""
+
+        def found() -> list[str]:
+            return [name for name in self._policies if name.rpartition("/")[0] == space]
+
+        holds(lambda: topic.get_subscription_count() and found(), seconds, POLL_S)
+        names = found()
+        if not names:
+            spaces = {name.rpartition("/")[0] for name in self._policies}
+            raise BackendError(
+                f"{self._nobody('policy_node', seconds, space, spaces)}."
+            )
+        if not topic.get_subscription_count():
+            condition = self._policies[names[0]][0]
+            raise BackendError(
+                f"{names[0]} hears no goals, its state is {condition!r}; see its log."
+            )
+        return names[0]
+
+    def _wait_for_gate(self, namespace: str, seconds: float) -> str:
+        """Waits for the gate of a namespace, and returns its name."""
+        space = namespace_of(namespace)
+        gate = f"{space}/{GATE}"
+        if not holds(lambda: gate in self._gates(), seconds, POLL_S):
+            spaces = {each.rpartition("/")[0] for each in self._gates()}
+            raise BackendError(f"{self._nobody(GATE, seconds, space, spaces)}.")
+        return gate
+
+    def _gates(self) -> set[str]:
+        """Returns the names of all gates that are seen."""
+        services = self._node.get_service_names_and_types()
+        ends = [
+            name.removesuffix("/arm")
+            for name, _ in services
+            if name.endswith(f"/{GATE}/arm")
+        ]
+        return set(ends)
+
+    def _nobody(
+        self, what: str, seconds: float, space: str = "", spaces: set[str] | None = None
+    ) -> str:
+        """Returns a clause that says where nobody answers, and where somebody does."""
+        where = (
+            f"in namespace {space or '/'} of ROS domain {self._context.get_domain_id()}"
+        )
+        told = f"no {what} was seen {where} within {seconds:g} s"
+        if not spaces:
+            return f"{told}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID"
+        names = sorted(each.strip("/") for each in spaces)
+        fix = f"say --namespace {names[0]}" if names[0] else "leave --namespace out"
+        return (
+            f"{told}; there is one in {', '.join(f'/{name}' for name in names)}: {fix}"
+        )
+
+    def _call(self, gate: str, service: str) -> GateAnswer:
+        client = self._node.create_client(Trigger, f"{gate}/{service}")
+        try:
+            if not client.wait_for_service(timeout_sec=ANSWER_S):
+                return GateAnswer(gate, False, "it has ended")
+            future = client.call_async(Trigger.Request())
+            if not holds(future.done, ANSWER_S, POLL_S):
+                return GateAnswer(
+                    gate, False, f"it does not answer within {ANSWER_S:g} s"
+                )
+            answer = future.result()
+            return GateAnswer(gate, bool(answer.success), str(answer.message))
+        finally:
+            self._node.destroy_client(client)
+
+    def _take_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            if status.name.endswith(POLICY):
+                values = {pair.key: pair.value for pair in status.values}
+                self._policies[status.name.removesuffix(POLICY)] = (
+                    status.message,
+                    values,
+                )
+
+    def __exit__(self, *_: object) -> None:
+        self._context.try_shutdown()
+        self._thread.join(timeout=2.0)
+        self._node.destroy_node()

@@ -1,0 +1,309 @@
+"""`nics up`, `nics arm`, `nics goal` and `nics stop`, as on a machine with the wheels alone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from command_line import nics
+from domains import claimed_domain
+
+from nics_drl_bridge.nodes import starting
+from nics_drl_bridge.nodes.starting import LAUNCHES, NodeStart
+
+NICS = [sys.executable, "-m", "nics_drl_bridge.commands.start"]
+COMPILED_S = 250.0  # for which the kernels may take
+ENDED_S = 30.0
+POLL_S = 0.05
+ARRIVE_S = 10.0
+ATTEMPTS = 6
+NODES = ("simulator_node", "command_gate", "middleware_node", "policy_node")
+HEAVY = "numpy numba scipy rclpy"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ("simulaton",),
+            "nothing called 'simulaton' to start; did you mean 'simulation'?",
+        ),
+        (
+            ("simulation", "wrld:=arena"),
+            "unknown argument 'wrld'; did you mean 'world'?",
+        ),
+        (("simulation", "world=arena"), "'world=arena': write name:=value"),
+        (("simulation", "--world", "arena"), "'--world': write name:=value"),
+        (("simulation", "world:=a", "world:=b"), "'world' is given twice"),
+        (("simulation", "stamped:=maybe"), "'stamped' is 'maybe'; give true or false"),
+        (("vehicle", "e_stop_required:=false"), "unknown argument 'e_stop_required'"),
+        (("vehicle", "params_file:=none.yaml"), "none.yaml: no such file"),
+    ],
+)
+def test_a_wrong_argument_is_one_sentence_and_starts_nothing(words, sentence, tmp_path):
+    done = nics("up", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.process
+def test_a_wrong_argument_is_told_before_anything_heavy_is_loaded():
+    ask = (
+        "import sys\n"
+        "from nics_drl_bridge.commands import start\n"
+        "sys.argv = ['nics', 'up', 'simulation', 'wrld:=arena']\n"
+        "try:\n"
+        "    start.main()\n"
+        "except SystemExit as end:\n"
+        f"    print(end.code, set(sys.modules) & set('{HEAVY}'.split()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", ask], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "2 set()\n"
+
+
+@pytest.mark.parametrize("name", LAUNCHES)
+def test_every_launch_lists_its_arguments(name, tmp_path):
+    done = nics("up", name, "--show-args", cwd=tmp_path)
+    assert done.returncode == 0
+    assert all(
+        f"{argument.name}:=" in done.stdout for argument in LAUNCHES[name]().arguments
+    )
+
+
+def test_a_viewer_that_is_not_installed_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(starting, "prefix_of", lambda package: None)
+    monkeypatch.setattr(
+        "nics_drl_bridge.nodes.node_process.prefix_of", lambda package: None
+    )
+    done = nics("up", "vehicle", "rviz:=true", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "the ROS 2 package 'rviz2' is not installed here" in done.stderr
+
+
+class Up:
+    """`nics up` in a process of its own, and the commands that talk to its nodes."""
+
+    def __init__(self, folder: Path, domain_id: int, *words: str) -> None:
+        self.log = folder / "up.log"
+        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [*NICS, "up", *words],
+                env=self.environment,
+                stdout=log,
+                stderr=log,
+                cwd=folder,
+                preexec_fn=lambda: signal.signal(
+                    signal.SIGINT, signal.default_int_handler
+                ),
+            )
+
+    @property
+    def text(self) -> str:
+        return self.log.read_text(encoding="utf-8", errors="replace")
+
+    @property
+    def children(self) -> list[int]:
+        pid = self.process.pid
+        return [
+            int(child)
+            for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        ]
+
+    def runs(self, *nodes: str) -> None:
+        deadline = time.monotonic() + COMPILED_S
+        while not all(f"[{node}]: running" in self.text for node in nodes):
+            assert self.process.poll() is None, self.text
+            assert time.monotonic() < deadline, self.text
+            time.sleep(POLL_S)
+
+    def tell(self, *words: object) -> subprocess.CompletedProcess[str]:
+        command = [*NICS, *map(str, words)]
+        return subprocess.run(
+            command, env=self.environment, capture_output=True, text=True
+        )
+
+    def end(self, number: int) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(ENDED_S)
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Starts `nics up`, `start(*words)`; it ends with the test."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    started = []
+    with claimed_domain() as domain_id:
+
+        def make(*words):
+            started.append(Up(tmp_path, domain_id, *words))
+            return started[-1], domain_id
+
+        yield make
+        for each in started:
+            each.kill()
+
+
+def gone(children):
+    deadline = time.monotonic() + ENDED_S
+    while any(Path(f"/proc/{child}").exists() for child in children):
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(POLL_S)
+    return True
+
+
+def drives(up, witness, goal):
+    """Whether the robot gets to a goal; its gate may stop it where the machine is busy."""
+    for _ in range(ATTEMPTS):
+        if witness.arrives(goal, 0.4, ARRIVE_S):
+            return True
+        up.tell("arm", "--reset")
+    return False
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+
+@linux
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
+    from nics_drl_bridge.nodes.processes import Witness
+
+    up, domain_id = start("simulation", "world:=empty", "start:=[0.0, 0.0, 0.0]")
+    up.runs(*NODES)
+    assert "nics arm" in up.text
+    with Witness(domain_id) as witness:
+        assert witness.sees(ENDED_S)
+        armed = up.tell("arm")
+        assert armed.returncode == 0, armed.stderr
+        assert "/command_gate is armed" in armed.stdout
+        goal = up.tell("goal", "1", "-0.5")
+        assert goal.returncode == 0, goal.stderr
+        assert "drives to (1.00, -0.50) m in the map" in goal.stdout
+        assert drives(up, witness, (1.0, -0.5)), up.text
+        stopped = up.tell("stop")
+        assert stopped.returncode == 0, stopped.stderr
+        assert "/command_gate has stopped its robot" in stopped.stdout
+        refused = up.tell("arm", "--wait", 5)
+        assert refused.returncode == 1
+        assert "refuses to arm" in refused.stderr
+        assert "e_stop_released: e_stop_pressed" in refused.stderr
+        again = up.tell("arm", "--reset")
+        assert again.returncode == 0, again.stderr
+        behind = up.tell("goal", "-1", "0", "--frame", "base_link")
+        assert behind.returncode == 0, behind.stderr
+        nowhere = up.tell("goal", "1", "0", "--frame", "kitchen", "--wait", 1)
+        assert nowhere.returncode == 1
+        assert "a goal in the frame 'kitchen' is refused" in nowhere.stderr
+    children = up.children
+    assert len(children) == len(NODES)
+    assert up.end(signal.SIGINT) == 130, up.text
+    assert gone(children)
+    assert "Traceback" not in up.text
+
+
+@linux
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_no_node_outlives_it_whatever_signal_ends_it(start, number):
+    up, _ = start("simulator", "world:=empty")
+    up.runs("simulator_node")
+    children = up.children
+    assert len(children) == 1
+    assert up.end(number) in (128 + number, -number)
+    assert gone(children)
+
+
+@linux
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_node_that_can_not_start_ends_the_others_with_its_sentence(start):
+    up, _ = start("simulation", "policy:=dynamic_widow")
+    assert up.process.wait(COMPILED_S) == 2
+    assert "unknown policy 'dynamic_widow'; did you mean 'dynamic_window'?" in up.text
+    assert "policy_node ended with code 2, so everything was ended" in up.text
+
+
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("arm",), "command_gate"),
+        (("stop",), "command_gate"),
+        (("goal", 1, 0), "policy_node"),
+    ],
+)
+def test_where_nothing_runs_each_command_says_so(
+    words, what, start, tmp_path, monkeypatch
+):
+    with claimed_domain() as domain_id:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
+        done = nics(*words, "--wait", 0.5, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"no {what} was seen in namespace / of ROS domain {domain_id}" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["arm", "stop"])
+def test_a_namespace_that_can_not_be_one_is_refused_without_ros(command, tmp_path):
+    done = nics(command, "--namespace", "2nd", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "namespace '2nd'" in done.stderr
+
+
+def test_a_text_that_looks_like_a_number_reaches_a_node_as_a_text(tmp_path):
+    from nics_drl_bridge.nodes.node_process import command_of
+
+    parameters = {
+        "world": "7",
+        "policy": "1e3",
+        "robots": ["1", "true"],
+        "rate": 2.0,
+        "on": True,
+    }
+    node = NodeStart("nics_drl_bridge", "simulator_node", "", parameters)
+    words = command_of(node, tmp_path)
+    text = Path(words[words.index("--params-file") + 1]).read_text(encoding="utf-8")
+    for line in (
+        '"world": "7"',
+        '"policy": "1e3"',
+        '- "true"',
+        '"rate": 2.0',
+        '"on": true',
+    ):
+        assert line in text
+
+
+def test_values_of_an_argument_stand_above_those_of_the_users_file(tmp_path):
+    from nics_drl_bridge.nodes.node_process import command_of
+
+    node = NodeStart(
+        "nics_drl_bridge", "policy_node", "ant", {"policy": "mppi"}, "own.yaml"
+    )
+    words = command_of(node, tmp_path)
+    files = [words[k + 1] for k, word in enumerate(words) if word == "--params-file"]
+    assert files[0] == "own.yaml"
+    assert '"/ant/policy_node":' in Path(files[1]).read_text(encoding="utf-8")
+    assert words[words.index("-r") + 1] == "__ns:=/ant"
