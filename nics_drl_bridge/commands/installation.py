@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from nics_drl_bridge.errors import MISSING_ROS
 from nics_drl_bridge.extensions import PACKAGE, TRAINING, lacking
+from nics_drl_bridge.nodes.message_packages import how_to_install
 
 EXTRAS = {  # what each brings, by the modules that it needs
     "bags": ("reading and writing rosbags", ("rosbags", "mcap")),
@@ -100,14 +101,12 @@ def _ros() -> list[Check]:
     distribution = os.environ.get("ROS_DISTRO") or "from wheels"
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     told = f"{distribution}, rclpy {release}, ROS_DOMAIN_ID {domain}"
-    fix = "it comes with a ROS 2 installation; there is no wheel"
-    return [
-        Check("ROS 2", True, told),
-        *(
-            Check(name, find_spec(name) is not None, what, fix)
-            for name, what in MESSAGES.items()
-        ),
-    ]
+    messages = []
+    for name, what in MESSAGES.items():
+        messages.append(
+            Check(name, find_spec(name) is not None, what, how_to_install(name))
+        )
+    return [Check("ROS 2", True, told), *messages]
 
 
 def _kernels() -> Check:

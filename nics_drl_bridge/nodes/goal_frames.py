@@ -11,6 +11,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.map_to_odom import transform_from_ros
+from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 
 
@@ -124,6 +125,7 @@ class GoalFrames:
         )
         heard = "one that /tf_static joins to them"
         if self._transforms is None:
-            heard = "install tf2_msgs for those that /tf_static joins to them"
+            heard = "one that /tf_static joins to them, which needs tf2_msgs"
+            heard = f"{heard} ({how_to_install('tf2_msgs')})"
         why = f"a goal in the frame {asked!r} is refused, which is not known here"
         raise ConfigError(f"{why}; give it in {names}, or {heard}.")

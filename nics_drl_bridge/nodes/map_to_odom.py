@@ -13,6 +13,7 @@ from rclpy.node import Node
 from nics_drl_bridge import geometry
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.recording import messages
 
 QUIET_S = 2.0  # so long after another's transform, ours is published again
@@ -56,9 +57,7 @@ class MapToOdom:
         self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._kind is None:
             told = "the package tf2_msgs is not installed, so that map -> odom is not published"
-            node.get_logger().warning(
-                f"{told}; install it with your ROS 2 distribution."
-            )
+            node.get_logger().warning(f"{told}; {how_to_install('tf2_msgs')}.")
             return
         self._publisher = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
         given = self._kind, "/tf", self._take, qos.TRANSFORMS

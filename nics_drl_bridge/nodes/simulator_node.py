@@ -39,6 +39,7 @@ from nics_drl_bridge.nodes.command_types import TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
+from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.nodes.simulation_interfaces import open_services
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -428,9 +429,9 @@ class DeviceNode(qos.QosWatch):
         self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._transforms is None:
             silent = "so that neither /tf nor /tf_static is published"
-            fix = "install it with your ROS 2 distribution."
+            fix = how_to_install("tf2_msgs")
             self.get_logger().warning(
-                f"the package tf2_msgs is not installed, {silent}; {fix}"
+                f"the package tf2_msgs is not installed, {silent}; {fix}."
             )
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)

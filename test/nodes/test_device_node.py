@@ -312,4 +312,6 @@ def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comer
 
 @pytest.mark.skipif(HAS_TF, reason="tf2_msgs is installed")
 def test_one_line_says_that_tf2_msgs_is_missing(stamped):
-    assert stamped.process.log.read_text().count("tf2_msgs is not installed") == 1
+    log = stamped.process.log.read_text()
+    assert log.count("tf2_msgs is not installed") == 1
+    assert "; install it by `nics install tf2_msgs`." in log
