@@ -33,6 +33,8 @@ ELSEWHERE = {
     r"nics bag replay drive( --rate| --lockstep)": "feeds nodes",
     r"nics watch (?!.*--record)": "serves until Ctrl-C",
     r"nics train .*(--watch|--engine ray)": "serves until Ctrl-C, or needs a cluster",
+    r"nics (up|arm|goal|stop)": "starts nodes, or talks to them",
+    r"nics install": "needs a compiler",
     r"nics train --settings shipped_": "is a long training",
 }
 """Lines that tests of the command itself run, as they need more than files or a short while."""
