@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge.commands.console import JsonOption, say
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.nodes.message_packages import shipped_packages, wheels_here
 
@@ -32,8 +33,9 @@ def install(
             help="Install there, with a setup.bash to be sourced; else into this environment."
         ),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Builds message packages over the wheels of ROS 2, which lack them; needs a compiler."""
+    """Builds messages that the wheels of ROS 2 lack."""
     from nics_drl_bridge.commands.message_build import (
         Generators,
         check_programs,
@@ -46,7 +48,7 @@ def install(
             source.name for source in sources if find_spec(source.name) is not None
         ]
         for name in present:
-            typer.echo(f"{name} is installed already")
+            say(as_json, f"{name} is installed already", package=name, prefix=None)
         sources = [source for source in sources if source.name not in present]
     if not sources:
         return
@@ -76,9 +78,10 @@ def install(
             generators.build(interfaces, place)
             if prefix is None:
                 check_import(source.name)
-            typer.echo(f"{source.name} is installed in {place}")
+            line = f"{source.name} is installed in {place}"
+            say(as_json, line, package=source.name, prefix=str(place))
     if prefix is not None:
-        typer.echo(f"to use what is there: source {write_setup(place)}")
+        _tell(f"to use what is there: source {write_setup(place)}")
 
 
 def source_of(name: str) -> Path:

@@ -26,8 +26,9 @@ def arm(
         Option("--reset", help="Release a latched stop first, as that of nics stop."),
     ] = False,
     wait: WaitOption = 20.0,
+    as_json: console.JsonOption = False,
 ) -> None:
-    """Arms command_gate, so that commands reach the robot; tells why it refuses."""
+    """Arms command_gate; tells why it refuses."""
     namespace_of(namespace)
     with console.needs_ros("nics arm"):
         from nics_drl_bridge.nodes.operator import Operator
@@ -36,7 +37,8 @@ def arm(
     if not answer.granted:
         typer.echo(f"nics: {answer.gate} refuses to arm: {answer.told}", err=True)
         raise typer.Exit(EXIT_REFUSED)
-    typer.echo(f"{answer.gate} is armed: the robot moves when its policy has a goal")
+    line = f"{answer.gate} is armed: the robot moves when its policy has a goal"
+    console.say(as_json, line, gate=answer.gate, armed=True)
 
 
 def stop(
@@ -44,22 +46,27 @@ def stop(
         str | None, Option(help="Of one robot; else every robot is stopped.")
     ] = None,
     wait: WaitOption = 5.0,
+    as_json: console.JsonOption = False,
 ) -> None:
-    """Presses the e-stop of command_gate; without a namespace, of every gate that is seen."""
+    """Stops one robot, or all, by the e-stop of its gate."""
     namespace_of(namespace or "")
     with console.needs_ros("nics stop"):
         from nics_drl_bridge.nodes.operator import Operator
     with Operator() as operator:
         answers = operator.stop(namespace, wait)
+    lines = []
     for answer in answers:
         space = answer.gate.rpartition("/")[0].strip("/")
         again = f"nics arm --reset{f' --namespace {space}' if space else ''}"
         if answer.granted:
-            typer.echo(
+            lines.append(
                 f"{answer.gate} has stopped its robot; `{again}` lets it drive again"
             )
         else:
             typer.echo(f"nics: {answer.gate} was NOT stopped: {answer.told}", err=True)
+    if lines or as_json:
+        stopped = {answer.gate: answer.granted for answer in answers}
+        console.say(as_json, "\n".join(lines), stopped=stopped)
     if not all(answer.granted for answer in answers):
         raise typer.Exit(EXIT_REFUSED)
 
@@ -68,7 +75,7 @@ def goal(
     x: Annotated[float, Argument(help="Ahead, along the x axis of the frame [m].")],
     y: Annotated[float, Argument(help="To the left, along its y axis [m].")],
     yaw: Annotated[
-        float, Option(help="Heading, which no shipped policy uses [rad].")
+        float, Option(help="Heading, which the policies here do not use [rad].")
     ] = 0.0,
     frame: Annotated[
         str,
@@ -78,8 +85,9 @@ def goal(
     ] = "",
     namespace: NamespaceOption = "",
     wait: WaitOption = 20.0,
+    as_json: console.JsonOption = False,
 ) -> None:
-    """Sends a goal to policy_node, and tells whether it has taken it."""
+    """Sends a goal; tells whether policy_node takes it."""
     namespace_of(namespace)
     with console.needs_ros("nics goal"):
         from nics_drl_bridge.nodes.operator import GoalRequest, Operator
@@ -90,4 +98,5 @@ def goal(
     if not answer.taken:
         typer.echo(f"nics: policy_node does not take the goal: {answer.told}", err=True)
         raise typer.Exit(EXIT_REFUSED)
-    typer.echo(f"policy_node drives to {answer.told}, while command_gate is armed")
+    line = f"policy_node drives to {answer.told}, while command_gate is armed"
+    console.say(as_json, line, taken=True, goal=answer.told)

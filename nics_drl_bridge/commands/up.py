@@ -46,7 +46,7 @@ def up(
         ),
     ] = False,
 ) -> None:
-    """Starts the nodes of a simulation, a vehicle or a fleet; Ctrl-C ends all of them."""
+    """Starts the nodes of a simulation, vehicle or fleet."""
     if what not in LAUNCHES:
         raise ConfigError(
             f"there is nothing called {what!r} to start; {nearest(what, LAUNCHES)}"

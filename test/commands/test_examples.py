@@ -84,4 +84,4 @@ def test_every_command_but_the_page_speaks_json():
         for name, command in KNOWN.items()
         if not any("--json" in option.opts for option in command.params)
     }
-    assert mute == {("watch",)}
+    assert mute == {("up",), ("watch",)}
