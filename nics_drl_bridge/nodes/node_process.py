@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from nics_drl_bridge.config import PACKAGE, dump_yaml
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.nodes.child_python import module_command
 from nics_drl_bridge.nodes.starting import NodeStart, prefix_of
 
 PR_SET_PDEATHSIG = 1
@@ -69,7 +70,7 @@ def command_of(node: NodeStart, folder: Path) -> list[str]:
 def program_of(node: NodeStart) -> list[str]:
     """Returns the words that start a node's program. Raises ConfigError if it is missing."""
     if node.own:
-        return [sys.executable, "-m", f"{PACKAGE}.nodes.start", node.executable]
+        return [*module_command(f"{PACKAGE}.nodes.start"), node.executable]
     prefix = prefix_of(node.package)
     if prefix is None:
         fix = "install it with your ROS 2 distribution, or start without it"
