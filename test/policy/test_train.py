@@ -111,8 +111,7 @@ def steps_in(path):
 def test_an_interrupted_training_comes_to_the_same_weights(
     engine, actions, tmp_path, monkeypatch
 ):
-    curriculum = {"success": 0.01}  # so that levels rise
-    teaching = {"path": 1.0, "contact": -10.0, "retries": 1, "curriculum": curriculum}
+    teaching = {"path": 1.0, "contact": -10.0, "retries": 1}
     chosen = settings(
         task_options={"actions": actions}, teaching=teaching, **ENGINES[engine]
     )
