@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.policy import train_algorithms, train_imitation, train_kernels
+from nics_drl_bridge.policy import train_algorithms, train_kernels
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_kernels import LOG_NORM, Batch, Net
 from nics_drl_bridge.policy.train_memory import memory_of
@@ -337,12 +337,11 @@ class LeanPpo:
             *spaces, hidden, normaliser, torch.nn.ReLU, memory
         )
         self.networks = Networks(actor, hidden, self._ppo.log_std)
-        seeds = np.random.SeedSequence(seed).generate_state(3)
+        seeds = np.random.SeedSequence(seed).generate_state(2)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
         self.learner = Learner(self.networks, self._ppo, int(seeds[1]), reflection)
         self.policy = actor
         self._settings = settings
-        self._imitation_seed = int(seeds[2])
         self.steps = 0  # of all worlds together, learnt from so far
         self._rollout: Driven | None = None  # the next one to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
@@ -353,7 +352,6 @@ class LeanPpo:
         watch.begin(self.steps)
         if self._rollout is None:
             self.collector.last = self.collector.env.reset()
-            self._imitate()
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
@@ -364,23 +362,6 @@ class LeanPpo:
             if watch.report(self.steps, self._successes, logger):
                 logger.record("train/loss", loss)
                 logger.dump(self.steps)
-
-    def _imitate(self) -> None:
-        """Begins with what an expert does, if the settings say so; its steps count as well."""
-        given = self._settings.imitation
-        part = self.collector
-        if given is None:
-            return
-        steps = given.steps // part.env.num_envs
-        rng = np.random.default_rng(self._imitation_seed)
-        expert = train_imitation.expert_of(self._settings, part.env)
-        drive = partial(train_imitation.drive, discount=self._ppo.discount, rng=rng)
-        shown, part.last = drive(part.env, expert, part.last, steps)
-        train_imitation.imitate(
-            self.networks, shown, given.epochs, self.learner.generator
-        )
-        part.networks.load_state_dict(self.networks.state_dict())
-        self.steps = len(shown.seen)
 
     def _advance(self, rollout: Driven, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""

@@ -79,16 +79,6 @@ class SacSettings(Schema):
     soft_update: Share = 0.01  # by which each gradient step moves the target critics
 
 
-class ImitationSettings(Schema):
-    """A start of the lean engine from what an expert does, by behaviour cloning."""
-
-    expert: str  # name of a planner, or a policy file
-    steps: Count = (
-        50_000  # driven by it, of all worlds together; they count as steps of training
-    )
-    epochs: Count = 10  # passes through them
-
-
 class StopSettings(Schema):
     """An early end, as soon as held-out success has stood in two evaluations in a row."""
 
@@ -142,9 +132,6 @@ class TrainingSettings(Schema):
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()  # used if `algorithm` is `ppo`
     sac: SacSettings = SacSettings()  # used if `algorithm` is `sac`
-    imitation: ImitationSettings | None = (
-        None  # start by imitating an expert; None: from scratch
-    )
 
     @field_validator("task_options")
     @classmethod
@@ -178,21 +165,6 @@ class TrainingSettings(Schema):
             raise ValueError(
                 f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _imitable(self) -> TrainingSettings:
-        if (given := self.imitation) is None:
-            return self
-        if not self.lean:
-            raise ValueError(
-                "imitation needs the lean engine of ppo; choose it, or leave that out"
-            )
-        if not self.num_envs <= given.steps < self.steps:
-            span = f"from {self.num_envs}, one in each world, to less than all {self.steps}"
-            raise ValueError(f"imitation.steps must be {span}; change them")
-        if given.steps > MOST_KEPT:
-            raise ValueError(f"imitation.steps may be {MOST_KEPT}; lower them")
         return self
 
     @property

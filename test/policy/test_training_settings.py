@@ -76,6 +76,7 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
             "teaching: {curriculum: {begin: 0.2}}",
             r"unknown key 'teaching.curriculum'",
         ),
+        ("imitation: {expert: mppi}", r"unknown key 'imitation'"),
         ("stop: {every: 10}", r"the key 'stop.success' is missing"),
         (
             "stop: {success: 1.1}",
