@@ -24,7 +24,6 @@ from nics_drl_bridge.policy import train_algorithms, train_kernels
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_kernels import LOG_NORM, Batch, Net
 from nics_drl_bridge.policy.train_memory import memory_of
-from nics_drl_bridge.policy.train_mirror import Reflection
 from nics_drl_bridge.policy.train_rollout import Driven, Transitions
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
@@ -157,11 +156,9 @@ class Learner:
         networks: Networks,
         ppo: PpoSettings,
         seed: int,
-        reflection: Reflection | None = None,
     ) -> None:
         self.networks = networks
         self.ppo = ppo
-        self._reflection = reflection
         self.generator = torch.Generator().manual_seed(seed)
         self._all = flattened(networks)
         self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
@@ -171,7 +168,7 @@ class Learner:
         self.core_is_free = threading.Event()  # no thread collects meanwhile
 
     def judge(self, driven: Driven) -> Transitions:
-        """Advantages and returns of a rollout, by the present critic, and mirror images."""
+        """Advantages and returns of a rollout, by the present critic."""
         networks = self.networks
         ppo = self.ppo
         with torch.no_grad():
@@ -194,9 +191,7 @@ class Learner:
         rollout = Transitions(*(each.flatten(0, 1) for each in rows))
         if networks.actor.memory.learnt:
             rollout = rollout._replace(state=driven.state, done=driven.done)
-        if self._reflection is None:
-            return rollout
-        return self._reflection.doubled(rollout)
+        return rollout
 
     def learn(self, rollout: Transitions, rate: float) -> float:
         """Learns from a rollout with a learning rate; returns the loss of the last batch."""
@@ -329,17 +324,13 @@ class LeanPpo:
         inputs = len(normaliser[0])
         parts = env.envs[0].task.scan_parts
         memory = memory_of(settings.memory, inputs, parts)
-        reflection = None
-        if self._ppo.mirror:
-            reflection = Reflection(env.envs[0].task.mirror(), memory.extra, parts)
-            normaliser = reflection.balanced(*normaliser)
         actor = train_algorithms.Actor(
             *spaces, hidden, normaliser, torch.nn.ReLU, memory
         )
         self.networks = Networks(actor, hidden, self._ppo.log_std)
         seeds = np.random.SeedSequence(seed).generate_state(2)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
-        self.learner = Learner(self.networks, self._ppo, int(seeds[1]), reflection)
+        self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
         self.policy = actor
         self._settings = settings
         self.steps = 0  # of all worlds together, learnt from so far

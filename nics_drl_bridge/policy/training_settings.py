@@ -47,9 +47,6 @@ class PpoSettings(Schema):
         default=0.0, ge=0.0
     )  # weight of the entropy bonus; more explores more
     log_std: float = -0.5  # of the actions at the start
-    mirror: bool = (
-        False  # True learns from each transition with left and right exchanged, too
-    )
 
 
 class StackMemory(Schema):
@@ -148,17 +145,9 @@ class TrainingSettings(Schema):
             raise ValueError(
                 "ppo's engine 'lean' alone learns a memory; use it, or leave it out"
             )
-        if self.ppo.mirror and not self.lean:
-            raise ValueError(
-                "ppo's engine 'lean' alone learns by ppo.mirror; leave that out"
-            )
-        if self.ppo.mirror and isinstance(self.memory, GruMemory):
-            raise ValueError(
-                "the state of a gru has no mirror image; leave out ppo.mirror"
-            )
         if self.num_envs > MOST_WORLDS:
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
-        rows = self.num_envs * self.ppo.rollout * (1 + self.ppo.mirror)
+        rows = self.num_envs * self.ppo.rollout
         kept = rows if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
             kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"

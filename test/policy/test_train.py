@@ -52,7 +52,6 @@ ENGINES = {
     "lean": {"algorithm": "ppo"},
     "gru": {"algorithm": "ppo", "memory": {"kind": "gru", "units": 5}},
     "stack": {"algorithm": "ppo", "memory": {"kind": "stack", "scans": 3, "every": 2}},
-    "mirror": {"algorithm": "ppo", "ppo": {"rollout": 16, "batch": 64, "mirror": True}},
     "sb3": {
         "algorithm": "ppo",
         "ppo": {"rollout": 16, "batch": 64, "epochs": 2, "engine": "sb3"},
@@ -103,7 +102,6 @@ def steps_in(path):
         ("gru", "continuous"),
         ("gru", "discrete"),
         ("stack", "continuous"),
-        ("mirror", "continuous"),
         ("sb3", "continuous"),
         ("sac", "continuous"),
     ],

@@ -90,12 +90,8 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
             r"key 'memory.*scans': .* greater than or equal to 2",
         ),
         (
-            "memory: {kind: gru}\nppo: {mirror: true}",
-            r"a gru has no mirror image; leave out ppo",
-        ),
-        (
-            "ppo: {engine: sb3, mirror: true}",
-            r"engine 'lean' alone learns by ppo.mirror; leave",
+            "ppo: {mirror: true}",
+            r"unknown key 'ppo.mirror'",
         ),
         (
             "memory: {kind: gru}\nppo: {engine: sb3}",
