@@ -49,21 +49,6 @@ class PpoSettings(Schema):
     log_std: float = -0.5  # of the actions at the start
 
 
-class StackMemory(Schema):
-    """Earlier scans beside the present one (Mnih and others 2015)."""
-
-    kind: Literal["stack"] = "stack"  # which kind of memory this is
-    scans: int = Field(default=4, ge=2, le=16)  # with the present one
-    every: int = Field(default=2, ge=1, le=16)  # steps between two of them
-
-
-class GruMemory(Schema):
-    """A gated recurrent unit (Cho and others 2014), learnt through the steps of a rollout."""
-
-    kind: Literal["gru"] = "gru"  # which kind of memory this is
-    units: int = Field(default=64, ge=1, le=1024)  # size of its state
-
-
 class SacSettings(Schema):
     """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3."""
 
@@ -119,10 +104,6 @@ class TrainingSettings(Schema):
     hidden: tuple[Width, ...] = Field(
         default=(64, 64), min_length=1, max_length=MOST_LAYERS
     )
-    # what the actor remembers between steps, with the engine `lean` only; None: nothing
-    memory: Annotated[StackMemory | GruMemory, Field(discriminator="kind")] | None = (
-        None
-    )
     threads: Annotated[int, Field(ge=1, le=1024)] = (
         1  # of PyTorch; results depend on it slightly
     )
@@ -141,10 +122,6 @@ class TrainingSettings(Schema):
 
     @model_validator(mode="after")
     def _holdable(self) -> TrainingSettings:
-        if self.memory is not None and not self.lean:
-            raise ValueError(
-                "ppo's engine 'lean' alone learns a memory; use it, or leave it out"
-            )
         if self.num_envs > MOST_WORLDS:
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
         rows = self.num_envs * self.ppo.rollout

@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
 from policy import foreign_nets
-from policy.policy_rig import MEMORIES, export_remembering, network
+from policy.policy_rig import export_remembering, network
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.registry import make_task
@@ -305,10 +305,10 @@ def test_a_policy_that_fails_when_it_runs_leaves_a_zero_and_ends_with_a_sentence
 PHASES = np.linspace(0.0, 2.0, 6)  # of the surroundings that it sees, scan after scan
 
 
-@pytest.fixture(scope="module", params=MEMORIES)
-def remembering(request, model, tmp_path_factory):
+@pytest.fixture(scope="module")
+def remembering(model, tmp_path_factory):
     path = tmp_path_factory.mktemp("remembering") / "car.onnx"
-    export_remembering(path, request.param, model, scan="around")
+    export_remembering(path, model, scan="around")
     return path
 
 

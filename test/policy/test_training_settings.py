@@ -82,24 +82,10 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
             "stop: {success: 1.1}",
             r"key 'stop.success': .* less than or equal to 1, not 1.1",
         ),
-        ("memory: {units: 8}", r"the key 'memory.kind' is missing"),
-        ("memory: {kind: lstm}", r"key 'memory': unknown kind 'lstm'; .*'stack'"),
-        ("memory: {kind: gru, scans: 4}", r"unknown key 'memory.*scans'; .*'units'"),
-        (
-            "memory: {kind: stack, scans: 1}",
-            r"key 'memory.*scans': .* greater than or equal to 2",
-        ),
+        ("memory: {kind: gru}", r"unknown key 'memory'"),
         (
             "ppo: {mirror: true}",
             r"unknown key 'ppo.mirror'",
-        ),
-        (
-            "memory: {kind: gru}\nppo: {engine: sb3}",
-            r"ppo's engine 'lean' alone learns a memory",
-        ),
-        (
-            "memory: {kind: stack}\nalgorithm: sac",
-            r"ppo's engine 'lean' alone learns a memory",
         ),
         (
             "task_options: {robot: x}",
