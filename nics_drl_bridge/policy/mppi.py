@@ -5,7 +5,6 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,9 +65,7 @@ class Mppi:
         """See `Policy`."""
         given = self._seen(observation)
         out = np.empty((len(given[0]), len(self.task.robot.command)))
-        self._run(
-            kernels.plan_all, (out, *given), self._plant, self._sampling, self.worth
-        )
+        self._plan(out, *given)
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
 
@@ -81,15 +78,20 @@ class Mppi:
         twists = rows[:, parts + 3 : parts + 6]
         return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
 
-    def _run(self, kernel: Any, arrays: tuple[NDArray[Any], ...], *given: Any) -> None:
-        """Runs a kernel for the rows of arrays (N, ...) on all cores, each with its own memory."""
+    def _plan(self, *arrays: Array) -> None:
+        """Plans for the rows of arrays (N, ...) on all cores, each with its own memory."""
         count = max(1, min(os.cpu_count() or 1, len(arrays[0]) // FEWEST))
         cuts = np.linspace(0, len(arrays[0]), count + 1).astype(int).tolist()
 
         def part(rows: slice) -> None:
             scratch, lanes = self._free.pop() if self._free else self._memory()
-            kernel(
-                *(each[rows] for each in arrays), (*self._sense, scratch), *given, lanes
+            kernels.plan_all(
+                *(each[rows] for each in arrays),
+                (*self._sense, scratch),
+                self._plant,
+                self._sampling,
+                self.worth,
+                lanes,
             )
             self._free.append((scratch, lanes))
 
