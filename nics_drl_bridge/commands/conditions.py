@@ -20,7 +20,6 @@ class Conditions:
     gate: str | None = (
         None  # limits, shipped or a file, of a gate between policy and robot
     )
-    fallback: str = ""  # planner behind the policy, none by default
     steps: int | None = (
         None  # time limit of an episode; None: that of policies, robot and world
     )

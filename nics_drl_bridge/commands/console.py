@@ -158,7 +158,7 @@ APART: dict[
 ] = {  # options that leave others nothing to do
     "evaluate": {
         "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
-        "shadow": ("places", "fallback", "lidar", "randomisation", "gate", "task"),
+        "shadow": ("places", "lidar", "randomisation", "gate", "task"),
     },
     "watch": {
         "ros": ("bag", "record", "policy", "lidar", "randomisation", "gate", "task"),

@@ -29,7 +29,7 @@ from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
 from nics_drl_bridge.policy.pace import pace_of
-from nics_drl_bridge.policy.policies import check_fallback, is_policy_file, open_policy
+from nics_drl_bridge.policy.policies import is_policy_file, open_policy
 from nics_drl_bridge.policy.stateful import Policy
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import expected_of
@@ -153,7 +153,7 @@ def env_with(
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:
     """Makes the env of a policy's task on a backend; opens the policy."""
     register_envs()
-    opened, task = open_policy(policy, model, conditions.fallback, conditions.kind)
+    opened, task = open_policy(policy, model, conditions.kind)
     task = replace(task, **conditions.task)
     given: dict[str, Any] = {
         "backend": backend,
@@ -247,8 +247,6 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives all policies through the same episodes everywhere; writes results, pictures."""
     seeds = order.seeds
     logs = order.out / "logs"
-    for policy in order.policies:
-        check_fallback(order.conditions.fallback, policy)
     contracts = contracts_of(order.policies, order.model)
     model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
@@ -420,14 +418,7 @@ def line_of(one: Evaluated) -> str:
         f"{LABELS[place]}{', as believed,' if place == VEHICLE else ''} {_percent(t.success.value)}"
         for place, t in one.tallies.items()
     )
-    planned = ", ".join(
-        f"{_percent(tally.fallback)} {LABELS[place]}"
-        for place, tally in one.tallies.items()
-        if not isnan(tally.fallback)
-    )
-    return f"{one.policy}: success {each}" + (
-        f"; fallback acted {planned}" if planned else ""
-    )
+    return f"{one.policy}: success {each}"
 
 
 def drive_vehicle(
@@ -466,7 +457,7 @@ def drive_vehicle(
         max(planned, key=lambda one: one.distance).confirm(confirm)
     under = limited(order.conditions, contracts, model, world, say)
     # A misfit is an error before anything moves.
-    open_policy(policy, model, order.conditions.fallback, order.conditions.kind)
+    open_policy(policy, model, order.conditions.kind)
     from nics_drl_bridge.nodes.listen import listen
 
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")

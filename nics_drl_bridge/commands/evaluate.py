@@ -55,14 +55,6 @@ def evaluate(
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
-    fallback: Annotated[
-        str,
-        Option(
-            metavar="PLANNER",
-            help="dynamic_window or mppi: acts where the policy asks for what can't "
-            "be stopped before a touch.",
-        ),
-    ] = "",
     out: Annotated[Path, Option(help="Folder for all output.")] = Path("runs/evaluate"),
     shadow: Annotated[
         Path | None, Option(help="Compare policies with the drive in a bag.")
@@ -158,7 +150,7 @@ def evaluate(
 
     count = episodes or (1 if hardware else 20)
     tell = partial(typer.echo, err=True)
-    under = Conditions(lidar, randomisation, gate, fallback, kind=task)
+    under = Conditions(lidar, randomisation, gate, kind=task)
     order = driving.EvaluationOrder(
         policies,
         out,

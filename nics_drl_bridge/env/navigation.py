@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT
-from nics_drl_bridge.env.mirror import mirror_of
 from nics_drl_bridge.env.task import (
     Episodes,
     Flags,
     Memory,
-    Mirror,
     Observation,
     Outcome,
     Task,
@@ -133,10 +131,6 @@ class Navigation(Task):
         progress = self._see(out, before.pose, after, memory)
         over = progress.reached | progress.touched
         return Outcome(self._terms(progress), over, self._facts(progress))
-
-    def mirror(self) -> Mirror:
-        """Sine of the bearing, velocity to the left and turn rate change their signs."""
-        return mirror_of(self, [1, 1, -1, 1, -1, -1])
 
     def _see(
         self, out: Observation, before: Array, now: RobotView, memory: Memory

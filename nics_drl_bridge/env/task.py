@@ -45,20 +45,6 @@ CONTACT_ANGLE = math.radians(4.0)  # 2 cm of what is 0.3 m away
 
 
 @dataclass(frozen=True)
-class Mirror:
-    """Mirror images of observations (..., O) and actions (..., C), or discrete ones (...).
-
-    They are seen[..., places] * signs, and actions[..., acted] * scale + offset, or acted[actions].
-    """
-
-    places: NDArray[np.intp]  # (O,)
-    signs: Array  # (O,)
-    acted: NDArray[np.intp]  # (C,), or (A,) the mirror images of discrete actions
-    scale: Array  # (C,), or empty
-    offset: Array  # (C,), not 0 where the limits of a command are not their own mirror image
-
-
-@dataclass(frozen=True)
 class Episodes:
     """Episodes at their start, in n worlds with M robots."""
 
@@ -294,18 +280,6 @@ class Task(ABC):
     def discrete_commands(self) -> Array:
         """(A, C) commands of the discrete actions."""
         return np.clip(discrete_commands(self.robot), *self.command_limits)
-
-    def mirror(self) -> Mirror:
-        """Observations and actions with left and right exchanged; see `mirror.mirror_of`.
-
-        A training asks for it if `ppo.mirror` says so. Raises ConfigError if there is none.
-        """
-        fault = (
-            f"task {type(self).__name__} does not tell what it looks like in a mirror"
-        )
-        raise ConfigError(
-            f"{fault}; give it a method `mirror`, or leave out ppo.mirror."
-        )
 
     # Building blocks of tasks.
 

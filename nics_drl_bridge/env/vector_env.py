@@ -162,11 +162,6 @@ class BridgeVectorEnv(
         self._teacher = Teacher(given, self.simulator)
 
     @property
-    def level(self) -> float:
-        """Share of the way from start to goal with which episodes begin, 1 but for a curriculum."""
-        return 1.0 if self._teacher is None else self._teacher.level
-
-    @property
     def changing(self) -> dict[str, NDArray[Any]]:
         """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
@@ -229,15 +224,11 @@ class BridgeVectorEnv(
             if starts is not None:
                 radius = self.model.robot.footprint_radius
                 guard.check_places("start", starts, scenes, self.world, radius)
-            if self._teacher is None:
-                moved = None
-            else:
-                moved = self._teacher.places(worlds, scenes)
-            return moved if starts is None else starts
+            return starts
 
         scenes = self.simulator.reset(seeds, worlds, places)
         if self._teacher is not None:
-            self._teacher.begin(worlds)
+            self._teacher.begin(worlds, scenes)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.begun(

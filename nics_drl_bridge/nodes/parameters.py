@@ -152,12 +152,6 @@ def policy() -> list[Row]:
             "A policy file (*.onnx), the mapping of a foreign one (*.yaml), or the name of a "
             "shipped one or of a baseline.",
         ),
-        Row(
-            "fallback",
-            "",
-            "A planner (dynamic_window, mppi) that acts where the policy's command can't be "
-            "stopped before a touch; empty for none.",
-        ),
         Row("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
         Row(
             "rate",

@@ -25,7 +25,6 @@ from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
-from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.stateful import begin, resume
@@ -102,10 +101,8 @@ class PolicyNode(ManagedNode):
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        name, fallback = (
-            str(self.get_parameter(key).value) for key in ("policy", "fallback")
-        )
-        self._policy, self._task = open_policy(name, model, fallback)
+        name = str(self.get_parameter("policy").value)
+        self._policy, self._task = open_policy(name, model)
         view = rehearse(model)  # so that all compiles now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
@@ -180,10 +177,6 @@ class PolicyNode(ManagedNode):
             "late": done.late,
             "longest inference [ms]": longest,
         }
-        if (planned := acted(self._policy)) is not None:
-            facts["by the fallback"] = planned
-        if self._answer is not None:
-            facts.update(self._answer.to_facts())
         return runner.Condition(
             f"{self.state}; {done.late} late inferences", done.late > 0, facts
         )

@@ -308,7 +308,7 @@ def bridge(setup: Setup) -> Iterator[NodeStart]:
         "limits": setup.limits() or None,
     }
     managed = {"autostart": setup.flag("autostart"), IMU: setup.text(IMU)}
-    of_policy = {"policy": setup.text("policy"), "fallback": setup.text("fallback")}
+    of_policy = {"policy": setup.text("policy")}
     own: dict[str, dict[str, Any]] = {
         "command_gate": of_gate,
         "middleware_node": managed,
@@ -382,7 +382,6 @@ def of_bridge() -> list[Argument]:
         Argument(
             "policy", "", "Policy file, or a policy by name; empty: of params_file"
         ),
-        Argument("fallback", "", "Planner behind the policy; empty: of params_file"),
         Argument("limits", "", limits),
         Argument(
             "autostart", "true", "Managed nodes configure and activate themselves"

@@ -17,7 +17,6 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.middleware.uncertainty import Uncertainty, gained_uncertainty
-from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
 
@@ -46,7 +45,6 @@ class Episode:
     bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
     reward: float  # sum over the episode
     believed: str | None = None  # by the robot itself, where `result` is by the truth
-    planned: int | None = None  # actions of the fallback, if the policy has one
     uncertain: Uncertainty | None = (
         None  # of the estimate, gained since the start, where known
     )
@@ -80,7 +78,6 @@ class Episode:
             "goal_distance_m": round(self.miss, 4),
             "steps": self.steps,
             "length_m": round(self.length, 4),
-            "fallback_actions": self.planned,
             "goal": self.goal.tolist(),
             "path": np.round(self.path, 4).tolist(),
             "uncertain": None if self.uncertain is None else self.uncertain._asdict(),
@@ -100,7 +97,6 @@ def drive(
         observation, info = env.reset(seed=seed, options=options)
         on_start()
         begin(policy)
-        before = acted(policy)
         goal, bodies = info.get("goal"), info["bodies"]
         if goal is None:  # a task of one's own may not show it
             goal = env.get_wrapper_attr("scene").goals[0]
@@ -119,15 +115,11 @@ def drive(
         collided = "collision" if np.any(info.get("collision", False)) else "time-out"
         believed = "success" if np.all(info.get("is_success", False)) else collided
         driven = np.array(paths), np.array(estimates), goal, bodies, total
-        planned = None if before is None else (acted(policy) or 0) - before
+        uncertain = None
         if covariances:
             uncertain = gained_uncertainty(covariances[0], covariances[-1])
-        else:
-            uncertain = None
         if "true_pose" not in info:
-            return Episode(
-                seed, believed, *driven, planned=planned, uncertain=uncertain
-            )
+            return Episode(seed, believed, *driven, uncertain=uncertain)
         known = info.get("true_collision")
         if known is None:  # then `touched` tells, or else the robot itself
             known = believed == "collision" if touched is None else touched()
@@ -137,7 +129,7 @@ def drive(
         ).all()
         wrong = (believed == "success" and not there) or believed == "collision"
         true = ELSEWHERE if wrong else believed
-        return Episode(seed, "collision" if hit else true, *driven, believed, planned)
+        return Episode(seed, "collision" if hit else true, *driven, believed)
     except BaseException:
         if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
             with uninterrupted():
@@ -349,7 +341,6 @@ class Tally(Summary):
     same: float  # share of the episodes that ended as in the first world
     deviation: ConfidenceInterval
     greatest_deviation: float  # maximum over all episodes [m]
-    fallback: float  # share of the actions that were the fallback's, NaN without one
 
     def figures(self) -> dict[str, Any]:
         """The tally as plain data, an interval as a list; non-finite values become null."""
@@ -380,14 +371,10 @@ def tallies(
         )
         pairs = list(zip(episodes, first, strict=True))
         gaps = [deviation(one, other) for one, other in pairs]
-        planned = [one.planned for one in episodes if one.planned is not None]
         found[place] = Tally(
             **vars(summarise(outcomes, control_period)),
             same=sum(one.result == other.result for one, other in pairs) / len(pairs),
             deviation=mean(gaps),
             greatest_deviation=max(gaps),
-            fallback=sum(planned) / max(int(sum(figures[0])), 1)
-            if planned
-            else math.nan,
         )
     return found

@@ -78,17 +78,11 @@ class Situation(NamedTuple):
 @kernel(allocates=True)
 def look(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-untyped-def]
     """Maps a scan of range shares (P,) around a robot whose goal (2,) is in `base_link` [m]."""
-    around = look_near(shares, goal, rays, outline, clearance, scratch)
-    put_ways(around, scratch.prices)
-    return around
-
-
-@kernel(allocates=True)
-def look_near(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-untyped-def]
-    """As `look`, without the ways to the goal, which take most of the time."""
     count = hits_of(scratch.hits, shares, rays)
     put_distances(scratch.map, scratch.hits[:count])
-    return Situation(scratch.map, goal, outline, clearance)
+    around = Situation(scratch.map, goal, outline, clearance)
+    put_ways(around, scratch.prices)
+    return around
 
 
 @kernel

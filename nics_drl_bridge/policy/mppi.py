@@ -5,7 +5,6 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,6 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
 SETTLED_S = 3.0  # after which a held command has led to its state
-LONGEST_STOP_S = 10.0  # for which a stop is looked at
 FINEST = 0.25  # share of a lag that a step of the roll-outs may take
 FEWEST = 8  # robots of a thread
 CLEARANCE = Clearance(margin=0.08, soft=0.4)
@@ -67,27 +65,9 @@ class Mppi:
         """See `Policy`."""
         given = self._seen(observation)
         out = np.empty((len(given[0]), len(self.task.robot.command)))
-        self._run(
-            kernels.plan_all, (out, *given), self._plant, self._sampling, self.worth
-        )
+        self._plan(out, *given)
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
-
-    def can_stop(
-        self, observation: NDArray[np.float32], commands: Array
-    ) -> NDArray[np.bool_]:
-        """True (...) where a robot that follows a command (..., C) for a period can stop after it.
-
-        That is with a margin between its true outline and all that the observation (..., O) shows;
-        what is within the margin already must not come nearer. Angles are held meanwhile.
-        """
-        scans, _, twists = self._seen(observation)
-        out = np.empty(len(scans), np.bool_)
-        given = out, np.atleast_2d(commands).astype(np.float64), scans, twists
-        tail = self._halt
-        most = max(tail.most, math.ceil(LONGEST_STOP_S / self._period))
-        self._run(kernels.stops_all, given, self._plant, tail._replace(most=most))
-        return out.reshape(observation.shape[:-1])
 
     def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
         """Scans (N, P) in shares, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
@@ -98,15 +78,20 @@ class Mppi:
         twists = rows[:, parts + 3 : parts + 6]
         return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
 
-    def _run(self, kernel: Any, arrays: tuple[NDArray[Any], ...], *given: Any) -> None:
-        """Runs a kernel for the rows of arrays (N, ...) on all cores, each with its own memory."""
+    def _plan(self, *arrays: Array) -> None:
+        """Plans for the rows of arrays (N, ...) on all cores, each with its own memory."""
         count = max(1, min(os.cpu_count() or 1, len(arrays[0]) // FEWEST))
         cuts = np.linspace(0, len(arrays[0]), count + 1).astype(int).tolist()
 
         def part(rows: slice) -> None:
             scratch, lanes = self._free.pop() if self._free else self._memory()
-            kernel(
-                *(each[rows] for each in arrays), (*self._sense, scratch), *given, lanes
+            kernels.plan_all(
+                *(each[rows] for each in arrays),
+                (*self._sense, scratch),
+                self._plant,
+                self._sampling,
+                self.worth,
+                lanes,
             )
             self._free.append((scratch, lanes))
 

@@ -20,7 +20,6 @@ HIT = 1e3  # cost of a touch at once; later ones cost less
 BEYOND = (
     1.3  # offers are drawn over this much of the range and cut: many are at its ends
 )
-STOPPED = 0.01  # speed of the outline at which a robot has stopped [m/s]
 # over the commands, to find those that a twist follows
 PASSES = 12
 EASE = 1e-6
@@ -137,53 +136,6 @@ def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no
         best = _roll(around, plant, sampling, worth, lanes)
         _average(best, sampling.temperature, lanes)
     out[:] = lanes.nominal[0]
-
-
-@kernel(allocates=True)
-def stops_all(out, commands, scans, twists, sense, plant, halt, lanes):  # type: ignore[no-untyped-def]
-    """Writes whether N robots can still stop after commands (N, C), without a touch, to out (N,).
-
-    As in a plan, by scans (N, P) and twists (N, 3); only the first lane is rolled out.
-    """
-    nowhere = np.zeros(2)
-    for n in range(out.shape[0]):
-        around = maps.look_near(scans[n], nowhere, *sense)
-        out[n] = _stops(commands[n], twists[n], around, plant, halt, lanes)
-
-
-@kernel
-def _stops(command, twist, around, plant, halt, lanes):  # type: ignore[no-untyped-def]
-    """Returns True if a robot that follows a command (C,) for a period, then stops, is clear."""
-    for given in command:
-        if not math.isfinite(given):
-            return False
-    _wait(twist, plant, lanes)
-    _put(lanes, plant.settled.shape[0])
-    states = plant.settled.shape[0]
-    limit = maps.touching(around)
-    for t in range(1 + halt.most):
-        for c in range(command.shape[0]):
-            given = command[c] if t == 0 or halt.holds[c] else halt.rest[c]
-            lanes.x[states + c, 0] = bend(given, plant.single.curves[c])
-        run(
-            lanes.pose,
-            lanes.x,
-            lanes.dq,
-            plant.terms,
-            plant.series,
-            plant.dt,
-            plant.substeps,
-        )
-        pose = lanes.pose
-        if maps.room_at(pose[0, 0], pose[1, 0], pose[2, 0], pose[3, 0], around) < limit:
-            return False
-        if max(abs(pose[0, 0]), abs(pose[1, 0])) > halt.far:
-            return False
-        dq = lanes.dq
-        fastest = math.hypot(dq[0, 0], dq[1, 0]) + around.outline.outer * abs(dq[2, 0])
-        if t > 0 and fastest < STOPPED:
-            break
-    return True
 
 
 @kernel

@@ -17,7 +17,6 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
-from nics_drl_bridge.policy.fallback import Fallback, check_readable
 from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import (
     Clearance,
@@ -277,7 +276,6 @@ POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
     "random": lambda task, _: RandomActions(task),
     "straight": StraightToGoal,
 }
-PLANNERS = ("dynamic_window", "mppi")  # those that may stand behind another
 
 
 def shipped_policies() -> list[str]:
@@ -303,27 +301,24 @@ def is_policy_file(name: str) -> bool:
 
 
 def make_policy(
-    name: str, task: Navigation, model: SimulatorModel | None = None, fallback: str = ""
+    name: str, task: Navigation, model: SimulatorModel | None = None
 ) -> Policy:
-    """Makes a policy by name, or the path of a file, with a fallback by name behind it, if any.
-
-    Raises ConfigError, PolicyError.
-    """
+    """Makes a policy by name, or the path of a file. Raises ConfigError, PolicyError."""
     if not is_policy_file(name):
-        return _backed(POLICIES[name](task, model), name, fallback, task, model)
+        return POLICIES[name](task, model)
     from nics_drl_bridge.policy.foreign import (
         load_any,
     )  # the others need no onnxruntime
 
     policy = load_any(name, model)
     policy.check_fits(model, task)
-    return _backed(_acting(policy), name, fallback, task, model)
+    return _acting(policy)
 
 
 def open_policy(
-    name: str, model: SimulatorModel, fallback: str = "", kind: str | None = None
+    name: str, model: SimulatorModel, kind: str | None = None
 ) -> tuple[Policy, Navigation]:
-    """Opens a policy, with a fallback if any, and its task: navigation, or one of a `kind`.
+    """Opens a policy and its task: navigation, or one of a `kind`.
 
     A kind is path/to/file.py:ClassName. Raises ConfigError, and PolicyError for another task.
     """
@@ -332,7 +327,7 @@ def open_policy(
             reason = "drives the task 'navigation' alone; leave it out, or --task"
             raise ConfigError(f"policy {name!r} {reason}.")
         task = Navigation(model.robot, model.lidar)
-        return _backed(POLICIES[name](task, model), name, fallback, task, model), task
+        return POLICIES[name](task, model), task
     from nics_drl_bridge.policy.foreign import load_any
 
     policy = load_any(name, model)
@@ -342,38 +337,7 @@ def open_policy(
             f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
         )
         raise PolicyError(name, "task.name", reason)
-    return _backed(_acting(policy), name, fallback, found, model), found
-
-
-def check_fallback(fallback: str, policy: str) -> None:
-    """Raises ConfigError unless a name is '', or a planner's other than the policy."""
-    if fallback and fallback not in PLANNERS:
-        raise ConfigError(
-            f"fallback {fallback!r}: no such planner; {nearest(fallback, PLANNERS)}"
-        )
-    if fallback and fallback == policy:
-        others = " or ".join(repr(name) for name in PLANNERS if name != policy)
-        raise ConfigError(
-            f"fallback {fallback!r} is the policy itself; take {others}, or none."
-        )
-
-
-def _backed(
-    policy: Policy,
-    name: str,
-    fallback: str,
-    task: Navigation,
-    model: SimulatorModel | None,
-) -> Policy:
-    """The policy of a name, with the planner of another behind it unless that is ''."""
-    check_fallback(fallback, name)
-    if not fallback:
-        return policy
-    check_readable(task, fallback)
-    try:
-        return Fallback(policy, POLICIES[fallback](task, model), task, model)
-    except ConfigError as error:
-        raise ConfigError(f"fallback {fallback!r}: {error}") from None
+    return _acting(policy), found
 
 
 def _acting(policy: "PolicyFile") -> Policy:

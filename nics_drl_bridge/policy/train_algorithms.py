@@ -25,9 +25,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.evaluation import Act
-from nics_drl_bridge.policy.stateful import Stateful
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch, tensors
-from nics_drl_bridge.policy.train_memory import Memory
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
@@ -79,10 +77,6 @@ def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
 
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
     """Returns the deterministic policy of an algorithm, without exploration noise."""
-    if isinstance(algorithm, Actor) and algorithm.memory.size:
-        return Stateful(
-            algorithm.step, algorithm.memory.size, algorithm.memory.start
-        ).act
 
     def act(observations: NDArray[np.float32]) -> NDArray[Any]:
         seen = torch.as_tensor(observations)
@@ -163,10 +157,7 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 class Actor(torch.nn.Module):
-    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
-
-    With a memory it takes a state (n, S) too, and returns the next one in addition.
-    """
+    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones."""
 
     def __init__(
         self,
@@ -175,10 +166,8 @@ class Actor(torch.nn.Module):
         hidden: Sequence[int],
         normaliser: tuple[Array, Array],
         activation: type[torch.nn.Module] = torch.nn.Tanh,
-        memory: Memory | None = None,
     ) -> None:
         super().__init__()
-        self.memory = Memory() if memory is None else memory
         self.discrete = isinstance(actions, gymnasium.spaces.Discrete)
         size = actions.shape or ()
         count = int(
@@ -187,30 +176,16 @@ class Actor(torch.nn.Module):
             else np.prod(size)
         )
         self.normaliser = Normaliser(observations, *normaliser)
-        widths = [self.normaliser.features_dim + self.memory.extra, *hidden, count]
+        widths = [self.normaliser.features_dim, *hidden, count]
         self.layers = layers_of(widths, ACTION_GAIN, activation)
 
-    def forward(self, observations: torch.Tensor, *state: torch.Tensor) -> Any:
+    def forward(self, observations: torch.Tensor) -> Any:
         """Parameters of the distribution of actions: its mode if continuous, else logits."""
-        seen = self.normaliser(observations)
-        if not self.memory.size:
-            return self.layers(seen)
-        seen, following = self.memory(seen, *state)
-        return self.layers(seen), following
+        return self.layers(self.normaliser(observations))
 
     def best(self, observations: torch.Tensor) -> torch.Tensor:
         """The most likely actions (n, C), or (n,) discrete."""
-        return self._best(self(observations))
-
-    def step(
-        self, observations: NDArray[np.float32], state: NDArray[np.float32]
-    ) -> tuple[NDArray[Any], NDArray[np.float32]]:
-        """The most likely actions (n, C) or (n,), and the next state (n, S)."""
-        with torch.no_grad():
-            raw, following = self(torch.as_tensor(observations), torch.as_tensor(state))
-            return self._best(raw).numpy(), following.numpy()
-
-    def _best(self, raw: torch.Tensor) -> torch.Tensor:
+        raw = self(observations)
         return raw.argmax(dim=1) if self.discrete else raw
 
 

@@ -155,7 +155,6 @@ class Watch:
         self._save = save
         self._tell = tell
         self._stop = stop
-        self._levels = list(settings.worlds) if settings.teaching.curriculum else []
         self._total = settings.steps
         self._every = settings.checkpoint_every
         self.collisions: deque[bool] = deque(maxlen=RECENT)  # of the last episodes
@@ -202,8 +201,6 @@ class Watch:
         logger.record("rollout/success_rate", progress.success)
         logger.record("rollout/collision_rate", progress.collision)
         logger.record("time/env_share", progress.env_share)
-        for world, one in zip(self._levels, self._env.envs, strict=False):
-            logger.record(f"curriculum/{world}", one.level)
         self._tell(progress)
         return True
 

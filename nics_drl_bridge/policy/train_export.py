@@ -28,7 +28,6 @@ with extensions.needed_by("the export of a policy"):
 
     from nics_drl_bridge.policy import onnx_graph, policy_file, rehearsal
     from nics_drl_bridge.policy.onnx_session import in_turn, open_session
-    from nics_drl_bridge.policy.train_memory import Memory
 
 Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
@@ -56,10 +55,9 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
     @property
     def state(self) -> tuple[int, float] | None:
         """Size and start value of the actor's state, if it has one."""
-        memory = getattr(self.actor, "memory", None)
-        if not isinstance(memory, Memory) or not memory.size:
-            return None
-        return memory.size, memory.start
+        size = getattr(self.actor, "state_size", 0)
+        start = getattr(self.actor, "state_start", 0.0)
+        return (int(size), float(start)) if size else None
 
     def forward(
         self, observation: torch.Tensor, *state: torch.Tensor
@@ -87,7 +85,8 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 def actor_of(model: Any) -> torch.nn.Module:
     """Returns the acting part of a PPO, A2C or SAC, or module like `Actor`, else ConfigError.
 
-    One with a state has a `memory`, see `train_memory.Memory`.
+    A module with a state takes it (n, S) after the observations, and returns the next one too.
+    Its attribute `state_size` is S; `state_start` is what each element begins with, 0 without it.
     """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):

@@ -1,6 +1,6 @@
 """Compiled inner loops of the lean engine: the gradients of PPO's loss.
 
-The loss is that of `train_ppo.loss_of`. These free the interpreter's lock, for which autograd's
+The loss is that of Stable-Baselines3. These free the interpreter's lock, for which autograd's
 many small steps would contend with the thread that collects. Shapes: n transitions, O
 observations, C outputs of the actor, W weights of a network.
 """

@@ -20,18 +20,15 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.policy import train_algorithms, train_imitation, train_kernels
+from nics_drl_bridge.policy import train_algorithms, train_kernels
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_kernels import LOG_NORM, Batch, Net
-from nics_drl_bridge.policy.train_memory import memory_of
-from nics_drl_bridge.policy.train_mirror import Reflection
 from nics_drl_bridge.policy.train_rollout import Driven, Transitions
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.threads import one_blas_thread, run_parts
 
 Ended = list[tuple[bool, bool]]  # success and collision of episodes
-Seen = tuple[torch.Tensor, torch.Tensor]  # features and state
 # of the loss, and of the norm of its gradient
 VALUE_WEIGHT = 0.5
 GRADIENT_LIMIT = 0.5
@@ -66,12 +63,6 @@ class Networks(torch.nn.Module):
             return raw.log_softmax(1).gather(1, actions[:, None]).squeeze(1)
         apart = (actions - raw) * torch.exp(-self.log_std)
         return -0.5 * apart.square().sum(1) - (self.log_std + float(LOG_NORM)).sum()
-
-    def entropy(self, raw: torch.Tensor) -> torch.Tensor:
-        """Entropy of the actions, averaged over outputs of the actor (n, C)."""
-        if self.actor.discrete:
-            return -(raw.softmax(1) * raw.log_softmax(1)).sum(1).mean()
-        return (self.log_std + 0.5 + float(LOG_NORM)).sum()
 
 
 def flattened(networks: Networks) -> torch.nn.Parameter:
@@ -126,29 +117,6 @@ def advantages_of(
     return errors
 
 
-def loss_of(
-    networks: Networks,
-    raw: torch.Tensor,
-    values: torch.Tensor,
-    batch: Transitions,
-    ppo: PpoSettings,
-) -> torch.Tensor:
-    """The loss of PPO with clipped ratios, as in Stable-Baselines3.
-
-    `raw` (n, C) are the outputs of the actor, `values` (n, 1) those of the critic.
-    """
-    gains = batch.advantages
-    gains = (gains - gains.mean()) / (gains.std() + 1e-8)
-    ratio = torch.exp(networks.log_probs(raw, batch.actions) - batch.log_probs)
-    policy = -torch.min(
-        gains * ratio, gains * ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip)
-    ).mean()
-    loss = policy + VALUE_WEIGHT * torch.nn.functional.mse_loss(
-        values.squeeze(-1), batch.returns
-    )
-    return loss - ppo.entropy * networks.entropy(raw) if ppo.entropy else loss
-
-
 class Learner:
     """Moves the weights by gradients of the loss."""
 
@@ -157,11 +125,9 @@ class Learner:
         networks: Networks,
         ppo: PpoSettings,
         seed: int,
-        reflection: Reflection | None = None,
     ) -> None:
         self.networks = networks
         self.ppo = ppo
-        self._reflection = reflection
         self.generator = torch.Generator().manual_seed(seed)
         self._all = flattened(networks)
         self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
@@ -171,7 +137,7 @@ class Learner:
         self.core_is_free = threading.Event()  # no thread collects meanwhile
 
     def judge(self, driven: Driven) -> Transitions:
-        """Advantages and returns of a rollout, by the present critic, and mirror images."""
+        """Advantages and returns of a rollout, by the present critic."""
         networks = self.networks
         ppo = self.ppo
         with torch.no_grad():
@@ -191,12 +157,7 @@ class Learner:
             gains,
             gains + values[:-1],
         )
-        rollout = Transitions(*(each.flatten(0, 1) for each in rows))
-        if networks.actor.memory.learnt:
-            rollout = rollout._replace(state=driven.state, done=driven.done)
-        if self._reflection is None:
-            return rollout
-        return self._reflection.doubled(rollout)
+        return Transitions(*(each.flatten(0, 1) for each in rows))
 
     def learn(self, rollout: Transitions, rate: float) -> float:
         """Learns from a rollout with a learning rate; returns the loss of the last batch."""
@@ -211,10 +172,8 @@ class Learner:
 
     def differentiate(self, batch: Transitions) -> torch.Tensor:
         """Sets the gradients of all weights for a batch; returns the loss."""
-        if batch.state is not None and batch.done is not None:
-            return self._through_time(batch, batch.state, batch.done)
         columns = batch.actions.float().view(len(batch.seen), -1)
-        given = Batch(*(each.numpy() for each in batch[:5]))._replace(
+        given = Batch(*(each.numpy() for each in batch))._replace(
             actions=columns.numpy()
         )
         (actor, critic), spread = self._nets, self.networks.log_std
@@ -230,20 +189,6 @@ class Learner:
         losses = run_parts(lambda job: job(), jobs) if free else [job() for job in jobs]
         return torch.tensor(sum(losses))
 
-    def _through_time(
-        self, batch: Transitions, state: torch.Tensor, done: torch.Tensor
-    ) -> torch.Tensor:
-        """The same by autograd, through all steps of the batch; the critic moves no memory."""
-        actor = self.networks.actor
-        seen = batch.seen[:, : actor.normaliser.features_dim].unflatten(0, done.shape)
-        features = actor.memory.unroll(seen, state, done).flatten(0, 1)
-        raw = actor.layers(features)
-        values = self.networks.critic(features.detach())
-        self._all.grad.zero_()
-        loss = loss_of(self.networks, raw, values, batch, self.ppo)
-        loss.backward()
-        return loss.detach()
-
 
 class Collector:
     """Drives the worlds with a copy of the networks."""
@@ -256,14 +201,12 @@ class Collector:
         self.ppo = ppo
         self.generator = torch.Generator().manual_seed(seed)
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
-        self.state = networks.actor.memory.begin(env.num_envs)  # (N, S) of the actor
 
     def collect(self) -> tuple[Driven, Ended]:
         """Drives all worlds for the steps of a rollout."""
         steps = self.ppo.rollout
         worlds = self.env.num_envs
         networks = self.networks
-        first = self.state
         space = cast("Any", self.env.action_space)
         seen = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
         rewards, done = torch.zeros(2, steps, worlds)
@@ -274,7 +217,7 @@ class Collector:
         final = [seen[0, :0]]
         with torch.no_grad():
             for t in range(steps):
-                seen[t], state = self._see(self.last, self.state)
+                seen[t] = self._see(self.last)
                 raw.append(networks.actor.layers(seen[t]))
                 actions.append(networks.draw(raw[t], self.generator))
                 acted = actions[t].numpy()
@@ -290,21 +233,19 @@ class Collector:
                     if one["TimeLimit.truncated"]:
                         cut.append(t * worlds + int(n))
                         last = one["terminal_observation"][None]
-                        final.append(self._see(last, state[n : n + 1])[0])
-                self.state = networks.actor.memory.begun(state, done[t])
-            seen[steps], _ = self._see(self.last, self.state)
+                        final.append(self._see(last))
+            seen[steps] = self._see(self.last)
             beyond = torch.tensor(cut, dtype=torch.int64), torch.cat(final)
             drawn = torch.stack(actions)
             log_probs = networks.log_probs(torch.cat(raw), drawn.flatten(0, 1)).view_as(
                 rewards
             )
-            return Driven(seen, drawn, log_probs, rewards, done, *beyond, first), ended
+            return Driven(seen, drawn, log_probs, rewards, done, *beyond), ended
 
-    def _see(self, observations: NDArray[np.float32], state: torch.Tensor) -> Seen:
-        """Features of observations (n, O) for the networks, and the next state (n, S)."""
-        actor = self.networks.actor
-        seen: Seen = actor.memory(
-            actor.normaliser(torch.from_numpy(observations)), state
+    def _see(self, observations: NDArray[np.float32]) -> torch.Tensor:
+        """Normalised observations (n, O) for the networks."""
+        seen: torch.Tensor = self.networks.actor.normaliser(
+            torch.from_numpy(observations)
         )
         return seen
 
@@ -326,23 +267,13 @@ class LeanPpo:
         self._ppo = settings.ppo
         hidden = settings.hidden
         spaces = env.observation_space, env.action_space
-        inputs = len(normaliser[0])
-        parts = env.envs[0].task.scan_parts
-        memory = memory_of(settings.memory, inputs, parts)
-        reflection = None
-        if self._ppo.mirror:
-            reflection = Reflection(env.envs[0].task.mirror(), memory.extra, parts)
-            normaliser = reflection.balanced(*normaliser)
-        actor = train_algorithms.Actor(
-            *spaces, hidden, normaliser, torch.nn.ReLU, memory
-        )
+        actor = train_algorithms.Actor(*spaces, hidden, normaliser, torch.nn.ReLU)
         self.networks = Networks(actor, hidden, self._ppo.log_std)
-        seeds = np.random.SeedSequence(seed).generate_state(3)
+        seeds = np.random.SeedSequence(seed).generate_state(2)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
-        self.learner = Learner(self.networks, self._ppo, int(seeds[1]), reflection)
+        self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
         self.policy = actor
         self._settings = settings
-        self._imitation_seed = int(seeds[2])
         self.steps = 0  # of all worlds together, learnt from so far
         self._rollout: Driven | None = None  # the next one to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
@@ -353,7 +284,6 @@ class LeanPpo:
         watch.begin(self.steps)
         if self._rollout is None:
             self.collector.last = self.collector.env.reset()
-            self._imitate()
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
@@ -364,23 +294,6 @@ class LeanPpo:
             if watch.report(self.steps, self._successes, logger):
                 logger.record("train/loss", loss)
                 logger.dump(self.steps)
-
-    def _imitate(self) -> None:
-        """Begins with what an expert does, if the settings say so; its steps count as well."""
-        given = self._settings.imitation
-        part = self.collector
-        if given is None:
-            return
-        steps = given.steps // part.env.num_envs
-        rng = np.random.default_rng(self._imitation_seed)
-        expert = train_imitation.expert_of(self._settings, part.env)
-        drive = partial(train_imitation.drive, discount=self._ppo.discount, rng=rng)
-        shown, part.last = drive(part.env, expert, part.last, steps)
-        train_imitation.imitate(
-            self.networks, shown, given.epochs, self.learner.generator
-        )
-        part.networks.load_state_dict(self.networks.state_dict())
-        self.steps = len(shown.seen)
 
     def _advance(self, rollout: Driven, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""
@@ -422,7 +335,6 @@ class LeanPpo:
             "steps": self.steps,
             "recent": list(self._successes),
             "last": torch.from_numpy(self.collector.last),
-            "memory": self.collector.state,
             "rollout": self._rollout and self._rollout._asdict(),
             "random": [
                 part.generator.get_state() for part in (self.collector, self.learner)
@@ -438,7 +350,6 @@ class LeanPpo:
         self._rollout = rollout and Driven(**rollout)
         self._successes.extend(state["recent"])
         self.collector.last = state["last"].numpy()
-        self.collector.state = state.get("memory", self.collector.state)
         generators = self.collector.generator, self.learner.generator
         for generator, random in zip(generators, state["random"], strict=True):
             generator.set_state(random)

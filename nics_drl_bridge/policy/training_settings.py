@@ -47,24 +47,6 @@ class PpoSettings(Schema):
         default=0.0, ge=0.0
     )  # weight of the entropy bonus; more explores more
     log_std: float = -0.5  # of the actions at the start
-    mirror: bool = (
-        False  # True learns from each transition with left and right exchanged, too
-    )
-
-
-class StackMemory(Schema):
-    """Earlier scans beside the present one (Mnih and others 2015)."""
-
-    kind: Literal["stack"] = "stack"  # which kind of memory this is
-    scans: int = Field(default=4, ge=2, le=16)  # with the present one
-    every: int = Field(default=2, ge=1, le=16)  # steps between two of them
-
-
-class GruMemory(Schema):
-    """A gated recurrent unit (Cho and others 2014), learnt through the steps of a rollout."""
-
-    kind: Literal["gru"] = "gru"  # which kind of memory this is
-    units: int = Field(default=64, ge=1, le=1024)  # size of its state
 
 
 class SacSettings(Schema):
@@ -77,16 +59,6 @@ class SacSettings(Schema):
     begin_after: Count = 5_000  # transitions of random actions before the first update
     discount: Share = 0.98  # gamma, per step
     soft_update: Share = 0.01  # by which each gradient step moves the target critics
-
-
-class ImitationSettings(Schema):
-    """A start of the lean engine from what an expert does, by behaviour cloning."""
-
-    expert: str  # name of a planner, or a policy file
-    steps: Count = (
-        50_000  # driven by it, of all worlds together; they count as steps of training
-    )
-    epochs: Count = 10  # passes through them
 
 
 class StopSettings(Schema):
@@ -132,19 +104,12 @@ class TrainingSettings(Schema):
     hidden: tuple[Width, ...] = Field(
         default=(64, 64), min_length=1, max_length=MOST_LAYERS
     )
-    # what the actor remembers between steps, with the engine `lean` only; None: nothing
-    memory: Annotated[StackMemory | GruMemory, Field(discriminator="kind")] | None = (
-        None
-    )
     threads: Annotated[int, Field(ge=1, le=1024)] = (
         1  # of PyTorch; results depend on it slightly
     )
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()  # used if `algorithm` is `ppo`
     sac: SacSettings = SacSettings()  # used if `algorithm` is `sac`
-    imitation: ImitationSettings | None = (
-        None  # start by imitating an expert; None: from scratch
-    )
 
     @field_validator("task_options")
     @classmethod
@@ -157,42 +122,15 @@ class TrainingSettings(Schema):
 
     @model_validator(mode="after")
     def _holdable(self) -> TrainingSettings:
-        if self.memory is not None and not self.lean:
-            raise ValueError(
-                "ppo's engine 'lean' alone learns a memory; use it, or leave it out"
-            )
-        if self.ppo.mirror and not self.lean:
-            raise ValueError(
-                "ppo's engine 'lean' alone learns by ppo.mirror; leave that out"
-            )
-        if self.ppo.mirror and isinstance(self.memory, GruMemory):
-            raise ValueError(
-                "the state of a gru has no mirror image; leave out ppo.mirror"
-            )
         if self.num_envs > MOST_WORLDS:
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
-        rows = self.num_envs * self.ppo.rollout * (1 + self.ppo.mirror)
+        rows = self.num_envs * self.ppo.rollout
         kept = rows if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
             kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"
             raise ValueError(
                 f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _imitable(self) -> TrainingSettings:
-        if (given := self.imitation) is None:
-            return self
-        if not self.lean:
-            raise ValueError(
-                "imitation needs the lean engine of ppo; choose it, or leave that out"
-            )
-        if not self.num_envs <= given.steps < self.steps:
-            span = f"from {self.num_envs}, one in each world, to less than all {self.steps}"
-            raise ValueError(f"imitation.steps must be {span}; change them")
-        if given.steps > MOST_KEPT:
-            raise ValueError(f"imitation.steps may be {MOST_KEPT}; lower them")
         return self
 
     @property

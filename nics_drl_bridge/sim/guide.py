@@ -66,18 +66,6 @@ class Guide:
         given = worlds, np.asarray(scenes.member, np.int64), scenes.bodies, scenes.goals
         kernels.guide(self.fields, *given, self._grid)
 
-    def nearer(self, worlds: NDArray[np.intp], scenes: Scenes, share: float) -> Array:
-        """Starts (n, M, 3) from which a share of the ways is left, with the headings of the scenes.
-
-        Where there is no room for one it stays as drawn. Call `begin` before.
-        """
-        starts = scenes.starts.copy()
-        member = np.asarray(scenes.member, np.int64)
-        kernels.nearer(
-            starts, worlds, member, scenes.bodies, share, self.fields, self._grid
-        )
-        return starts
-
     def lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:
         """Lengths (n, M) [m] of the ways from where the robots of some worlds are.
 

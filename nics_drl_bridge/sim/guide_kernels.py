@@ -17,7 +17,6 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
 from nics_drl_bridge.sim.state import Array, Integers
 
-ROOM = 0.1  # space that a start needs beside the robot's circle [m]
 COMFORT = (
     0.3  # space beside the robot's circle from which on a way is no longer tight [m]
 )
@@ -177,63 +176,6 @@ def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
                 most = max(most, min(ways[i, j] - way, np.float32(1e3)))
                 ways[i, j] = way
     return most
-
-
-@kernel(allocates=True)
-def nearer(out, worlds, member, bodies, share, fields, grid):  # type: ignore[no-untyped-def]
-    """Moves starts `out` (n, M, 3) along their ways until a share of these is left.
-
-    Of the worlds (n,) given: member (n,), bodies (n, K, 7); `fields` are those of all worlds. A
-    start for which there is no room where it would come to stays where it is.
-    """
-    for n in range(out.shape[0]):
-        p = member[n]
-        wide = grid.sizes[p]
-        x = grid.frames[p, 0]
-        y = grid.frames[p, 1]
-        cell = grid.frames[p, 2]
-        for m in range(out.shape[1]):
-            ways = fields[worlds[n], m, : wide[0], : wide[1]]
-            i = min(max(int((out[n, m, 1] - y) / cell), 0), wide[0] - 1)
-            j = min(max(int((out[n, m, 0] - x) / cell), 0), wide[1] - 1)
-            i, j = _descend(i, j, share * ways[i, j], ways)
-            at_x = x + (j + 0.5) * cell
-            at_y = y + (i + 0.5) * cell
-            if grid.walls[p, i, j] >= grid.outer + ROOM and _is_clear(
-                at_x, at_y, bodies[n], grid
-            ):
-                out[n, m, 0] = at_x
-                out[n, m, 1] = at_y
-
-
-@kernel
-def _descend(i, j, wanted, ways):  # type: ignore[no-untyped-def]
-    """The first cell, down the ways (rows, columns) from row i, column j, with no longer a way."""
-    while ways[i, j] > wanted:
-        row = i
-        column = j
-        for a in range(max(i - 1, 0), min(i + 2, ways.shape[0])):
-            for b in range(max(j - 1, 0), min(j + 2, ways.shape[1])):
-                if ways[a, b] < ways[row, column]:
-                    row = a
-                    column = b
-        if row == i and column == j:
-            break
-        i = row
-        j = column
-    return i, j
-
-
-@kernel
-def _is_clear(x, y, bodies, grid):  # type: ignore[no-untyped-def]
-    """True if a robot at a place has room beside bodies (K, 7), those that move included."""
-    for k in range(bodies.shape[0]):
-        body = bodies[k]
-        if body[RADIUS] > 0.0:
-            gap = _gap(x, y, body, collision.outline_of(body, grid.outlines))
-            if gap < grid.outer + ROOM:
-                return False
-    return True
 
 
 @kernel(allocates=True)

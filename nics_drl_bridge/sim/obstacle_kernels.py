@@ -21,9 +21,6 @@ from nics_drl_bridge.sim.state import Array, State, Surroundings
 DRAWS = 64  # Greatest number of draws per obstacle and period
 MOST = 10_000  # Obstacles of a world at most: draws do not depend on how many there are
 TURN = 2.0  # Greatest turn rate of an obstacle [rad/s]
-LOOK = 1.0  # A wandering obstacle looks ahead by the distance of this time [s], plus its radius
-MARGIN = 0.1  # Free space that it keeps at its sides [m]
-TRIES = 8  # Directions that it tries in one period
 MOST_CORNERS = 32  # Greatest number of waypoints that a patrol passes in a period
 NEAREST = (
     1e-3  # Least distance for which a force is computed [m]: at 0 it has no direction
@@ -46,21 +43,18 @@ def _share(seed, counter):  # type: ignore[no-untyped-def]
 
 @kernel
 def begin(n: int, state: State, plans: Array) -> None:
-    """Begins an episode of world n: draws the speed and initial direction of each obstacle."""
+    """Begins an episode of world n: draws the speed of each obstacle."""
     seed = state.seeds[n]
     bodies = state.bodies
     for k in range(plans.shape[0]):
         mark = state.marks[n, k]
         row = plans[k]
-        counter = k * DRAWS
         mark[:] = 0.0
         if row[at.KIND] == at.STILL:
             continue
         low = row[at.SPEED_LOW]
         high = row[at.SPEED_HIGH]
-        mark[at.SPEED] = low + (high - low) * _share(seed, counter)
-        mark[at.DIRECTION] = (2.0 * _share(seed, counter + 1) - 1.0) * math.pi
-        mark[at.AIM] = mark[at.DIRECTION]
+        mark[at.SPEED] = low + (high - low) * _share(seed, k * DRAWS)
         mark[at.GOAL_X], mark[at.GOAL_Y] = bodies[n, k, X], bodies[n, k, Y]
         mark[at.UNTIL] = -1.0
         mark[at.WAY] = 1.0
@@ -101,9 +95,7 @@ def steer(
             continue
         dx = velocity[k, 0] * period
         dy = velocity[k, 1] * period
-        if kind == at.WANDER:
-            dx, dy = _wander(mark, k, traffic, seed, (draws + k) * DRAWS)
-        elif kind == at.PATROL:
+        if kind == at.PATROL:
             dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
         wished_x = dx
         wished_y = dy
@@ -116,46 +108,6 @@ def steer(
         if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
             turn = wrap(math.atan2(dy, dx) - body[HEADING]) / period
             velocity[k, 2] = min(max(turn, -TURN), TURN)
-
-
-@kernel
-def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-untyped-def]
-    for part in (0.5, 1.0):
-        way = part * reach
-        free, _, _ = at.clearance(
-            x + way * math.cos(angle), y + way * math.sin(angle), k, traffic
-        )
-        if free < room and free < here:
-            return True
-    return False
-
-
-@kernel
-def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
-    body = traffic.bodies[k]
-    speed = mark[at.SPEED]
-    period = traffic.period
-    x = body[X]
-    y = body[Y]
-    radius = body[RADIUS]
-    here, nx, ny = at.clearance(x, y, k, traffic)
-    reach = LOOK * speed + radius
-    aim = mark[at.AIM]
-    near = here < reach + radius + MARGIN
-    if near and _blocked(x, y, aim, reach, here, radius + MARGIN, k, traffic):
-        away = math.atan2(-ny, -nx)
-        for i in range(TRIES):
-            aim = away + (_share(seed, counter + i) - 0.5) * math.pi
-            if not _blocked(x, y, aim, reach, here, radius + MARGIN, k, traffic):
-                break
-        mark[at.AIM] = aim
-    turn = wrap(aim - mark[at.DIRECTION])
-    mark[at.DIRECTION] = wrap(
-        mark[at.DIRECTION] + min(max(turn, -TURN * period), TURN * period)
-    )
-    # It slows down in turns, so that it does not move far off its intended direction.
-    way = speed * period * max(math.cos(aim - mark[at.DIRECTION]), 0.0)
-    return way * math.cos(mark[at.DIRECTION]), way * math.sin(mark[at.DIRECTION])
 
 
 @kernel
@@ -319,7 +271,7 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
         mark[at.GOAL_X] = gx
         mark[at.GOAL_Y] = gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
-            free, _, _ = at.clearance(gx, gy, k, traffic)
+            free = at.clearance(gx, gy, k, traffic)
             if free >= radius + ROOM:
                 break
     way = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)

@@ -1,4 +1,4 @@
-"""Motion of obstacles: straight ahead, from waypoint to waypoint, or as people walk."""
+"""Motion of obstacles: from waypoint to waypoint, or as people walk."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import separation_kernels as at
 
-__all__ = ["Motion", "Patrol", "Pedestrian", "Wander", "plan_arrays"]
+__all__ = ["Motion", "Patrol", "Pedestrian", "plan_arrays"]
 FASTEST = (
     10.0  # Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
 )
@@ -33,13 +33,6 @@ def _fast(speed: tuple[float, float]) -> tuple[float, float]:
 Speed = Annotated[tuple[float, float], AfterValidator(_fast)]
 Strength = Annotated[float, Field(ge=0.0, le=STRONGEST)]
 Distance = Annotated[float, Field(ge=1e-3, le=STRONGEST)]
-
-
-class Wander(Schema):
-    """Moves straight ahead, by a speed drawn per episode, and turns when something is near."""
-
-    kind: Literal["wander"] = "wander"  # which kind of motion this is
-    speed: Speed  # range to draw from, per episode [m/s]
 
 
 class Patrol(Schema):
@@ -97,11 +90,11 @@ class Pedestrian(Schema):
     fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
 
 
-Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]
+Motion = Annotated[Patrol | Pedestrian, Field(discriminator="kind")]
 
 
 def plan_arrays(
-    motions: Sequence[Wander | Patrol | Pedestrian | None],
+    motions: Sequence[Patrol | Pedestrian | None],
 ) -> tuple[Array, Array]:
     """Returns the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
     rows = np.zeros((len(motions), at.PLAN))
@@ -110,9 +103,7 @@ def plan_arrays(
         if motion is None:
             continue
         row[[at.SPEED_LOW, at.SPEED_HIGH]] = motion.speed
-        if isinstance(motion, Wander):
-            row[at.KIND] = at.WANDER
-        elif isinstance(motion, Patrol):
+        if isinstance(motion, Patrol):
             row[at.KIND], row[at.LOOP], row[at.PAUSE] = (
                 at.PATROL,
                 motion.loop,

@@ -36,9 +36,9 @@ from nics_drl_bridge.sim.state import Array, MapField
     FLUCTUATION,
     PLAN,
 ) = range(17)
-STILL, WANDER, PATROL, PEDESTRIAN = range(4)  # values of the column KIND
+STILL, PATROL, PEDESTRIAN = range(3)  # values of the column KIND
 # Memory of an obstacle, a row of marks (N, K, F).
-SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
+SPEED, VX, VY, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(10)
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
 ROBOT_GAP = 0.1  # Which an obstacle keeps to a robot, as people do [m]; less may look like a touch
 PASSES = (
@@ -98,21 +98,11 @@ def map_direction(x, y, grid):  # type: ignore[no-untyped-def]
 
 @kernel
 def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
-    """Distance from a point to the nearest object except body k [m], and the unit vector to it."""
+    """Distance from a point to the nearest object except body k [m]."""
     bodies = traffic.bodies
     walls = traffic.walls
     field = traffic.field
-    left = x - field[0]
-    right = field[2] - x
-    low = y - field[1]
-    high = field[3] - y
-    least = min(left, right)
-    nx = 1.0 if right <= left else -1.0
-    ny = 0.0
-    if min(low, high) < least:
-        least = min(low, high)
-        nx = 0.0
-        ny = 1.0 if high <= low else -1.0
+    least = min(min(x - field[0], field[2] - x), min(y - field[1], field[3] - y))
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
         ox = px - x
@@ -120,8 +110,6 @@ def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
         away2 = ox * ox + oy * oy
         if least > 0.0 and 0.0 < away2 < least * least:
             least = math.sqrt(away2)
-            nx = ox / least
-            ny = oy / least
     for j in range(bodies.shape[0]):
         if j != k and bodies[j, RADIUS] > 0.0:
             ox = bodies[j, X] - x
@@ -129,15 +117,8 @@ def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
             reach = least + bodies[j, RADIUS]
             away2 = ox * ox + oy * oy
             if reach > 0.0 and 0.0 < away2 < reach * reach:
-                away = math.sqrt(away2)
-                least = away - bodies[j, RADIUS]
-                nx = ox / away
-                ny = oy / away
-    away = map_distance(x, y, traffic.grid)
-    if away < least:
-        nx, ny = map_direction(x, y, traffic.grid)
-        least = away
-    return least, nx, ny
+                least = math.sqrt(away2) - bodies[j, RADIUS]
+    return min(least, map_distance(x, y, traffic.grid))
 
 
 @kernel

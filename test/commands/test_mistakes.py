@@ -74,7 +74,6 @@ MISTAKES = {
     "evaluate differential --in fasst": "there is no such simulator; did you mean 'fast'?",
     "evaluate differential --in fast --world circels": "did you mean 'circles'?",
     "evaluate differential --in fast --gate mechanum": "did you mean 'mecanum'?",
-    "evaluate differential --in fast --fallback dynamic": "no such planner; did you mean",
     "evaluate differential --in fast --lidar rplidar": "unknown lidar 'rplidar'; did you mean",
     "evaluate differential --in fast --randomisation milt": "did you mean 'mild'?",
     "policy info diferential": "neither a file nor a shipped policy; did you mean 'differential'?",

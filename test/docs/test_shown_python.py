@@ -35,7 +35,6 @@ BEFORE = {
 ELSEWHERE = {
     ("howto.md", 1): "needs a simulator in another process",
     ("policy_file.md", 3): "needs a policy with a state",
-    ("tasks.md", 3): "is a method of the class above",
 }
 SAVED = {("tasks.md", 1): "my_task.py"}
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from robots import direct_model, field, lidar
 
-from nics_drl_bridge.env.teaching import Curriculum, Teaching
+from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.errors import ConfigError
 
 BLIND_BEHIND = lidar(beams=37, angle_min=-np.pi / 2.0, angle_max=np.pi / 2.0)
 BACK = np.array([[-1.0, 0.0, 0.0]], np.float32)
@@ -100,124 +99,24 @@ def test_an_episode_that_succeeded_is_not_driven_again():
     assert len(set(seeds)) == len(seeds)
 
 
-WIDE = field(9.0, count=4, goal_distance=[2.0, 6.0])
-AHEAD = np.array([[1.0, 0.0, 0.0]], np.float32)
-
-
-def starts_of(level, world=WIDE, worlds=20):
-    """Starts (N, 3), goals (N, 2), and the lengths of the ways (N,) at a level."""
-    env = BridgeVectorEnv(worlds, direct_model(), world, autoreset_mode="SameStep")
-    env.teach(Teaching(path=1.0, curriculum=Curriculum(begin=level)))
-    env.reset(seed=2)
-    teacher = env._teacher
-    return (
-        env._starts[:, 0].copy(),
-        env.simulator.goals[:, 0].copy(),
-        teacher._left[:, 0].copy(),
-    )
-
-
-def test_starts_of_a_curriculum_leave_a_share_of_the_way_with_the_headings_and_goals_as_drawn():
-    drawn, goals, whole = starts_of(1.0)
-    for level in (0.3, 0.7):
-        starts, same, left = starts_of(level)
-        np.testing.assert_array_equal(same, goals)
-        np.testing.assert_array_equal(starts[:, 2], drawn[:, 2])
-        moved = (starts != drawn).any(axis=1)
-        assert moved.mean() > 0.8
-        assert (left[moved] <= level * whole[moved] + 0.15).all()
-        assert left[moved].mean() > (level - 0.1) * whole[moved].mean()
-
-
-def test_a_start_moves_along_the_way_around_a_wall():
-    places = {"starts": {"at": [[-3.0, 0.0, 0.0]]}, "goals": {"at": [[3.0, 0.0]]}}
-    apart = {"goal_distance": [1.0, 9.0], "clearance": 0.0, "obstacles": []}
-    wall = field(9.0, walls=[[0.0, -4.5, 0.0, 2.0]], **places, **apart)
-    (half,), _, _ = starts_of(0.5, wall, 1)
-    assert half[1] > 2.0
-    assert abs(half[0]) < 0.5
-
-
-def test_a_start_stays_as_drawn_where_there_is_no_room_on_the_way():
-    places = {"starts": {"at": [[-2.0, 0.0, 0.0]]}, "goals": {"at": [[2.0, 0.0]]}}
-    moving = {
-        "shapes": [{"kind": "circle", "radius": 0.4}],
-        "at": [[0.0, 0.0, 0.0]],
-        "motion": {"kind": "pedestrian", "speed": [0.2, 0.4]},
-    }
-    apart = {"goal_distance": [1.0, 9.0], "clearance": 0.0}
-    crowd = field(9.0, obstacles=[moving], **places, **apart)
-    free = field(9.0, obstacles=[], **places, **apart)
-    assert starts_of(0.5, crowd, 1)[0][0].tolist() == [-2.0, 0.0, 0.0]
-    assert abs(starts_of(0.5, free, 1)[0][0, 0]) < 0.2
-
-
-def test_a_start_that_a_user_names_is_not_moved():
-    env = BridgeVectorEnv(1, direct_model(), WIDE, autoreset_mode="SameStep")
-    env.teach(Teaching(curriculum=Curriculum()))
-    _, info = env.reset(seed=2, options={"start": [0.5, 0.25, 1.0]})
-    assert info["start"][0].tolist() == [0.5, 0.25, 1.0]
-
-
-def levels(action, steps, success=0.7):
-    """The level after each step, in worlds whose goals lie ahead."""
-    places = {"starts": {"at": [[-2.0, 0.0, 0.0]]}, "goals": {"at": [[2.0, 0.0]]}}
-    world = field(9.0, goal_distance=[1.0, 9.0], obstacles=[], **places)
-    env = BridgeVectorEnv(
-        120, direct_model(), world, max_episode_steps=30, autoreset_mode="SameStep"
-    )
-    env.teach(Teaching(curriculum=Curriculum(begin=0.4, step=0.3, success=success)))
-    env.reset(seed=0)
-    for _ in range(steps):
-        env.step(np.tile(action, (120, 1)))
-        yield round(env.level, 9)
-
-
-def test_the_level_rises_with_success_and_does_not_without():
-    reached = list(levels(AHEAD, 70))
-    assert reached == sorted(reached)
-    assert set(reached) == {0.4, 0.7, 1.0}
-    assert set(levels(BACK, 70)) == {0.4}
-
-
-def test_only_episodes_that_began_at_a_level_count_for_it():
-    env = BridgeVectorEnv(120, direct_model(), WIDE, autoreset_mode="SameStep")
-    env.teach(Teaching(curriculum=Curriculum(begin=0.2, step=0.1)))
-    env.reset(seed=0)
-    all_of_them = np.ones(120, np.bool_)
-    found = []
-    for anew in (False, False, True):
-        if anew:
-            env.reset(seed=0)
-        env._teacher.again(all_of_them, all_of_them)
-        found.append(round(env.level, 9))
-    assert found == [0.3, 0.3, 0.4]
-
-
-def test_a_curriculum_is_for_one_robot():
-    env = BridgeVectorEnv(2, direct_model(), WIDE, "cooperative_reaching")
-    with pytest.raises(ConfigError, match="moves a single robot's start; leave it out"):
-        env.teach(Teaching(curriculum=Curriculum()))
-
-
-def test_levels_do_not_depend_on_the_number_of_threads():
+def test_teaching_does_not_depend_on_the_number_of_threads():
     def driven(threads):
         env = BridgeVectorEnv(
             120,
             direct_model(),
-            WIDE,
+            field(9.0, count=4, goal_distance=[2.0, 6.0]),
             max_episode_steps=20,
             autoreset_mode="SameStep",
             threads=threads,
         )
-        env.teach(Teaching(path=1.0, retries=1, curriculum=Curriculum(success=0.05)))
+        env.teach(Teaching(path=1.0, retries=1))
         env.reset(seed=0)
+        ahead = np.tile(np.array([[1.0, 0.0, 0.0]], np.float32), (120, 1))
         for _ in range(50):
-            seen = env.step(np.tile(AHEAD, (120, 1)))[0]
-        return seen, env.level, env._starts.copy()
+            seen = env.step(ahead)[0]
+        return seen, env._starts.copy()
 
     one = driven(1)
     three = driven(3)
-    assert 0.2 < one[1] == three[1]
     np.testing.assert_array_equal(one[0], three[0])
-    np.testing.assert_array_equal(one[2], three[2])
+    np.testing.assert_array_equal(one[1], three[1])

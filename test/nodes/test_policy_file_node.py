@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
 from policy import foreign_nets
-from policy.policy_rig import MEMORIES, export_remembering, network
+from policy.policy_rig import export_remembering, network
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.registry import make_task
@@ -189,30 +189,6 @@ def test_its_diagnostics_count_inferences(driving):
     robot, _ = driving
     robot.peer.until(lambda: int(facts(robot).get("answered", 0)) > 0, "diagnostics")
     assert facts(robot)["late"] == "0"
-    assert "by the fallback" not in facts(robot)
-
-
-def test_a_fallback_commands_over_dds_what_it_does_in_process_and_is_counted(
-    launch, meet, domain_id, model
-):
-    given = {"policy": "straight", "fallback": "dynamic_window", "goal": [1.5, 0.0]}
-    launch("policy_node", domain_id, **given, deadline=5.0)
-    robot, scan = Robot(meet(domain_id)), scan_of(model.lidar.angles)
-    angles = model.lidar.angles
-    ranges = np.full(model.lidar.beams, 2.9, np.float32)
-    ranges[np.abs(angles) < 0.3] = model.robot.footprint_radius + 0.06
-    scan.ranges = array.array("f", ranges.tobytes())
-    view = RobotView(np.zeros(3), np.zeros(3), ranges, 0.0, 0.0, 0.0)
-    commands = {}
-    for fallback in ("", "dynamic_window"):
-        policy, task = open_policy("straight", model, fallback)
-        action = policy.act(task.observation(view, {"goal": np.array([1.5, 0.0])}))
-        commands[fallback] = task.robot.to_cmd_vel(task.command(action))
-    assert np.abs(commands[""] - commands["dynamic_window"]).max() > 0.1
-    assert robot.hears(scan) == pytest.approx(commands["dynamic_window"], abs=1e-4)
-    robot.peer.until(
-        lambda: int(facts(robot).get("by the fallback", 0)) > 0, "diagnostics"
-    )
 
 
 def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(
@@ -242,8 +218,6 @@ def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(
         ({"policy": "none.onnx"}, "none.onnx: field 'file'"),
         ({"policy": "dynamic_widow"}, "did you mean 'dynamic_window'"),
         ({"rate": -1.0}, "rate -1.0"),
-        ({"fallback": "mpi"}, "fallback 'mpi': no such planner; did you mean 'mppi'?"),
-        ({"fallback": "dynamic_window"}, "is the policy itself; take 'mppi', or none."),
     ],
 )
 def test_what_cannot_be_driven_ends_it_with_one_sentence(
@@ -305,10 +279,10 @@ def test_a_policy_that_fails_when_it_runs_leaves_a_zero_and_ends_with_a_sentence
 PHASES = np.linspace(0.0, 2.0, 6)  # of the surroundings that it sees, scan after scan
 
 
-@pytest.fixture(scope="module", params=MEMORIES)
-def remembering(request, model, tmp_path_factory):
+@pytest.fixture(scope="module")
+def remembering(model, tmp_path_factory):
     path = tmp_path_factory.mktemp("remembering") / "car.onnx"
-    export_remembering(path, request.param, model, scan="around")
+    export_remembering(path, model, scan="around")
     return path
 
 

@@ -12,10 +12,7 @@ from robots import direct_model, lidar
 
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.policy import contract, onnx_graph
-from nics_drl_bridge.policy.train_algorithms import Actor
 from nics_drl_bridge.policy.train_export import export_policy
-from nics_drl_bridge.policy.train_memory import memory_of
-from nics_drl_bridge.policy.training_settings import GruMemory, StackMemory
 
 SECTORS = 24
 
@@ -71,28 +68,29 @@ def weight(proto):
     return tensor, np.array(onnx.numpy_helper.to_array(tensor))
 
 
-MEMORIES = {
-    "gru": GruMemory(kind="gru", units=6),
-    "stack": StackMemory(kind="stack", scans=3, every=2),
-}
+class Remembering(torch.nn.Module):
+    """A network with a state, whose actions differ from step to step."""
+
+    state_size = 6
+    state_start = 0.25
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.keep = torch.nn.Linear(inputs + self.state_size, self.state_size)
+        self.act = torch.nn.Linear(self.state_size, outputs)
+
+    def forward(self, seen: torch.Tensor, state: torch.Tensor):
+        following = torch.tanh(self.keep(torch.cat([seen, state], 1)))
+        return self.act(following), following
 
 
-def remembering(task, kind: str) -> Actor:
-    """An actor with a memory, whose actions differ from step to step."""
-    torch.manual_seed(0)
-    size = task.observation_space.shape[0]
-    spaces = task.observation_space, task.action_space
-    memory = memory_of(MEMORIES[kind], size, task.scan_parts)
-    actor = Actor(*spaces, [16], (np.zeros(size), np.ones(size)), memory=memory)
-    actor.layers[-1].weight.data.mul_(40.0)
-    return actor
-
-
-def export_remembering(path: Path, kind: str, model=None, **options):
+def export_remembering(path: Path, model=None, **options):
     model = model or model_of()
     task = make_task("navigation", model, {"scan": SECTORS} | options)
-    actor = remembering(task, kind)
-    return export_policy(actor, task, model, path), task, actor
+    outputs = 9 if task.actions == "discrete" else len(model.robot.command)
+    network = Remembering(task.observation_space.shape[0], outputs)
+    return export_policy(network, task, model, path), task, network
 
 
 def sequence(task, steps: int, *lead: int, seed: int = 1):

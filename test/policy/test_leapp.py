@@ -22,14 +22,14 @@ from nics_drl_bridge.policy.policy_file import load_policy, policy_of
 from policy import foreign_nets
 from policy.policy_rig import SECTORS, export, export_remembering, sequence
 
-KINDS = ("plain", "discrete", "beams", "gru", "stack")
+KINDS = ("plain", "discrete", "beams", "remembering")
 
 
 def made(folder, kind):
     """A policy file of a kind, and its task."""
     path = folder / "policy.onnx"
-    if kind in ("gru", "stack"):
-        return export_remembering(path, kind)[:2]
+    if kind == "remembering":
+        return export_remembering(path)[:2]
     options = {"discrete": {"actions": "discrete"}, "beams": {"scan": None}}.get(
         kind, {}
     )
@@ -86,7 +86,7 @@ def test_the_runner_of_leapp_takes_it_and_gives_the_same(tmp_path, kind):
 
 
 def test_the_bundle_says_what_it_needs(tmp_path):
-    policy, task = made(tmp_path, "gru")
+    policy, task = made(tmp_path, "remembering")
     data = described(export_bundle(policy, tmp_path / "bundle"))
     node = data["models"]["policy"]
     pipeline = data["pipeline"]

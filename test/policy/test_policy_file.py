@@ -22,7 +22,6 @@ from nics_drl_bridge.policy.contract import GoldenEntry
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.policy_file import load_policy
 from policy.policy_rig import (
-    MEMORIES,
     SECTORS,
     bytes_of,
     contract_in,
@@ -384,10 +383,10 @@ def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path):
 # A state.
 
 
-@pytest.fixture(scope="module", params=MEMORIES)
-def remembering(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def remembering(tmp_path_factory):
     path = tmp_path_factory.mktemp("remembering") / "go.onnx"
-    export_remembering(path, request.param)
+    export_remembering(path)
     return path
 
 

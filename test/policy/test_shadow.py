@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.shadow import Shadow, shadow
 from nics_drl_bridge.robot.spec import load_robot
-from policy.policy_rig import MEMORIES, export_remembering
+from policy.policy_rig import export_remembering
 
 pytestmark = pytest.mark.slow
 LIDAR = load_lidar("paper")
@@ -98,11 +98,11 @@ def test_a_policy_in_the_shadow_of_its_own_drive_commands_what_was_driven(record
     assert all(figures["opposite"] == 0.0 for figures in made.differences().values())
 
 
-@pytest.fixture(params=MEMORIES)
-def remembering(request, tmp_path):
+@pytest.fixture
+def remembering(tmp_path):
     """A policy with a state, the goal and the messages of its drive."""
     path = tmp_path / "car.onnx"
-    export_remembering(path, request.param, builtin_model("ackermann"), scan=None)
+    export_remembering(path, builtin_model("ackermann"), scan=None)
     return str(path), *driven_by(str(path))
 
 

@@ -13,7 +13,6 @@ from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train_export import Deployed, export_policy
 from policy.policy_rig import (
-    MEMORIES,
     SECTORS,
     export,
     export_remembering,
@@ -115,30 +114,29 @@ DIRECT_LOW = model_of().robot.command_low
 DIRECT_HIGH = model_of().robot.command_high
 
 
-@pytest.mark.parametrize("kind", MEMORIES)
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
-def test_a_file_with_a_state_acts_as_the_module_step_by_step(tmp_path, kind, actions):
-    policy, task, actor = export_remembering(
-        tmp_path / "one.onnx", kind, actions=actions
-    )
+def test_a_file_with_a_state_acts_as_the_module_step_by_step(tmp_path, actions):
+    policy, task, module = export_remembering(tmp_path / "one.onnx", actions=actions)
     kept = policy.contract.state
-    assert (kept.size, kept.start) == (actor.memory.size, actor.memory.start)
-    ours = theirs = actor.memory.begin(4).numpy()
+    assert (kept.size, kept.start) == (module.state_size, module.state_start)
+    ours = np.full((4, kept.size), kept.start, np.float32)
+    theirs = torch.from_numpy(ours)
     for seen in sequence(task, 8, 4):
         before = ours
         action, command, ours = policy.run(seen, ours)
-        wanted, theirs = actor.step(seen, theirs)
-        assert ours == pytest.approx(theirs, abs=1e-5)
-        assert command == pytest.approx(task.command(wanted), abs=1e-5)
+        with torch.no_grad():
+            raw, theirs = module(torch.from_numpy(seen), theirs)
+        wanted = raw.argmax(dim=1) if actions == "discrete" else raw.clamp(-1.0, 1.0)
+        assert ours == pytest.approx(theirs.numpy(), abs=1e-5)
+        assert command == pytest.approx(task.command(wanted.numpy()), abs=1e-5)
         assert command == pytest.approx(task.command(action), abs=1e-5)
     assert np.abs(ours - before).max() > 0.01
     alone, _, _ = policy.run(seen[1], before[1])
     assert alone == pytest.approx(action[1], abs=1e-6)
 
 
-@pytest.mark.parametrize("kind", MEMORIES)
-def test_what_a_policy_with_a_state_does_depends_on_what_it_saw_before(tmp_path, kind):
-    policy, task, _ = export_remembering(tmp_path / "one.onnx", kind)
+def test_what_a_policy_with_a_state_does_depends_on_what_it_saw_before(tmp_path):
+    policy, task, _ = export_remembering(tmp_path / "one.onnx")
     rows = sequence(task, 2)
     acting = make_policy(str(policy.path), task)
     first = acting.act(rows[0])

@@ -132,7 +132,7 @@ def test_the_picture_of_an_open_field_is_as_wide_and_deep_as_its_bounds():
 def test_obstacles_that_move_are_marked_with_the_ways_of_those_that_patrol():
     patrol = {"kind": "patrol", "waypoints": [[-2.0, -2.0], [2.0, -2.0]], "speed": 0.5}
     rings = []
-    for motion in (None, {"kind": "wander", "speed": [0.1, 0.2]}, patrol):
+    for motion in (None, {"kind": "pedestrian", "speed": [0.1, 0.2]}, patrol):
         world = field(count=1, obstacles=[circles(1) | {"motion": motion}])
         image = decoded(world_picture(world, 0.2, 0))
         rings.append(len(pixels_of(image, MODEL, off=30)))

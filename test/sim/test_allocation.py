@@ -21,7 +21,7 @@ GROWTH = 2500
 """What a stretch of steps may leave behind [bytes]: less than an object for each."""
 FEW = 2
 """Times that compiled code allocates per step: the handle of the commands that it is given."""
-MOVING = {**circles(3), "motion": {"kind": "wander", "speed": [0.2, 0.5]}}
+MOVING = {**circles(3), "motion": {"kind": "pedestrian", "speed": [0.2, 0.5]}}
 SCENES = {
     "circles": (lambda: field(6.0, 5), 1, 160),
     "map": (lambda: load_world("room"), 1, 160),

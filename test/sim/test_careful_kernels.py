@@ -373,7 +373,7 @@ def test_nothing_overlaps_in_a_long_drive_of_fast_robots(deviation):
         {
             "shapes": [CIRCLE],
             "count": 3,
-            "motion": {"kind": "wander", "speed": [0.5, 2.0]},
+            "motion": {"kind": "pedestrian", "speed": [0.5, 2.0]},
         },
     ]
     simulator = FastSimulator(

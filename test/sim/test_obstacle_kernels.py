@@ -21,19 +21,18 @@ from nics_drl_bridge.sim.obstacles import (
     Motion,
     Patrol,
     Pedestrian,
-    Wander,
     plan_arrays,
 )
 from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
-WANDER = Wander(speed=(0.3, 0.8))
 WALKER = Pedestrian()
+STROLLER = Pedestrian(speed=(0.3, 0.8))
 SQUARE = Patrol(
     waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7
 )
-MIXED = [WANDER, SQUARE, WALKER, None, WALKER, WANDER]
+MIXED = [STROLLER, SQUARE, WALKER, None, WALKER, STROLLER]
 WALLS = np.array([(-3.0, 0.5, -0.5, 0.5), (0.8, -1.0, 0.8, 3.0)])
 TOUCH = 1e-9
 
@@ -44,9 +43,7 @@ class Mover(Schema):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize(
-    "motions", [[WANDER] * 6, [WALKER] * 6, MIXED], ids=["wander", "walk", "mixed"]
-)
+@pytest.mark.parametrize("motions", [[WALKER] * 6, MIXED], ids=["walk", "mixed"])
 @pytest.mark.parametrize("walls", [None, WALLS], ids=["open", "walled"])
 def test_nothing_ever_touches_or_leaves_the_field(motions, walls, seed):
     radii = np.array(
@@ -65,7 +62,7 @@ def test_nothing_ever_touches_or_leaves_the_field(motions, walls, seed):
             assert track.distance(solid) > radii[k] - TOUCH
 
 
-@pytest.mark.parametrize("motions", [[WANDER] * 6, MIXED], ids=["wander", "mixed"])
+@pytest.mark.parametrize("motions", [[WALKER] * 6, MIXED], ids=["walk", "mixed"])
 def test_two_that_move_do_not_touch_within_a_period_either(motions):
     radii = np.full(6, 0.25)
     seen = watch(
@@ -80,13 +77,10 @@ def test_two_that_move_do_not_touch_within_a_period_either(motions):
         assert away[:, ~np.eye(6, dtype=bool)].min() > 0.5 - TOUCH
 
 
-@pytest.mark.parametrize("motion", ["wander", "pedestrian"])
-def test_what_moves_stays_within_open_bounds_wherever_they_lie_and_uses_all_of_them(
-    motion,
-):
+def test_what_moves_stays_within_open_bounds_wherever_they_lie_and_uses_all_of_them():
     low = np.array([10.0, -2.0])
     high = np.array([13.0, 1.0])
-    group = circles(4) | {"motion": {"kind": motion, "speed": [0.5, 0.9]}}
+    group = circles(4) | {"motion": {"kind": "pedestrian", "speed": [0.5, 0.9]}}
     world = {"name": "open", "bounds": [*low, *high], "goal_distance": [0.5, 2.0]}
     world = World.model_validate(world | {"obstacles": [group], "clearance": 0.05})
     simulator = FastSimulator(direct_model(), world, 3)
@@ -118,39 +112,17 @@ def test_speeds_stay_within_their_bounds():
         if motion is not None:
             low, high = np.broadcast_to(motion.speed, 2)
             assert low <= drawn[k] <= high
-            assert fastest[k] <= (high if motion is WALKER else drawn[k]) * (
+            assert fastest[k] <= (drawn[k] if motion is SQUARE else high) * (
                 1.0 + 1e-12
             )
     assert np.abs(seen.velocities[..., 2]).max() <= kernels.TURN
 
 
 def test_an_obstacle_looks_where_it_goes():
-    seen = watch([WANDER], np.zeros((1, 2)), [0.2], steps=300)
+    seen = watch([SQUARE], np.array(SQUARE.waypoints[:1]), [0.2], steps=300)
     ahead = np.arctan2(seen.velocities[:, 0, 1], seen.velocities[:, 0, 0])
     off = np.angle(np.exp(1j * (seen.headings[1:, 0] - ahead)))
     assert np.median(np.abs(off)) < 1e-9
-
-
-def test_a_wandering_obstacle_goes_straight_where_the_way_is_free():
-    seen = watch([WANDER], np.zeros((1, 2)), [0.2], half=(50.0, 50.0), steps=200)
-    way = np.diff(seen.places[:, 0], axis=0)
-    assert np.allclose(way, way[0])
-    assert np.allclose(seen.speeds, seen.marks[0, 0, at.SPEED])
-
-
-def test_wandering_obstacles_turn_away_before_they_touch_and_never_get_stuck():
-    seen = watch([WANDER], np.zeros((1, 2)), [0.2], steps=3000)
-    room = 3.0 - 0.2 - np.abs(seen.places[:, 0]).max(axis=1)
-    assert (room < 0.02).mean() < 0.01
-    crowd = watch(
-        [WANDER] * 8,
-        scattered([0.2] * 8, (3.0, 3.0), np.random.default_rng(5)),
-        [0.2] * 8,
-        steps=3000,
-    )
-    for begin in range(0, 3000, 200):  # in any 20 s each of them gets somewhere
-        part = crowd.places[begin : begin + 200]
-        assert (np.ptp(part, axis=0).max(axis=1) > 0.3).all()
 
 
 def on_path(corners, speed, pause, times):
@@ -302,8 +274,7 @@ def test_a_seed_gives_the_same_motion_in_any_batch():
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.4])
-@pytest.mark.parametrize("motion", [WANDER, WALKER], ids=["wander", "walk"])
-def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
+def test_what_moves_keeps_clear_of_a_static_map(heading):
     cells = np.zeros((120, 120), np.int8)
     cells[40:50, 20:70] = 100
     cells[70:100, 80:84] = 100
@@ -329,7 +300,7 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
         ):
             places.append(spot)
     seen = watch(
-        [motion] * count, np.array(places), [radius] * count, grid=map_field(grid)
+        [WALKER] * count, np.array(places), [radius] * count, grid=map_field(grid)
     )
     d = seen.places - (x, y)
     local = np.stack(
@@ -344,9 +315,12 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
 @pytest.mark.parametrize(
     ("motion", "sentence"),
     [
-        ({"kind": "wander", "speed": [0.8, 0.3]}, "speed must be [least, greatest]"),
-        ({"kind": "wander", "speed": [0.0, 0.3]}, "above 0"),
-        ({"kind": "wander", "speed": [1.0, 30.0]}, "at most 10 m/s"),
+        (
+            {"kind": "pedestrian", "speed": [0.8, 0.3]},
+            "speed must be [least, greatest]",
+        ),
+        ({"kind": "pedestrian", "speed": [0.0, 0.3]}, "above 0"),
+        ({"kind": "pedestrian", "speed": [1.0, 30.0]}, "at most 10 m/s"),
         (
             {"kind": "patrol", "waypoints": [[0, 0]], "speed": 1.0},
             "motion.patrol.waypoints",
@@ -360,6 +334,7 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
             "must differ",
         ),
         ({"kind": "pedestrian", "relaxation": 0.0}, "relaxation"),
+        ({"kind": "wander", "speed": [0.3, 0.8]}, "unknown kind 'wander'"),
         (
             {"kind": "pedestrain"},
             "unknown kind 'pedestrain'; did you mean 'pedestrian'?",
@@ -386,9 +361,9 @@ def test_motions_are_read_by_their_kind():
 
 def test_plans_hold_the_waypoints_of_all_patrols_one_after_the_other():
     rows, waypoints = plan_arrays(
-        [None, SQUARE, WANDER, Patrol(waypoints=((0, 0), (1, 1)), speed=1)]
+        [None, SQUARE, WALKER, Patrol(waypoints=((0, 0), (1, 1)), speed=1)]
     )
-    assert rows[:, at.KIND].tolist() == [at.STILL, at.PATROL, at.WANDER, at.PATROL]
+    assert rows[:, at.KIND].tolist() == [at.STILL, at.PATROL, at.PEDESTRIAN, at.PATROL]
     assert rows[[1, 3], at.FIRST].tolist() == [0, 4]
     assert np.array_equal(waypoints, [*SQUARE.waypoints, (0, 0), (1, 1)])
     assert [part.shape for part in plan_arrays([])] == [(0, 16), (0, 2)]

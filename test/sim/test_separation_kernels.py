@@ -47,7 +47,7 @@ def test_whatever_all_of_them_wish_nothing_touches_at_any_time_of_the_period(ben
     solid = MultiLineString([wall.reshape(2, 2) for wall in WALLS])
     for seed in range(100):
         rng, bodies = crowd(seed)
-        kinds = rng.integers(0, 4, 5)
+        kinds = rng.integers(0, 3, 5)
         radii = bodies[:, 5]
         around = traffic(bodies, kinds, rng.uniform(-0.3, 0.3, (2, 2)))
         wishes = rng.normal(0.0, 0.4, (5, 2)) * (kinds != at.STILL)[:, None]
@@ -73,7 +73,7 @@ def test_nobody_runs_into_a_robot_that_keeps_its_velocity():
         speeds = towards[None] * 0.5
         before = np.linalg.norm(bodies[1, :2] - bodies[0, :2]) - bodies[:, 5].sum()
         wish = (bodies[1, :2] - bodies[0, :2]) * rng.uniform(0.5, 2.0)
-        around = traffic(bodies, [at.WANDER], speeds, WALLS[:0])
+        around = traffic(bodies, [at.PEDESTRIAN], speeds, WALLS[:0])
         moved = restrain(*wish, 0, around, True)
         after = bodies[1, :2] + speeds[0] * PERIOD - bodies[0, :2] - moved
         gap = np.linalg.norm(after) - bodies[:, 5].sum()
@@ -87,7 +87,7 @@ def test_a_wish_that_nothing_hinders_is_granted_to_the_bit():
     bodies[0, :2] = 0.0
     bodies[0, 5] = 0.1
     wish = 0.0123, -0.0456
-    around = traffic(bodies, [at.WANDER], walls=sides(HALF))
+    around = traffic(bodies, [at.PEDESTRIAN], walls=sides(HALF))
     for bends in (True, False):
         assert restrain(*wish, 0, around, bends) == wish
 
@@ -96,7 +96,7 @@ def test_one_bends_along_a_wall_where_the_other_stops():
     _, bodies = crowd(0, count=1, robots=0)
     bodies[0, :2] = (0.0, 0.9)
     bodies[0, 5] = 0.1
-    around = traffic(bodies, [at.WANDER], walls=sides(HALF))
+    around = traffic(bodies, [at.PEDESTRIAN], walls=sides(HALF))
     x, y = restrain(0.05, 0.05, 0, around, True)
     assert x == pytest.approx(0.05)
     assert abs(y) < 1e-12
@@ -110,7 +110,7 @@ def test_a_field_without_walls_holds_them_too(bends):
     bodies[0, 5], reached = 0.1, np.zeros(2)
     for _ in range(300):
         bodies[0, :2] = rng.uniform(-1.0, 1.0, 2) * (HALF - 0.1)
-        around = traffic(bodies, [at.WANDER], walls=WALLS[:0])
+        around = traffic(bodies, [at.PEDESTRIAN], walls=WALLS[:0])
         moved = restrain(*rng.normal(0.0, 1.0, 2), 0, around, bends)
         reached = np.maximum(reached, np.abs(bodies[0, :2] + moved))
     assert (reached <= HALF - 0.1 + TOUCH).all()
@@ -127,7 +127,7 @@ def test_nobody_jumps_through_a_thin_wall_of_a_map(bends, way):
     bodies[0, 5] = 0.2
     thin = map_field(GridMap(cells, 0.05, (-1.5, -1.5, 0.0)))
     around = traffic(
-        bodies, [at.WANDER], walls=WALLS[:0], half=np.full(2, 5.0), grid=thin
+        bodies, [at.PEDESTRIAN], walls=WALLS[:0], half=np.full(2, 5.0), grid=thin
     )
     for _ in range(20):
         moved = restrain(way, 0.0, 0, around, bends)
@@ -140,17 +140,17 @@ def test_what_overlaps_already_may_leave_but_get_no_deeper():
     _, bodies = crowd(0, count=2, robots=0)
     bodies[:, :2] = [(0.0, 0.0), (0.15, 0.0)]
     bodies[:, 5] = 0.1
-    around = traffic(bodies, [at.WANDER, at.STILL], walls=WALLS[:0])
+    around = traffic(bodies, [at.PEDESTRIAN, at.STILL], walls=WALLS[:0])
     assert restrain(-0.05, 0.01, 0, around, True) == (-0.05, 0.01)
     x, y = restrain(0.05, 0.01, 0, around, True)
     assert (x, y) == (0.0, 0.01)
 
 
-def test_clearance_is_the_distance_to_the_nearest_thing_and_points_at_it():
+def test_clearance_is_the_distance_to_the_nearest_thing():
     for seed in range(50):
         rng, bodies = crowd(seed)
         x, y = rng.uniform(-1.0, 1.0, 2) * HALF
-        least, nx, ny = clearance(x, y, 3, traffic(bodies, [at.WANDER] * 5))
+        least = clearance(x, y, 3, traffic(bodies, [at.PEDESTRIAN] * 5))
         walls = [LineString(wall.reshape(2, 2)) for wall in WALLS]
         discs = [
             Point(*body[:2]).buffer(body[5], 256)
@@ -163,9 +163,6 @@ def test_clearance_is_the_distance_to_the_nearest_thing_and_points_at_it():
         assert least == pytest.approx(
             min(spot.distance(thing) for thing in walls + discs), abs=1e-4
         )
-        there = Point(x + least * nx, y + least * ny)
-        assert min(there.distance(thing) for thing in walls + discs) < 1e-4
-        assert np.hypot(nx, ny) == pytest.approx(1.0)
 
 
 def test_the_nearest_point_of_a_wall_without_length_is_its_end():

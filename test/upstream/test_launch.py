@@ -102,7 +102,6 @@ def test_arguments_reach_every_node(launch, told):
         model="differential",
         world="corridor",
         policy="go_to_goal",
-        fallback="dynamic_window",
         stamped="false",
         start="1.0, 0.5, 0.25",
         autostart="false",
@@ -127,13 +126,12 @@ def test_arguments_reach_every_node(launch, told):
     assert told(launched, "/car/command_gate", *names) == given
     names = (
         "policy",
-        "fallback",
         "model",
         "enable_stamped_cmd_vel",
         "autostart",
         "base_frame",
     )
-    given = ["go_to_goal", "dynamic_window", "differential", False, False, "base_link"]
+    given = ["go_to_goal", "differential", False, False, "base_link"]
     assert told(launched, "/car/policy_node", *names) == given
     launched.ends_well()
 
@@ -155,15 +153,12 @@ def test_a_fleet_has_a_bridge_in_each_namespace_with_the_frames_of_its_robot(
 
 def test_what_is_not_given_stands_in_the_file_of_parameters(launch, told, tmp_path):
     text = find_config("bridge", "nodes").read_text(encoding="utf-8")
-    own = text.replace("fallback: ''", "fallback: mppi")
+    own = text.replace("policy: dynamic_window", "policy: mppi")
     own = own.replace("e_stop_required: true", "e_stop_required: false")
     file = tmp_path / "car.yaml"
     file.write_text(own, encoding="utf-8")
     launched = launch("vehicle.launch.py", params_file=file, autostart="false")
-    assert told(launched, "/policy_node", "fallback", "policy") == [
-        "mppi",
-        "dynamic_window",
-    ]
+    assert told(launched, "/policy_node", "policy") == ["mppi"]
     # But a vehicle requires an emergency stop, whatever its file says.
     names = "e_stop_required", "limits", "use_sim_time"
     assert told(launched, "/command_gate", *names) == [True, "differential", False]
