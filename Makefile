@@ -85,7 +85,7 @@ fi
 @# A ROS 2 built against numpy 1 crashes on numpy 2, which some of the pins need.
 @if [ "$(ROS)" = system ] && $(BASE) -c \
 		'import numpy, sys; sys.exit(numpy.__version__[:2] != "1.")' 2>/dev/null; then \
-	sed -E 's/^numpy==[^ ;]+/numpy<2/; /^(contourpy|matplotlib|rerun-sdk|scipy|shapely)==/d' \
+	sed -E 's/^numpy==[^ ;]+/numpy<2/; /^(contourpy|matplotlib|scipy|shapely)==/d' \
 		constraints.txt > $(VENV)/constraints.txt; \
 else \
 	cp constraints.txt $(VENV)/constraints.txt; \

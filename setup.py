@@ -57,7 +57,7 @@ EXTRAS = {
     # needs `deploy` alone. A library of its pictures has wheels for this platform only.
     "leapp": [f"leapp>=0.7.2; {ROS_WHEELS_EXIST}"],
     "view": ["websockets>=14"],
-    "video": ["imageio-ffmpeg>=0.5", "rerun-sdk>=0.24"],
+    "video": ["imageio-ffmpeg>=0.5"],
     # The site of docs/, and what runs and shows its notebooks.
     "docs": [
         "ipykernel>=6.29",

@@ -69,7 +69,6 @@ HOMES = {
     "mcap": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
     "websockets": ("watch/server.py",),
-    "rerun": ("watch/record.py",),
     "imageio_ffmpeg": ("watch/record.py",),
 }
 
