@@ -166,6 +166,5 @@ setup(
         f"{PACKAGE}.nodes": [f"mujoco_node = {PACKAGE}.extras.mujoco.node:main"],
         f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
         f"{PACKAGE}.viewers": [f"human = {PACKAGE}.watch.human:HumanView"],
-        f"{PACKAGE}.salvage": [f"bag = {PACKAGE}.extras.bags.salvage:salvaged"],
     },
 )

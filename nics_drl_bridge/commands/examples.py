@@ -58,7 +58,6 @@ EXAMPLES = {
     "bag info": ("nics bag info drive --json",),
     "bag replay": ("nics bag replay drive --rate 2",),
     "bag export": ("nics bag export drive --lerobot dataset --model my_robot",),
-    "bag salvage": ("nics bag salvage damaged whole",),
 }
 
 
