@@ -18,7 +18,6 @@ bag = typer.Typer(
 )
 
 STORAGES = ("mcap", "sqlite3")
-TASK = "Drive to the goal without touching anything."
 BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
 StorageOption = Annotated[
     str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")
@@ -156,90 +155,27 @@ def replay(
 @bag.command()
 def export(
     path: BagArgument,
-    lerobot: Annotated[
-        Path | None,
-        Option(metavar="FOLDER", help="Write a LeRobot dataset, format v3.0."),
-    ] = None,
     mcap: Annotated[
-        Path | None, Option(metavar="FOLDER", help="Write an MCAP bag for Foxglove.")
-    ] = None,
+        Path, Option(metavar="FOLDER", help="Write an MCAP bag for Foxglove.")
+    ],
     model: Annotated[
         str | None,
         Option(
             "--model",
             "--robot",
-            help="A model's folder, or a shipped robot: for commands, lidar and its mount.",
+            help="A model's folder, or a shipped robot: for its lidar's mount.",
             autocompletion=console.ROBOTS,
-        ),
-    ] = None,
-    topic: Annotated[
-        list[str] | None,
-        Option(
-            metavar="ROLE=TOPIC",
-            help="For example odom=/car/odom. Roles: scan, odom, cmd_vel, pose.",
-        ),
-    ] = None,
-    fps: Annotated[
-        int | None,
-        Option(min=1, help="Frames per second; the commands' rate by default."),
-    ] = None,
-    gap: Annotated[
-        float, Option(help="Data older than this end an episode [s].")
-    ] = 0.5,
-    task: Annotated[str, Option(help="The robot's task, in words.")] = TASK,
-    succeeded: Annotated[
-        str | None,
-        Option(
-            metavar="all|none|NUMBERS",
-            help="Episodes that succeeded, such as 0,2,5; if known.",
         ),
     ] = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Converts a bag to a LeRobot dataset, or to MCAP for Foxglove."""
-    from nics_drl_bridge.errors import ConfigError
+    """Converts a bag to MCAP for Foxglove."""
+    from nics_drl_bridge.extras.bags.convert import convert
     from nics_drl_bridge.generator import open_model
 
-    if lerobot is None and mcap is None:
-        raise ConfigError("nothing to write; say --lerobot FOLDER or --mcap FOLDER.")
-    known = None if model is None else open_model(model)
-    lines = []
-    told = dict[str, Any]()
-    if lerobot is not None:
-        from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
-
-        check_output(lerobot)
-    if mcap is not None:
-        from nics_drl_bridge.extras.bags.convert import convert
-
-        added = told["added"] = convert(path, mcap, known)
-        told["mcap"] = str(mcap)
-        also = f", with {' and '.join(added)} added" if added else ""
-        lines.append(f"bag written to {mcap}{also}")
-    if lerobot is not None:
-        from nics_drl_bridge.extras.bags.frames import frames_of
-
-        frames = frames_of(path, console.roles_of(topic or []), known, fps, gap)
-        episodes = len(frames.lengths)
-        total = int(frames.lengths.sum())
-        reached = _numbers(succeeded, episodes)
-        write_dataset(
-            frames, lerobot, task, known.robot.name if known else None, reached
-        )
-        if frames.dropped:
-            typer.echo(
-                f"left out: {frames.dropped} episodes of a single frame", err=True
-            )
-        told |= {
-            "lerobot": str(lerobot),
-            "episodes": episodes,
-            "frames": total,
-            "fps": frames.fps,
-            "left_out": frames.dropped,
-        }
-        counts = f"{episodes} episodes, {total} frames at {frames.fps} Hz"
-        lines.append(f"{counts}, written to {lerobot}")
-    console.say(as_json, "\n".join(lines), **told)
+    added = convert(path, mcap, None if model is None else open_model(model))
+    also = f", with {' and '.join(added)} added" if added else ""
+    console.say(as_json, f"bag written to {mcap}{also}", mcap=str(mcap), added=added)
 
 
 def _storage(name: str) -> Any:
@@ -248,21 +184,6 @@ def _storage(name: str) -> Any:
     if name not in STORAGES:
         raise ConfigError(f"--storage {name!r}: {nearest(name, STORAGES)}")
     return name
-
-
-def _numbers(given: str | None, episodes: int) -> set[int] | None:
-    from nics_drl_bridge.errors import ConfigError
-
-    if given is None:
-        return None
-    if given in ("all", "none"):
-        return set(range(episodes)) if given == "all" else set()
-    words = [word.strip() for word in given.split(",")]
-    if not all(word.isdecimal() for word in words):
-        raise ConfigError(
-            f"--succeeded {given!r}: must be all, none, or numbers as in 0,2,5."
-        )
-    return {int(word) for word in words}
 
 
 def _row(each: Any) -> tuple[str, ...]:
