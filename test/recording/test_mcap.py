@@ -123,8 +123,6 @@ def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
         with pytest.raises(DamageError, match=said) as caught:
             list(records(memoryview(data)))
         assert caught.value.offset == len(good)
-        if caught.value.end is not None:
-            assert caught.value.end == len(good) + len(record)
 
 
 def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(
