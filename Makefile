@@ -56,7 +56,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-lerobot test-ament test-release ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
+.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-ament test-release ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -85,7 +85,7 @@ fi
 @# A ROS 2 built against numpy 1 crashes on numpy 2, which some of the pins need.
 @if [ "$(ROS)" = system ] && $(BASE) -c \
 		'import numpy, sys; sys.exit(numpy.__version__[:2] != "1.")' 2>/dev/null; then \
-	sed -E 's/^numpy==[^ ;]+/numpy<2/; /^(contourpy|matplotlib|rerun-sdk|scipy|shapely)==/d' \
+	sed -E 's/^numpy==[^ ;]+/numpy<2/; /^(contourpy|matplotlib|scipy|shapely)==/d' \
 		constraints.txt > $(VENV)/constraints.txt; \
 else \
 	cp constraints.txt $(VENV)/constraints.txt; \
@@ -126,7 +126,7 @@ test-quick: setup ## under a minute, after each edit: no processes, no training
 
 test-all: test ## before a release: the long campaigns, other distributions, clients and Ray too
 	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
-	$(MAKE) test-jazzy test-messages test-clients test-lerobot test-ament test-release test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
+	$(MAKE) test-jazzy test-messages test-clients test-ament test-release test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
 
 ros-status:
 ifeq ($(ROS),system)
@@ -245,25 +245,6 @@ $(CLIENTS)/.ready: Makefile
 		$(CLIENTS)/bin/python -m pip install -qq $(CLIENT_LIBRARIES)
 	@touch $@
 
-# LeRobot without what it needs for cameras and motors; torch and Parquet are those of .venv.
-LEROBOT := .venv-lerobot
-LEROBOT_LIBRARIES := accelerate av datasets deepdiff draccus==0.10.0 einops huggingface-hub jsonlines \
-	pandas termcolor
-
-test-lerobot: setup $(LEROBOT)/.ready ## LeRobot opens the datasets that are exported, in .venv-lerobot
-	LEROBOT_PYTHON=$(LEROBOT)/bin/python $(BIN)/python -m pytest test/extras/bags/test_export.py \
-		-k lerobot_opens $(PYTEST_ARGS)
-
-$(LEROBOT)/.ready: Makefile
-	@echo "Building $(LEROBOT) with Python $(VERSION); the first time takes a minute or more."
-	@test -x $(LEROBOT)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(LEROBOT)
-	@echo "$(abspath $(VENV))/lib/python$(VERSION)/site-packages" \
-		> $(LEROBOT)/lib/python$(VERSION)/site-packages/shared.pth
-	@export PIP_DISABLE_PIP_VERSION_CHECK=1; \
-		$(CLEAN_ENV) $(LEROBOT)/bin/python -m pip install -qq --no-deps lerobot==0.4.4; \
-		$(CLEAN_ENV) $(LEROBOT)/bin/python -m pip install -qq $(LEROBOT_LIBRARIES)
-	@touch $@
-
 # The linters of ament, with the plugins that it looks for. `ament_xmllint` leaves package.xml out,
 # whose schema it would ask the network for; `make test` holds that against what colcon reads.
 AMENT := .venv-ament
@@ -316,4 +297,4 @@ clean: ## remove what building and testing left behind
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
 distclean: clean ## the same, and all environments (.venv and those of test-...) and runs/
-	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(TOOLS) $(CLIENTS) $(LEROBOT) $(AMENT) runs
+	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(TOOLS) $(CLIENTS) $(AMENT) runs

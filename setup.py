@@ -57,7 +57,7 @@ EXTRAS = {
     # needs `deploy` alone. A library of its pictures has wheels for this platform only.
     "leapp": [f"leapp>=0.7.2; {ROS_WHEELS_EXIST}"],
     "view": ["websockets>=14"],
-    "video": ["imageio-ffmpeg>=0.5", "rerun-sdk>=0.24"],
+    "video": ["imageio-ffmpeg>=0.5"],
     # The site of docs/, and what runs and shows its notebooks.
     "docs": [
         "ipykernel>=6.29",
@@ -166,6 +166,5 @@ setup(
         f"{PACKAGE}.nodes": [f"mujoco_node = {PACKAGE}.extras.mujoco.node:main"],
         f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
         f"{PACKAGE}.viewers": [f"human = {PACKAGE}.watch.human:HumanView"],
-        f"{PACKAGE}.salvage": [f"bag = {PACKAGE}.extras.bags.salvage:salvaged"],
     },
 )

@@ -3,9 +3,8 @@
 Simulated drives of robots that drift, with noisy odometry and motion capture, both at 10 Hz, both
 100 ms late, 5 % of them lost. The odometry is compared with where the robot was at its stamp; the
 estimate, harder, with where the robot is when it is asked, 100 ms later. NEES is that of the pose
-at the newest measurement, once at the end of each drive. Then drives by odometry alone whose clock
-is set on the way, and random steps, all of which have to leave the covariance finite, symmetric
-and positive definite.
+at the newest measurement, once at the end of each drive. Then random steps, all of which
+have to leave the covariance finite, symmetric and positive definite.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from measuring import clock_jumps
 from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -28,7 +26,6 @@ from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import ODOM, Kind
 from nics_drl_bridge.middleware.middleware import Middleware
-from nics_drl_bridge.middleware.timeline import ReportedPose
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
@@ -45,19 +42,11 @@ CONTROLS = {
     "overconfident": "a filter that expects a quarter of the noise",
     "nan": "an estimate that is no number",
     "stands": "robots that do not move",
-    "stood_still": "a robot that is taken to have stood still while its clock was set",
 }
 SHARE, SHARE_OF_EACH = 0.2, 0.35
 """The estimate may be off by this share of what odometry is, over all robots and of each."""
 LEAST_WAY_M = 3.0
 """A robot that drives less [m] shows nothing."""
-JUMP_ERROR_M, JUMP_END_M = (0.2, 1.0), 2.0
-"""After a jump the estimate may be off by this, at the median and the 99th percentile, and at the
-99th percentile at the end of the drive, by odometry alone [m]."""
-JUMP_NEES, JUMP_NEES_P99 = 4.0, 16.27
-"""Greatest mean and 99th percentile of NEES after a jump; of chi-squared, 99 and 99.9 % of which
-lie below 11.3 and 16.27, a filter around a model that is not linear has somewhat more tail."""
-LEAST_UNSEEN_M = 0.2
 POSE_STD = np.array([0.02, 0.02, 0.02])
 """Of motion capture [m, m, rad]."""
 STATE_DRIFT = 0.02
@@ -109,16 +98,6 @@ class _NoNumber(Middleware):
         return replace(super().view(now_ns), pose=np.full(3, np.nan))
 
 
-class _StoodStill(Middleware):
-    def _follow_clock(self, told: ReportedPose) -> None:
-        belief = self.estimator.belief
-        std = np.sqrt(np.diag(belief.covariance)[:3])
-        self.estimator.reset(told.stamp_ns, belief.mean[:3], std)
-        self._begin(told.stamp_ns)
-        self._trail.reset()
-        self.cache.newest.clear()
-
-
 def _overconfident(model: SimulatorModel) -> Middleware:
     levels = {
         name: level.model_copy(update={"std": level.std / 4.0})
@@ -132,7 +111,6 @@ MAKES: dict[str | None, Callable[[SimulatorModel], Middleware]] = {
     "no_filter": _NoFilter,
     "overconfident": _overconfident,
     "nan": _NoNumber,
-    "stood_still": _StoodStill,
 }
 
 
@@ -271,9 +249,8 @@ def cycle_us(model: SimulatorModel, cycles: int) -> float:
 
 
 def run(drives: int, steps: int, seed: int, control: str | None) -> dict[str, Any]:
-    """Drives every robot, sets its clock, then takes random steps with one after the other."""
+    """Drives every robot, then takes random steps with one after the other."""
     found = {}
-    jumped = {}
     moving = control != "stands"
     make = MAKES.get(control, Middleware)
     for robot in ROBOTS:
@@ -283,17 +260,11 @@ def run(drives: int, steps: int, seed: int, control: str | None) -> dict[str, An
         found[robot] = [
             drive(model, simulator, make(model), one, moving) for one in seeds
         ]
-        jumped[robot] = clock_jumps.campaign(model, simulator, make, seeds, moving)
     shares = [random_steps(noisy(r), -(-steps // len(ROBOTS)), seed) for r in ROBOTS]
     return {
         **summary([each for robot in ROBOTS for each in found[robot]]),
         "robots": {robot: summary(found[robot]) for robot in ROBOTS},
         "drives": drives * len(ROBOTS),
-        "clock_jump": {
-            **clock_jumps.summary([each for robot in ROBOTS for each in jumped[robot]]),
-            "nees_bars": [JUMP_NEES, JUMP_NEES_P99],
-            "robots": {robot: clock_jumps.summary(jumped[robot]) for robot in ROBOTS},
-        },
         "random_steps": sum(share["random_steps"] for share in shares),
         "finite_and_positive_definite": all(
             share["finite_and_positive_definite"] for share in shares
@@ -322,7 +293,7 @@ def missed(result: dict[str, Any], steps: int) -> list[str]:
         said.append(
             f"the covariance was unsound after {result['random_steps']} random steps"
         )
-    return said + _missed_jumps(result["clock_jump"])
+    return said
 
 
 def _missed_share(who: str, figures: dict[str, Any], most: float) -> list[str]:
@@ -332,29 +303,6 @@ def _missed_share(who: str, figures: dict[str, Any], most: float) -> list[str]:
     return [
         f"{who}: the estimate is off by {share:.2f} of what odometry is, more than {most}"
     ]
-
-
-def _missed_jumps(jumps: dict[str, Any]) -> list[str]:
-    bars = {
-        "error_p50_m": JUMP_ERROR_M[0],
-        "error_p99_m": JUMP_ERROR_M[1],
-        "end_error_p99_m": JUMP_END_M,
-        "nees_mean": JUMP_NEES,
-        "nees_p99": JUMP_NEES_P99,
-        "end_nees_mean": JUMP_NEES,
-        "end_nees_p99": JUMP_NEES_P99,
-    }
-    said = [
-        f"after a clock jump {name} is {jumps[name]:.3g}, more than {bar:g}"
-        for name, bar in bars.items()
-        if not jumps[name] <= bar
-    ]
-    if not jumps["driven_unseen_m"] >= LEAST_UNSEEN_M:
-        said.append(
-            f"the robots drove {jumps['driven_unseen_m']:.2f} m while their clock was set, less "
-            f"than {LEAST_UNSEEN_M} m"
-        )
-    return said
 
 
 def table_of(result: dict[str, Any]) -> str:
@@ -370,13 +318,6 @@ def table_of(result: dict[str, Any]) -> str:
             f"{each['nees_mean']:.2f}",
             f"{low:.2f} to {high:.2f}",
         )
-    jumps = result["clock_jump"]
-    text += (
-        f"after a clock jump, by odometry alone, {jumps['driven_unseen_m']:.2f} m unseen: off by "
-        f"{jumps['error_p50_m']:.3f} m (99 %: {jumps['error_p99_m']:.3f} m), NEES "
-        f"{jumps['nees_mean']:.2f} (99 %: {jumps['nees_p99']:.1f}); at the end 99 %: "
-        f"{jumps['end_error_p99_m']:.3f} m, {jumps['end_nees_p99']:.1f}\n"
-    )
     sound = "all" if result["finite_and_positive_definite"] else "NOT all"
     return (
         f"{text}{result['random_steps']} random steps, {sound} finite and positive definite; "

@@ -2,8 +2,8 @@
 
 What the package writes is written by a process that is killed with SIGKILL at random moments, and
 read back with one flipped bit. Bags are cut off at any byte and changed at any place, as this
-package writes them and as others do; whatever can be read of them is read: by `nics bag info`,
-`nics generate` and `nics bag salvage`.
+package writes them and as others do; whatever can be read of them is read: by `nics bag info`
+and `nics generate`.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 
 Each node is ended many times while it starts (after its first line), while it compiles its kernels
 into an empty cache, within a native step of compiling that is drawn out to seconds, and
-while it runs, beside loops that are always busy. It has to end by itself, with exit code 0. Without
-loops, the median first line, which says that a node starts, has to come in time, too. The control
-takes away what ends a node within such a step; elsewhere Python's own handlers are as fast.
+while it runs, beside loops that are always busy. It has to end by itself, with exit code 0, or,
+until it runs, that of the signal. Without loops, the median first line, which says that a node
+starts, has to come in time, too. The control takes away what ends a node within such a step;
+elsewhere Python's own handlers are as fast.
 """
 
 from __future__ import annotations
@@ -137,7 +138,9 @@ def ended(
         process.kill()
         process.wait()
     told = log.read_text(errors="replace")
-    clean = code == 0 and "Traceback" not in told
+    # Until a node runs, the signal may end it as by default.
+    codes = (0,) if phase == "running" else (0, -signal.SIGINT, -signal.SIGTERM)
+    clean = code in codes and "Traceback" not in told
     said = "" if clean else told[-2000:]
     return {
         "code": code,

@@ -40,7 +40,6 @@ INSTALL = {  # libraries, and the extra of this package that brings each
     "onnxscript": "train",
     "pettingzoo": "multi",
     "ray": "train,distributed",
-    "rerun": "video",
     "rosbags": "bags",
     "stable_baselines3": "train",
     "tensorboard": "train",

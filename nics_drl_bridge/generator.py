@@ -42,7 +42,7 @@ TABLE_FOLDER = "lidar_table"
 REPORT_FILE = "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
 MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
-# what `nics generate` draws of a fit
+# what `nics generate` draws of a fit; some pictures are of earlier versions
 REPORT_PAGE = "report.html"
 PICTURES_FOLDER = "pictures"
 PICTURES = (

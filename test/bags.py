@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import sqlite3
+import struct
 from collections.abc import Iterable
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.exceptions import EndOfFile
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from nics_drl_bridge.interface import NS_PER_S
@@ -195,3 +201,18 @@ def write(
             for t, message in rows:
                 writer.write(connection, ns(t), STORE.serialize_cdr(message, kind))
     return path
+
+
+def unfinished_messages(folder: Path) -> int:
+    """Number of messages in the only file of a bag that was never closed."""
+    (file,) = (p for p in folder.iterdir() if p.suffix in (".mcap", ".db3"))
+    if file.suffix == ".db3":
+        with closing(sqlite3.connect(file)) as base:
+            (count,) = base.execute("SELECT COUNT(*) FROM messages").fetchone()
+        return int(count)
+    count = 0
+    # The library reports a cut-off record in either way.
+    with file.open("rb") as stream, suppress(EndOfFile, struct.error):
+        for record in StreamReader(stream).records:
+            count += isinstance(record, Message)
+    return count

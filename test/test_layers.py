@@ -65,11 +65,10 @@ HOMES = {
     "pettingzoo": ("env/pettingzoo_env.py",),
     "ray": ("extras/ray/*",),
     "rosbags": ("recording/*", "extras/bags/*"),
-    "pyarrow": ("recording/*", "extras/bags/*"),
+    "pyarrow": ("recording/*",),
     "mcap": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
     "websockets": ("watch/server.py",),
-    "rerun": ("watch/record.py",),
     "imageio_ffmpeg": ("watch/record.py",),
 }
 

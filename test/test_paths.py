@@ -79,20 +79,17 @@ def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
 
 @pytest.mark.slow
 @KINDS
-def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
+def test_a_bag_is_written_told_and_looked_through_at_either(tmp_path, kind):
     pytest.importorskip("rosbags")
     from nics_drl_bridge.extras.bags.info import bag_info
-    from nics_drl_bridge.extras.bags.salvage import salvage
     from nics_drl_bridge.recording.bag_file import is_bag
     from nics_drl_bridge.recording.write import write_bag
 
     place = kind(tmp_path / "drive")
-    rest = kind(tmp_path / "rest")
     write_bag(record(CAR, np.random.default_rng(0), duration=5.0), place, CAR)
-    salvage(place, rest)
-    assert is_bag(rest)
-    assert bag_info(rest).messages == bag_info(place).messages
-    assert facts_of_bag(place).topics.keys() == facts_of_bag(rest).topics.keys()
+    assert is_bag(place)
+    assert bag_info(place).messages > 0
+    assert "/cmd_vel" in facts_of_bag(place).topics
 
 
 @KINDS

@@ -7,7 +7,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.report.fit_pictures import timing_curves
 from nics_drl_bridge.threads import one_blas_thread, run_parts
 
 
@@ -42,7 +41,7 @@ def test_an_error_restores_the_threads_too():
     assert blas_threads() == {2}
 
 
-@pytest.mark.parametrize("function", [fit, identify, timing_curves])
+@pytest.mark.parametrize("function", [fit, identify])
 def test_whatever_solves_many_small_systems_is_limited(function):
     seen = []
 

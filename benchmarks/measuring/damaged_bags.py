@@ -13,7 +13,6 @@ import numpy as np
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.bags.info import bag_info
-from nics_drl_bridge.extras.bags.salvage import salvage
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.readers import read_recording
@@ -36,7 +35,7 @@ class Score:
     Attributes:
         tracebacks: exceptions that are not one sentence for people.
         silent_partial: bags that were read without a word although something was missing, or,
-            of bags with checksums, changed; also what a salvage kept that was never written.
+            of bags with checksums, changed.
         refused, accepted: how many bags were.
         told: some words on each of what went wrong.
     """
@@ -166,7 +165,6 @@ def judge(sample: Sample, files: dict[str, bytes], folder: Path, score: Score) -
             score.told.append(f"{sample.path.name}: {act.__name__}: {fault}")
     score.refused += refused
     score.accepted += not refused
-    _salvaged(bag, sample, score)
 
 
 def _same(bag: Path, sample: Sample) -> str:
@@ -194,24 +192,6 @@ def _read(bag: Path, sample: Sample) -> str:
     streams: Any = read_recording(bag, load_robot(ROBOT)).streams
     fits = len(streams["command"].t) == len(sample.held["/cmd_vel"][1])
     return "" if fits else "commands are missing"
-
-
-def _salvaged(bag: Path, sample: Sample, score: Score) -> None:
-    try:
-        salvage(bag, bag.parent / "salvaged")
-        kept = _held(bag.parent / "salvaged")
-    except BridgeError:
-        return
-    except Exception as error:  # noqa: BLE001 - these are what is counted
-        score.tracebacks += 1
-        score.told.append(f"salvage: {type(error).__name__}: {error}")
-        return
-    known = {topic: set(digests) for topic, (_, _, digests) in sample.held.items()}
-    if sample.sealed and any(
-        set(d) - known.get(t, set()) for t, (_, _, d) in kept.items()
-    ):
-        score.silent_partial += 1
-        score.told.append("salvage: kept what was never written")
 
 
 def damage_bags(folder: Path, cuts: int, changes: int, seed: int) -> Score:

@@ -548,7 +548,6 @@ TABLES: Mapping[str, Table] = {
     "table2_hokuyo": lidar.TABLE2_HOKUYO,
     "table3": lidar.TABLE3,
     "lidar_complexity": lidar.COMPLEXITY,
-    "sensor_models": lidar.MODELS,
     "maps": lidar.MAPS,
     "fig4": lidar.FIG4,
     "estimator": ESTIMATOR,

@@ -165,23 +165,6 @@ COMPLEXITY = Table(
         for name in ("exact", "baked")
     ),
 )
-MODELS = Table(
-    ("table", "scans/s", "times as long, shortest", "median", "size"),
-    tuple(
-        (
-            "lidar_sensor_models",
-            title,
-            f"{{scans_per_s.{key}|.1e}}",
-            f"{{times_as_long.{key}|.2f}}",
-            f"{{times_as_long_median.{key}|.2f}}",
-            size,
-        )
-        for key, title, size in (
-            (each, each, f"{{table_bytes.{each} x1e-6|.1f}} MB")
-            for each in ("no model", "incidence dropout", "intensity", "both")
-        )
-    ),
-)
 MAPS = Table(
     (
         "720 beams, map of 20 m x 20 m at 0.05 m",

@@ -78,7 +78,6 @@ RUNS: dict[str, Run] = {
     ),
     "lidar_complexity": row("lidar_complexity", "", "--most 16 --scans 64 --repeats 5"),
     "lidar_peers": row("lidar_peers", "", "--scans 128 --scenes 5 --repeats 2"),
-    "lidar_sensor_models": row("lidar_sensor_models", "", "--scans 128 --repeats 10"),
     "node_endings": row(
         "node_endings", "", "--times 1 --phases starting running", HOUR
     ),

@@ -97,10 +97,6 @@ JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instea
 TopicsOption = Annotated[
     Path | None, Option(help="YAML file: a bag's topic for each role.")
 ]
-SalvageOption = Annotated[
-    bool,
-    Option("--salvage", help="Use what is intact of a damaged bag; report the rest."),
-]
 OtherLidarOption = Annotated[
     str | None,
     Option(
@@ -274,18 +270,6 @@ def needs_ros(what: str) -> Iterator[None]:
         if (error.name or "").startswith("nics_drl_bridge"):
             raise
         raise ConfigError(f"{what} {MISSING_ROS.format(module=error.name)}") from None
-
-
-@contextmanager
-def intact(recording: Path, salvage: bool) -> Iterator[Path]:
-    """Yields a recording; or, if wanted, the intact part of a bag, after telling what is lost."""
-    if not salvage:
-        yield recording
-        return
-    with extensions.load("salvage", "bag")(recording) as (whole, lines):
-        for line in lines:
-            typer.echo(line, err=True)
-        yield whole
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -57,8 +57,7 @@ EXAMPLES = {
     "bag record": ("nics bag record drive --duration 60",),
     "bag info": ("nics bag info drive --json",),
     "bag replay": ("nics bag replay drive --rate 2",),
-    "bag export": ("nics bag export drive --lerobot dataset --model my_robot",),
-    "bag salvage": ("nics bag salvage damaged whole",),
+    "bag export": ("nics bag export drive --mcap shown --model my_robot",),
 }
 
 

@@ -18,7 +18,7 @@ EXTRAS = {  # what each brings, by the modules that it needs
     "train": ("training", TRAINING),
     "multi": ("teams, as PettingZoo environments", ("pettingzoo",)),
     "view": ("the page of nics watch", ("websockets",)),
-    "video": ("MP4 and Rerun files of nics watch", ("imageio_ffmpeg", "rerun")),
+    "video": ("MP4 files of nics watch", ("imageio_ffmpeg",)),
     "mujoco": ("robots with real wheels, in MuJoCo", ("mujoco",)),
     "distributed": ("training on a Ray cluster", ("ray",)),
 }

@@ -1,7 +1,6 @@
 """`nics record`, `inspect`, `import`, `generate` and `urdf`: from a robot to its model."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -304,7 +303,6 @@ def generate(
     strict: Annotated[
         bool, Option(help="Refuse if an input was not moved on its own.")
     ] = False,
-    salvage: console.SalvageOption = False,
     anyway: Annotated[
         bool,
         Option(
@@ -336,12 +334,8 @@ def generate(
     shapes = load_world(world).shapes
     named = ", ".join(map(str, recording))
     roles = topic_roles(topics, topic or ())
-    with ExitStack() as stack:
-        whole = [
-            stack.enter_context(console.intact(each, salvage)) for each in recording
-        ]
-        stack.enter_context(console.progress_bar(f"reading {named}"))
-        spec, drives = robot_and_drives(whole, robot, roles, mapping)
+    with console.progress_bar(f"reading {named}"):
+        spec, drives = robot_and_drives(recording, robot, roles, mapping)
     pairs = zip(drives, names_of_sources(recording), strict=True)
     drives = [replace(drive, source=name) for drive, name in pairs]
     with console.progress_bar("generating"):

@@ -60,9 +60,7 @@ def watch(
     ] = None,
     record: Annotated[
         Path | None,
-        Option(
-            metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page."
-        ),
+        Option(metavar="FILE", help="Write .mp4 or .gif instead of a page."),
     ] = None,
     episodes: Annotated[
         int, Option(min=1, help="For --record: number of episodes.")

@@ -46,7 +46,6 @@ from nics_drl_bridge.identify.repair import (
     repaired,
 )
 from nics_drl_bridge.identify.signals import speed_index
-from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.identify.terms import linear_fit, shared, through_state
 from nics_drl_bridge.identify.textbook_model import (
     actuated_spec,
@@ -103,9 +102,6 @@ class Findings:
     held_out: open_loop.OpenLoop | None = (
         None  # open-loop errors on that part, of `judge`
     )
-    structure: tuple[
-        str, ...
-    ] = ()  # sentences on residuals that depend on X, of `judge`
     judgement: tuple[
         HorizonErrors, ...
     ] = ()  # on that part, beside yardsticks, of `judge`
@@ -499,7 +495,6 @@ def judge(drive: Drive, findings: Findings) -> Findings:
         calibration=replace(calibration, notes=_plain(findings)),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
         linear=replace(linear, model=rated) if model is linear.model else linear,
-        structure=structure(findings),
     )
     return replace(findings, notes=_notes(drive, findings))
 
@@ -589,7 +584,6 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
             spec,
             verdict.levels_of(findings.training.recording.command, spec),
         ),
-        *findings.structure,
         *(
             verdict.doubts_of_fit(linear, calibration.is_exact)
             if findings.width is None
@@ -608,17 +602,6 @@ def _why_replaced(drive: Drive, findings: Findings) -> Iterator[str]:
     whole = findings.whole
     if coarse := verdict.coarsest_state(whole.recording, whole.spec, linear.unmoved):
         yield verdict.Gap(f"{coarse}.")
-
-
-def structure(findings: Findings) -> tuple[str, ...]:
-    """Says on what the residuals of the model depend; where they do, its terms mislead."""
-    if findings.calibration.is_exact:
-        return ()
-    (linear, model), training = _fitted(findings), findings.training
-    tried = max((trial.order for trial in findings.trials), default=0)
-    samples = aligned(training, findings)
-    still = linear.unmoved
-    return tuple(structures(model, samples, training.spec, still, tried))
 
 
 def _left_out(

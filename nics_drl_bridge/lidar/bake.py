@@ -1,9 +1,8 @@
 """Baking: scans of every shape on the lidar's main axis, stored in a table (Sec. IV-B)."""
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, rotate
 from nics_drl_bridge.lidar import bake_kernels
-from nics_drl_bridge.lidar.sensor_models import Function, SensorModel, returned
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
@@ -42,14 +40,11 @@ def bake(
     spec: LidarSpec,
     shapes: Sequence[Shape],
     density: Density | None = None,
-    sensor_model: Function | Sequence[SensorModel] | None = None,
 ) -> LidarTable:
     """Scans shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
 
-    Equal shapes are baked once, by default at `Density.for_beams`. The sensor model is that of the
-    lidar, or other named models, or a function of ranges and incidence; where it gives `inf`, a
-    beam passes through to objects behind. It costs nothing at run time. Raises ConfigError if the
-    table would be too large, or a shape covers too many beams.
+    Equal shapes are baked once, by default at `Density.for_beams`. Raises ConfigError if the table
+    would be too large, or a shape covers too many beams.
     """
     shapes = tuple(dict.fromkeys(shapes))
     density = density or Density.for_beams(spec.angle_increment)
@@ -77,9 +72,8 @@ def bake(
         cells.astype(np.int16),
         np.zeros(int(sizes.sum()) + padding(spec.angle_increment), np.float32),
     )
-    _fill(bake_kernels.rows_of_turn, table.rows, table, grids)
-    model = spec.sensor_model if sensor_model is None else sensor_model
-    return apply_model(table, grids, model) if callable(model) or model else table
+    _fill(table, grids)
+    return table
 
 
 def with_shapes(
@@ -90,7 +84,7 @@ def with_shapes(
         return table
     if not table.has_rows:
         return LidarTable.without_rows(spec, (*table.shapes, *shapes))
-    return bake(spec, (*table.shapes, *shapes), table.density, table.sensor_model)
+    return bake(spec, (*table.shapes, *shapes), table.density)
 
 
 def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
@@ -210,12 +204,8 @@ def _miss(
     return worst
 
 
-def _fill(
-    kernel: Callable[..., None],
-    out: NDArray[np.float32],
-    table: LidarTable,
-    grids: Sequence[Grid],
-) -> None:
+def _fill(table: LidarTable, grids: Sequence[Grid]) -> None:
+    """Writes the rows of all cells into the table."""
     outlines = table.outlines
     distances = table.density.distances
     done = 0
@@ -229,8 +219,8 @@ def _fill(
                 np.int64
             )
             layout = np.stack([start, grid.cell[t, :, 0], grid.cell[t, :, 1]])
-            kernel(
-                out,
+            bake_kernels.rows_of_turn(
+                table.rows,
                 layout,
                 shape,
                 grid.distances,
@@ -240,36 +230,3 @@ def _fill(
                 table.density.phases,
             )
             done += 1
-
-
-def apply_model(
-    table: LidarTable, grids: Sequence[Grid], model: Function | Sequence[SensorModel]
-) -> LidarTable:
-    """Returns a table as the device measures, by all models or one function; overwrites rows."""
-    cosines = np.zeros(table.rows.shape, np.float32)
-    _fill(bake_kernels.cosines_of_turn, cosines, table, grids)
-    cosines = np.minimum(cosines, np.float32(1.0))
-    phases = table.density.phases
-    ends = table.start + table.widths * phases
-    if callable(model):
-        for begin, end in zip(table.start, ends, strict=True):
-            both = (
-                a[begin:end].reshape(phases, -1).T.ravel()
-                for a in (table.rows, cosines)
-            )
-            row, cosine = both
-            changed = model(row, np.arccos(cosine.astype(np.float64)))
-            table.rows[begin:end] = (
-                np.asarray(changed, np.float32).reshape(-1, phases).T.ravel()
-            )
-        return table
-    bounds = np.append(table.grid[:, 2].astype(np.int64), len(ends))
-    for shape, (first, last) in zip(
-        table.shapes, itertools.pairwise(bounds), strict=True
-    ):
-        part = slice(int(table.start[first]), int(ends[last - 1]))
-        incidence = np.arccos(cosines[part].astype(np.float64))
-        table.rows[part] = returned(
-            model, table.rows[part], incidence, shape.reflectivity
-        )
-    return replace(table, sensor_model=tuple(model))

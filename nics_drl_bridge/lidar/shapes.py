@@ -27,14 +27,7 @@ Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Size = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 
 
-class Surface(Schema):
-    """Properties of a shape's surface, common to all shapes."""
-
-    # for a model of intensity, by default its own; 1 is white and diffuse, a retroreflector > 1
-    reflectivity: float | None = Field(default=None, gt=0.0, le=1e6)
-
-
-class Outlined(Surface):
+class Outlined(Schema):
     """A shape with corners."""
 
     @property
@@ -48,7 +41,7 @@ class Outlined(Surface):
         return _reach(self.outline)
 
 
-class Circle(Surface):
+class Circle(Schema):
     """A disc around its own origin."""
 
     kind: Literal["circle"] = "circle"  # which kind of shape this is
@@ -260,13 +253,9 @@ class Outlines:
 def describe(shape: Shape) -> str:
     """Describes a shape in a few words."""
     if isinstance(shape, Circle):
-        words = f"circle of radius {shape.radius:g} m"
-    elif isinstance(shape, Rectangle):
-        words = f"rectangle of {shape.size[0]:g} x {shape.size[1]:g} m"
-    elif isinstance(shape, Segment):
-        words = f"segment of {np.hypot(*np.subtract(*shape.ends)):.3g} m"
-    else:
-        words = f"polygon of {len(shape.points)} corners, radius {shape.radius:.3g} m"
-    if shape.reflectivity is None:
-        return words
-    return f"{words}, reflectivity {shape.reflectivity:g}"
+        return f"circle of radius {shape.radius:g} m"
+    if isinstance(shape, Rectangle):
+        return f"rectangle of {shape.size[0]:g} x {shape.size[1]:g} m"
+    if isinstance(shape, Segment):
+        return f"segment of {np.hypot(*np.subtract(*shape.ends)):.3g} m"
+    return f"polygon of {len(shape.points)} corners, radius {shape.radius:.3g} m"

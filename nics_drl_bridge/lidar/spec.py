@@ -8,7 +8,7 @@ m is a little less there, and still a return.
 
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,6 @@ from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Mount, Schema, find_config, load_yaml
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
-from nics_drl_bridge.lidar.sensor_models import SensorModels
 from nics_drl_bridge.lidar.shapes import LARGEST
 
 FULL_CIRCLE_TOLERANCE = 1e-6
@@ -47,6 +46,17 @@ def check_angles(angle_min: float, angle_max: float) -> None:
         raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
 
 
+def without_sensor_model(data: Any) -> Any:
+    """Takes an empty `sensor_model` of an earlier version out of a file's content."""
+    if not isinstance(data, dict) or "sensor_model" not in data:
+        return data
+    if data["sensor_model"]:
+        raise ValueError(
+            "sensor models are no longer simulated; take the key sensor_model out"
+        )
+    return {key: value for key, value in data.items() if key != "sensor_model"}
+
+
 class LidarSpec(Schema):
     """A planar lidar. Beam 0 points at `angle_min`, the others follow counter-clockwise.
 
@@ -67,7 +77,11 @@ class LidarSpec(Schema):
     frame: str = Field(default="laser", min_length=1)  # id of the lidar's own frame
     no_return: NoReturn = "inf"  # the device's value for it; in the package it is `inf`
     faults: LidarFaults = LidarFaults()  # further faults of the device's ranges
-    sensor_model: SensorModels = ()  # effects of surfaces on its returns, baked into its tables
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_sensor_model(cls, data: Any) -> Any:
+        return without_sensor_model(data)
 
     @model_validator(mode="after")
     def _consistent(self) -> "LidarSpec":

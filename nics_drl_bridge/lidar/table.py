@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, read_text, validate
 from nics_drl_bridge.errors import ModelError
@@ -24,9 +24,8 @@ from nics_drl_bridge.files import (
     write_text,
 )
 from nics_drl_bridge.lidar.baked_kernels import TABLE_SHAPE, TableArrays
-from nics_drl_bridge.lidar.sensor_models import SensorModel, SensorModels
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
-from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.lidar.spec import LidarSpec, without_sensor_model
 
 FORMAT = "nics_drl_bridge/lidar_table/4"
 ABOUT_FILE = "about.json"
@@ -62,7 +61,11 @@ class TableAbout(Schema):
     shapes: tuple[Shape, ...]
     density: Density
     beam_angle: float = Field(gt=0.0, lt=7.0)
-    sensor_model: SensorModels = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_sensor_model(cls, data: Any) -> Any:
+        return without_sensor_model(data)
 
 
 def padding(beam_angle: float) -> int:
@@ -93,7 +96,6 @@ class LidarTable:
     start: NDArray[np.int32]  # (cells,) begin of each row in `rows`
     cell: NDArray[np.int16]  # (cells, 6) see above
     rows: NDArray[np.float32]  # (R,) ranges [m], padded by what one look-up can read
-    sensor_model: tuple[SensorModel, ...] = ()  # named models that were baked in
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> "LidarTable":
@@ -106,9 +108,7 @@ class LidarTable:
             np.zeros((0, 6), np.int16),
             np.zeros(0, np.float32),
         )
-        return cls(
-            shapes, Density(), spec.angle_increment, grid, *none, spec.sensor_model
-        )
+        return cls(shapes, Density(), spec.angle_increment, grid, *none)
 
     @property
     def has_rows(self) -> bool:

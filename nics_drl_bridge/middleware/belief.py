@@ -32,24 +32,6 @@ class Belief(NamedTuple):
     gyro: Gyro | None = None  # None before the first yaw rate
 
 
-class Foreseen(NamedTuple):
-    """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement.
-
-    If in advance, `gains` are what a twist corrects present and anchor by.
-    """
-
-    time_ns: int
-    mean: Array
-    covariance: Array
-    expected: tuple[Array, Array]
-    error: Array  # see `Belief`
-    since: Anchor | None  # at the time of the prediction
-    anchor: Anchor | None  # the same as of the predicted time
-    gains: tuple[tuple[Array, ...], tuple[Array, ...]] | None = (
-        None  # `kernels.gain`, `recall`
-    )
-
-
 def parted(covariance: Array) -> Array:
     """Returns a copy of a covariance (3 + S, 3 + S) with pose and state uncorrelated."""
     copied = np.array(covariance)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.belief import Belief, Foreseen, Unseen, parted
+from nics_drl_bridge.middleware.belief import Belief, Unseen, parted
 from nics_drl_bridge.middleware.kernels import Anchor, Log, MotionModel, log_of
 from nics_drl_bridge.middleware.measurement import (
     Acceptance,
@@ -105,7 +105,8 @@ class Estimator:
         self._suddenly = np.eye(3 + size, size, -3)
         self._filter = ExtendedKalmanFilter(3 + size, 3)
         self._anchor: Anchor | None = None
-        self._foreseen: Foreseen | None = None  # of the present belief and commands
+        # Expected twist and its derivative, of the present belief and commands.
+        self._expected: tuple[Array, Array] | None = None
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
@@ -127,29 +128,17 @@ class Estimator:
             self.time_ns, odom, twist, mean, covariance, covariance[:, :3].copy()
         )
 
-    def lose(
-        self, time_ns: int, seconds: float, continuous: bool, command: Array
-    ) -> None:
-        """Continues from the last odometry, seconds ago, at a time [ns] to which the clock was set.
+    def restart(self, time_ns: int, seconds: float, command: Array) -> None:
+        """Begins anew at the last pose, at a time [ns] to which the clock was set.
 
-        The robot may be anywhere within reach, unless odometry is `continuous`: then the next one's
-        pose bridges the motion. The command (C,) is in effect.
+        The robot may be anywhere that it reaches in the seconds since the last odometry. The
+        command (C,) is in effect.
         """
-        anchor = self._anchor or Anchor(
-            self.time_ns, STILL, STILL, self._filter.x, self._filter.P
-        )
-        seconds = max(
-            seconds, (self.time_ns - anchor.time_ns) / NS_PER_S
-        )  # after an outlier
-        covariance = self.unseen.doubted(anchor.covariance, seconds)
-        known = self._anchor is not None and continuous
-        if known:
-            since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S))
-        else:
-            since = None
-        known_so = anchor.mean, covariance, (0, 0, 0), since, True, self._suddenly
+        mean = self._filter.x
+        covariance = self.unseen.doubted(self._filter.P, seconds)
         gyro = None if self._gyro is None else self._gyro.restarted()
-        self.belief = Belief(time_ns, *known_so, self._roughness, self._missed, gyro)
+        begun = mean, covariance, (0, 0, 0), None, False, self._suddenly
+        self.belief = Belief(time_ns, *begun, self._roughness, self._missed, gyro)
         self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
@@ -164,7 +153,7 @@ class Estimator:
         self.time_ns, self._filter.x, self._filter.P = belief[:3]
         self._outliers, self._anchor, self._lost, self._error = belief[3:7]
         self._roughness, self._missed, self._gyro = belief[7:]
-        self._foreseen = None
+        self._expected = None
 
     @property
     def covariance(self) -> Array:
@@ -190,7 +179,7 @@ class Estimator:
         The estimate may be set back as far as `needed_ns`, by default not at all.
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
-        self._foreseen = None
+        self._expected = None
         # By the longest delay of a command after the common latency.
         needed_ns -= int(self._motion.terms.late.max(initial=0)) * self._motion.step_ns
         given = np.asarray(command, np.float64), self._least, self._most, needed_ns
@@ -209,44 +198,26 @@ class Estimator:
 
     def predict(self, time_ns: int) -> None:
         """Moves the estimate forward to a time; an earlier time changes nothing."""
-        if time_ns <= self.time_ns:
+        now = self.time_ns
+        if time_ns <= now:
             return
-        here = self._foreseen
-        if here is None or here.time_ns != time_ns or here.since is not self._anchor:
-            here = self._foreseen = self._forecast(time_ns)
-        self._lost = self._lost or time_ns - self.time_ns > self._motion.longest_ns
-        self.time_ns, self._filter.x, self._filter.P, self._error = (
-            *here[:3],
-            here.error,
-        )
-        self._anchor = here.anchor
-
-    def foresee(self, time_ns: int) -> None:
-        """Computes in advance the prediction to a time and the update by a twist measured then.
-
-        `predict` and `correct` take over the same bits.
-        """
-        self._foreseen = None
-        if time_ns > self.time_ns:
-            # Gains and covariances do not depend on the value that is measured.
-            here = self._forecast(time_ns)
-            gains = self._gains(here.anchor, here.expected[1], here.covariance)
-            self._foreseen = here._replace(gains=gains)
-
-    def _forecast(self, time_ns: int) -> Foreseen:
         own = self._filter
         motion = self._motion
         log = self._log
-        now = self.time_ns
         mean, covariance, expected, error, transition = kernels.forecast(
             own.x, own.P, self._process, now, time_ns, motion, log
         )
         if time_ns - now > motion.longest_ns:
             covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
-        since = anchor = self._anchor
+            self._lost = True
+        anchor = self._anchor
         if anchor is not None and anchor.cross is not None:
-            anchor = anchor._replace(cross=transition @ anchor.cross)
-        return Foreseen(time_ns, mean, covariance, expected, error, since, anchor)
+            self._anchor = anchor._replace(cross=transition @ anchor.cross)
+        self.time_ns = time_ns
+        own.x = mean
+        own.P = covariance
+        self._error = error
+        self._expected = expected
 
     def update(
         self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None
@@ -319,7 +290,7 @@ class Estimator:
                 and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None
             ):
                 self._jump(*bridged)
-                self._foreseen = None
+                self._expected = None
         verdict = self._correct(measurement, odom is not None and not lost)
         if verdict.outcome is Acceptance.OUTLIER and not (lost and odom is not None):
             return verdict  # the next odometry's way then leads past this one
@@ -361,10 +332,10 @@ class Estimator:
                 GATE[Kind.POSE],
             )
         if way and outcome is Acceptance.USED and given_noise is None:
-            here = self._foreseen_here
-            ready = here.gains if here is not None and here.anchor is anchor else None
-            ready = ready or self._gains(anchor, derivative, own.P)
-            own.x, own.P = kernels.follow(own.x, innovation, *ready, anchor, *way)
+            # A twist is but a moment's, the way between two odometries all that wheels did since.
+            recall = kernels.recall(anchor, derivative, own.P, noise)
+            gain = kernels.gain(own.P, derivative, noise)
+            own.x, own.P = kernels.follow(own.x, innovation, gain, recall, anchor, *way)
         else:
             self._recall(innovation, derivative, noise)
             if kind is Kind.POSE and outcome is Acceptance.JUMP:
@@ -390,7 +361,7 @@ class Estimator:
             outcome is Acceptance.JUMP and kind is Kind.TWIST
         ):
             self._count(kind, 0)
-        self._foreseen = None
+        self._expected = None
         if outcome is Acceptance.USED and not (scattered and distance > WELL):
             self._roughen(kind, SMOOTHER)
         return Judgement(distance, outcome)
@@ -417,16 +388,6 @@ class Estimator:
         rough = min(max(1.0, factor * self._roughness[kind]), ROUGHEST)
         if rough != self._roughness[kind]:
             self._roughness = _with(self._roughness, kind, rough)
-            self._foreseen = None  # whose gains are those of the former noise
-
-    def _gains(self, anchor: Anchor | None, derivative: Array, spread: Array) -> Any:
-        """Returns what a twist corrects present and newest odometry by; None without that."""
-        # A twist is but a moment's, the way between two odometries all that wheels did since.
-        if anchor is None or anchor.cross is None:
-            return None
-        noise = self._noise_of(Kind.TWIST)
-        recall = kernels.recall(anchor, derivative, spread, noise)
-        return kernels.gain(spread, derivative, noise), recall
 
     def _recall(self, innovation: Array, derivative: Array, noise: Array) -> None:
         """Corrects where the newest odometry was, by what is about to correct the present."""
@@ -442,21 +403,11 @@ class Estimator:
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
         if kind is Kind.POSE:
             return self._filter.x[:3], self._observe_pose
-        if (here := self._foreseen_here) is not None:
-            twist, derivative = here.expected
-        else:
-            now = self.time_ns
-            twist, derivative = kernels.expect(
-                self._filter.x, now, self._motion, self._log
-            )
+        if self._expected is not None:
+            return self._expected
+        now = self.time_ns
+        twist, derivative = kernels.expect(self._filter.x, now, self._motion, self._log)
         return twist, derivative
-
-    @property
-    def _foreseen_here(self) -> Foreseen | None:
-        foreseen = self._foreseen
-        if foreseen is not None and foreseen.mean is self._filter.x:
-            return foreseen
-        return None
 
     def _surprise(
         self,

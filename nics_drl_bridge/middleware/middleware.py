@@ -27,7 +27,7 @@ from nics_drl_bridge.middleware.measurement import (
     Kind,
     Measurement,
 )
-from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
+from nics_drl_bridge.middleware.timeline import Stamps
 
 NOT_FINITE = "NaN or inf"
 LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
@@ -108,7 +108,6 @@ class Middleware:
         self._sensors = model.sensors
         self.estimator = Estimator(model)
         self._timeline = timeline.Timeline(self.estimator)
-        self._trail = timeline.Trail(self.estimator.unseen.walk)
         self._stamps = Stamps(round(model.control_period * NS_PER_S))
         self.reset(0, np.zeros(3))
 
@@ -118,7 +117,6 @@ class Middleware:
         self._clock_jumps = 0
         self._commanded = np.zeros(self._width)
         self.estimator.reset(time_ns, pose, std)
-        self._trail.reset()
         self._begin(time_ns)
 
     def place(self, pose: ArrayLike, covariance: ArrayLike) -> None:
@@ -220,39 +218,23 @@ class Middleware:
             return self.cache.reject(f"{ODOM}: {NOT_FINITE}")
         if fault := self._stamps.fault(stamp_ns, None):
             return self.cache.reject(f"{ODOM}: {fault}")
-        odometry = ReportedPose(stamp_ns, arrival_ns, *value)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
             # At a reset the pose is known: the odometry of that time adds nothing.
             self._timeline.anchor(value[0])
-        elif self._trail.contradicts(odometry):
-            self._follow_clock(odometry)
-        else:
-            return self._measure_odometry(odometry, turn_variance)
-        self._stamps.accept(stamp_ns, arrival_ns)
-        self.cache.take(ODOM, stamp_ns, arrival_ns, value)
-        self._trail.use(odometry)
-        return True
-
-    def _measure_odometry(
-        self, odometry: ReportedPose, turn_variance: float | None
-    ) -> bool:
-        """Measures an odometry; True if accepted. Continues from it if the clock was set."""
-        stamp_ns, arrival_ns, pose, twist = odometry
+            self._stamps.accept(stamp_ns, arrival_ns)
+            self.cache.take(ODOM, stamp_ns, arrival_ns, value)
+            return True
         measurement = Measurement(
-            Kind.TWIST, twist, odom=pose, turn_variance=turn_variance
+            Kind.TWIST, value[1], odom=value[0], turn_variance=turn_variance
         )
-        reason = self._measure(stamp_ns, arrival_ns, measurement, (pose, twist))
-        if not reason:
-            self._trail.use(odometry)
-        elif reason in (
+        reason = self._measure(stamp_ns, arrival_ns, measurement, value)
+        of_clock = (
             self._stamps.from_the_future,
             timeline.TOO_OLD,
             timeline.BEFORE_START,
-        ):
-            if self._stamps.refuse():
-                self._follow_clock(odometry)
-            else:
-                self._trail.refuse(odometry)
+        )
+        if reason in of_clock and self._stamps.refuse():
+            self._follow_clock(stamp_ns, arrival_ns, measurement)
         return not reason
 
     def pose(
@@ -314,17 +296,15 @@ class Middleware:
             self.cache.take(topic, stamp_ns, arrival_ns, kept)
         return reason
 
-    def _follow_clock(self, odometry: ReportedPose) -> None:
-        """Continues from an odometry to whose stamp the clock was set, by the motion it shows."""
-        seconds = self._trail.seconds(odometry)
-        continuous = self._trail.continuous(odometry)
-        self.estimator.lose(odometry.stamp_ns, seconds, continuous, self._commanded)
-        self.estimator.correct(
-            Measurement(Kind.TWIST, odometry.twist, odom=odometry.pose)
-        )
-        self._begin(odometry.stamp_ns)
-        self._trail.reset()
-        self._trail.use(odometry)
+    def _follow_clock(
+        self, stamp_ns: int, arrival_ns: int, odometry: Measurement
+    ) -> None:
+        """Begins anew at the last pose, at the stamp of an odometry to which the clock was set."""
+        last = self.cache.newest.get(ODOM)
+        seconds = 0.0 if last is None else (arrival_ns - last.arrival_ns) * S_PER_NS
+        self.estimator.restart(stamp_ns, seconds, self._commanded)
+        self.estimator.correct(odometry)
+        self._begin(stamp_ns)
         self.cache.newest.clear()
         self._clock_jumps += 1
 

@@ -3,16 +3,13 @@
 from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass
-from itertools import pairwise
 from operator import attrgetter, index
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge import geometry
-from nics_drl_bridge.interface import NS_PER_S, Array
-from nics_drl_bridge.middleware.belief import JITTER_S, Belief
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.middleware.belief import Belief
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import (
     Acceptance,
@@ -31,19 +28,6 @@ FUTURE_NS = (
 CLOCK_JUMP = (
     10  # Odometries rejected in a row for their stamps that show that a clock was set
 )
-NEAR_NS = (
-    HISTORY_NS + 2 * NS_PER_S
-)  # Stamps farther back [ns] are all rejected, see `Stamps`
-CONTRADICTED_NS = (
-    200_000_000  # A smaller error of a stamp [ns] may be a longer transmission
-)
-IN_STEP = (
-    5  # Odometries in a row in step with their stamps, before arrivals measure time
-)
-# Between odometry's pose and twist: greatest standard deviations, and always allowed [m, rad].
-SIGMA = 6.0
-LEAST = 0.01
-STILL = 0.02  # Slower motion [m/s, rad/s] gives no information about time
 Moment = tuple[
     int, int
 ]  # Stamp [ns] and kind: the order of measurements, however they arrive
@@ -192,121 +176,3 @@ class Stamps:
         """Records an odometry rejected for its stamp; True if the clock has jumped."""
         self._refused += 1
         return self._refused >= CLOCK_JUMP
-
-
-class ReportedPose(NamedTuple):
-    """An odometry as received: stamp and arrival [ns], pose in `odom` (3,), body twist (3,)."""
-
-    stamp_ns: int
-    arrival_ns: int
-    pose: Array
-    twist: Array
-
-
-class Trail:
-    """Follows the odometries since the last one that was used.
-
-    If the robot moves, the path between two odometries and their twists give the time between them.
-    If arrivals agree with it and the stamp does not, the clock was set. `walk` (3,) is the variance
-    per second by which pose and twist of odometry differ [m^2/s, rad^2/s].
-    """
-
-    def __init__(self, walk: Array) -> None:
-        self._walk = walk
-        self.reset()
-
-    def reset(self) -> None:
-        """Forgets all odometries."""
-        self._recent: deque[ReportedPose] = deque(maxlen=IN_STEP + 1)
-        self._refused: deque[ReportedPose] = deque(maxlen=CLOCK_JUMP)
-
-    def use(self, odometry: ReportedPose) -> None:
-        """Records an odometry that is used."""
-        self._refused.clear()
-        if not self._recent or odometry.stamp_ns > self._recent[-1].stamp_ns:
-            self._recent.append(odometry)
-
-    def refuse(self, odometry: ReportedPose) -> None:
-        """Records an odometry that is rejected for its stamp."""
-        self._refused.append(odometry)
-
-    def contradicts(self, odometry: ReportedPose) -> bool:
-        """True if path and arrival of an odometry both show that the clock was set by a little."""
-        if len(self._recent) <= IN_STEP:
-            return False
-        last = self._recent[-1]
-        passed = odometry.stamp_ns - last.stamp_ns
-        waited = odometry.arrival_ns - last.arrival_ns
-        if (
-            abs(passed - waited) < CONTRADICTED_NS
-            or not -NEAR_NS <= passed - waited <= FUTURE_NS
-        ):
-            return False
-        if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
-            return False
-        seconds = _seconds(last, odometry, 0.0)
-        clear = CONTRADICTED_NS / NS_PER_S
-        stamped = passed / NS_PER_S
-        arrived = waited / NS_PER_S
-        return (
-            seconds > 0.0
-            and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * clear)
-            and abs(seconds - stamped) >= clear
-            and self._fits(last, odometry, seconds)
-            and not self._fits(last, odometry, stamped)
-        )
-
-    def _in_step(self, before: ReportedPose, after: ReportedPose) -> bool:
-        passed = after.stamp_ns - before.stamp_ns
-        waited = after.arrival_ns - before.arrival_ns
-        return 2 * abs(waited - passed) <= passed and self._fits(
-            before, after, passed / NS_PER_S
-        )
-
-    def seconds(self, now: ReportedPose) -> float:
-        """Time since the last used odometry, by its arrival and by the stamps since [s]."""
-        if not self._recent:
-            return 0.0
-        waited = max(now.arrival_ns - self._recent[-1].arrival_ns, 0)
-        stamped = now.stamp_ns - (*self._refused, now)[0].stamp_ns
-        # The last used one may have been a second late; the arrivals then show too little time.
-        return max(waited, min(stamped, waited + HISTORY_NS)) / NS_PER_S
-
-    def continuous(self, now: ReportedPose) -> bool:
-        """True if the poses since the last used odometry form one path and follow the motion."""
-        if not self._recent:
-            return False
-        path = [self._recent[-1], *self._refused, now]
-        unmoved = all(np.array_equal(each.pose, path[0].pose) for each in path)
-        if unmoved and any((np.abs(each.twist) > STILL).any() for each in path):
-            return False
-        times = [(b.stamp_ns - a.stamp_ns) / NS_PER_S for a, b in pairwise(path[1:])]
-        first = max(self.seconds(now) - sum(times), 0.0)
-        spans = [(max(first - JITTER_S, 0.0), first + JITTER_S)]
-        spans += [(0.5 * each, 1.5 * each) for each in times]
-        return all(
-            self._fits(a, b, float(np.clip(_seconds(a, b, high), low, high)))
-            for (a, b), (low, high) in zip(pairwise(path), spans, strict=True)
-        )
-
-    def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
-        mean = (before.twist + after.twist) / 2.0
-        change = np.abs(after.twist - before.twist)
-        moved = geometry.between(before.pose, after.pose)
-        off = np.abs(geometry.between(geometry.exp(mean * seconds), moved))
-        span = abs(seconds)
-        return bool(
-            (
-                off <= LEAST + SIGMA * np.sqrt(self._walk * span) + change * span / 2.0
-            ).all()
-        )
-
-
-def _seconds(before: ReportedPose, after: ReportedPose, standing: float) -> float:
-    """Time [s] in which the mean twist leads between two poses; `standing` if it is at rest."""
-    mean = (before.twist + after.twist) / 2.0
-    if not (np.abs(mean) > STILL).any():
-        return standing
-    return float(
-        geometry.log(geometry.between(before.pose, after.pose)) @ mean / (mean @ mean)
-    )

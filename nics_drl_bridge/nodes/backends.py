@@ -260,7 +260,6 @@ class DdsBackend:
         self._link.check_alone()  # while the simulator is at work
         self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
         self._now_ns += self._period_ns
-        self._middleware.estimator.foresee(self._now_ns)
 
     def _check_stamps(self) -> None:
         for topic in self._topics:

@@ -1,13 +1,13 @@
 """The end of a node's process: at once while it has nothing to leave behind, and never slowly.
 
 Python runs its handlers of signals between two steps of its own, and none is run while LLVM
-compiles for seconds. Until a node runs, it has nothing to leave behind, and the handler is a C
-function that ends the process. Nor is Python finalised in the end, which takes as long again as
-all else on a busy machine: libraries are unloaded while their threads run.
+compiles for seconds. Until a node runs, it has nothing to leave behind, and the signals have their
+default effect: they end the process, whose exit code is then that of the signal. Nor is Python
+finalised in the end, which takes as long again as all else on a busy machine: libraries are
+unloaded while their threads run.
 """
 
 import contextlib
-import ctypes
 import os
 import signal
 import sys
@@ -34,9 +34,7 @@ ENDING = (
 """Signals that end a process unless it handles them, but SIGKILL, those of a fault in the process
 itself, and those that Python ignores, as SIGPIPE."""
 OUTPUT_S = 1.0  # for which the last lines may take to be written
-_leave: int | None = (
-    None  # address of the handler; None in a process that is more than one node
-)
+_own_process = False  # True in a process that is one node and nothing else
 _within = False  # `at_once`
 
 
@@ -60,29 +58,24 @@ def ending_signals() -> list[int]:
 
 def own_process() -> None:
     """Lets `at_once` take effect: this process is one node and nothing else."""
-    global _leave
-    from nics_drl_bridge.nodes.ending_kernels import address_of_leave
-
-    _leave = address_of_leave()
+    global _own_process
+    _own_process = True
 
 
 @contextlib.contextmanager
 def at_once() -> Iterator[None]:
-    """Lets the signals that end it end the process with code 0, whatever it is doing."""
+    """Lets the signals that end it end the process at once, whatever it is doing."""
     global _within
-    if _leave is None or _within:
+    if not _own_process or _within:
         yield
         return
-    handle = ctypes.CDLL(None).signal
-    handle.argtypes = (ctypes.c_int, ctypes.c_void_p)
-    handle.restype = ctypes.c_void_p
-    numbers = ending_signals()
-    for number in numbers:
-        handle(number, _leave)
+    handlers = {number: signal.getsignal(number) for number in ending_signals()}
+    for number in handlers:
+        signal.signal(number, signal.SIG_DFL)
     _within = True
     try:
         yield
     finally:
         _within = False
-        for number in numbers:  # Python's own handlers again
-            signal.signal(number, signal.getsignal(number))
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

@@ -97,7 +97,7 @@ def opened(path: str | Path) -> "Iterator[BagFile]":
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         fault = f"can't be read as a bag ({shortened(why, LONGEST_REASON)})"
-        advice = "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew"
+        advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record anew"
         if path.suffix == ROS_1:
             advice = "mend it with `rosbag reindex`, or record anew"
         said = f"{path}: {fault}; it is damaged or was not closed: {advice}."

@@ -1,9 +1,7 @@
 """MCAP files: records parsed by the library `mcap`, and the checks that its readers leave out."""
 
 import struct
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from importlib import import_module
 from mmap import ACCESS_READ, ACCESS_WRITE, mmap
 from pathlib import Path
@@ -35,13 +33,12 @@ _PART = 2**20
 
 
 class DamageError(ValueError):
-    """Damage of a file: byte offset of the record, what is wrong, offset of the next record."""
+    """Damage of a file: byte offset of the record, and what is wrong."""
 
-    def __init__(self, offset: int, what: str, end: int | None = None) -> None:
+    def __init__(self, offset: int, what: str) -> None:
         super().__init__(f"byte {offset}: {what}")
         self.offset = offset
         self.what = what
-        self.end = end
 
 
 class Record(NamedTuple):
@@ -89,48 +86,15 @@ def records(data: memoryview, place: int = 0) -> Iterator[Record]:
             try:
                 content = next(parsed)
             except UnicodeDecodeError:
-                raise DamageError(place, "a text is not UTF-8", end) from None
+                raise DamageError(place, "a text is not UTF-8") from None
             except EndOfFile:
                 stream.place = len(data) + 1
             if stream.place != end:
-                raise DamageError(place, "a record is shorter than its fields", end)
+                raise DamageError(place, "a record is shorter than its fields")
         yield Record(place, end, content)
         if isinstance(content, kinds.Footer):
             return
         place = end
-
-
-@dataclass
-class McapSummary:
-    """Contents of a file, gathered from the records read so far."""
-
-    schemas: dict[int, kinds.Schema] = field(default_factory=dict)  # by id
-    channels: dict[int, kinds.Channel] = field(default_factory=dict)  # by id
-    counts: Counter[int] = field(
-        default_factory=Counter
-    )  # number of messages by channel
-    span: tuple[int, int] | None = (
-        None  # first and last time [ns]; None before the first message
-    )
-
-    def see(self, record: Record) -> kinds.Message | None:
-        """Registers a schema, a channel or a message; returns the message."""
-        found = record.content
-        if isinstance(found, kinds.Message):
-            if found.channel_id not in self.channels:
-                fault = f"a message of the unknown channel {found.channel_id}"
-                raise DamageError(record.offset, fault)
-            first, last = self.span or (found.log_time, found.log_time)
-            self.span = min(first, found.log_time), max(last, found.log_time)
-            self.counts[found.channel_id] += 1
-            return found
-        known: dict[int, Any] = (
-            self.schemas if isinstance(found, kinds.Schema) else self.channels
-        )
-        if known.setdefault(found.id, found) != found:
-            kind = type(found).__name__.lower()
-            raise DamageError(record.offset, f"a second {kind} with the id {found.id}")
-        return None
 
 
 def unpacked(record: Record) -> memoryview:
@@ -178,148 +142,57 @@ def seal(path: Path) -> None:
             )
 
 
-@dataclass
-class _Walk:
-    data: McapSummary = field(default_factory=McapSummary)  # of the data section
-    summary: McapSummary = field(default_factory=McapSummary)  # of the summary
-    data_end: int = 0  # offset of the summary; 0 within the data
-    # Offset, length and time span of each chunk, by the data and by the summary.
-    chunks: set[tuple[int, ...]] = field(default_factory=set)
-    indexed: set[tuple[int, ...]] = field(default_factory=set)
-    statistics: Record | None = None
-    # Time and offset in the last chunk of its messages, by channel.
-    places: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
-
-
 def check_mcap(path: Path) -> None:
-    """Checks a file (https://mcap.dev/spec) from its first byte to its last (DamageError)."""
+    """Checks records, chunks and checksums from first byte to last, before a reader (DamageError).
+
+    Index and statistics are not held against the messages; `BagFile` compares counts and times.
+    """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
     data = mapped(path)
-    walk = _Walk()
     end = len(data) - len(MAGIC)
     if data[: len(MAGIC)] != MAGIC:
         raise DamageError(0, "it does not begin as an MCAP file")
     if end <= len(MAGIC) or data[end:] != MAGIC:
         fault = "it does not end as an MCAP file: it is cut off or was not closed"
         raise DamageError(len(data), fault)
+    data_end = 0  # offset of the summary; 0 within the data
     for record in records(data[:end], len(MAGIC)):
-        if record.offset == len(MAGIC) and not isinstance(record.content, kinds.Header):
+        content = record.content
+        if record.offset == len(MAGIC) and not isinstance(content, kinds.Header):
             raise DamageError(record.offset, "the header is missing")
-        if walk.data_end:
-            _in_summary(walk, record)
-        else:
-            _in_data(walk, record, data)
+        if isinstance(content, kinds.Chunk):
+            _check_chunk(record)
+        elif isinstance(content, kinds.DataEnd):
+            data_end = record.end
+            _check_crc(record, data[: record.offset], content.data_section_crc, "data")
     footer = record.content
     if not isinstance(footer, kinds.Footer) or record.end != end:
         raise DamageError(record.offset, "its end has no footer")
-    summary = data[footer.summary_start : record.end - 4]
-    if (
-        footer.summary_start
-        and not walk.data_end <= footer.summary_start <= record.offset
-    ):
-        raise DamageError(record.offset, "the footer points to no summary")
-    if (
-        footer.summary_start
-        and footer.summary_crc
-        and crc32(summary) != footer.summary_crc
-    ):
-        raise DamageError(record.offset, "the checksum of its summary is wrong")
-    _agree(walk)
-
-
-def _in_data(walk: _Walk, record: Record, data: memoryview) -> None:
-    found = record.content
-    if isinstance(found, INSIDE):
-        walk.data.see(record)
-    elif isinstance(found, kinds.Chunk):
-        try:
-            _in_chunk(walk, record)
-        except DamageError as damage:
-            raise DamageError(record.offset, damage.what) from None
-    elif isinstance(found, kinds.MessageIndex):
-        if sorted(found.records) != sorted(walk.places.pop(found.channel_id, [])):
-            raise DamageError(
-                record.offset, "the index of a chunk does not fit its messages"
-            )
-    elif isinstance(found, kinds.DataEnd):
-        if (
-            found.data_section_crc
-            and crc32(data[: record.offset]) != found.data_section_crc
-        ):
-            raise DamageError(record.offset, "the checksum of its data is wrong")
-        walk.data_end = record.end
-    elif isinstance(found, (kinds.Footer, kinds.ChunkIndex, kinds.Statistics)):
-        raise DamageError(record.offset, "the summary begins before the data end")
-
-
-def _in_chunk(walk: _Walk, record: Record) -> None:
-    """Walks through a chunk and keeps its messages for the index records that follow it."""
-    walk.places = {}
-    times: list[int] = []
-    for inner in records(unpacked(record)):
-        if not isinstance(inner.content, INSIDE):
-            kind = type(inner.content).__name__
-            raise DamageError(record.offset, f"a chunk holds a record of kind {kind}")
-        message = walk.data.see(inner)
-        if message is not None:
-            times.append(message.log_time)
-            walk.places.setdefault(message.channel_id, []).append(
-                (message.log_time, inner.offset)
-            )
-    span = record.content.message_start_time, record.content.message_end_time
-    if times and (min(times), max(times)) != span:
-        raise DamageError(
-            record.offset, "a chunk's messages are not of the time that it names"
-        )
-    walk.chunks.add((record.offset, record.end - record.offset, *span))
-
-
-def _in_summary(walk: _Walk, record: Record) -> None:
-    found = record.content
-    if isinstance(found, (kinds.Chunk, kinds.Message)):
-        raise DamageError(record.offset, "there are data behind their end")
-    if isinstance(found, kinds.DataEnd):
-        raise DamageError(record.offset, "its data end twice")
-    if isinstance(found, (kinds.Schema, kinds.Channel)):
-        walk.summary.see(record)
-    elif isinstance(found, kinds.ChunkIndex):
-        span = found.message_start_time, found.message_end_time
-        walk.indexed.add((found.chunk_start_offset, found.chunk_length, *span))
-    elif isinstance(found, kinds.Statistics):
-        walk.statistics = record
-
-
-def _agree(walk: _Walk) -> None:
-    data = walk.data
-    summary = walk.summary
-    for name in ("schemas", "channels"):
-        ours = getattr(data, name)
-        theirs = getattr(summary, name)
-        if theirs and any(theirs.get(key) != value for key, value in ours.items()):
-            raise DamageError(
-                walk.data_end, f"the {name} of its summary are not those of its data"
-            )
-    for channel in data.channels.values():
-        if channel.schema_id and channel.schema_id not in data.schemas:
-            raise DamageError(
-                walk.data_end, f"the channel {channel.topic!r} has no schema"
-            )
-    if walk.indexed and walk.indexed != walk.chunks:
-        raise DamageError(walk.data_end, "the index of its chunks does not fit them")
-    if walk.statistics is None:
+    if not footer.summary_start:
         return
-    told: kinds.Statistics = walk.statistics.content
-    counts = Counter({key: n for key, n in told.channel_message_counts.items() if n})
-    if not (
-        told.message_count == data.counts.total()
-        and (not counts or counts == data.counts)
-        and told.chunk_count in (0, len(walk.chunks))
-        and data.span in (None, (told.message_start_time, told.message_end_time))
-    ):
-        raise DamageError(
-            walk.statistics.offset, "its statistics do not fit its messages"
-        )
+    if not data_end <= footer.summary_start <= record.offset:
+        raise DamageError(record.offset, "the footer points to no summary")
+    summary = data[footer.summary_start : record.end - 4]
+    _check_crc(record, summary, footer.summary_crc, "summary")
+
+
+def _check_crc(record: Record, data: memoryview, crc: int, name: str) -> None:
+    if crc and crc32(data) != crc:
+        raise DamageError(record.offset, f"the checksum of its {name} is wrong")
+
+
+def _check_chunk(record: Record) -> None:
+    """Walks through a chunk, which holds nothing but schemas, channels and messages."""
+    try:
+        for inner in records(unpacked(record)):
+            if not isinstance(inner.content, INSIDE):
+                kind = type(inner.content).__name__
+                raise DamageError(
+                    record.offset, f"a chunk holds a record of kind {kind}"
+                )
+    except DamageError as damage:
+        raise DamageError(record.offset, damage.what) from None
 
 
 def _zstd() -> Any:

@@ -20,11 +20,6 @@ from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
 
 FORMAT = "nics_drl_bridge/recording/4"
-PLAIN_FORMAT = "nics_drl_bridge/recording/3"  # without deviations and repairs
-COMMENT_FORMAT = "nics_drl_bridge/recording/2"  # checksum in the comment of the archive
-UNSEALED_FORMAT = (
-    "nics_drl_bridge/recording/1"  # without checksum; all three can still be read
-)
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
 MeasuredBy = Literal["", "odometry", "tracker", "truth"]
 """What measured a pose: odometry, which drifts; motion capture or a localiser; a simulation."""
@@ -312,23 +307,18 @@ def load_recording(path: str | Path) -> Recording:
         arrays = _arrays(data)
         meta = json.loads(str(arrays["meta"]))
         version = meta["format"]
-        if version in (FORMAT, PLAIN_FORMAT):
-            files.check_sealed(io.BytesIO(data))
-        elif (
-            version == COMMENT_FORMAT
-            and data[-64:] != files.sha256(data[:-64]).encode()
-        ):
-            raise ValueError("its checksum is missing or does not fit the rest")
-        if version not in (FORMAT, PLAIN_FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
+        if version != FORMAT:
             advice = "record it anew or use the version of the package that wrote it"
             raise RecordingError(
                 f"{path}: format {version!r} is not {FORMAT!r}; {advice}."
             )
+        files.check_sealed(io.BytesIO(data))
         streams: Any = {
             n: _stream(arrays, n, clock) for n, clock in meta["clocks"].items()
         }
         latency = Latency.model_validate(meta.get("latency", {}))
-        variables, repairs = tuple(meta["variables"]), tuple(meta.get("repairs", ()))
+        variables = tuple(meta["variables"])
+        repairs = tuple(meta["repairs"])
         found = Recording(
             **streams, source=str(path), variables=variables, latency=latency
         )

@@ -283,7 +283,7 @@ def bag_sink(
     """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
 
     Until then it is in a hidden folder `.NAME.*` beside it. If the storage fails, as on a full
-    disk, what was written stays in such a folder, for `salvage`.
+    disk, what was written stays in such a folder.
 
     `keep` is for what can't be had again, a recording: if the block raises, the bag is finished
     with what was written, and what a killed process leaves stays there, too. Without it, the former
@@ -337,7 +337,9 @@ def bag_sink(
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         reason = reason.removeprefix(f"{path}: ").removesuffix(".")
         rest = f"what was written until then lies in {unfinished}"
-        advice = "save it with `nics bag salvage` where there is room"
+        advice = (
+            "recover it with `mcap recover` or `ros2 bag reindex` where there is room"
+        )
         if not written:
             rest = "nothing was written yet"
             advice = "choose another place"

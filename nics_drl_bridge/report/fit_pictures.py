@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import clocks
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive, pose_residual
+from nics_drl_bridge.identify.drive import pose_residual
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
@@ -23,8 +21,6 @@ from nics_drl_bridge.identify.report import CalibratedValue, estimates
 from nics_drl_bridge.identify.signals import (
     DIFFERENCE,
     held,
-    moved_commands,
-    nominal_lags,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
@@ -41,7 +37,6 @@ from nics_drl_bridge.style import (
     panels,
     png,
 )
-from nics_drl_bridge.threads import one_blas_thread
 
 SHOWN_S = 8.0
 PATHS = 6
@@ -50,23 +45,16 @@ UNSEEN_PANEL = Panel(3.4, 3.4)  # of one of them on a page
 SETTLED_S = 1.0
 LEAST_SHARE = 1e-12
 LEAST_RATE = 1e-6
-BURSTS_SHOWN = 12
 MOST_POINTS = 3000
 BINS = 60
 CURVE_POINTS = 400  # of an input curve
 REACH = 5.0  # histograms end at this many standard deviations
-# largest shift in time of a curve, and number of its points
-REACH_S = 0.5
-TRIALS = 81
 CAPTIONS = {
     "accuracy": "Error against the number of terms; circles mark how many are kept.",
     "residuals": "Rates on unseen data, those of the model, and the residuals.",
     "alignment": "Commands as stamped and as they take effect, and the response of the robot.",
-    "timing": "Unexplained motion for each shift in time; the estimate is at the minimum.",
-    "bursts": "Poses that arrive in bursts, and the times assigned to them.",
     "mounting": "Velocities before and after correction: base_link of a robot that can't move "
     "sideways has no lateral velocity.",
-    "wheels": "Wheel speeds against the motion: the scale, and which wheel is the left one.",
     "inputs": "How motors change commands, over the range of the drive, and the rates that the "
     "terms ask for.",
     "noise": "Sensor noise, and the growth of prediction errors, next to the drift that simulator "
@@ -324,59 +312,11 @@ def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, b
     """The pictures of a calibration by name, as far as the recording shows them, each a PNG."""
     found = estimates(identified)
     drawn = {
-        each.__name__: each(identified, found)
-        for each in (timing, bursts, mounting, wheels)
+        "mounting": mounting(identified, found),
+        "inputs": inputs(spec, identified),
+        "noise": noise(identified),
     }
-    drawn |= {"inputs": inputs(spec, identified), "noise": noise(identified)}
     return {name: picture for name, picture in drawn.items() if picture is not None}
-
-
-def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
-    """Draws the unexplained part over each shift in time, with the estimate and its uncertainty."""
-    curves = timing_curves(identified.drive, identified.calibration)
-    if not curves:
-        return None
-    figure, grid = panels(1, len(curves), (5.2 * len(curves), 3.8))
-    for axes, curve in zip(grid, curves, strict=True):
-        estimate = found[curve.name]
-        value = estimate.value or 0.0
-        sigma = estimate.sigma or 0.0
-        axes.plot(curve.value, curve.unexplained, color=MEASURED)
-        span = 2.0 * sigma
-        label = "two standard uncertainties"
-        axes.axvspan(value - span, value + span, color=MODEL, alpha=0.25, label=label)
-        axes.axvline(value, color=MODEL, linestyle="--", label="estimate")
-        axes.set(
-            xlabel=f"{estimate.name} [s]", ylabel="unexplained / spread of the signal"
-        )
-        _finish(axes, estimate.text)
-    return png(figure)
-
-
-def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
-    """Draws stamps of the poses as they arrived, and as they were spread."""
-    t = identified.recording.pose.t
-    groups = identified.drive.bursts
-    if groups is None:
-        return None
-    shown = slice(0, int(BURSTS_SHOWN * groups.size))
-    spread = identified.drive.sample_t
-    figure, (axes, intervals) = panels(1, 2, (9.0, 3.8))
-    number = np.arange(len(t))[shown]
-    axes.plot(t[shown] - t[0], number, ".", color=OTHER, label="as they arrived")
-    axes.plot(
-        spread[shown] - t[0], number, "-", color=MODEL, label="spread over the period"
-    )
-    axes.set(xlabel="stamp [s]", ylabel="pose number")
-    _finish(axes, f"{found['burst_period_s'].text}, {groups.size:.0f} poses in each")
-    edges = list(np.linspace(0.0, 1.5 * groups.period_s, 60))
-    intervals.hist(np.diff(t), edges, color=OTHER, label="as they arrived")
-    intervals.hist(
-        np.diff(spread), edges, color=MODEL, alpha=0.7, label="spread over the period"
-    )
-    intervals.set(xlabel="time between two poses [s]", ylabel="number")
-    _finish(intervals, "intervals")
-    return png(figure)
 
 
 def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
@@ -411,44 +351,6 @@ def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes
 def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
     axes.plot(*tracked, ".", markersize=3, color=OTHER, label="tracked body")
     axes.plot(*base, ".", markersize=3, color=MODEL, label="base_link")
-
-
-def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
-    """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
-    drive = identified.drive
-    calibration = identified.calibration
-    units = clocks.wheel_means(drive, calibration)
-    if units is None or calibration.wheel_scale is None:
-        return None
-    turn = drive.twists.twist[:, 2]
-    along = clocks.speed_along(drive, calibration)
-    rows: tuple[tuple[str, str, str, Array, Array], ...] = (
-        (
-            "wheel_scale",
-            "mean of both wheels [unit]",
-            "speed [m/s]",
-            units.mean(axis=1),
-            along,
-        ),
-        (
-            "turn_scale",
-            "right less left wheel [unit]",
-            "yaw rate [rad/s]",
-            units[:, 1] - units[:, 0],
-            turn,
-        ),
-    )
-    figure, grid = panels(1, 2, (10.0, 4.0))
-    for axes, (name, x_label, y_label, x, y) in zip(grid, rows, strict=True):
-        axes.plot(x, y, ".", markersize=4, color=MEASURED, label="measured")
-        estimate = found[name]
-        if estimate.value is not None:
-            ends = np.array([x.min(), x.max()])
-            axes.plot(ends, estimate.value * ends, "--", color=MODEL, label="scale")
-        axes.set(xlabel=x_label, ylabel=y_label)
-        swapped = "" if name == "wheel_scale" else f"\n{found['wheels_swapped'].text}"
-        _finish(axes, estimate.text + swapped)
-    return png(figure)
 
 
 def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
@@ -595,63 +497,3 @@ def _growth(
 def _value(level: Level) -> str:
     spread = "" if level.uncertainty is None else f" ± {level.uncertainty:.1g}"
     return f"{level.std:.3g}{spread} {level.unit}"
-
-
-class ShiftCurve(NamedTuple):
-    """Residual against an estimated time."""
-
-    name: str  # as in `Calibration`
-    value: Array  # (n,) trial values of the time [s]
-    unexplained: Array  # (n,) root mean square, as a share of the signal's spread
-
-
-@one_blas_thread
-def timing_curves(drive: Drive, calibration: Calibration) -> tuple[ShiftCurve, ...]:
-    """Returns a curve for the clock offset and one for the latency, if they were estimated."""
-    if not moved_commands(drive.recording.command).any():
-        return ()
-    names = ("clock_offset_s", "command_latency_s")
-    found = (
-        _curve(drive, calibration, name)
-        for name in names
-        if name in calibration.uncertainty
-    )
-    return tuple(curve for curve in found if curve is not None)
-
-
-def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | None:
-    recording = drive.recording
-    spec = drive.spec
-    twists = drive.twists
-    state = recording.state
-    wheels = recording.wheels
-    command = recording.command
-    value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, TRIALS)
-    signal = (twists.start, twists.end, twists.twist)
-    of_clock = name == "clock_offset_s"
-    if state is not None and of_clock:
-        by_shift = clocks.residual_by_shift(state, signal)
-        rest = [by_shift(np.array([-d])) for d in value]
-    elif state is not None:
-        by_delay = clocks.state_residual(command, state, spec)
-        rest = [by_delay(np.array([d])) for d in value]
-    else:
-        if not of_clock and recording.pose.clock != command.clock:
-            if wheels is None:
-                return None
-            signal = (
-                wheels.t - float(np.median(np.diff(wheels.t))),
-                wheels.t,
-                wheels.values,
-            )
-        lags = np.array([r.lag_s for r in calibration.responses])
-        lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
-        if not len(
-            lags
-        ):  # nothing lags behind: the fit found the latency by predictions
-            return None
-        left = clocks.response_residual(command, spec, signal)
-        delays = calibration.command_latency_s - value if of_clock else value
-        own = delays_of([r.command for r in calibration.responses], calibration.inputs)
-        rest = [left(lags, own + d, calibration.motors) for d in delays]
-    return ShiftCurve(name, value, np.array([np.sqrt(np.mean(r**2)) for r in rest]))

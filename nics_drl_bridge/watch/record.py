@@ -1,30 +1,25 @@
-"""Files of what the page shows: MP4, GIF, and `.rrd` for Rerun's viewer."""
+"""Files of what the page shows: MP4 and GIF."""
 
 import io
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from nics_drl_bridge import geometry
 from nics_drl_bridge.env.rendering import WorldPicture
-from nics_drl_bridge.env.snapshot import hits_of
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.extensions import require
 from nics_drl_bridge.files import check_above, whole_file, write_bytes
-from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
-from nics_drl_bridge.watch.frame import Frame, Stage, WorldFrame
+from nics_drl_bridge.watch.frame import Frame, Stage
 
 Pixels = NDArray[np.uint8]  # (H, W, 3)
 COLOURS = 128  # of a GIF, whose size grows with them
 ALIKE = 12  # difference of two colours of which a GIF has one
 SAMPLES = 12  # frames that its colours are taken from
-CORNERS = 24  # of a disc
 
 
 def pictures(stage: Stage, frames: Iterable[Frame]) -> Iterator[Pixels]:
@@ -110,83 +105,7 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
                 video.send(np.ascontiguousarray(each))
 
 
-def write_rrd(path: Path, stage: Stage, frames: Iterable[Frame]) -> None:
-    """Writes a recording of Rerun."""
-    import rerun
-
-    with (
-        whole_file(path) as part,
-        rerun.RecordingStream("nics_drl_bridge") as recording,
-    ):
-        recording.save(str(part))
-        members = [member for world in stage.worlds for member in world.members]
-        for frame in frames:
-            recording.set_time("time", duration=frame.time_s)
-            for n, world in enumerate(frame.worlds):
-                _log(rerun, recording, f"world_{n}", stage, world)
-                walls = members[world.place].all_walls().reshape(-1, 2, 2)
-                recording.log(f"world_{n}/walls", rerun.LineStrips2D(walls * FLIP))
-        recording.flush()
-
-
-FLIP = np.array([1.0, -1.0])  # Rerun draws y downwards
-
-
-def _log(rerun: Any, recording: Any, at: str, stage: Stage, world: WorldFrame) -> None:
-    shot = world.shot
-    model = stage.model
-    shapes = [shape for each in stage.worlds for shape in each.shapes]
-    bodies = [
-        FLIP
-        * _ring(
-            body[[X, Y, HEADING]], body[RADIUS], shapes[int(body[SHAPE]) % len(shapes)]
-        )
-        for body in shot.bodies
-        if body[RADIUS] > 0.0
-    ]
-    recording.log(
-        f"{at}/obstacles", rerun.LineStrips2D(bodies, colors=[0x8D, 0x99, 0xAE])
-    )
-    recording.log(
-        f"{at}/goals",
-        rerun.Points2D(FLIP * shot.goals, radii=0.1, colors=[230, 159, 0]),
-    )
-    for m, (pose, ranges) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
-        robot = model.robot
-        own = f"{at}/robot_{m}"
-        ring = _ring(pose, robot.footprint_radius, robot)
-        recording.log(
-            f"{own}/footprint", rerun.LineStrips2D([FLIP * ring], colors=[0, 114, 178])
-        )
-        hits = hits_of(model.lidar, pose, ranges)
-        recording.log(
-            f"{own}/scan", rerun.Points2D(FLIP * hits, radii=0.02, colors=[213, 94, 0])
-        )
-        if world.trails:
-            way = [FLIP * world.trails[m]]
-            recording.log(f"{own}/trail", rerun.LineStrips2D(way, colors=[0, 158, 115]))
-        for c, command in enumerate(model.robot.command):
-            if shot.commands is not None:
-                value = rerun.Scalars(float(shot.commands[m, c]))
-                recording.log(f"{own}/commands/{command.name}", value)
-
-
-def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
-    """Closed outline (V + 1, 2) of a shape, or of a robot by its footprint, at a pose (3,)."""
-    outline: Any = getattr(shape, "footprint", None)
-    if outline is None:
-        outline = np.asarray(getattr(shape, "outline", np.zeros((0, 2))))
-        outline = outline * (radius / shape.radius) if len(outline) else outline
-    corners = np.array(outline, np.float64)
-    if not len(corners):
-        turns = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
-        corners = radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    return np.asarray(
-        geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
-    )
-
-
-LIBRARIES = {".mp4": ("imageio_ffmpeg",), ".rrd": ("rerun",)}
+LIBRARIES = {".mp4": ("imageio_ffmpeg",)}
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
     ".gif": lambda path, stage, frames, fps: write_gif(
         path, pictures(stage, frames), fps
@@ -194,7 +113,6 @@ WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
     ".mp4": lambda path, stage, frames, fps: write_mp4(
         path, pictures(stage, frames), fps
     ),
-    ".rrd": lambda path, stage, frames, _: write_rrd(path, stage, frames),
 }
 
 

@@ -35,14 +35,6 @@ def test_the_estimate_is_off_by_as_much_as_it_claims(result):
 
 
 @pytest.mark.campaign
-def test_after_a_clock_jump_too(result):
-    jumps = result["clock_jump"]
-    assert jumps["drives"] == 33
-    assert jumps["driven_unseen_m"] > 0.2
-    assert jumps["nees_p99"] < 16.27
-
-
-@pytest.mark.campaign
 def test_every_random_step_leaves_the_covariance_positive_definite(result):
     assert result["random_steps"] == 3_000
     assert result["finite_and_positive_definite"] is True
@@ -56,10 +48,9 @@ def test_every_random_step_leaves_the_covariance_positive_definite(result):
         ("no_filter", "all robots: the estimate is off by"),
         ("overconfident", "NEES is"),
         ("nan", "all robots: the estimate is off by nan"),
-        ("stands", "while their clock was set, less than 0.2 m"),
-        ("stood_still", "after a clock jump nees_p99 is"),
+        ("stands", "all robots: the estimate is off by"),
     ],
 )
 def test_a_control_misses_its_bar(control, bar):
-    size = SMALL if control in ("overconfident", "stood_still") else TINY
+    size = SMALL if control == "overconfident" else TINY
     assert any(bar in line for line in fails(SCRIPT, control, *size))

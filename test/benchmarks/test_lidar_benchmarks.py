@@ -256,44 +256,6 @@ def polar(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.campaign
-def test_sensor_models_are_compared_with_none_in_one_run():
-    _, result = asked(
-        "lidar_sensor_models.py",
-        "--scans",
-        "64",
-        "--repeats",
-        "2",
-        "--distances",
-        "10",
-        "--rotations",
-        "16",
-    )
-    tables = ["no model", "incidence dropout", "intensity", "both"]
-    assert list(result["scans_per_s"]) == tables
-    assert result["times_as_long"]["no model"] == 1.0
-    assert min(result["scans_per_s"].values()) > 0.0
-    assert (
-        result["table_bytes"]["no model"] == result["table_bytes"]["incidence dropout"]
-    )
-    assert not missed_but(result, "times as long")
-
-
-SMALL = ("--scans", "64", "--repeats", "2", "--distances", "10", "--rotations", "16")
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize(
-    ("control", "bar"), [("plain", "beams return"), ("slow", "times as long, bar")]
-)
-def test_sensor_models_that_do_nothing_or_are_slow_are_found(control, bar):
-    assert control in {"plain", "slow"}
-    options = SMALL if control == "plain" else (*SMALL[:3], "20", *SMALL[4:])
-    assert any(
-        bar in line for line in fails("lidar_sensor_models.py", control, *options)
-    )
-
-
-@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"),
     [("coarse", "RMSE"), ("nan", "RMSE nan"), ("slow", "as fast as exact")],

@@ -14,7 +14,7 @@ PHASES = ("starting", "compiling", "native")
 SHORT = ("--times", "2", "--loops", "0", "--nodes", "middleware_node")
 
 
-def test_a_node_ends_at_once_with_0_also_while_it_starts_or_compiles():
+def test_a_node_ends_at_once_also_while_it_starts_or_compiles():
     code, result = asked(SCRIPT, *SHORT, "--phases", *PHASES)
     assert set(result["endings"]) == {f"middleware_node {phase}" for phase in PHASES}
     assert not [

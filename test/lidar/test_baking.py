@@ -8,7 +8,7 @@ from robots import lidar
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.bake import bake, with_shapes
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon
+from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
 from nics_drl_bridge.lidar.table import Density, LidarTable, padding
 
 SPEC = lidar(beams=360, range_min=0.0)
@@ -124,48 +124,3 @@ def test_shapes_are_added_to_a_table_without_rows_at_no_cost():
     more = with_shapes(SPEC, table, [STRIP])
     assert more.shapes == (SQUARE, STRIP)
     assert not more.has_rows
-
-
-def flat(distance):
-    """A wide wall across the main axis, and the body that puts it there."""
-    wall = Polygon(points=((0.0, -0.4), (0.02, -0.4), (0.02, 0.4), (0.0, 0.4)))
-    return wall, np.array([(distance, 0.0, 0.0)])
-
-
-def test_a_sensor_model_sees_the_angle_of_incidence():
-    seen = []
-
-    def model(ranges, incidence):
-        seen.append((ranges.copy(), incidence.copy()))
-        return ranges
-
-    wall, _ = flat(1.0)
-    table = bake(SPEC, [wall], Density(distances=40, rotations=4, phases=4), model)
-    assert np.array_equal(table.rows, bake(SPEC, [wall], table.density).rows)
-    # Rotation 0: a ray at angle a meets the wall at angle a, and its range is distance / cos a.
-    ranges, incidence = seen[20]
-    distance = np.linspace(wall.radius, wall.radius + 3.0, 40)[20]
-    truly = np.arccos(np.minimum(distance / ranges, 1.0))
-    assert incidence == pytest.approx(truly, abs=0.01)
-    assert incidence.max() > 0.15
-
-
-def test_a_beam_that_the_sensor_model_loses_goes_through_to_what_is_behind():
-    def grazing(ranges, incidence):
-        return np.where(incidence > 0.15, np.inf, ranges)
-
-    wall, pose = flat(1.5)
-    table = bake(SPEC, [wall], SMALL)
-    lossy = bake(SPEC, [wall], SMALL, grazing)
-    assert lossy.rows.shape == table.rows.shape
-    scans = []
-    for one in (table, lossy):
-        scanner = Scanner(SPEC, one, "baked")
-        behind = [[2.5, -2.0, 2.5, 2.0]]
-        scans.append(scanner.scan(HERE, scanner.place([wall], pose), behind)[0])
-    angle = np.abs(SPEC.angles)
-    on_wall = angle < np.arctan2(0.39, 1.5)
-    assert scans[0][on_wall].max() < 1.6
-    assert scans[1][on_wall & (angle < 0.1)].max() < 1.6
-    assert scans[1][on_wall & (angle > 0.2)].min() > 2.4
-    assert not np.isnan(scans[1]).any()

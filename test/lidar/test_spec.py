@@ -176,3 +176,13 @@ def test_two_lidars_keep_their_own_beams():
     one = lidar(beams=10)
     other = lidar(beams=20)
     assert (len(one.angles), len(other.angles), len(one.angles)) == (10, 20, 10)
+
+
+def test_an_empty_sensor_model_of_an_earlier_version_is_read_and_another_refused():
+    content = lidar(beams=4).model_dump(mode="json")
+    assert validate(content | {"sensor_model": []}, LidarSpec, "x") == lidar(beams=4)
+    models = [{"kind": "incidence_dropout", "greatest_incidence": 1.0}]
+    with pytest.raises(ConfigError, match="sensor models are no longer") as refused:
+        validate(content | {"sensor_model": models}, LidarSpec, "lidar.yaml")
+    assert str(refused.value).startswith("lidar.yaml: ")
+    assert "\n" not in str(refused.value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -497,66 +496,6 @@ def test_the_noise_of_the_pose_is_that_of_the_model():
         spread.append(np.sqrt(estimator.covariance[0, 0]))
     assert spread[0] == pytest.approx(0.01, rel=0.2)
     assert spread[1] > 3.0 * spread[0]
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_to_foresee_changes_no_bit_whatever_comes_instead(robot):
-    model = builtin_model(robot)
-    plain = Estimator(model)
-    foreseeing = Estimator(model)
-    rng = np.random.default_rng(4)
-    times = np.cumsum(rng.integers(1, 2 * PERIOD, 400))
-    outcomes = set()
-    for time, then in itertools.pairwise(times.tolist()):
-        foreseeing.foresee(then if rng.random() < 0.7 else then + PERIOD)
-        command = random_command(model, rng)
-        twist = 0.3 * rng.normal(size=3)
-        stamp = time + int(rng.integers(-PERIOD, PERIOD))
-        moment = then if rng.random() < 0.8 else (time + then) // 2
-        pose = rng.normal(size=3)
-        event = rng.random()
-        spreads = []
-        for one in (plain, foreseeing):
-            if event < 0.3:
-                one.command(stamp, command, 0)
-            elif event < 0.35:
-                one.belief = one.belief._replace(mean=one.belief.mean + 0.01)
-            elif event < 0.37:
-                one.reset(time, pose)
-            one.predict(moment)
-            spreads.append(one.twist_covariance)
-            corrected = (
-                one.update(Kind.TWIST, twist)
-                if event < 0.9
-                else one.update(Kind.POSE, pose)
-            )
-            outcomes.add(corrected.outcome)
-        for mine, other in zip(plain.belief, foreseeing.belief, strict=True):
-            assert np.array_equal(mine, other)
-        assert np.array_equal(*spreads)
-    assert len(outcomes) > 2
-
-
-def test_what_is_foreseen_is_not_worked_out_again(monkeypatch):
-    estimator = Estimator(builtin_model("ackermann"))
-    estimator.foresee(PERIOD)
-    monkeypatch.setattr(kernels, "forecast", None)
-    monkeypatch.setattr(kernels, "expect", None)
-    estimator.update(Kind.POSE, np.zeros(3))
-    with pytest.raises(TypeError):
-        estimator.predict(PERIOD)  # a correction came between
-
-    monkeypatch.undo()
-    odometry = Measurement(Kind.TWIST, np.zeros(3), odom=np.zeros(3))
-    estimator.anchor(np.zeros(3))
-    estimator.foresee(PERIOD)
-    for name in ("forecast", "expect", "gain", "recall"):
-        monkeypatch.setattr(kernels, name, None)
-    estimator.predict(PERIOD)
-    assert estimator.correct(odometry).outcome is Acceptance.USED
-    assert estimator.time_ns == PERIOD
-    with pytest.raises(TypeError):
-        estimator.correct(odometry)  # that was for one
 
 
 @pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])

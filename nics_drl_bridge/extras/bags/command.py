@@ -1,4 +1,4 @@
-"""`nics bag record|info|replay|export|salvage`."""
+"""`nics bag record|info|replay|export`."""
 
 from dataclasses import asdict
 from functools import partial
@@ -9,16 +9,15 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros
+from nics_drl_bridge.commands.console import needs_ros
 from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 bag = typer.Typer(
-    help="Records, describes, replays, exports, salvages bags.", no_args_is_help=True
+    help="Records, describes, replays, exports bags.", no_args_is_help=True
 )
 
 STORAGES = ("mcap", "sqlite3")
-TASK = "Drive to the goal without touching anything."
 BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
 StorageOption = Annotated[
     str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")
@@ -61,13 +60,11 @@ def record(
 def info(
     path: BagArgument,
     as_json: console.JsonOption = False,
-    salvage: SalvageOption = False,
 ) -> None:
     """Shows a bag's topics, rates, gaps, and the clock of its stamps."""
     from nics_drl_bridge.extras.bags.info import bag_info
 
-    with intact(path, salvage) as whole:
-        told = bag_info(whole)
+    told = bag_info(path)
     span = f"{told.duration_s:.3f} s"
     size = f"{told.size_bytes / 1e6:.2f} MB"
     line = f"{path}: {told.messages} messages in {span}, {size}"
@@ -127,152 +124,58 @@ def replay(
     out: Annotated[
         Path | None, Option(help="For --estimate: .npz or .csv to write.")
     ] = None,
-    salvage: SalvageOption = False,
     as_json: console.JsonOption = False,
 ) -> None:
     """Plays a bag over ROS 2, or runs the middleware's estimator on it."""
-    with intact(path, salvage) as whole:
-        if estimate:
-            from nics_drl_bridge.generator import open_model
-            from nics_drl_bridge.middleware import playback
+    if estimate:
+        from nics_drl_bridge.generator import open_model
+        from nics_drl_bridge.middleware import playback
 
-            made = playback.estimate(
-                whole, open_model(model), console.roles_of(topic or [])
-            )
-            if out is not None:
-                playback.write_estimate(made, out)
-            rejected = dict(sorted(made.rejected.items()))
-            number = len(made.stamp_ns)
-            x, y, heading = last = made.pose[-1].tolist()
-            lines = [
-                f"not used: {count} of {reason}" for reason, count in rejected.items()
-            ]
-            lines.append(
-                f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}"
-            )
-            told = {"estimates": number, "last": last, "not_used": rejected}
-            line = "\n".join((*lines, f"sha256 {made.digest}"))
-            console.say(as_json, line, **told, sha256=made.digest)
-            return
-        with needs_ros("nics bag replay"):
-            from nics_drl_bridge.extras.bags.live import play_bag
-        say = partial(typer.echo, err=True)
-        sent = play_bag(
-            whole, topics or (), rate, loop, clock, namespace, lockstep, say
+        made = playback.estimate(path, open_model(model), console.roles_of(topic or []))
+        if out is not None:
+            playback.write_estimate(made, out)
+        rejected = dict(sorted(made.rejected.items()))
+        number = len(made.stamp_ns)
+        x, y, heading = last = made.pose[-1].tolist()
+        lines = [f"not used: {count} of {reason}" for reason, count in rejected.items()]
+        lines.append(
+            f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}"
         )
-        console.say(as_json, f"{sent} messages were published", published=sent)
+        told = {"estimates": number, "last": last, "not_used": rejected}
+        line = "\n".join((*lines, f"sha256 {made.digest}"))
+        console.say(as_json, line, **told, sha256=made.digest)
+        return
+    with needs_ros("nics bag replay"):
+        from nics_drl_bridge.extras.bags.live import play_bag
+    say = partial(typer.echo, err=True)
+    sent = play_bag(path, topics or (), rate, loop, clock, namespace, lockstep, say)
+    console.say(as_json, f"{sent} messages were published", published=sent)
 
 
 @bag.command()
 def export(
     path: BagArgument,
-    lerobot: Annotated[
-        Path | None,
-        Option(metavar="FOLDER", help="Write a LeRobot dataset, format v3.0."),
-    ] = None,
     mcap: Annotated[
-        Path | None, Option(metavar="FOLDER", help="Write an MCAP bag for Foxglove.")
-    ] = None,
+        Path, Option(metavar="FOLDER", help="Write an MCAP bag for Foxglove.")
+    ],
     model: Annotated[
         str | None,
         Option(
             "--model",
             "--robot",
-            help="A model's folder, or a shipped robot: for commands, lidar and its mount.",
+            help="A model's folder, or a shipped robot: for its lidar's mount.",
             autocompletion=console.ROBOTS,
         ),
     ] = None,
-    topic: Annotated[
-        list[str] | None,
-        Option(
-            metavar="ROLE=TOPIC",
-            help="For example odom=/car/odom. Roles: scan, odom, cmd_vel, pose.",
-        ),
-    ] = None,
-    fps: Annotated[
-        int | None,
-        Option(min=1, help="Frames per second; the commands' rate by default."),
-    ] = None,
-    gap: Annotated[
-        float, Option(help="Data older than this end an episode [s].")
-    ] = 0.5,
-    task: Annotated[str, Option(help="The robot's task, in words.")] = TASK,
-    succeeded: Annotated[
-        str | None,
-        Option(
-            metavar="all|none|NUMBERS",
-            help="Episodes that succeeded, such as 0,2,5; if known.",
-        ),
-    ] = None,
-    salvage: SalvageOption = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Converts a bag to a LeRobot dataset, or to MCAP for Foxglove."""
-    with intact(path, salvage) as whole:
-        from nics_drl_bridge.errors import ConfigError
-        from nics_drl_bridge.generator import open_model
+    """Converts a bag to MCAP for Foxglove."""
+    from nics_drl_bridge.extras.bags.convert import convert
+    from nics_drl_bridge.generator import open_model
 
-        if lerobot is None and mcap is None:
-            raise ConfigError(
-                "nothing to write; say --lerobot FOLDER or --mcap FOLDER."
-            )
-        known = None if model is None else open_model(model)
-        lines = []
-        told = dict[str, Any]()
-        if lerobot is not None:
-            from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
-
-            check_output(lerobot)
-        if mcap is not None:
-            from nics_drl_bridge.extras.bags.convert import convert
-
-            added = told["added"] = convert(whole, mcap, known)
-            told["mcap"] = str(mcap)
-            also = f", with {' and '.join(added)} added" if added else ""
-            lines.append(f"bag written to {mcap}{also}")
-        if lerobot is not None:
-            from nics_drl_bridge.extras.bags.frames import frames_of
-
-            frames = frames_of(whole, console.roles_of(topic or []), known, fps, gap)
-            episodes = len(frames.lengths)
-            total = int(frames.lengths.sum())
-            reached = _numbers(succeeded, episodes)
-            write_dataset(
-                frames, lerobot, task, known.robot.name if known else None, reached
-            )
-            if frames.dropped:
-                typer.echo(
-                    f"left out: {frames.dropped} episodes of a single frame", err=True
-                )
-            told |= {
-                "lerobot": str(lerobot),
-                "episodes": episodes,
-                "frames": total,
-                "fps": frames.fps,
-                "left_out": frames.dropped,
-            }
-            counts = f"{episodes} episodes, {total} frames at {frames.fps} Hz"
-            lines.append(f"{counts}, written to {lerobot}")
-        console.say(as_json, "\n".join(lines), **told)
-
-
-@bag.command()
-def salvage(
-    path: BagArgument,
-    out: Annotated[Path, Argument(help="Folder of the bag to write.")],
-    storage: StorageOption = "mcap",
-    as_json: console.JsonOption = False,
-) -> None:
-    """Writes the intact part of a damaged bag to a new one."""
-    from nics_drl_bridge.recording.messages import check_libraries
-
-    check_libraries(path, "reading")
-    from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
-
-    lines = salvage_bag(path, out, _storage(storage)).lines()
-    console.say(
-        as_json, "\n".join((*lines, f"bag written to {out}")), path=str(out), told=lines
-    )
+    added = convert(path, mcap, None if model is None else open_model(model))
+    also = f", with {' and '.join(added)} added" if added else ""
+    console.say(as_json, f"bag written to {mcap}{also}", mcap=str(mcap), added=added)
 
 
 def _storage(name: str) -> Any:
@@ -281,21 +184,6 @@ def _storage(name: str) -> Any:
     if name not in STORAGES:
         raise ConfigError(f"--storage {name!r}: {nearest(name, STORAGES)}")
     return name
-
-
-def _numbers(given: str | None, episodes: int) -> set[int] | None:
-    from nics_drl_bridge.errors import ConfigError
-
-    if given is None:
-        return None
-    if given in ("all", "none"):
-        return set(range(episodes)) if given == "all" else set()
-    words = [word.strip() for word in given.split(",")]
-    if not all(word.isdecimal() for word in words):
-        raise ConfigError(
-            f"--succeeded {given!r}: must be all, none, or numbers as in 0,2,5."
-        )
-    return {int(word) for word in words}
 
 
 def _row(each: Any) -> tuple[str, ...]:

@@ -10,12 +10,8 @@ from typer.testing import CliRunner
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
-import numpy as np
 
 from nics_drl_bridge.commands.cli import app
-from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.write import write_bag
-from nics_drl_bridge.robot.spec import load_robot
 
 
 def nics(*words):
@@ -58,7 +54,7 @@ def test_a_damaged_bag_is_one_sentence_for_every_command(damaged, words):
     assert told.exit_code == 2
     (sentence,) = told.stderr.splitlines()
     assert sentence.startswith(f"nics: {damaged}: ")
-    assert "nics bag salvage" in sentence
+    assert "mcap recover" in sentence
 
 
 @pytest.mark.process
@@ -75,37 +71,3 @@ def test_a_damaged_bag_is_one_sentence_for_the_process_too(damaged):
     assert told.returncode == 2
     (sentence,) = told.stderr.splitlines()
     assert sentence.startswith(f"nics: {damaged}: ")
-
-
-def test_what_is_intact_is_saved_and_the_loss_is_told(damaged, tmp_path):
-    told = nics("bag", "salvage", damaged, tmp_path / "saved")
-    assert told.exit_code == 0, told.output
-    assert "of 360 are lost" in told.stdout
-    assert nics("bag", "info", tmp_path / "saved").exit_code == 0
-    facts = json.loads(
-        nics("bag", "salvage", damaged, tmp_path / "anew", "--json").stdout
-    )
-    assert facts["path"] == str(tmp_path / "anew")
-    assert facts["told"] == told.stdout.splitlines()[:-1]
-    looked = nics("bag", "info", damaged, "--salvage")
-    assert looked.exit_code == 0
-    assert "of 360 are lost" in looked.stderr
-
-
-@pytest.mark.slow
-def test_generate_takes_what_is_intact_when_told_to(tmp_path):
-    car = load_robot("ackermann")
-    bag = tmp_path / "drive"
-    write_bag(textbook.record(car, np.random.default_rng(0), duration=30.0), bag, car)
-    words = ("--robot", "ackermann", "--salvage", "--out", tmp_path / "model")
-    told = nics("generate", cut(bag, 0.8), *words)
-    assert told.exit_code == 0, told.output
-    assert "are lost" in told.stderr
-    assert (tmp_path / "model" / "model.yaml").is_file()
-
-
-def test_what_a_salvaged_bag_lacks_is_said_of_the_users_own(tmp_path):
-    bag = bags.write(tmp_path / "drive", {"/cmd_vel": bags.commands()})
-    told = nics("generate", bag, "--salvage", "--out", tmp_path / "model")
-    assert told.exit_code == 2
-    assert told.stderr.splitlines()[-1].startswith(f"nics: {bag}: ")
