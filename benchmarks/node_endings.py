@@ -42,9 +42,8 @@ PHASES = {
 }
 COLD = ("compiling", "native")  # into an empty cache
 NEVER_COMPILES = ("record_node",)
-MOMENTS_S = (
-    2.0  # after its line, a node is ended at moments that are spread over this time [s]
-)
+# after its line, a node is ended at moments that are spread over this time [s]
+MOMENTS_S = 2.0
 MODEL = ["-p", "model:=ackermann"]
 GIVEN = {
     "command_gate": [*MODEL, "-p", "limits:=ackermann"],

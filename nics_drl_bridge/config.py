@@ -21,9 +21,8 @@ from nics_drl_bridge.errors import ConfigError, nearest, shortened
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
 MAX_BYTES = 2**20  # maximum size of a YAML file
-MAX_VALUES = (
-    50_000  # keys, values and lists; an alias counts as everything it stands for
-)
+# keys, values and lists; an alias counts as everything it stands for
+MAX_VALUES = 50_000
 _LONGEST_PROBLEM = 200
 
 

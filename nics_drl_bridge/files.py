@@ -308,9 +308,8 @@ def sync_folder(folder: Path) -> None:
         _fsync(file)
 
 
-SUMS = (
-    "SHA256SUMS"  # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
-)
+# manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
+SUMS = "SHA256SUMS"
 MOST_BYTES = (
     256 * 2**20
 )  # of a file of arrays: a day of driving, or a table of a thousand shapes

@@ -76,9 +76,8 @@ class SimulatorModel:
     lidar: LidarSpec
     table: LidarTable  # baked ranges of the obstacles' shapes and of the robot itself
     noise: Noise = field(default_factory=Noise)  # of sensors and motion
-    control_period: float = (
-        CONTROL_PERIOD_S  # between commands; a whole number of `kinematics.dt`
-    )
+    # between commands; a whole number of `kinematics.dt`
+    control_period: float = CONTROL_PERIOD_S
     report: str = ""  # how the model was made, as readable text
     latency: Latency = field(
         default_factory=Latency

@@ -136,9 +136,8 @@ class Bicycle:
     """Geometry of a robot that steers; `base_link` is the middle of the unsteered axle."""
 
     wheelbase: float  # [m]
-    front_drive: bool = (
-        False  # the speed is that of the steered wheel, along its own direction
-    )
+    # the speed is that of the steered wheel, along its own direction
+    front_drive: bool = False
 
     def twist(self, speed: Array, angle: Array) -> Array:
         """Returns the body twist (..., 3) of speeds [m/s] and steering angles [rad] (...)."""

@@ -48,9 +48,8 @@ class ForeignRobot:
     ] = ()  # greatest rates of the commands, by the robot's own driver
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)  # pose of the tracked body
     pose_s: float = 0.01  # between poses
-    arm_known: bool = (
-        True  # the tracked point's x is defined, as no other point moves alike
-    )
+    # the tracked point's x is defined, as no other point moves alike
+    arm_known: bool = True
     dead_zone: float | None = None  # greatest throttle at which it stands
     wheels: dict[str, float] = field(default_factory=dict)  # radii and base [m]
     ticks_per_turn: int = 0  # of encoders that are recorded in place of commands

@@ -22,9 +22,8 @@ from nics_drl_bridge.policy.route import route
 
 Array = NDArray[np.float64]
 DEADLINE_S = 300.0
-STUCK_S = (
-    2.0  # silence after which the simulator, which waits for commands, is told a zero
-)
+# silence after which the simulator, which waits for commands, is told a zero
+STUCK_S = 2.0
 REPLAN = 40  # feedbacks after which the path is planned anew
 
 

@@ -14,21 +14,17 @@ class Conditions:
     """Conditions of an evaluation; None leaves the model's lidar, or randomisation and gate out."""
 
     lidar: str | None = None  # shipped lidar or file, instead of the model's
-    randomisation: str | None = (
-        None  # shipped one or file, which draws each episode's numbers
-    )
-    gate: str | None = (
-        None  # limits, shipped or a file, of a gate between policy and robot
-    )
-    steps: int | None = (
-        None  # time limit of an episode; None: that of policies, robot and world
-    )
+    # shipped one or file, which draws each episode's numbers
+    randomisation: str | None = None
+    # limits, shipped or a file, of a gate between policy and robot
+    gate: str | None = None
+    # time limit of an episode; None: that of policies, robot and world
+    steps: int | None = None
     task: Mapping[str, Any] = field(
         default_factory=dict
     )  # options, instead of the policy's own
-    kind: str | None = (
-        None  # path/to/file.py:ClassName of a policy's task, if it is not shipped
-    )
+    # path/to/file.py:ClassName of a policy's task, if it is not shipped
+    kind: str | None = None
 
     @property
     def ranges(self) -> Randomisation | None:

@@ -72,20 +72,16 @@ class DemoPlan:
     """Plan of a demo."""
 
     out: Path  # output folder
-    robot: str | None = (
-        None  # name or YAML file, as the world; None: as the recording tells
-    )
+    # name or YAML file, as the world; None: as the recording tells
+    robot: str | None = None
     world: str = "arena"
-    recording: Path | None = (
-        None  # of a drive; None makes one with the robot's textbook kinematics
-    )
+    # of a drive; None makes one with the robot's textbook kinematics
+    recording: Path | None = None
     episodes: int = 5  # number of episodes, in process and again over DDS
-    policy: str | None = (
-        None  # a policy file or a name, to drive with instead of training one
-    )
-    train_steps: int | None = (
-        None  # environment steps of the training; None: as in `demo.yaml`
-    )
+    # a policy file or a name, to drive with instead of training one
+    policy: str | None = None
+    # environment steps of the training; None: as in `demo.yaml`
+    train_steps: int | None = None
 
     @property
     def model(self) -> Path:

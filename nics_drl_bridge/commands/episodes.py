@@ -57,9 +57,8 @@ GATE = "command_gate"
 RAW = "cmd_vel_raw"
 LISTEN_S = 5.0
 ARM_S = 60.0
-START_S = (
-    180.0  # time that a node may take to start [s]; its kernels may have to be compiled
-)
+# time that a node may take to start [s]; its kernels may have to be compiled
+START_S = 180.0
 PANELS = 6
 HEADS = (
     "policy",
@@ -215,9 +214,8 @@ class EvaluationOrder:
 
     policies: Sequence[str]  # files, or names of shipped policies or of baselines
     out: Path  # output folder
-    model: str | None = (
-        None  # folder of a model or a shipped robot; None: the policies' own robot
-    )
+    # folder of a model or a shipped robot; None: the policies' own robot
+    model: str | None = None
     world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
     seed: int = evaluation.FIRST_SEED

@@ -37,9 +37,8 @@ class GoalOrder:
     """
 
     point: Point | None = None  # x, y [m]; None: the world's own, of each episode
-    frame: str | None = (
-        None  # None: `robot` where the start is the present place, else `map`
-    )
+    # None: `robot` where the start is the present place, else `map`
+    frame: str | None = None
     start: str = WAIT  # or PRESENT
     localised: bool = False  # a pose sensor tells where the robot is in `map`
     confirm_beyond_m: float = FAR_M

@@ -15,9 +15,8 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
-LIMIT = (
-    1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
-)
+# Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
+LIMIT = 1000.0
 ONE = np.float32(1.0).view(np.int32)
 BLOCK = 64  # Beams that are looked at together
 FURTHEST = np.float32(0.04)  # What a beam may say for or against a contact, at most [m]

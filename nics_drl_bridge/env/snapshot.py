@@ -25,9 +25,8 @@ class Snapshot:
     estimates: Array | None = None  # (M, 3) poses that the robots believe in
     covariance: Array | None = None  # (M, 3, 3) of the estimates [m, rad]
     commands: Array | None = None  # (M, C) that the robots follow
-    gate: str | None = (
-        None  # rule of the gate that stopped the command, `shield`, or "" if none
-    )
+    # rule of the gate that stopped the command, `shield`, or "" if none
+    gate: str | None = None
 
 
 def goals_of(memory: Mapping[str, NDArray[Any]]) -> Array:

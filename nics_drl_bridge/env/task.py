@@ -86,23 +86,20 @@ class Task(ABC):
 
     # True if a method uses `before.ranges`; otherwise these may be the new ones, without a copy
     keeps_last_scan: ClassVar[bool] = True
-    observes_sensors: ClassVar[bool] = (
-        False  # True if it observes the further `sensors`
-    )
+    # True if it observes the further `sensors`
+    observes_sensors: ClassVar[bool] = False
     shown: ClassVar[
         tuple[str, ...]
     ] = ()  # names of memory arrays that `info` always contains
 
     robot: RobotSpec  # gives commands, their limits, and the footprint
     lidar: LidarSpec  # gives the scan
-    actions: Actions = (
-        "continuous"  # a Box, or `discrete`: the paper's drives, see `DRIVES`
-    )
+    # a Box, or `discrete`: the paper's drives, see `DRIVES`
+    actions: Actions = "continuous"
     # returns this close to the footprint count as a contact [m], in the mean of `CONTACT_ANGLE`
     contact_margin: float = 0.02
-    top_speed: float | None = (
-        None  # of commands in m/s, where the robot's limits are wider [m/s]
-    )
+    # of commands in m/s, where the robot's limits are wider [m/s]
+    top_speed: float | None = None
     # sectors instead of beams, to mean the same for any lidar; contact is judged from the beams
     scan: ScanLayout | None = None
     sensors: tuple[Sensor, ...] = ()  # further ones, whose shares end each observation

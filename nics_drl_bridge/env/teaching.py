@@ -15,12 +15,10 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 class Teaching(Schema):
     """Rewards by what only the simulator knows, and repetition; nothing by default."""
 
-    contact: float | None = (
-        None  # reward of a contact that the task misses, which ends the episode
-    )
-    path: float = (
-        0.0  # reward of each metre by which the way around obstacles gets shorter
-    )
+    # reward of a contact that the task misses, which ends the episode
+    contact: float | None = None
+    # reward of each metre by which the way around obstacles gets shorter
+    path: float = 0.0
     retries: int = Field(
         default=0, ge=0, le=1000
     )  # times that a failed episode is driven again

@@ -153,9 +153,8 @@ class BridgeVectorEnv(
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
-        self.ready = (
-            False  # False after an exception too, which leaves worlds between two steps
-        )
+        # False after an exception too, which leaves worlds between two steps
+        self.ready = False
 
     def teach(self, given: Teaching) -> None:
         """Adds rewards beside the task's from the next reset on, and retries in `SameStep`."""

@@ -24,12 +24,10 @@ FORMAT = "nics_drl_bridge/black_box/4"
 KEPT_S = 30.0
 LATEST_S = 1e12
 MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
-MOST_VALUES = (
-    1_000_000  # greatest number of values in such a file; 30 s of a gate have 100,000
-)
-MOST_INPUTS = (
-    20_000  # greatest number of inputs that are decided on again; each takes some 30 us
-)
+# greatest number of values in such a file; 30 s of a gate have 100,000
+MOST_VALUES = 1_000_000
+# greatest number of inputs that are decided on again; each takes some 30 us
+MOST_INPUTS = 20_000
 
 
 class Entry(NamedTuple):

@@ -130,21 +130,18 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     return Cause("no_motion", ODOM, detail)
 
 
-SAME_SHARE = (
-    0.99  # two scans with this share of equal beams are the same; one may always differ
-)
-TELLING_SHARE = (
-    0.9  # a scan is old if this share of the beams that must have changed did not
-)
+# two scans with this share of equal beams are the same; one may always differ
+SAME_SHARE = 0.99
+# a scan is old if this share of the beams that must have changed did not
+TELLING_SHARE = 0.9
 CHANGE = 0.02  # least change of a beam that must have changed [m]
 HEADINGS = (
     -0.03,
     0.0,
     0.03,
 )  # errors of odometry for all of which a beam must have changed [rad]
-NEIGHBOURS = (
-    1.5  # an old beam is compared with beams at most this many beam spacings away
-)
+# an old beam is compared with beams at most this many beam spacings away
+NEIGHBOURS = 1.5
 LEAST_BEAMS = 3
 
 

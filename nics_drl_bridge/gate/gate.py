@@ -24,17 +24,15 @@ from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
 
 Taken = tuple[GateState, str]  # and the reason why an input is not taken, or ""
-GREATEST_SPEED = (
-    100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
-)
+# greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
+GREATEST_SPEED = 100.0
 SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
 """A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
 # jump of an odometry pose that may come from imprecision [m, rad]
 LEAP = 0.1
 LEAP_TURN = 0.2
-ANGLE_TOLERANCE = (
-    1e-3  # greatest deviation of the last beam from its declared angle [rad]
-)
+# greatest deviation of the last beam from its declared angle [rad]
+ANGLE_TOLERANCE = 1e-3
 BEHIND_S = 0.2  # by which irregular stamps may fall behind while the gate settles
 Check = Callable[
     [GateConfig, GateState, inputs.Arm, float], str

@@ -13,9 +13,8 @@ from nics_drl_bridge.sim.collision_kernels import Outline
 
 CELL, CELLS = 0.05, 48
 """Width of a cell [m], and their number along each side of what is remembered."""
-REMEMBERED_S = (
-    30.0  # time after which ground is forgotten, but for what is beside the robot [s]
-)
+# time after which ground is forgotten, but for what is beside the robot [s]
+REMEMBERED_S = 30.0
 
 
 def look(

@@ -52,9 +52,8 @@ class Command:
 
     stamp_ns: int  # of the scan it was computed from
     twist: Array  # (3,) linear.x, linear.y, angular.z of `cmd_vel`
-    source: str = (
-        ""  # its publisher, in words; empty if the middleware does not tell it
-    )
+    # its publisher, in words; empty if the middleware does not tell it
+    source: str = ""
     publishers: int = 1  # then: how many publish on its topic
 
 

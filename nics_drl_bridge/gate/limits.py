@@ -13,12 +13,10 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
-IMPLAUSIBLE = (
-    10.0  # a command beyond this multiple of its limit is a fault, and refused
-)
-LEAST_STEP_S = (
-    1e-3  # motions closer in time are not published: their derivatives would be noise
-)
+# a command beyond this multiple of its limit is a fault, and refused
+IMPLAUSIBLE = 10.0
+# motions closer in time are not published: their derivatives would be noise
+LEAST_STEP_S = 1e-3
 PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the whole range within one is a typo
 SNAP = 1e-12  # a value this close to its target, as a share of the greatest value, has reached it
 GREATEST = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
@@ -26,16 +24,14 @@ STILL = 1e-9
 LEAST_NORMAL = float(
     np.finfo(np.float64).tiny
 )  # numbers nearer to zero lose digits: denormal
-LEAST_MOTION = (
-    0.01  # if no speed may exceed this, the robot can't be driven [m/s or rad/s]
-)
+# if no speed may exceed this, the robot can't be driven [m/s or rad/s]
+LEAST_MOTION = 0.01
 LONGEST_START_S, STARTED = 10.0, 0.01
 """Within the first [s] a command must be able to reach the second (share of its greatest value)."""
 SPEED = "m/s"
 TURN = "rad/s"
-CAR_TURN = (
-    4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
-)
+# greatest turn rate of a robot that is commanded by steering angle [rad/s]
+CAR_TURN = 4.0
 
 
 class CommandLimit(Schema):

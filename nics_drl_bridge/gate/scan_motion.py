@@ -71,12 +71,10 @@ class Settings:
     sector_share: float = 0.45
     held_share: float = 0.2
     greatest_changed: float = 0.5
-    confirmed_s: float = (
-        0.15  # time over which scans must say so, without one that says otherwise
-    )
-    forgotten_s: float = (
-        1.0  # time after which an unconfirmed contradiction is forgotten
-    )
+    # time over which scans must say so, without one that says otherwise
+    confirmed_s: float = 0.15
+    # time after which an unconfirmed contradiction is forgotten
+    forgotten_s: float = 1.0
 
 
 SETTINGS = Settings()

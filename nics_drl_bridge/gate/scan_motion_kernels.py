@@ -7,9 +7,8 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 
-LARGEST_WINDOW = (
-    129  # beams; a direction of a denser lidar is the median of some of its beams
-)
+# beams; a direction of a denser lidar is the median of some of its beams
+LARGEST_WINDOW = 129
 
 
 class Directions(NamedTuple):

@@ -35,9 +35,8 @@ FINEST = 6  # bisections of the scale
 SPEEDS, TURNS = 3, 9
 """Arcs of the family: number of speeds along each axis, and number of turn rates."""
 CREEP = 0.1  # a speed that is not safe at this [m/s] would use up what a turn on the spot needs
-MOVING = (
-    0.1  # above this speed the ratio of turn rate to speed gives the curvature [m/s]
-)
+# above this speed the ratio of turn rate to speed gives the curvature [m/s]
+MOVING = 0.1
 CALM = 0.5  # share of its deceleration with which the robot should stop when nothing is sudden
 STEP = 0.02  # distance between two checked places of the footprint on an arc [m]
 WALL_M = 0.05  # greatest distance between places of a wall on the footprint [m]

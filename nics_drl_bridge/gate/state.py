@@ -39,20 +39,17 @@ class ShieldConfig:
     margin: float  # clearance kept around the footprint [m]
     hold_s: float  # longest time until the next decision
     footprint_radius: float  # of the circle around the robot [m]
-    wheelbase: float = (
-        0.0  # of a car, which is commanded by steering angle [m]; 0 for others
-    )
-    obstacle_speed: float = (
-        0.0  # of moving obstacles that approach [m/s]; 0: all are static
-    )
+    # of a car, which is commanded by steering angle [m]; 0 for others
+    wheelbase: float = 0.0
+    # of moving obstacles that approach [m/s]; 0: all are static
+    obstacle_speed: float = 0.0
     range_max: float = INF  # of the lidar [m]
     range_noise: tuple[float, float] = (
         0.0,
         0.0,
     )  # std, in metres and as a share of the range
-    unknown_share: float = (
-        0.5  # of unknown beams from which a direction counts as blocked
-    )
+    # of unknown beams from which a direction counts as blocked
+    unknown_share: float = 0.5
     unknown_width: float = 0.35  # angle over which that share is taken [rad]
     # Corners of the footprint in `base_link`, in order [m]; none of a robot that is a circle.
     outline: tuple[tuple[float, float], ...] = ()
@@ -78,31 +75,25 @@ class GateConfig:
     range_min: float  # of the lidar [m]
     scan_rate: float  # declared [Hz]
     odom_rate: float  # declared [Hz]
-    odom_rate_declared: bool = (
-        True  # else it is the least that a model needs: more is as good
-    )
+    # else it is the least that a model needs: more is as good
+    odom_rate_declared: bool = True
     range_max: float = 0.0  # of the lidar [m]; 0 if unknown
-    scan_age_s: float = (
-        0.30  # greatest age of the newest scan, and of the scan behind a command
-    )
+    # greatest age of the newest scan, and of the scan behind a command
+    scan_age_s: float = 0.30
     odom_age_s: float = 0.30  # greatest age of the newest odometry
     command_age_s: float = 0.30  # greatest age of the newest command
     race_s: float = 0.05  # time by which a command may overtake its scan
-    settle_s: float = (
-        1.0  # for which data must be fresh and the robot at rest before arming
-    )
+    # for which data must be fresh and the robot at rest before arming
+    settle_s: float = 1.0
     rate_tolerance: float = 0.3  # relative deviation of a rate from the declared one
     # A stamp this far back, or before arming this far ahead, is a jump; if armed, see `AHEAD_S`.
     clock_jump_s: float = 0.5
-    clock_rate: float = (
-        1.0  # of the stamps [s/s]; not 1 only in a simulation out of real time
-    )
-    simulated: bool = (
-        False  # stamps are those of a simulator, which may fall behind real time
-    )
-    gap_s: float = (
-        0.2  # longest time between two ticks, and length of the stop after a longer one
-    )
+    # of the stamps [s/s]; not 1 only in a simulation out of real time
+    clock_rate: float = 1.0
+    # stamps are those of a simulator, which may fall behind real time
+    simulated: bool = False
+    # longest time between two ticks, and length of the stop after a longer one
+    gap_s: float = 0.2
     e_stop_required: bool = True  # one that was never heard counts as pressed
     e_stop_silence_s: float = 0.25  # after which one that was heard counts as pressed
     estimate_required: bool = True  # arming needs an estimator that has converged
@@ -110,13 +101,11 @@ class GateConfig:
     estimate_position: float = 0.5  # [m]
     estimate_heading: float = 0.3  # [rad]
     estimate_silence_s: float = 0.5  # greatest age of the estimate for that
-    frozen_distance: float = (
-        0.2  # path over which identical scans are frozen [m, or rad turned]
-    )
+    # path over which identical scans are frozen [m, or rad turned]
+    frozen_distance: float = 0.2
     stuck_s: float = 1.0  # time without motion while commanded that causes a stop
-    stop_when_held: bool = (
-        True  # stop when scans show none of the motion that odometry shows
-    )
+    # stop when scans show none of the motion that odometry shows
+    stop_when_held: bool = True
     odom_std: tuple[float, float] = (0.0, 0.0)  # of odometry's twist [m/s, rad/s]
     range_noise: tuple[float, float] = (
         0.0,
@@ -213,9 +202,8 @@ class EstimateTrack:
     marks: tuple[
         EstimateMark, ...
     ] = ()  # recent ones, oldest first; the first is the origin
-    fault: str = (
-        ""  # why the newest estimate does not go on from them; it is the new origin
-    )
+    # why the newest estimate does not go on from them; it is the new origin
+    fault: str = ""
     last_fault: str = ""  # the newest such reason
 
 
@@ -233,13 +221,11 @@ class ScanMotion:
     """Whether recent scans show the motion that odometry shows."""
 
     views: tuple[ReducedScan, ...] = ()  # recent ones, oldest first
-    held_since_ns: int | None = (
-        None  # stamp of the first scan that contradicts odometry
-    )
+    # stamp of the first scan that contradicts odometry
+    held_since_ns: int | None = None
     held: str = ""  # what the newest scan contradicts, once others have before
-    share: float = (
-        NAN  # of the motion by odometry that the newest scan shows; NaN: undecided
-    )
+    # of the motion by odometry that the newest scan shows; NaN: undecided
+    share: float = NAN
 
 
 @dataclass(frozen=True)
@@ -272,9 +258,8 @@ class EStopState:
 
     latched: bool = False  # it was pressed, and not reset since
     held: bool = False  # its topic last reported it as pressed
-    heard_s: float | None = (
-        None  # time of the last message on its topic; None if there was none
-    )
+    # time of the last message on its topic; None if there was none
+    heard_s: float | None = None
     reason: str = ""  # why a press may have been missed; empty if it was heard
 
 
@@ -316,15 +301,13 @@ class GateState:
     estimates: EstimateTrack = EstimateTrack()
     command_s: float = -INF
     pending: Command | None = None  # whose scan has not arrived yet
-    pending_s: float | None = (
-        None  # since when commands name such scans; None: the newest does not
-    )
+    # since when commands name such scans; None: the newest does not
+    pending_s: float | None = None
     views: tuple[
         View, ...
     ] = ()  # recent ones, for the detection of motion; empty without shield
-    ground: Ground | None = (
-        None  # None if the lidar sees all around, and without shield
-    )
+    # None if the lidar sees all around, and without shield
+    ground: Ground | None = None
     # (P, 3) in the newest scan: x, y in `base_link` [m], and greatest speed of each [m/s].
     obstacles: Array | None = None
     behind_s: float = (

@@ -26,9 +26,8 @@ SHIELD_SPANS = {  # beyond them the robot could never move
     "obstacle_speed": (0, 100),
 }
 HARDEST = SHIELD_SPANS["deceleration"][1]
-LEAST_DATA = (
-    2  # least number that must arrive while the gate settles, for a rate to be known
-)
+# least number that must arrive while the gate settles, for a rate to be known
+LEAST_DATA = 2
 
 
 def gate_config(

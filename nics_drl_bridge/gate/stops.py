@@ -20,19 +20,16 @@ SCAN = "scan"
 ODOM = "odom"
 RAW = "cmd_vel_raw"
 E_STOP = "e_stop"
-KEPT = (
-    64  # number of remembered stamps; a command on an older scan is on an unknown one
-)
+# number of remembered stamps; a command on an older scan is on an unknown one
+KEPT = 64
 MARK_S = 0.05  # time between two marks [s]
 DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
 SIMULATED_LAG = 0.2  # share of real time that a simulator may lose
-AHEAD_S = (
-    0.1  # data of an armed gate that lead the envelope by this are from the future [s]
-)
+# data of an armed gate that lead the envelope by this are from the future [s]
+AHEAD_S = 0.1
 SOURCE_S = 1.0  # time after which another publisher's first command is no turn, but a new start [s]
-FROZEN_INPUTS = (
-    20  # a running clock does not give this many inputs in a row the same time
-)
+# a running clock does not give this many inputs in a row the same time
+FROZEN_INPUTS = 20
 
 
 def arrived(

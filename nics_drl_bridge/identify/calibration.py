@@ -29,9 +29,8 @@ UNIFORM = 1e-6
 WHOLE = 1e-6  # a period of so nearly a whole number of steps has one
 SAME_STEP = 1e-3  # share of a step by which rounded stamps may change it
 SHARED = 0.5  # minimum share of rows with common stamps; only then are the other rows dropped
-STATE_GAP = (
-    2.5  # rates are unknown between states that are this many median steps apart
-)
+# rates are unknown between states that are this many median steps apart
+STATE_GAP = 2.5
 
 
 @dataclass(frozen=True)
@@ -51,9 +50,8 @@ class Calibration:
     clock_offset_s: float = 0.0  # added to the pose's stamps, gives the commands' clock
     # from a command's stamp to its effect
     command_latency_s: Annotated[float, Field(le=LONGEST_DELAY_S)] = 0.0
-    rotation_rad: float = (
-        0.0  # heading of `base_link` minus the heading of the tracked body
-    )
+    # heading of `base_link` minus the heading of the tracked body
+    rotation_rad: float = 0.0
     lever_arm_m: tuple[float, float] = (
         0.0,
         0.0,
@@ -68,16 +66,13 @@ class Calibration:
         default_factory=dict
     )  # of inferred states' rates
     burst_period_s: NonNegativeFloat = 0.0  # between bursts of poses; 0 without bursts
-    position_noise_m: NonNegativeFloat = (
-        0.0  # standard deviation of x and y of the pose
-    )
+    # standard deviation of x and y of the pose
+    position_noise_m: NonNegativeFloat = 0.0
     heading_noise_rad: NonNegativeFloat = 0.0
-    wheel_scale: float | None = (
-        None  # speed per unit of the wheels' mean [m/s]; None if unknown
-    )
-    turn_scale: float | None = (
-        None  # yaw rate per unit of right wheel minus left [rad/s]
-    )
+    # speed per unit of the wheels' mean [m/s]; None if unknown
+    wheel_scale: float | None = None
+    # yaw rate per unit of right wheel minus left [rad/s]
+    turn_scale: float | None = None
     wheels_swapped: bool | None = None  # left and right interchanged; None if unknown
     # Standard uncertainty of each estimated value, by the names above.
     uncertainty: dict[str, Annotated[float, AllowInfNan()]] = field(

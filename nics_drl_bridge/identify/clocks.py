@@ -53,12 +53,10 @@ MIN_TIME_S = 5e-4
 CERTAIN = 3.0  # a correction below this many standard uncertainties is not made
 CLUSTER_S = 2.5  # residuals further apart are independent
 NO_LAG_S = 0.005
-MOST_UNEXPLAINED = (
-    0.5  # share of a motion's variance, beyond which no delay is believed
-)
-EARLY_WORTH = (
-    0.8  # a motion precedes its commands if that takes what is left to this share
-)
+# share of a motion's variance, beyond which no delay is believed
+MOST_UNEXPLAINED = 0.5
+# a motion precedes its commands if that takes what is left to this share
+EARLY_WORTH = 0.8
 # The delay is sought in so many parts of a drive, this far around that of the whole. It drifts if
 # it grows by more than the least, and the parts lie on a line to this share of its growth.
 DRIFT_PARTS = 4
@@ -215,12 +213,10 @@ class TimingEstimate:
     lags: Array  # (S,) of the inferred states [s]; empty if the state was measured
     lag_sigma: Array  # (S,) [s]; NaN for a nominal lag
     separated: bool  # True if offset and latency could be separated
-    early: float = (
-        0.0  # by which motion on the commands' clock precedes them: no clock of it [s]
-    )
-    drift: float = (
-        0.0  # by which the pose's clock gains on the commands' [s/s]; 0 if none shows
-    )
+    # by which motion on the commands' clock precedes them: no clock of it [s]
+    early: float = 0.0
+    # by which the pose's clock gains on the commands' [s/s]; 0 if none shows
+    drift: float = 0.0
     # (S,) by which inferred states follow their commands after the latency, beside lags [s]
     delays: Array = field(default_factory=lambda: np.zeros(1))
     motors: Motors | None = None  # of inferred states; None if nothing holds them back

@@ -6,9 +6,8 @@ from nics_drl_bridge.identify.acceptance import usual
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.robot.taylor import HorizonErrors
 
-HARDLY = (
-    0.8  # share of the errors of a constant twist from which on commands hardly help
-)
+# share of the errors of a constant twist from which on commands hardly help
+HARDLY = 0.8
 LONGEST_S = 1.0  # latencies that are longer,
 EARLIEST_S = -0.2  # or shorter, are implausible
 

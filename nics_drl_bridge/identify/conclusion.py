@@ -14,9 +14,8 @@ from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.taylor import EndErrors
 
 OF_PATH = " of the path"
-ENOUGH_S = (
-    60.0  # of a drive; the errors of a longer one have other causes than its length
-)
+# of a drive; the errors of a longer one have other causes than its length
+ENOUGH_S = 60.0
 UNSEEN = "otherwise a policy would rely on motion the model never saw"
 UNTRIED = "The drive was too short to test the model on unseen data."
 

@@ -19,12 +19,10 @@ from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MIN_STAMPS = 20
-BURSTY = (
-    5.0  # in bursts the mean interval is more than this many times the 30th percentile
-)
-WITHIN_BURST = (
-    0.25  # stamps less than this share of the period apart belong to one burst
-)
+# in bursts the mean interval is more than this many times the 30th percentile
+BURSTY = 5.0
+# stamps less than this share of the period apart belong to one burst
+WITHIN_BURST = 0.25
 UNEVEN = 0.5
 LEAST_WHOLE = 0.1  # share of gap-free stretches from which on only those are used
 NEGLIGIBLE = 1e-6  # m, rad
@@ -44,9 +42,8 @@ class Settings:
     train_until_s: float = float(
         "inf"
     )  # end of the part to learn from, from the first pose
-    assume: bool = (
-        False  # completes the model by the textbook for inputs that never moved
-    )
+    # completes the model by the textbook for inputs that never moved
+    assume: bool = False
     strict: bool = False  # refuses a drive that did not move every input independently
     control_period_s: float = 0.1  # of which the model's step is to be a part
 

@@ -13,17 +13,14 @@ from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_o
 from nics_drl_bridge.robot.spec import RobotSpec
 
 STILL = 1e-3  # a variable whose spread is below this share of its range did not move
-NOISE_ONLY = (
-    1.5  # nor did a state below this multiple of its noise whose command did not move
-)
+# nor did a state below this multiple of its noise whose command did not move
+NOISE_ONLY = 1.5
 DEPENDENT = 1e-7  # a normalised feature with a smaller part orthogonal to those before is a copy
-TOGETHER = (
-    1e-3  # commands are linearly dependent if a normalised combination is smaller
-)
+# commands are linearly dependent if a normalised combination is smaller
+TOGETHER = 1e-3
 MIN_SAMPLES_PER_TERM = 5
-NEGLIGIBLE = (
-    1e-3  # a velocity component below this share of the other one is modelled as zero
-)
+# a velocity component below this share of the other one is modelled as zero
+NEGLIGIBLE = 1e-3
 NOISY = 5e-4  # a measured state is noisy if its noise exceeds this share of its range
 BULK = 0.75  # share of the rows used in the initial fit
 CONCENTRATIONS = 12
@@ -40,9 +37,8 @@ BULK_PERCENTILE = 90.0
 GAUSSIAN_BULK = 1.645
 GRID_S = 0.05
 ENDS = (2.0, 98.0)  # percentiles that bound the range of a command
-NARROW = (
-    0.4  # a drive over a smaller share of a command's range says little about the rest
-)
+# a drive over a smaller share of a command's range says little about the rest
+NARROW = 0.4
 
 
 @dataclass(frozen=True)

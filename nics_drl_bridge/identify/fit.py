@@ -26,9 +26,8 @@ Library = Callable[
 
 ALPHA: Alpha = 0.99
 ORDER = 2
-ROUNDING = (
-    1e-9  # standardised coefficients below this share of the rates are rounding errors
-)
+# standardised coefficients below this share of the rates are rounding errors
+ROUNDING = 1e-9
 SAME_STEP = 1e-3
 ROUNDING_S = 1e-6
 

@@ -45,9 +45,8 @@ WORTH = 0.8  # and to this one once all is adjusted to it
 # Standard deviation of a uniform distribution about one of its ends, as a share of its width: a
 # lag before a limit looks like a delay, which may be none.
 END = 3.0**-0.5
-EXPLAINED = (
-    0.5  # a component of the twist counts if commands leave less than this share of it
-)
+# a component of the twist counts if commands leave less than this share of it
+EXPLAINED = 0.5
 NO_EFFECT = 1e-6  # a limit or dead zone is not determined by less than this share of the residual
 WIDER = 5.0  # times by which a limit may change while it is adjusted
 

@@ -41,15 +41,12 @@ CURVE_SCALE = 0.1
 # of a gain backwards
 BACK_SCALE = 0.2
 BACK_RANGE = (0.2, 5.0)
-SMALL_DEAD = (
-    0.05  # share of a command's reach at which the search for a dead zone begins
-)
-TWO_WAY = (
-    0.05  # share of the rows in which a command drives backwards, to tell its gain
-)
-NEAR_END = (
-    0.01  # share of a command's reach by which it must exceed the end of its curve
-)
+# share of a command's reach at which the search for a dead zone begins
+SMALL_DEAD = 0.05
+# share of the rows in which a command drives backwards, to tell its gain
+TWO_WAY = 0.05
+# share of a command's reach by which it must exceed the end of its curve
+NEAR_END = 0.01
 SELDOM = 1.0  # percentage of a drive that is to exceed a limit of a rate
 STRONG = 95.0  # percentile of the rates at which limits are first sought
 LEVER_SCALE_M = 0.05
@@ -142,9 +139,8 @@ class Form:
     limits: tuple[str, ...] = ()  # states with a greatest fall and rise
     back: tuple[str, ...] = ()  # commands whose curve has a gain of its own backwards
     drag: tuple[str, ...] = ()  # states with a drag by their square, and a back-EMF
-    tyres: bool = (
-        False  # True if a car turns less at speed than its textbook, and slips aside
-    )
+    # True if a car turns less at speed than its textbook, and slips aside
+    tyres: bool = False
     delays: tuple[
         tuple[str, float], ...
     ] = ()  # likely ones of all commands [s]; (): they share it

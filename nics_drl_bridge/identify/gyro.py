@@ -20,9 +20,8 @@ from nics_drl_bridge.recording.heading import (
 from nics_drl_bridge.recording.recording import Recording
 
 LEAST_COVERED = 0.9  # share of a drive for which there must be a gyro
-UNLIKE_TRACKER = (
-    0.1  # difference from 1 of the ratio of turns, if the gyro is to fit a tracker
-)
+# difference from 1 of the ratio of turns, if the gyro is to fit a tracker
+UNLIKE_TRACKER = 0.1
 
 
 def turned_by_gyro(recording: Recording) -> Recording:

@@ -76,9 +76,8 @@ class Findings:
     whole: Drive  # repaired by `repair`
     timing: timings.TimingEstimate  # of `clocks`; nominal before
     repairs: tuple[str, ...] = ()  # sentences of `repair`
-    speed: Array | None = (
-        None  # (n,) expected over the training part's twists, of `mounting`
-    )
+    # (n,) expected over the training part's twists, of `mounting`
+    speed: Array | None = None
     mounting: Mounting | None = None  # of `mounting`
     # Of `clocks`, `mounting`, `responses` and `noise`; then of `refine`.
     calibration: Calibration = field(default_factory=Calibration)
@@ -99,22 +98,18 @@ class Findings:
     refinement: tuple[str, ...] = ()  # sentences of `refine`
     assumptions: tuple[str, ...] = ()  # sentences of `complete`
     unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
-    held_out: open_loop.OpenLoop | None = (
-        None  # open-loop errors on that part, of `judge`
-    )
+    # open-loop errors on that part, of `judge`
+    held_out: open_loop.OpenLoop | None = None
     judgement: tuple[
         HorizonErrors, ...
     ] = ()  # on that part, beside yardsticks, of `judge`
-    yardstick: Yardstick | None = (
-        None  # the textbook fitted to the training part, of `judge`
-    )
-    replaced: str = (
-        ""  # sentence on the model in whose place the textbook was put, of `settle`
-    )
+    # the textbook fitted to the training part, of `judge`
+    yardstick: Yardstick | None = None
+    # sentence on the model in whose place the textbook was put, of `settle`
+    replaced: str = ""
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
-    refit: "Findings | None" = (
-        None  # on all data, of `refit`; None if the trial's model is kept
-    )
+    # on all data, of `refit`; None if the trial's model is kept
+    refit: "Findings | None" = None
 
 
 Stage = Callable[[Drive, Findings], Findings]

@@ -10,12 +10,10 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import bounds_of, emf_of, next_state
 
-WIDTH = (
-    16  # windows that are predicted at a time: vector instructions take some at once
-)
-SMALL_TURN = (
-    0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
-)
+# windows that are predicted at a time: vector instructions take some at once
+WIDTH = 16
+# below this angle the series of sin(a)/a is exact to the last digits [rad]
+SMALL_TURN = 0.3
 
 
 @kernel(allocates=True)

@@ -25,9 +25,8 @@ from nics_drl_bridge.robot.spec import (
 )
 
 WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
-NOISE = (
-    0.02  # share of the usual speed, and turn rate, that the noise of a twist may reach
-)
+# share of the usual speed, and turn rate, that the noise of a twist may reach
+NOISE = 0.02
 SAMPLES = 2.5  # half a width holds at least this many samples
 # steps of models, by that of the poses
 FINE_S = 0.01

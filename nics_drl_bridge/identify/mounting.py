@@ -27,9 +27,8 @@ DISTINCT = 4.0  # the second direction of motion must exceed the noise by this f
 MIN_SECOND = 0.05  # it must have at least this share of the size of the first
 STILL = 1e-3
 ONE_WAY = 0.05  # share of all turning that does not count as the other way
-FLAT = (
-    0.02  # less of the direction without extent lies in the plane: it only never turned
-)
+# less of the direction without extent lies in the plane: it only never turned
+FLAT = 0.02
 MIN_LENGTH = 1e-4  # m, rad
 REGULAR = 0.8
 BLOCKS = 8

@@ -25,18 +25,15 @@ SPACING_S = 0.25
 GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
-OUTLYING = (
-    10.0  # a window whose error is more than this many times the median contains a jump
-)
-RUN_AWAY_M = (
-    1e4  # a larger error of a prediction over a second is divergence, not drift
-)
+# a window whose error is more than this many times the median contains a jump
+OUTLYING = 10.0
+# a larger error of a prediction over a second is divergence, not drift
+RUN_AWAY_M = 1e4
 BLOCKS = 8
 TINY = 1e-9
 NEGLIGIBLE = 1e-4  # a smaller level is rounding: a tenth of a millimetre after a second
-WITHIN_SIGMA = (
-    68.27  # percentage of a normal distribution within one standard deviation
-)
+# percentage of a normal distribution within one standard deviation
+WITHIN_SIGMA = 68.27
 MIN_ROWS = 40
 
 

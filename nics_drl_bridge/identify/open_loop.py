@@ -18,9 +18,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 HORIZON_S = 5.0
 SPACING_S = 0.1
 SETTLE_S = 1.0  # windows start no sooner than this after the first command if the state is inferred
-END_TOLERANCE = (
-    0.6  # from a window's end to the nearest sample, as a share of the period
-)
+# from a window's end to the nearest sample, as a share of the period
+END_TOLERANCE = 0.6
 
 
 @dataclass(frozen=True)

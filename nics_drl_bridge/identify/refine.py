@@ -33,9 +33,8 @@ HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distan
 OUTLYING = 10.0  # a window whose error is this many times the median contains a jump,
 OUTLYING_SHARE = 0.25  # if the error is also more than this share of the longest path
 MOST_OUTLIERS = 0.3
-STEEPEST = (
-    1e100  # slopes of a diverging model are clipped, so that their scaling stays finite
-)
+# slopes of a diverging model are clipped, so that their scaling stays finite
+STEEPEST = 1e100
 TURN_RAD = 1e-5  # step of the finite difference by the rotation
 DIVERGED = 1e3
 LEAST_SCALE = 0.05
@@ -312,9 +311,8 @@ def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     # An inferred speed is that along the direction of travel, vx = 1 speed; known lags are fixed.
     free = model.coefficients != 0.0
     if not calibration.responses:
-        free[3:] = (
-            False  # the rates of a measured state were fitted to that state itself
-        )
+        # the rates of a measured state were fitted to that state itself
+        free[3:] = False
     for i, response in enumerate(calibration.responses):
         alone, command = linear_terms(model, response.state, response.command)
         if alone is None:

@@ -41,14 +41,12 @@ JUMP_TURN = 0.3
 AROUND = 5  # steps on either side of one
 TOLD = 3  # jumps that are told one by one
 MOST_JUMPS = 0.02  # of the steps: more of them are noise
-MOST = (
-    0.15  # jumps in more than this share of the rows are not faults of single samples
-)
+# jumps in more than this share of the rows are not faults of single samples
+MOST = 0.15
 HELD_S = 0.5  # a pose that keeps one value for longer, and then leaps, was held
 EXCESS = 0.01  # commands may exceed their limits by this share of their range
-WRONG_UNIT = (
-    5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
-)
+# times the limit is another unit: degrees are 57, rpm 9.5 times larger
+WRONG_UNIT = 5.0
 UNIT_PERCENTILE = 75.0
 STEERED_PERCENTILE = 95.0
 # Commands are compared with the motion over this time [s], that many times or more, at any delay
@@ -59,17 +57,15 @@ MIN_COMPARED = 20
 # from this correlation on, another unit explains sizes by up to this ratio
 ALIKE = 0.85
 NEAR = 1.2
-SCALED = (
-    1.5  # times that a robot drives otherwise than told: less is slip, or a worn wheel
-)
+# times that a robot drives otherwise than told: less is slip, or a worn wheel
+SCALED = 1.5
 # a pose that stays within this, or this
 STANDING_M = 1e-3
 STANDING_RAD = 2e-3
 FROZEN = 12.0
 # many times its noise, never moved
-SWAPPED = (
-    0.6  # least correlation of each of two commands with what the other should move
-)
+# least correlation of each of two commands with what the other should move
+SWAPPED = 0.6
 PLACES = {
     "linear.x": 0,
     "angular.z": 1,

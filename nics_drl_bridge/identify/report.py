@@ -22,9 +22,8 @@ TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_a
 DEAD_ZONE = "dead zone on both sides of 0"
 EAGER = "does more than in proportion, by minus"
 LEAST_DIGITS = 3  # of a coefficient: the printed equations predict as the model does
-MOST_LEFT = (
-    0.5  # share of the error of standing still above which a model is hardly better
-)
+# share of the error of standing still above which a model is hardly better
+MOST_LEFT = 0.5
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:

@@ -38,9 +38,8 @@ SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
 PULL = 0.001  # usual weight of the first coefficients against the predictions
-REFERENCE_M_S = (
-    0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
-)
+# error that weighs as much, at a pull of 1, as a term as large as the rates
+REFERENCE_M_S = 0.1
 DRIFT_M_S = 0.01  # by which good predictions go astray: noise counts as time
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
 EVALUATIONS = 60
@@ -83,9 +82,8 @@ class Shooting:
     commands: Commands
     shaped: Shape
     trust: Trust
-    mounted: bool = (
-        False  # True if the last three values are the pose of what `q` is, in the base
-    )
+    # True if the last three values are the pose of what `q` is, in the base
+    mounted: bool = False
     noise_m: float = 0.0  # standard deviation of measured positions
     fixed: Array | None = None  # values (I,) that are used instead of those given
     horizons: tuple[float, ...] = HORIZONS_S

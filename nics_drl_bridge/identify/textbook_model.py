@@ -20,14 +20,12 @@ from nics_drl_bridge.robot.taylor import TaylorModel, evaluate
 
 Powers = NDArray[np.int64]
 
-MARGIN = (
-    1.25  # times the greatest value of an actuator on a drive that its range reaches
-)
+# times the greatest value of an actuator on a drive that its range reaches
+MARGIN = 1.25
 LEAST_COSINE = 0.1  # of a steering angle
 NEGLIGIBLE = 1e-3  # share of a rate below which a term of the expansion is left out
-UNLIMITED = (
-    0.5  # share of the widest range that is searched: a limit beyond it was not found
-)
+# share of the widest range that is searched: a limit beyond it was not found
+UNLIMITED = 0.5
 
 
 def textbook_calibration(

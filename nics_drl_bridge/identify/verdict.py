@@ -31,10 +31,9 @@ UNEXPLAINED = 0.5
 WORSE = 1.25  # times the trial's error on the part that both know; a refit beyond is not believed
 MANY_OUTLIERS = 0.001
 BACKWARDS = 0.3  # angle [rad] from half a turn below which a body faces backwards
-GAP_STEPS = (
-    3.0  # a pause of the pose longer than so many usual steps, and MAX_GAP_S, is a gap
-)
-GAPS_TOLD = 4  # one by one
+# a pause of the pose longer than so many usual steps, and MAX_GAP_S, is a gap
+GAP_STEPS = 3.0
+GAPS_TOLD = 12  # one by one, the longest of them, in the order of time
 LINEAR = "Predictions by terms of a higher order ran away, so the model has those of order 1 alone."
 EARLY = "The robot moves"  # begins a note on motion before its commands
 COARSE = (
@@ -93,7 +92,7 @@ def about_gaps(drive: Drive) -> Iterator[str]:
     t = drive.dated.t
     pose = drive.dated.values
     rows = _gap_rows(drive)
-    for row in rows[:GAPS_TOLD]:
+    for row in sorted(rows[:GAPS_TOLD]):
         moved = geometry.between(pose[row], pose[row + 1])
         span = t[row + 1] - t[row]
         begin = t[row] - t[0]

@@ -31,9 +31,8 @@ MOST_WINDOWS = 200
 # poses that tell the twist at a window's start: time and number
 BEFORE_S = 0.2
 FEWEST = 4
-STEADY_M_S = (
-    0.05  # greatest standard error of a speed at a start that is taken from a parabola
-)
+# greatest standard error of a speed at a start that is taken from a parabola
+STEADY_M_S = 0.05
 HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
 LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
 MOST_EVALUATIONS = 60
@@ -202,9 +201,8 @@ class _Form:
     start: TextbookResponse
     moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
     mounted: NDArray[np.bool_]  # (3,) of the mounting
-    one_limit: bool = (
-        False  # True if it speeds up and slows down by the same acceleration
-    )
+    # True if it speeds up and slows down by the same acceleration
+    one_limit: bool = False
 
     @property
     def slips(self) -> bool:

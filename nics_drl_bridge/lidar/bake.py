@@ -21,9 +21,8 @@ COARSE = np.radians(
 )  # between grid rotations, steps are of at most half of this [rad]
 MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)  # least first beam of a row, relative to the bearing
-MISS = (
-    0.02  # an edge that two corners miss by more [beams] is found by climbing the hull
-)
+# an edge that two corners miss by more [beams] is found by climbing the hull
+MISS = 0.02
 
 
 @dataclass(frozen=True)
@@ -120,9 +119,8 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
             two, climb = _candidates(wound, parts, len(hull))
             miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
-            far_off[:, 0] = (
-                True  # near contact, the rim of a cell does not bound its interior
-            )
+            # near contact, the rim of a cell does not bound its interior
+            far_off[:, 0] = True
             cell[..., 2 + 2 * side : 4 + 2 * side] = np.where(
                 far_off[..., None], climb, two
             )

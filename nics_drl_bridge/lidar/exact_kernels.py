@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
-ROUNDING = (
-    1e-6  # beams this near to an edge, in beams, are candidates; the exact test decides
-)
+# beams this near to an edge, in beams, are candidates; the exact test decides
+ROUNDING = 1e-6
 IN_LINE = 1e-9  # a wall whose line passes a lidar nearer than this is seen edge-on [m]
 HALF_PI = 0.5 * math.pi
 TINY = 1e-300  # avoids NaN for the angle of a zero vector

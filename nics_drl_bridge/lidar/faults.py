@@ -34,12 +34,10 @@ class LidarFaults(Schema):
     the square of the range, in full at range_max.
     """
 
-    skew: Skew = (
-        "none"  # which way it turns while the robot moves; none: all beams at once
-    )
-    too_close: TooClose = (
-        "minus_inf"  # what it reports for a return nearer than range_min
-    )
+    # which way it turns while the robot moves; none: all beams at once
+    skew: Skew = "none"
+    # what it reports for a return nearer than range_min
+    too_close: TooClose = "minus_inf"
     noise_proportional: float = Field(
         default=0.0, ge=0.0, le=10.0
     )  # added to noise_std, per metre

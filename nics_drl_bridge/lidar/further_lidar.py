@@ -13,9 +13,8 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, to_device
 
-ANGLE_TOLERANCE = (
-    1e-3  # greatest deviation of the last beam from the declared angle [rad]
-)
+# greatest deviation of the last beam from the declared angle [rad]
+ANGLE_TOLERANCE = 1e-3
 
 
 class FurtherLidar(Sensor):

@@ -14,17 +14,15 @@ RINGS = 13
 PLACES = 256
 BANDS = 8
 SEED = 0
-TOUCHING = (
-    1e-3  # of the nearest ring from the shape's circle, as a share of the lidar's range
-)
+# of the nearest ring from the shape's circle, as a share of the lidar's range
+TOUCHING = 1e-3
 OUTLIER = 0.3  # greatest allowed error of any beam [m]
 DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
 SLANT = np.radians(
     1.5
 )  # between line of sight and edge at most, in the search for outliers [rad]
-NARROWEST = (
-    0.1  # least interval of looked-up distances, as a share of the lidar's range
-)
+# least interval of looked-up distances, as a share of the lidar's range
+NARROWEST = 0.1
 
 
 def lookup_distances(

@@ -43,12 +43,10 @@ class GridMap:
     cells: NDArray[np.int8]  # (rows, columns)
     resolution: float  # side of a cell [m]
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    unknown_stops: bool = (
-        False  # True: cells that are neither free nor occupied stop a beam
-    )
-    occupied_from: int = (
-        OCCUPIED  # least value of occupied cells; 100 as in Nav2's static layer
-    )
+    # True: cells that are neither free nor occupied stop a beam
+    unknown_stops: bool = False
+    # least value of occupied cells; 100 as in Nav2's static layer
+    occupied_from: int = OCCUPIED
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -134,9 +132,8 @@ class MapFile(Schema):
         ge=0.0, le=1.0
     )  # from this darkness on pixels are occupied
     free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
-    mode: Literal["trinary", "scale", "raw"] = (
-        "trinary"  # how pixels become cells, see above
-    )
+    # how pixels become cells, see above
+    mode: Literal["trinary", "scale", "raw"] = "trinary"
 
     @model_validator(mode="after")
     def _consistent(self) -> "MapFile":

@@ -26,15 +26,13 @@ from nics_drl_bridge.lidar.table import LidarTable
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
 NO_WALLS = np.zeros((0, 4))
-GREATEST_ERROR = (
-    0.01  # `auto` looks up at distances where the ranges' RMSE is at most this [m]
-)
+# `auto` looks up at distances where the ranges' RMSE is at most this [m]
+GREATEST_ERROR = 0.01
 _MEASURED: dict[
     tuple[Any, ...], tuple[float, float]
 ] = {}  # cache of `lookup_distances`
-WIDEST_BEAMS = (
-    0.2  # `auto` scans beams farther apart exactly: rows of few points err [rad]
-)
+# `auto` scans beams farther apart exactly: rows of few points err [rad]
+WIDEST_BEAMS = 0.2
 
 
 @dataclass(frozen=True)

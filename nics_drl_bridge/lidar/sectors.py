@@ -25,15 +25,12 @@ from nics_drl_bridge.lidar.spec import (
 )
 
 Ranges = NDArray[np.float32]
-COARSEST_RAD = (
-    0.21  # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
-)
-BORDER_RAD = (
-    1e-4  # A beam this near to a border counts in both: headers have angles in float32
-)
-RANGE_TOLERANCE = (
-    1e-5  # Share by which a lidar's range may be less than the layout's, by float32
-)
+# Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
+COARSEST_RAD = 0.21
+# A beam this near to a border counts in both: headers have angles in float32
+BORDER_RAD = 1e-4
+# Share by which a lidar's range may be less than the layout's, by float32
+RANGE_TOLERANCE = 1e-5
 
 
 class ScanLayout(Schema):

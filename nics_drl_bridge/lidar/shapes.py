@@ -18,9 +18,8 @@ MOST_SHAPES = 1_000  # in one group of obstacles
 # Extent of a shape [m]: less is invisible, more fits in no world
 SMALLEST = 1e-6
 LARGEST = 1e4
-SAME_PLACE = (
-    1e-9  # corners within this distance, as a share of the shape's radius, coincide
-)
+# corners within this distance, as a share of the shape's radius, coincide
+SAME_PLACE = 1e-9
 FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]

@@ -31,9 +31,8 @@ FORMAT = "nics_drl_bridge/lidar_table/4"
 ABOUT_FILE = "about.json"
 ARRAYS = ("grid", "start", "cell", "rows")
 TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))  # and a manifest
-POINT_ANGLE = (
-    0.01  # greatest default angle of points in a row, as `MOST_PHASES` allows [rad]
-)
+# greatest default angle of points in a row, as `MOST_PHASES` allows [rad]
+POINT_ANGLE = 0.01
 MOST_PHASES = 8
 MOST_WIDE = 0xFFFF  # greatest number of beams in a row
 

@@ -56,9 +56,8 @@ ANYWHERE = (
 # of a robot at rest: expected and measured speeds [m/s, rad/s]
 STANDS = 0.01
 ABOUT_STANDS = 0.05
-LONGEST_GAP_S = (
-    10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
-)
+# Longest gap that is predicted [s]: beyond, the robot may be anywhere
+LONGEST_GAP_S = 10.0
 
 
 class Estimator:

@@ -14,13 +14,11 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot import kernels as robot
 
-RUNAWAY = (
-    1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
-)
+# Bound on poses, states and their derivatives; beyond, the model has diverged
+RUNAWAY = 1e9
 SHORT_S = 0.25  # longest time in which the way is that of the twists at its ends
-LEAST_PIVOT = (
-    1e-12  # Lower bound on a variance given the variables before, as a share of its own
-)
+# Lower bound on a variance given the variables before, as a share of its own
+LEAST_PIVOT = 1e-12
 LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
 
 

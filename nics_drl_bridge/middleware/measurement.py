@@ -35,12 +35,10 @@ class Measurement(NamedTuple):
     kind: Kind
     value: Array
     noise: Array | None = None  # covariance of the value; None for the model's
-    odom: Array | None = (
-        None  # (3,) pose that came with a twist: how far the robot came
-    )
-    turn_variance: float | None = (
-        None  # of a twist's yaw rate, as told; None for the model's
-    )
+    # (3,) pose that came with a twist: how far the robot came
+    odom: Array | None = None
+    # of a twist's yaw rate, as told; None for the model's
+    turn_variance: float | None = None
 
 
 class Acceptance(IntEnum):

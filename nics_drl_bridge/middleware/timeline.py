@@ -22,12 +22,10 @@ HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
 DUPLICATE = "duplicate"
-FUTURE_NS = (
-    NS_PER_S  # By which a stamp may be early [ns], or two control periods if longer
-)
-CLOCK_JUMP = (
-    10  # Odometries rejected in a row for their stamps that show that a clock was set
-)
+# By which a stamp may be early [ns], or two control periods if longer
+FUTURE_NS = NS_PER_S
+# Odometries rejected in a row for their stamps that show that a clock was set
+CLOCK_JUMP = 10
 Moment = tuple[
     int, int
 ]  # Stamp [ns] and kind: the order of measurements, however they arrive

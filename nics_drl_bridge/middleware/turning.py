@@ -21,15 +21,13 @@ LEAST_STD = 1e-4  # lower bound on that [rad/s]
 GREATEST_VARIANCE = 1.0  # a greater one says that the rate is not known [rad^2/s^2]
 BIAS_STD = 0.1  # of a gyro that was never at rest [rad/s]
 BIAS_WALK = 1e-4  # random walk of a bias [rad/s / sqrt(s)]
-LEAST_BIAS_STD = (
-    3e-4  # by which the rate of standing wheels may differ from the bias [rad/s]
-)
+# by which the rate of standing wheels may differ from the bias [rad/s]
+LEAST_BIAS_STD = 3e-4
 CLAIM = 25.0  # factor by which a variance may differ from what is seen, and is believed
 FEWEST_SEEN = 30  # yaw rates that show their noise
 SMOOTHING = 0.05  # weight of a new yaw rate in that
-LONGEST_GAP_NS = (
-    250_000_000  # between two yaw rates; beyond, the wheels turn the robot [ns]
-)
+# between two yaw rates; beyond, the wheels turn the robot [ns]
+LONGEST_GAP_NS = 250_000_000
 FROZEN = 25  # equal yaw rates in a row of a gyro that is stuck,
 CHANGED_RADPS = 0.1  # if the wheels turn the robot so much faster or slower since
 GREATEST_CHANGE = 40.0  # angular acceleration that no robot exceeds [rad/s^2]
@@ -50,13 +48,11 @@ SLOPES = (
 )  # of the gyro's turns to the wheels'; beyond, its axis or unit is wrong
 LEAST_CONTRADICTION = 0.005  # rad, between two odometries
 TURNING_RADPS = 0.1  # slower turns of the wheels do not show their slip
-SCATTER_KNOWN_S = (
-    5.0  # of driving and standing, from which on the wheels' scatter is known
-)
+# of driving and standing, from which on the wheels' scatter is known
+SCATTER_KNOWN_S = 5.0
 WHEELS_BIAS = 0.004  # constant error of rolling wheels [rad/s]
-WRONG_FOR_S = (
-    3.0  # other errors of rolling wheels last so long: they are no independent news
-)
+# other errors of rolling wheels last so long: they are no independent news
+WRONG_FOR_S = 3.0
 ABOUT_RADPS = 0.005  # yaw rate of a robot that about stands, over a second
 STANDING = 4.0  # standard deviations from the bias within which the robot stands, too
 
@@ -84,18 +80,16 @@ class Gyro(NamedTuple):
     product: float = 0.0
     difference_square: float = 0.0
     wheels_turned: float = 0.0  # sum of the sizes [rad]
-    scatter: float = (
-        0.0  # mean square difference of both rates while going straight [rad^2/s^2]
-    )
+    # mean square difference of both rates while going straight [rad^2/s^2]
+    scatter: float = 0.0
     compared_s: float = 0.0
     # Of the newest odometry that was used; None before.
     odom: Array | None = None  # (3,) its pose, as it was received
     odom_ns: int = 0
     odom_total: float = 0.0  # integral of all rates until then [rad]
     wheels_rate: float = 0.0  # yaw rate of its twist [rad/s]
-    wheels_rate_when_equal: float = (
-        0.0  # the same before the gyro was `FROZEN` times equal
-    )
+    # the same before the gyro was `FROZEN` times equal
+    wheels_rate_when_equal: float = 0.0
 
     @property
     def variance(self) -> float:
@@ -151,12 +145,10 @@ class Turned(NamedTuple):
     odom: Array  # (3,) pose on a path of the same displacements
     twist: Array  # (3,)
     gyro: Gyro
-    heading_variance: float = (
-        0.0  # gained by the heading, beside what the filter adds [rad^2]
-    )
-    rate_variance: float = (
-        0.0  # of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
-    )
+    # gained by the heading, beside what the filter adds [rad^2]
+    heading_variance: float = 0.0
+    # of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
+    rate_variance: float = 0.0
 
 
 def believable_variance(variance: float | None) -> float | None:

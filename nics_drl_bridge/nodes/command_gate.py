@@ -62,12 +62,10 @@ FOREIGN_SETTINGS = {
     command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
     command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
 }
-STALE_S = (
-    0.05  # a motion that was decided on longer ago than this is decided on again [s]
-)
-SCAN_PERIODS = (
-    1.75  # for a slow lidar, default age limit of a command's scan, in its periods
-)
+# a motion that was decided on longer ago than this is decided on again [s]
+STALE_S = 0.05
+# for a slow lidar, default age limit of a command's scan, in its periods
+SCAN_PERIODS = 1.75
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "

@@ -32,9 +32,8 @@ PLANAR = np.ix_(
     [0, 1, 5], [0, 1, 5]
 )  # x, y and heading in the 6 x 6 covariance of a message
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
-UNUSED_VARIANCE = (
-    1e6  # variance of z, roll and pitch, which a planar robot does not measure
-)
+# variance of z, roll and pitch, which a planar robot does not measure
+UNUSED_VARIANCE = 1e6
 FIELD = re.compile(
     r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)"
 )  # type, in a `.msg` file

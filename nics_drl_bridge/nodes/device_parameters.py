@@ -25,9 +25,8 @@ START = "episode_start"
 GIVEN = "episode_start_given"
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-SLACK = (
-    0.1  # a step may be early by this share of it, because timers are no more precise
-)
+# a step may be early by this share of it, because timers are no more precise
+SLACK = 0.1
 PATIENCE_NS = (
     NS_PER_S // 2
 )  # steps missed for longer than this are not made up for [ns]

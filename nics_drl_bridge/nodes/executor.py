@@ -31,9 +31,8 @@ Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its argu
 HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
 """Returned by a callback that has woken another thread of this process. The executor then keeps out
 of that thread's way for a part of the time since it last did so, at most for LONGEST_REST_S."""
-MOST_AT_ONCE = (
-    32  # a timer without a period is always ready, and the thread has other work, too
-)
+# a timer without a period is always ready, and the thread has other work, too
+MOST_AT_ONCE = 32
 
 
 class StandingExecutor(SingleThreadedExecutor):
@@ -258,9 +257,8 @@ class _Entities:
         triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
             if guard.handle.pointer in triggered:
-                guard._executor_triggered = (
-                    True  # waiting has reset it; set again for rclpy
-                )
+                # waiting has reset it; set again for rclpy
+                guard._executor_triggered = True
         woken = own is not None and own.handle.pointer in triggered
         if woken:
             triggered.remove(own.handle.pointer)

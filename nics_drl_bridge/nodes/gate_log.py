@@ -27,9 +27,8 @@ from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
 LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
-LONGEST_LINE_S = (
-    64.0  # the same for a kind that does not cease: each time it is doubled [s]
-)
+# the same for a kind that does not cease: each time it is doubled [s]
+LONGEST_LINE_S = 64.0
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
 GRACE_S = 0.5  # in which the writer may clean up what it gives up [s]
 POLL_S = 0.005
@@ -57,9 +56,8 @@ class GateLog:
         self._hardware = robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
-        self._rule: str | None = (
-            None  # that stops the robot; "" while commands pass, None at first
-        )
+        # that stops the robot; "" while commands pass, None at first
+        self._rule: str | None = None
         self._burst: set[str] = (
             set()
         )  # with a written stop since commands last passed for long

@@ -45,9 +45,8 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 SPIN_S = 0.2
 POLL_S = 0.002
 NO_RANDOMISATION = "none"
-LOST_S = (
-    1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
-)
+# a request to repeat data that stays unanswered for longer was itself lost [s]
+LOST_S = 1.0
 
 
 def _exit_at_signals() -> None:
@@ -92,9 +91,8 @@ class Link:
             self._began_s = time.monotonic()
             if stamped is None:
                 stamped = self.hears_stamped(command_topic, patience_s)
-            self.frame = (
-                ""  # of the robot, in which commands are; unknown until it is set
-            )
+            # of the robot, in which commands are; unknown until it is set
+            self.frame = ""
             self.stamped = stamped
             self._kind: Any = TwistStamped if stamped else Twist
             self.commands = self.node.create_publisher(

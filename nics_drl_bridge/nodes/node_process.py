@@ -96,9 +96,8 @@ class ChildProcess:
         """Starts it; its output goes to a file, or where that of this process goes."""
         self.name = name
         chosen = dict(environment or {})
-        chosen["PYTHONSAFEPATH"] = (
-            "1"  # no modules of the working folder, which may be a model
-        )
+        # no modules of the working folder, which may be a model
+        chosen["PYTHONSAFEPATH"] = "1"
         output = None if log is None else log.open("wb")
         try:
             # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.

@@ -20,9 +20,8 @@ PROGRAM = Path(__file__).with_name("output_forwarder.py")
 STDOUT = 1
 STDERR = 2
 PIPE_BYTES = 2**20  # most that Linux gives a user's process
-COLOUR = (
-    "RCUTILS_COLORIZED_OUTPUT"  # of ROS 2: whether log lines are coloured, "0" or "1"
-)
+# of ROS 2: whether log lines are coloured, "0" or "1"
+COLOUR = "RCUTILS_COLORIZED_OUTPUT"
 
 DISABLE_FILES = ["--ros-args", "--disable-external-lib-logs"]
 FILE_CHOICES = (

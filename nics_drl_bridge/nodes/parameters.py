@@ -273,9 +273,8 @@ def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     ]
 
 
-NEWEST = (
-    "simulation_interfaces/srv/SpawnEntities"  # of 2.1, the oldest version that will do
-)
+# of 2.1, the oldest version that will do
+NEWEST = "simulation_interfaces/srv/SpawnEntities"
 STANDARD = Row(
     "simulation_interfaces",
     True,

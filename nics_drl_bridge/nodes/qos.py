@@ -98,9 +98,8 @@ MOMENT_S = 0.5
 UNKNOWN = "_UNKNOWN_"
 MOST_WAITING = 10_000  # messages that are taken at once, if a publisher never pauses
 
-OVERRIDES = (
-    "qos_overrides."  # parameters of a user for the quality of service of a topic
-)
+# parameters of a user for the quality of service of a topic
+OVERRIDES = "qos_overrides."
 # Topics, by the name before any remapping, whose quality of service decides whether a robot stops.
 FIXED_TOPICS = ("cmd_vel", "cmd_vel_raw", "e_stop", "ackermann_cmd")
 CHOICES: dict[str, Any] = {

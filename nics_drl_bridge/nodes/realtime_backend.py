@@ -22,9 +22,8 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01
 SAY_EVERY_S = 2.0
-SERVICES_S = (
-    0.5  # a peer that shows no services this long after its topics is a vehicle [s]
-)
+# a peer that shows no services this long after its topics is a vehicle [s]
+SERVICES_S = 0.5
 COMMAND_S = 0.5  # least time and periods that a command lasts
 PERIODS = 2  # then a zero follows
 STILL = (0.02, 0.05)  # a slower robot is at rest [m/s, rad/s]
@@ -42,9 +41,8 @@ class RealtimeOptions(Schema):
     domain_id: int | None = Field(None, ge=0, le=232)  # the environment's by default
     timeout_s: PositiveFloat = 30.0  # longest wait for a peer or an answer
     vehicle: bool | None = None  # a vehicle has no services; None: detected
-    period_s: PositiveFloat | None = (
-        None  # of a step; the model's control period by default
-    )
+    # of a step; the model's control period by default
+    period_s: PositiveFloat | None = None
     stale_after_s: PositiveFloat = 0.5  # age from which data are too old for a view
     # An episode on a vehicle waits until it stands at the requested pose, or takes the present one.
     start: Literal["wait", "present"] = "wait"
@@ -55,15 +53,13 @@ class RealtimeOptions(Schema):
         0.1,
     )  # of the start's pose [m, rad]
     start_timeout_s: PositiveFloat = 300.0  # longest wait for that
-    say: Callable[[str], None] | None = (
-        None  # told what is missing; the node's logger by default
-    )
+    # told what is missing; the node's logger by default
+    say: Callable[[str], None] | None = None
     # `cmd_vel_raw` leads through `command_gate`: then each command is a TwistStamped with the stamp
     # of the scan that it answers.
     command_topic: str = Field("cmd_vel", min_length=1)
-    stamped: bool | None = (
-        None  # `cmd_vel` is a TwistStamped; None: as the robot hears it
-    )
+    # `cmd_vel` is a TwistStamped; None: as the robot hears it
+    stamped: bool | None = None
     pose_type: str = "none"  # of `pose`, a pose sensor in `map`
     # Topic of the gyro that turns odometry; `auto`: the usual ones, if the model was made with one
     imu: str = Field("auto", min_length=1)

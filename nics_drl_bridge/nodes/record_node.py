@@ -38,9 +38,8 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 PATIENCE_S = 10.0
 POLL_S = 0.01
-HALT_S = (
-    0.5  # zero is repeated for this long [s]: a best-effort subscriber may miss one
-)
+# zero is repeated for this long [s]: a best-effort subscriber may miss one
+HALT_S = 0.5
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 PLACE = "recording"
 FEWEST = 2

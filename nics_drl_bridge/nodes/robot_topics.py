@@ -88,9 +88,8 @@ class RobotTopics:
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
         self._header = b""
         self._told = ""
-        self._placed: tuple[Array, Array] | None = (
-            None  # pose and covariance of `initialpose`
-        )
+        # pose and covariance of `initialpose`
+        self._placed: tuple[Array, Array] | None = None
         self._subscriptions: list[Any] = []
         self._commands = CommandListener(
             node,

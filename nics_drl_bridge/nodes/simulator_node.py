@@ -52,9 +52,8 @@ CLOCK = "/clock"
 CLOCK_NS = 15_000_000
 WATCH_S = 2.0
 QUIET_S = 5.0
-LONGEST_TICK_S = (
-    0.005  # longest time between two checks for delayed data that are due [s]
-)
+# longest time between two checks for delayed data that are due [s]
+LONGEST_TICK_S = 0.005
 
 # Makes the simulator of some robots; may declare its own parameters at the node. Its control
 # period is that of the given model.

@@ -15,9 +15,8 @@ class Sources:
         self._node = node
         self._topic = topic
         self._names: dict[bytes, str] = {}
-        self.publishers = (
-            1  # that the graph shows, where no message tells its publisher
-        )
+        # that the graph shows, where no message tells its publisher
+        self.publishers = 1
         self._tells_publisher = True
 
     def name_of(self, info: Mapping[str, Any]) -> str:

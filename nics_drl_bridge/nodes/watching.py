@@ -60,9 +60,8 @@ class RosSource:
         self._goal = np.zeros((0, 2))
         self._gate: str | None = None
         self._truth: Array | None = None
-        self._map_frame = (
-            "map"  # in which goals are; as the estimate or the simulator names it
-        )
+        # in which goals are; as the estimate or the simulator names it
+        self._map_frame = "map"
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
         self._context = open_context([], domain_id)

@@ -28,9 +28,8 @@ SUFFIX = ".onnx"
 MAPPINGS = (".yaml", ".yml")  # suffixes of the mapping of a foreign policy
 GOLDEN = 16
 GOLDEN_SEED = 0
-GOLDEN_SPREAD = (
-    3.0  # distance from zero of golden observations, if their limits are wider
-)
+# distance from zero of golden observations, if their limits are wider
+GOLDEN_SPREAD = 3.0
 GAP_PERIODS = 5  # control periods without an observation after which a state is reset
 MOST_ENTRIES = 20_000
 CHECKSUM = 8  # hexadecimal digits of a field's checksum, which detects mistakes but is no signature
@@ -99,12 +98,10 @@ class Contract(Schema):
     sensors: tuple[AnySensor, ...] = ()  # further ones that it observes
     task: TaskEntry
     observation: ObservationEntry
-    state: StateEntry | None = (
-        None  # None: each action follows from one observation alone
-    )
-    batch: Literal[1] | None = (
-        None  # greatest number of observations in one run; None: any
-    )
+    # None: each action follows from one observation alone
+    state: StateEntry | None = None
+    # greatest number of observations in one run; None: any
+    batch: Literal[1] | None = None
     actions: Literal["continuous", "discrete"]
     control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
     # time limit of the episodes that it learnt in; older files do not tell it

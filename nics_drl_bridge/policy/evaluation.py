@@ -25,9 +25,8 @@ Act = Callable[
     [NDArray[np.float32]], NDArray[Any]
 ]  # actions (N, C) for observations (N, O)
 
-FIRST_SEED = (
-    1_000_000  # first seed of an evaluation, far from the seeds of any training
-)
+# first seed of an evaluation, far from the seeds of any training
+FIRST_SEED = 1_000_000
 DRIFT_M = 0.1  # a robot stops where it believes its goal is; odometry may have drifted by this much
 ELSEWHERE = "elsewhere"
 CONFIDENCE = 0.95
@@ -45,9 +44,8 @@ class Episode:
     bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
     reward: float  # sum over the episode
     believed: str | None = None  # by the robot itself, where `result` is by the truth
-    uncertain: Uncertainty | None = (
-        None  # of the estimate, gained since the start, where known
-    )
+    # of the estimate, gained since the start, where known
+    uncertain: Uncertainty | None = None
 
     @property
     def believed_success(self) -> bool:

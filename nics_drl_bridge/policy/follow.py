@@ -23,9 +23,8 @@ class GoalCheck:
     xy_goal_tolerance: float = 0.25  # [m]
     yaw_goal_tolerance: float = 0.25  # [rad]; robots that steer are not turned
     stateful: bool = True  # a place that was reached stays so while the robot turns
-    path_length_tolerance: float = (
-        1.0  # greatest length of the way that may be left [m]
-    )
+    # greatest length of the way that may be left [m]
+    path_length_tolerance: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,10 @@ class Scaled(Schema):
     """Numbers as a network takes them: cut to `limits`, (x - subtract) / divide, cut to `clip`."""
 
     limits: Limits | None = None  # least and greatest before scaling; None: not cut
-    subtract: Numbers = (
-        0.0  # subtracted first: one number for all elements, or one for each
-    )
-    divide: Numbers = (
-        1.0  # by which that is divided: one number for all elements, or one for each
-    )
+    # subtracted first: one number for all elements, or one for each
+    subtract: Numbers = 0.0
+    # by which that is divided: one number for all elements, or one for each
+    divide: Numbers = 1.0
     clip: Limits | None = None  # least and greatest after scaling; None: not cut
 
     @field_validator("divide")
@@ -65,9 +63,8 @@ class InputPart(Scaled):
         default=1, ge=1, le=MOST_SCANS
     )  # steps of it, this and earlier ones
     newest_first: bool = False  # order of a history
-    output: str | None = (
-        None  # the network's, whose numbers of the step before are `last.output`
-    )
+    # the network's, whose numbers of the step before are `last.output`
+    output: str | None = None
     value: Numbers | None = None  # of a `constant`
 
     @model_validator(mode="after")
@@ -104,9 +101,8 @@ class OutputCommand(Schema):
     limits: Limits | None = None  # least and greatest before scaling; None: not cut
     multiply: float = 1.0  # factor on the element
     add: float = 0.0  # added after that, in the unit of the command
-    clip: Limits | None = (
-        None  # least and greatest command; None: the robot's own limits alone
-    )
+    # least and greatest command; None: the robot's own limits alone
+    clip: Limits | None = None
 
 
 class Choices(Schema):
@@ -128,9 +124,8 @@ class ForeignPolicy(Schema):
     network: str = Field(
         min_length=1
     )  # an .onnx file or a LEAPP bundle, relative to the mapping
-    robot: str | None = (
-        None  # that it drives where none is named: a shipped one or a model
-    )
+    # that it drives where none is named: a shipped one or a model
+    robot: str | None = None
     control_period: float | None = Field(
         default=None, gt=0.0, le=10.0
     )  # None: the robot's [s]
@@ -144,9 +139,8 @@ class ForeignPolicy(Schema):
     outputs: dict[str, OutputCommand] = Field(
         default_factory=dict
     )  # the commands, by their names
-    choices: Choices | None = (
-        None  # instead of `outputs`: fixed commands, of which it chooses one
-    )
+    # instead of `outputs`: fixed commands, of which it chooses one
+    choices: Choices | None = None
 
     @model_validator(mode="after")
     def _one_way_out(self) -> "ForeignPolicy":

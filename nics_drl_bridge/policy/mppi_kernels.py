@@ -17,9 +17,8 @@ from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, bend, rates, run
 
 HIT = 1e3  # cost of a touch at once; later ones cost less
-BEYOND = (
-    1.3  # offers are drawn over this much of the range and cut: many are at its ends
-)
+# offers are drawn over this much of the range and cut: many are at its ends
+BEYOND = 1.3
 # over the commands, to find those that a twist follows
 PASSES = 12
 EASE = 1e-6

@@ -25,16 +25,14 @@ CONTRACT_LIMIT = (
     4 * 2**20
 )  # maximum size of the contract [bytes], mostly golden observations
 MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
-MOST_WORK = (
-    20_000_000  # multiplications, or numbers read and written, for one observation
-)
+# multiplications, or numbers read and written, for one observation
+MOST_WORK = 20_000_000
 MOST_AT_ONCE = (
     64 * MOST_NUMBERS
 )  # of all nodes' outputs in one run: at most 256 MB of float32
 ROWS = 16  # observations for which the sizes are computed, as many as there are golden ones
-SMALL = (
-    1024  # maximum length of an integer array that may be a shape, an axis or an index
-)
+# maximum length of an integer array that may be a shape, an axis or an index
+SMALL = 1024
 GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
 MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
 INPUT = "observation"

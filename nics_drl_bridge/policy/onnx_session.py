@@ -22,9 +22,8 @@ class GraphNeeds:
     ]  # of inputs and outputs; None: whole numbers, one for each row
     batch: int | None  # greatest number of observations in one run; None: any
     graph_sha256: str
-    start: float | None = (
-        None  # of each element of the state; None: the policy has no state
-    )
+    # of each element of the state; None: the policy has no state
+    start: float | None = None
 
 
 def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> int:

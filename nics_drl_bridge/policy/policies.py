@@ -92,9 +92,8 @@ class StraightToGoal:
     """Turns to the goal and drives there, ignoring obstacles; ConfigError: see `command_for`."""
 
     task: Navigation
-    model: SimulatorModel | None = (
-        None  # tells the twists of a robot whose kind does not
-    )
+    # tells the twists of a robot whose kind does not
+    model: SimulatorModel | None = None
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `Policy`."""

@@ -29,9 +29,8 @@ from nics_drl_bridge.policy.onnx_session import (
 )
 
 MEMORY = 512 * 2**20  # beyond what the libraries use [bytes]
-MEMORY_OF_SIZE = (
-    8  # the same for each byte of the file: a network is held several times
-)
+# the same for each byte of the file: a network is held several times
+MEMORY_OF_SIZE = 8
 CPU_S = 10  # time of a processor; a network of 32 MB takes a tenth of it here
 WALL_S = 60.0  # on a computer that is busy with other things
 MOST_REMEMBERED = 10_000

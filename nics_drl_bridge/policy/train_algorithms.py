@@ -37,9 +37,8 @@ LEAST_SHARE = 0.25  # of the span of an observation, or of its mean if that is l
 OBSERVED_STEPS = 32
 OBSERVED_WORLDS = 256
 GAIN = 2.0**0.5
-ACTION_GAIN = (
-    0.01  # initial gain of an actor's last layer: all its actions are near zero
-)
+# initial gain of an actor's last layer: all its actions are near zero
+ACTION_GAIN = 0.01
 LOG_EVERY = {
     "ppo": 1,
     "sac": 1000,

@@ -48,9 +48,8 @@ class TrainVecEnv(VecEnv):
         self._ended: list[int] = []
         self._actions: NDArray[Any] = np.zeros(0)
         self.stepping_s = 0.0  # wall time in the envs [s]
-        self.on_step: Callable[[], None] | None = (
-            None  # called after each step of all worlds
-        )
+        # called after each step of all worlds
+        self.on_step: Callable[[], None] | None = None
 
     def reset(self) -> Observation:
         """Begins an episode in every world, with the seeds given to `seed`."""

@@ -84,22 +84,19 @@ class TrainingSettings(Schema):
     worlds: dict[str, Count] = Field(
         default={"circles": 256}, min_length=1
     )  # copies of each world
-    randomisation: str | None = (
-        None  # quantities drawn in each episode: a shipped one or a file
-    )
+    # quantities drawn in each episode: a shipped one or a file
+    randomisation: str | None = None
     teaching: Teaching = (
         Teaching()
     )  # rewards by what only the simulator knows, and repetition
-    steps: Count = (
-        1_000_000  # environment steps of all worlds together, at most with `stop`
-    )
+    # environment steps of all worlds together, at most with `stop`
+    steps: Count = 1_000_000
     stop: StopSettings | None = None  # early end; None: after all steps
     # time limit of an episode [steps]; left out, `nics train` makes it 30 s, or 1.8 times what the
     # longest straight way to a goal of the worlds takes at top speed, if that is more
     max_episode_steps: Count = 300
-    algorithm: Literal["ppo", "sac"] = (
-        "ppo"  # learning algorithm; its settings are under its name
-    )
+    # learning algorithm; its settings are under its name
+    algorithm: Literal["ppo", "sac"] = "ppo"
     # sizes of the hidden layers, in actor and critic alike
     hidden: tuple[Width, ...] = Field(
         default=(64, 64), min_length=1, max_length=MOST_LAYERS

@@ -296,9 +296,8 @@ class CommandGuess(NamedTuple):
     candidates: dict[
         str, Candidate
     ]  # by the robot's names, for the user to choose from
-    of_wheels: bool = (
-        False  # True: no command was recorded, the wheels' own motion stands in
-    )
+    # True: no command was recorded, the wheels' own motion stands in
+    of_wheels: bool = False
 
 
 def guess_command(

@@ -26,9 +26,8 @@ CANDIDATES = 12
 ALONE = 0.5  # probability to change a single command
 REDRAWN = 0.6  # else, each further one
 BINS = 4
-CENTRED = (
-    2.0  # weight of the distance from the centre against the familiarity of a command
-)
+# weight of the distance from the centre against the familiarity of a command
+CENTRED = 2.0
 # The path stays inside the circle by a margin plus the way of a reaction at top speed.
 MARGIN_M = 0.05
 REACTION_S = 0.2
@@ -359,9 +358,8 @@ class DrivePlan:
     """Options of a drive; a value out of its range raises ConfigError."""
 
     robot: RobotSpec  # the robot that drives
-    bound: float = (
-        2.0  # radius of the circle around the start that contains the whole robot [m]
-    )
+    # radius of the circle around the start that contains the whole robot [m]
+    bound: float = 2.0
     duration: float = 60.0  # [s]
     speed: float = 1.0  # share of the greatest speeds and rates to use
     seed: int = 0  # of the pattern

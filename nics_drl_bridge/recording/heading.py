@@ -26,9 +26,8 @@ LEAST_BIAS_STD = 1e-5  # rad/s
 USUAL_BIAS = 0.01
 USUAL_FACTOR = 0.5
 LEAST_RATE_NOISE = 1e-3  # of a block's mean rate [rad/s]
-UNLIKE_BLOCKS = (
-    2.0  # factor of errors, as blocks of a drive are not independent of each other
-)
+# factor of errors, as blocks of a drive are not independent of each other
+UNLIKE_BLOCKS = 2.0
 DRIFTS = 4.0  # standard errors of its slope beyond which a bias drifts
 DRIFT_SPAN_S = 20.0  # a drift of the bias shows only between rests so far apart
 LEAST_TURN_RAD = 1.0  # sum of all turns, below which a drive does not show a scale

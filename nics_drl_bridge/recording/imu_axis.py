@@ -12,9 +12,8 @@ GRAVITY = (
     13.0,
 )  # an acceleration at rest [m/s^2]; others have gravity removed, or are none
 UPRIGHT = 0.85  # least share of gravity along the axis that points up
-REMEMBERED = (
-    200  # messages over which the acceleration is averaged while a robot drives
-)
+# messages over which the acceleration is averaged while a robot drives
+REMEMBERED = 200
 
 
 class UpAxis(NamedTuple):

@@ -17,9 +17,8 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import STREAMS, Episode, Recording, Stream
 
 LEARNT_SHARE = 2.0 / 3.0  # of each recording
-APART_S = (
-    30.0  # between two episodes: longer than any prediction and any search for a delay
-)
+# between two episodes: longer than any prediction and any search for a delay
+APART_S = 30.0
 LEAD_S = 2.0  # of commands before an episode, for states to follow them
 SETTLE_S = 5.0  # for which the first of these commands counts before them
 AFTER_S = 5.0  # of commands after an episode, for searches of a delay

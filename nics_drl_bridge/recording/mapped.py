@@ -37,9 +37,8 @@ from nics_drl_bridge.recording.values import MappedReader, Series, together, uni
 
 QUATERNION_TOLERANCE = 0.05
 MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
-MOST_UNTRACKED = (
-    0.05  # share of poses whose quaternion is zero: the tracker had lost the body
-)
+# share of poses whose quaternion is zero: the tracker had lost the body
+MOST_UNTRACKED = 0.05
 NO_LENGTH = 1e-9
 SHORTEST_S = 1.0
 SHORT_OF_EARTH = {"lat", "lon", "lng", "long"}  # short names of latitude and longitude

@@ -181,9 +181,8 @@ class Value(Schema):
     # other columns, flags, and the values at which this one counts; `otherwise` stands in its place
     when: dict[str, Condition] = Field(default_factory=dict)
     otherwise: float = 0.0  # in SI, where a flag is not as `when` needs it
-    time: Annotated[Time | None, _short("from")] = (
-        None  # stamps of this value; None: of its stream
-    )
+    # stamps of this value; None: of its stream
+    time: Annotated[Time | None, _short("from")] = None
     clock: str | None = None  # name of the clock of these stamps; None: of its stream
 
     @field_validator("unit")
@@ -215,12 +214,10 @@ class Measured(Schema):
     in_: str | None = Field(
         default=None, alias="in"
     )  # file or topic of columns that name none
-    time: Annotated[Time | None, _short("from")] = (
-        None  # stamps; None: those of the whole mapping
-    )
-    clock: str | None = (
-        None  # clock of the stamps; two clocks differ by an unknown offset
-    )
+    # stamps; None: those of the whole mapping
+    time: Annotated[Time | None, _short("from")] = None
+    # clock of the stamps; two clocks differ by an unknown offset
+    clock: str | None = None
 
 
 class PoseSource(Measured):
@@ -233,9 +230,8 @@ class PoseSource(Measured):
     quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
     # of x and y, and in the covariance; an angle if they are longitude and latitude
     unit: Annotated[str, _of_kind(("m", "rad"))] = "m"
-    heading_unit: Annotated[str, _of_kind(("rad",))] = (
-        "rad"  # of the heading and its variance
-    )
+    # of the heading and its variance
+    heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
     # what measured it: `odometry`, which drifts, or a `tracker`, as motion capture or a localiser;
@@ -301,18 +297,15 @@ class OdometrySource(Measured):
 class Mapping(Schema):
     """A recording of any form as the streams of a Recording."""
 
-    robot: str | dict[str, Any] | None = (
-        None  # a shipped robot's name, a path, or its definition
-    )
+    # a shipped robot's name, a path, or its definition
+    robot: str | dict[str, Any] | None = None
     in_: str | None = Field(
         default=None, alias="in"
     )  # file or topic of streams that name none
-    time: Annotated[Time | None, _short("from")] = (
-        None  # stamps of all streams; None: a bag's own
-    )
-    clock: str | None = (
-        None  # clock of all streams; None: `robot`, unless a bag's headers differ
-    )
+    # stamps of all streams; None: a bag's own
+    time: Annotated[Time | None, _short("from")] = None
+    # clock of all streams; None: `robot`, unless a bag's headers differ
+    clock: str | None = None
     # column whose value changes from one episode to the next; None: one drive
     episode: Reference | None = None
     pose: Annotated[
@@ -323,12 +316,10 @@ class Mapping(Schema):
         default_factory=dict
     )  # measured states, by their names
     wheels: WheelSource | None = None  # wheel speeds, if they were recorded
-    imu: ImuSource | None = (
-        None  # acceleration and yaw rate, or a second heading, if recorded
-    )
-    odometry: OdometrySource | None = (
-        None  # the robot's own body velocity, if it was recorded
-    )
+    # acceleration and yaw rate, or a second heading, if recorded
+    imu: ImuSource | None = None
+    # the robot's own body velocity, if it was recorded
+    odometry: OdometrySource | None = None
 
     @model_validator(mode="before")
     @classmethod

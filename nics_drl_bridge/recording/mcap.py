@@ -26,9 +26,8 @@ INSIDE = (
 MOST_UNPACKED = (
     256 * 2**20
 )  # maximum size of one chunk or message, decompressed [bytes]
-MOST_PACKED_SHARE = (
-    1000  # compression ratio of a file that decompresses to more than that
-)
+# compression ratio of a file that decompresses to more than that
+MOST_PACKED_SHARE = 1000
 _PART = 2**20
 
 

@@ -179,9 +179,8 @@ class Offer:
 
     depth: int = 10  # of its history
     reliable: bool = True  # False for best effort
-    transient_local: bool = (
-        False  # late subscribers get earlier messages; False for volatile
-    )
+    # late subscribers get earlier messages; False for volatile
+    transient_local: bool = False
 
 
 def offers_of(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:

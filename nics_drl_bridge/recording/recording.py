@@ -23,9 +23,8 @@ FORMAT = "nics_drl_bridge/recording/4"
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
 MeasuredBy = Literal["", "odometry", "tracker", "truth"]
 """What measured a pose: odometry, which drifts; motion capture or a localiser; a simulation."""
-IRREGULAR = (
-    0.5  # share of the median by which a step differs if it is a gap or a repetition
-)
+# share of the median by which a step differs if it is a gap or a repetition
+IRREGULAR = 0.5
 # steps that differ by less are equally long, but for rounding
 JITTER = 1e-4
 ROUNDING_S = 1e-6
@@ -39,9 +38,8 @@ SLOWEST_SAMPLING_S = 2.0
 HARDEST = 14.0
 HARDEST_OF_CARS = 60.0
 SMALL_M = 1.0
-SLOWEST_IN_CM = (
-    300.0  # speed from which on millimetres are likelier than centimetres [m/s]
-)
+# speed from which on millimetres are likelier than centimetres [m/s]
+SLOWEST_IN_CM = 300.0
 FASTEST_TURN = 15.0  # a robot that turns faster for long [rad/s] does so in degrees
 FULL_TURN_DEG = 360.0
 # A heading in degrees leads along the path to this share, better by so much than the same in
@@ -69,9 +67,8 @@ class Stream:
     t: Array  # (T,) stamps [s], never decreasing
     values: Array  # (T, D)
     clock: str = "robot"
-    sigma: Array | None = (
-        None  # (T, D) standard deviations of the values, where they are known
-    )
+    # (T, D) standard deviations of the values, where they are known
+    sigma: Array | None = None
 
     @property
     def weights(self) -> Array:
@@ -113,22 +110,18 @@ class Recording:
     command: Stream  # (T, C) in the order of the RobotSpec
     pose: Stream  # (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame
     state: Stream | None = None  # (T, S) measured, in the order of the RobotSpec
-    wheels: Stream | None = (
-        None  # (T, 2) left and right wheel speed in the encoder's units
-    )
-    imu: Stream | None = (
-        None  # (T, 3) acceleration along x, y [m/s^2], yaw rate [rad/s]
-    )
-    odometry: Stream | None = (
-        None  # (T, 3) vx, vy [m/s], yaw rate [rad/s] of the wheels
-    )
+    # (T, 2) left and right wheel speed in the encoder's units
+    wheels: Stream | None = None
+    # (T, 3) acceleration along x, y [m/s^2], yaw rate [rad/s]
+    imu: Stream | None = None
+    # (T, 3) vx, vy [m/s], yaw rate [rad/s] of the wheels
+    odometry: Stream | None = None
     source: str = "recording"  # its origin, for reports and errors
     variables: tuple[
         str, ...
     ] = ()  # names of X = [state, command] of the recorded robot, if known
-    robot: dict[str, Any] | None = (
-        None  # its definition as in its YAML file, if a mapping says it
-    )
+    # its definition as in its YAML file, if a mapping says it
+    robot: dict[str, Any] | None = None
     latency: Latency = field(
         default_factory=Latency
     )  # of scan and odometry, if it shows

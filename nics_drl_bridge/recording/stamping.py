@@ -23,17 +23,14 @@ HEADER = "header"
 # Median delay from header to receipt on the recorder's own clock: a localiser may take its time,
 # but nothing is received before it was stamped.
 SAME_CLOCK_S = (-0.001, 1.0)
-MAX_WANDER_S = (
-    1.0  # the delay from headers of one clock to their receipt varies by less
-)
-STALLED = (
-    2.0  # percentage of messages that a stalled recorder may have received even later,
-)
+# the delay from headers of one clock to their receipt varies by less
+MAX_WANDER_S = 1.0
+# percentage of messages that a stalled recorder may have received even later,
+STALLED = 2.0
 MAX_STALL_S = 30.0  # but by no more than this
 MAX_LATE = 0.01  # share of messages that may arrive after one with a later stamp
-MAX_UNSTAMPED = (
-    0.05  # share that may lack a stamp at the start: a simulation has no time yet
-)
+# share that may lack a stamp at the start: a simulation has no time yet
+MAX_UNSTAMPED = 0.05
 ROBOT_STREAMS = (
     "command",
     "state",
@@ -49,9 +46,8 @@ SPLIT = (
     ("sec", "nsecs"),
 )
 ROWS_A_SECOND = 5  # from which on stamps in whole seconds lack the rest
-COUNTING = (
-    16.0  # times the usual step of a counter fit between its overflows, which lose
-)
+# times the usual step of a counter fit between its overflows, which lose
+COUNTING = 16.0
 LOST = 2.0  # no more than this many steps
 PARTS = 10  # its values are in all of so many parts
 # or they go so far, which is this share of all their steps

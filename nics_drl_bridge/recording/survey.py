@@ -18,9 +18,8 @@ from nics_drl_bridge.recording.values import dates_of
 
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # of a table
-SHORTEST_STEP_S = (
-    1e-4  # stamps that would be closer are not in the unit that their name says
-)
+# stamps that would be closer are not in the unit that their name says
+SHORTEST_STEP_S = 1e-4
 MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
 TIMES = {
     "time",

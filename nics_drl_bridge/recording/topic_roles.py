@@ -69,15 +69,13 @@ class TopicRoles(Schema):
     odom: str | None = None
     joint_states: str | None = None  # JointState, for measured state and wheel speeds
     imu: str | None = None  # Imu
-    frame: str | None = (
-        None  # parent of the transforms to use, for a `pose` topic with several
-    )
+    # parent of the transforms to use, for a `pose` topic with several
+    frame: str | None = None
     child_frame: str | None = None  # their child, the robot
     # joint of each state variable; by default guessed by the joints' names
     state: dict[str, JointSource | str] = Field(default_factory=dict)
-    wheels: tuple[str, str] | None = (
-        None  # left and right joint of wheel speeds; None: guessed
-    )
+    # left and right joint of wheel speeds; None: guessed
+    wheels: tuple[str, str] | None = None
     # `header` takes all times from the messages' headers, `receive` from their receipt by the bag,
     # `auto` from the header if there is one
     stamps: Stamps = "auto"

@@ -209,9 +209,8 @@ class BagSink:
         self.store = msgs.typestore()
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
-        self.fault: BaseException | None = (
-            None  # the first one of the file or the database
-        )
+        # the first one of the file or the database
+        self.fault: BaseException | None = None
 
     def add_topic(
         self,

@@ -40,9 +40,8 @@ JUMP = 5.0
 JUMP_M = 0.2
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
-SHORT_WINDOW_S = (
-    2.0  # over which turns are compared if the robot was heard for a few seconds only
-)
+# over which turns are compared if the robot was heard for a few seconds only
+SHORT_WINDOW_S = 2.0
 UNITS = (
     (1000.0, "mm/s"),
     (100.0, "cm/s"),
@@ -58,9 +57,8 @@ OFFSET_S = 5.0
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
-ODD_SHARE = (
-    0.01  # a value in more than this share of the beams is intended by the lidar
-)
+# a value in more than this share of the beams is intended by the lidar
+ODD_SHARE = 0.01
 
 error = partial(Mismatch, "error")
 warning = partial(Mismatch, "warning")

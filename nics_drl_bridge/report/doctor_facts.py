@@ -97,9 +97,8 @@ class Facts:
         default_factory=list
     )  # of odometry: vx, vy [m/s], wz [rad/s]
     lengths: list[float] = field(default_factory=list)  # of odometry's quaternions
-    uncovered: int = (
-        0  # number of odometry messages whose covariance of pose or twist is all zeros
-    )
+    # number of odometry messages whose covariance of pose or twist is all zeros
+    uncovered: int = 0
     commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
     clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
     gyro: GyroReader = field(default_factory=GyroReader)
@@ -202,9 +201,8 @@ class Expected:
     robot: RobotSpec
     lidar: LidarSpec
     period_s: float  # between commands
-    scan: ScanLayout | None = (
-        None  # that any lidar may fill; None: the beams of exactly this one
-    )
+    # that any lidar may fill; None: the beams of exactly this one
+    scan: ScanLayout | None = None
     gyro: bool = False  # the model was made with one
 
 

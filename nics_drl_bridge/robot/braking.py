@@ -21,27 +21,22 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import BEYOND, TaylorModel
 
-LONGEST_STOP_S = (
-    60.0  # a robot that still moves after this time cannot be shown to stop [s]
-)
+# a robot that still moves after this time cannot be shown to stop [s]
+LONGEST_STOP_S = 60.0
 LONGEST_START_S = 30.0  # after which a held command has led to its steady motion [s]
-CREEP = (
-    0.05  # a robot that moves no faster than this stands [m/s, of its whole footprint]
-)
+# a robot that moves no faster than this stands [m/s, of its whole footprint]
+CREEP = 0.05
 BIAS = 0.05  # share of its greatest speed at which a model may creep at rest, by a bias of its fit
 BIAS_STEERED = 0.15  # likewise with steered wheels: a polynomial is less exact there
 FIXED = 1e-9  # a state that changes by less in a step has settled, as a share of the greatest
-DEVIATIONS = (
-    2.0  # standard errors of the model's coefficients by which it may respond slower
-)
+# standard errors of the model's coefficients by which it may respond slower
+DEVIATIONS = 2.0
 SLOWEST = 0.5  # least factor on the response of a model by its standard errors
-SLACK_M = (
-    0.15  # length beside which a stopping distance need not be bounded tightly [m]
-)
+# length beside which a stopping distance need not be bounded tightly [m]
+SLACK_M = 0.15
 STRAIGHT = 0.1  # a motion turns if its turn moves the footprint by more than this share
-MINOR = (
-    0.1  # a lesser component of a twist counts from this share of the greatest one on
-)
+# a lesser component of a twist counts from this share of the greatest one on
+MINOR = 0.1
 ALIKE = 0.1  # components whose braking times differ by less stop together
 LEVERS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)
 """That are tried, in footprint radii."""
@@ -72,9 +67,8 @@ class Drift:
 
     least: float = 1.0  # factor
     greatest: float = 1.0  # factor
-    share: float = (
-        1.0  # greatest share of the greatest component that a lesser one comes to
-    )
+    # greatest share of the greatest component that a lesser one comes to
+    share: float = 1.0
 
     @property
     def is_none(self) -> bool:
@@ -98,9 +92,8 @@ class OwnTurn:
         float  # of the turn that follows; infinite if the lags are all [rad/s^2]
     )
     least_turn: float = 1.0  # share of this bound by which the robot turns at least
-    least_path: float = (
-        1.0  # share of the bound of its path that the robot moves at least
-    )
+    # share of the bound of its path that the robot moves at least
+    least_path: float = 1.0
 
     def mean_time_s(self, rate: Array) -> Array:
         """Returns the times (...) at full turn rates (...) in which the robot turns as far."""

@@ -19,9 +19,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 # Of sin(t) / t and (1 - cos(t)) / t: to 1e-14 for a turn below 0.1 rad, 1e-8 below WIDE_TURN.
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
-WIDE_TURN = (
-    0.5  # For larger turns per step sine and cosine are used, not the series [rad]
-)
+# For larger turns per step sine and cosine are used, not the series [rad]
+WIDE_TURN = 0.5
 GREATEST_ORDER = 4
 # columns of `Terms.curves`, as in `InputCurve`
 DEAD = 0

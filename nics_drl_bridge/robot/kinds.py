@@ -29,9 +29,8 @@ from nics_drl_bridge.robot.spec import (
 from nics_drl_bridge.robot.template import Template
 
 BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
-MISSPELT = (
-    0.8  # least likeness of a misspelt parameter; other parameters' are less alike
-)
+# least likeness of a misspelt parameter; other parameters' are less alike
+MISSPELT = 0.8
 MOST_VARIED = 6
 AT_ONCE_S = 1e-9  # lag of a robot whose commands are what its wheels do
 T = TypeVar("T")
@@ -147,9 +146,8 @@ class RobotKind:
     )  # of its actuators; None: not known
     drawing: Callable[[RobotSpec], Drawing]
     template: Template = field(default_factory=Template)
-    sideways: bool = (
-        False  # True if it is driven sideways by commands other than a twist's
-    )
+    # True if it is driven sideways by commands other than a twist's
+    sideways: bool = False
     slips: bool = False  # True if it moves otherwise than the twist that is commanded
     front_drive: bool = False  # True if the speed is that of the steered wheel
 

@@ -10,9 +10,8 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MEASURED: Literal["measured"] = "measured"
-ASSUMED_STATE_DRIFT = (
-    0.1  # of an unmeasured state within a second, as a share of its range
-)
+# of an unmeasured state within a second, as a share of its range
+ASSUMED_STATE_DRIFT = 0.1
 
 
 class Level(Schema):

@@ -46,9 +46,8 @@ Unit = Literal[
 ]
 MOST_CORNERS = 512  # of a footprint
 MOST_VARIABLES = 32  # of a state or a command
-LARGEST = (
-    10.0  # reach of a footprint [m]: none of a robot or a car, but many in centimetres
-)
+# reach of a footprint [m]: none of a robot or a car, but many in centimetres
+LARGEST = 10.0
 LENGTHS = {
     "wheelbase",
     "track",
@@ -59,9 +58,8 @@ LENGTHS = {
 }
 LONGEST = 20.0  # of these parameters, in reaches of the footprint
 FARTHEST_STEERED = 3.2  # angle of a wheel [rad]
-SHARPEST = (
-    0.2  # Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
-)
+# Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
+SHARPEST = 0.2
 FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
 
@@ -121,9 +119,8 @@ class StateVariable(Variable):
 class CommandVariable(Variable):
     """A component of the command, with its field of `cmd_vel` if that drives the robot."""
 
-    cmd_vel: CmdVelField | None = (
-        None  # field of `cmd_vel` that carries it; None: in process only
-    )
+    # field of `cmd_vel` that carries it; None: in process only
+    cmd_vel: CmdVelField | None = None
 
     @property
     def turns(self) -> bool:

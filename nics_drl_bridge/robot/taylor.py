@@ -342,17 +342,15 @@ class HorizonErrors:
     path_m: float  # mean length of the measured path
     model: EndErrors
     kept_twist: EndErrors  # of a robot that keeps the twist of the start
-    textbook: EndErrors | None = (
-        None  # of the textbook, fitted to the same part; None: not fitted
-    )
+    # of the textbook, fitted to the same part; None: not fitted
+    textbook: EndErrors | None = None
     band_m: float | None = None  # distance within which 95 % of the ends are expected
     coverage: float | None = None  # share of the ends within it
     # Noise of the differences between the model's errors and those of the yardsticks [m]
     kept_twist_noise_m: float | None = None
     textbook_noise_m: float | None = None
-    standing: EndErrors | None = (
-        None  # of a robot that never moves; None: an older file
-    )
+    # of a robot that never moves; None: an older file
+    standing: EndErrors | None = None
     standing_noise_m: float | None = None  # of the difference to it [m]
 
 
@@ -396,9 +394,8 @@ class NamedTaylorModel(Schema):
     inputs: tuple[InputCurve, ...] = ()
     friction: dict[str, NonNegativeFloat] | None = None  # by state
     drag: dict[str, NonNegativeFloat] | None = None  # by state
-    back_emf: dict[str, dict[str, NonNegativeFloat]] | None = (
-        None  # by state and command
-    )
+    # by state and command
+    back_emf: dict[str, dict[str, NonNegativeFloat]] | None = None
     limits: dict[str, tuple[Fall, Rise]] | None = None  # by state
 
     def model(self) -> TaylorModel:

@@ -13,9 +13,8 @@ Ranges = Mapping[str, tuple[float, float]]
 # command tells in its own unit may come to a multiple of that.
 TWIST_RANGES = {"vx": ("m/s", 10.0), "vy": ("m/s", 10.0), "wz": ("rad/s", 10.0)}
 BEYOND = 2.0
-MISSPELT = (
-    0.85  # least likeness of a misspelt parameter: "steering_rate" is no "steering_lag"
-)
+# least likeness of a misspelt parameter: "steering_rate" is no "steering_lag"
+MISSPELT = 0.85
 SHARES = 1.0  # range of a command without a unit, in both directions
 
 

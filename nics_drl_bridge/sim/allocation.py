@@ -27,12 +27,10 @@ from nics_drl_bridge.sim.world import World
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
-CROWD = (
-    4096  # Least number of pairs of a robot and a body for sorting bodies into cells
-)
-FEWEST_OF_A_CROWD = (
-    8  # Least number of robots: for fewer, testing all bodies takes less time
-)
+# Least number of pairs of a robot and a body for sorting bodies into cells
+CROWD = 4096
+# Least number of robots: for fewer, testing all bodies takes less time
+FEWEST_OF_A_CROWD = 8
 STANDING = 32  # Least number of obstacles, all of which stand, for sorting them into cells once
 
 

@@ -16,9 +16,8 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.sim.state import Array
 
-TOUCHING = (
-    1e-12  # Outlines this near touch; their depth then decides about an overlap [m]
-)
+# Outlines this near touch; their depth then decides about an overlap [m]
+TOUCHING = 1e-12
 ON_EDGE = 1e-9  # Tolerance beyond the ends of an edge for intersections, as a share of its length
 FLOAT32 = 1e-6  # Relative rounding error of the distances of a map
 

@@ -19,9 +19,8 @@ FREE = 0
 BODIES = 1
 WALLS = 2
 MAP = 4
-SEVERAL = (
-    32  # Most bodies that are listed near a robot; if there are more, all are tested
-)
+# Most bodies that are listed near a robot; if there are more, all are tested
+SEVERAL = 32
 
 
 @kernel

@@ -132,9 +132,8 @@ class DeviceWorld:
         )
 
 
-LEAST_VARIANCE = (
-    1e-9  # Of odometry without noise: in ROS, a covariance of zeros means unknown
-)
+# Of odometry without noise: in ROS, a covariance of zeros means unknown
+LEAST_VARIANCE = 1e-9
 
 
 def variances(std: tuple[float, float]) -> Array:

@@ -49,9 +49,8 @@ class Entity:
     parts: tuple[
         Placed, ...
     ] = ()  # its shapes and their poses in the entity's own frame
-    start: Array | None = (
-        None  # (3,) where it was spawned; None for what the world came with
-    )
+    # (3,) where it was spawned; None for what the world came with
+    start: Array | None = None
     motion: Motion | None = None
 
 

@@ -17,9 +17,8 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
 from nics_drl_bridge.sim.state import Array, Integers
 
-COMFORT = (
-    0.3  # space beside the robot's circle from which on a way is no longer tight [m]
-)
+# space beside the robot's circle from which on a way is no longer tight [m]
+COMFORT = 0.3
 TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
 """Cost of a metre where the circle just fits, where only the outline does, and where nothing does;
 in between it is interpolated."""

@@ -62,9 +62,8 @@ something, before and after the substep [m]; and 1 if it touched something befor
 SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
 NOTHING = 1e-12  # Distances up to this count as zero [m]
 PARTING = 1e-5  # Speed at which what is turned aside parts, so that roundings don't add up [m/s]
-MOST_LOOKS = (
-    2000  # After so many a pair counts as touching: only absurdly fast turns need more
-)
+# After so many a pair counts as touching: only absurdly fast turns need more
+MOST_LOOKS = 2000
 
 
 class Moving(NamedTuple):

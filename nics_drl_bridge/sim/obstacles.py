@@ -14,12 +14,10 @@ from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import separation_kernels as at
 
 __all__ = ["Motion", "Patrol", "Pedestrian", "plan_arrays"]
-FASTEST = (
-    10.0  # Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
-)
-STRONGEST = (
-    1e3  # Upper bound on the parameters of the social force model, each in its unit
-)
+# Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
+FASTEST = 10.0
+# Upper bound on the parameters of the social force model, each in its unit
+STRONGEST = 1e3
 
 
 def _fast(speed: tuple[float, float]) -> tuple[float, float]:
@@ -44,9 +42,8 @@ class Patrol(Schema):
         min_length=2, max_length=1000
     )
     speed: float = Field(gt=0.0, le=FASTEST)  # [m/s]
-    loop: bool = (
-        True  # continue from the last waypoint to the first; otherwise back and forth
-    )
+    # continue from the last waypoint to the first; otherwise back and forth
+    loop: bool = True
     pause: float = Field(default=0.0, ge=0.0, le=1e6)  # at each waypoint [s]
 
     @model_validator(mode="after")
@@ -78,9 +75,8 @@ class Pedestrian(Schema):
     range: Distance = 0.3  # sigma [m]
     wall_repulsion: Strength = 10.0  # U0 [m^2/s^2]
     wall_range: Distance = 0.2  # R [m]
-    foresight: Strength = (
-        1.0  # delta t, the time by which the others' motion is extrapolated [s]
-    )
+    # delta t, the time by which the others' motion is extrapolated [s]
+    foresight: Strength = 1.0
     view: float = Field(
         default=math.radians(200.0), ge=0.0, le=2.0 * math.pi
     )  # 2 phi [rad]

@@ -78,9 +78,8 @@ class KinematicRanges(Schema):
     """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
 
     scale: Factor = AS_IT_IS  # for every coefficient
-    response: Factor = (
-        AS_IT_IS  # on all time constants of the state alike, one for each robot
-    )
+    # on all time constants of the state alike, one for each robot
+    response: Factor = AS_IT_IS
     dofs: dict[str, Factor] = Field(
         default_factory=dict
     )  # overrides it, by name of a rate (`wz`)
@@ -92,9 +91,8 @@ class OdometryRanges(Schema):
     """Errors of odometry and motion: factors on the model's levels, or levels instead."""
 
     noise: Factor | None = None  # factor on the noise of the measured twist
-    drift: Factor | None = (
-        None  # on the motion that the model does not explain, if measured
-    )
+    # on the motion that the model does not explain, if measured
+    drift: Factor | None = None
     odom_linear: Level | None = None  # noise of velocity [m/s]
     odom_angular: Level | None = None  # of yaw rate [rad/s]
     position_drift: Level | None = None  # of x and y [m/sqrt(s)]

@@ -23,9 +23,8 @@ from nics_drl_bridge.sim.state import Array, Integers, MapField
 
 TRIES = 2000
 RESTARTS = 50
-DETOURS = (
-    4  # Pairs of start and goal without a path after which the obstacles are redrawn
-)
+# Pairs of start and goal without a path after which the obstacles are redrawn
+DETOURS = 4
 MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
 DRAWN = 0
 NO_OBSTACLES = 1

@@ -41,9 +41,8 @@ STILL, PATROL, PEDESTRIAN = range(3)  # values of the column KIND
 SPEED, VX, VY, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(10)
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
 ROBOT_GAP = 0.1  # Which an obstacle keeps to a robot, as people do [m]; less may look like a touch
-PASSES = (
-    3  # Number of times a displacement is bent before the remaining excess is shortened
-)
+# Number of times a displacement is bent before the remaining excess is shortened
+PASSES = 3
 FINEST = 0.25  # Least step along a path through a static map, in cells
 HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
 

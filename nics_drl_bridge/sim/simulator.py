@@ -36,16 +36,14 @@ Indices = NDArray[np.int64]
 R = TypeVar("R")
 # Poses of robots (n, M, 3), or a function that tells them for scenes; None: as the scenes have them
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
-MOST_ROBOTS = (
-    1_000  # Greatest number of robots in one world; each is tested against every other
-)
+# Greatest number of robots in one world; each is tested against every other
+MOST_ROBOTS = 1_000
 MOST_NUMBERS = (
     2**30
 )  # Most values in all worlds, some GB: beams of robots, states of obstacles
 PER_BODY = 64
-TOLERANCE = (
-    0.05  # Beyond the range of commands that was recorded, as a share of their limits
-)
+# Beyond the range of commands that was recorded, as a share of their limits
+TOLERANCE = 0.05
 # Arrays of the state with a row for each robot.
 OF_ROBOT = (
     "pose",

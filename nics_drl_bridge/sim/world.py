@@ -36,16 +36,14 @@ class Obstacles(Schema):
     shapes: tuple[Shape, ...] = Field(
         min_length=1, max_length=MOST_SHAPES
     )  # each takes any
-    count: int | tuple[int, int] | None = (
-        None  # or [least, greatest], drawn per episode
-    )
+    # or [least, greatest], drawn per episode
+    count: int | tuple[int, int] | None = None
     gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
     at: tuple[
         Pose, ...
     ] = ()  # fixed poses, x, y [m], heading [rad], instead of `count` at random
-    motion: Motion | None = (
-        None  # their motion, see `sim.obstacles`; by default they stand still
-    )
+    # their motion, see `sim.obstacles`; by default they stand still
+    motion: Motion | None = None
 
     @field_validator("count", mode="before")
     @classmethod
@@ -106,18 +104,16 @@ class World(Schema):
     """World of the episodes; everything is in the frame `map`."""
 
     name: str  # the name users refer to it by
-    size: tuple[Side, Side] | None = (
-        None  # along x, y of a walled field around the origin [m]
-    )
+    # along x, y of a walled field around the origin [m]
+    size: tuple[Side, Side] | None = None
     bounds: Region | None = None  # instead, x1, y1, x2, y2 of a field without walls [m]
     # further straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
     # a static map beside or instead of a field: a shipped one, or Nav2's YAML, from this folder
     map: str | None = None
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
-    clearance: Distance = (
-        0.3  # around the footprint at start, goal, and on a path between [m]
-    )
+    # around the footprint at start, goal, and on a path between [m]
+    clearance: Distance = 0.3
     goal_distance: tuple[
         Distance, Distance
     ]  # least and greatest, from start straight to goal [m]

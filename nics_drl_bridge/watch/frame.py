@@ -40,9 +40,8 @@ class Stage:
     )  # of policies and worlds
     chosen: Mapping[str, str] = field(default_factory=dict)
     span_s: tuple[float, float] | None = None  # of a bag [s]
-    model_name: str = (
-        ""  # as whoever started the page names the model; else its robot's name
-    )
+    # as whoever started the page names the model; else its robot's name
+    model_name: str = ""
 
     def plain(self) -> dict[str, Any]:
         """The stage as plain data."""

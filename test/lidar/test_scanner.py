@@ -583,9 +583,8 @@ def test_a_static_map_is_seen_beside_the_bodies_and_within_the_limits(renderer):
         beams=4, angle_min=0.0, angle_max=2.0 * np.pi, range_min=0.3, range_max=3.0
     )
     cells = np.zeros((100, 100), np.int8)
-    cells[:, 70] = cells[98, :] = cells[48, 50] = (
-        100  # east at 2 m, north at 4.8 m, south, near
-    )
+    # east at 2 m, north at 4.8 m, south, near
+    cells[:, 70] = cells[98, :] = cells[48, 50] = 100
     scanner = make_scanner(
         spec, [SQUARE], renderer, GridMap(cells, 0.1, origin=(-5.0, -5.0, 0.0))
     )

@@ -26,9 +26,8 @@ class BagTopic:
     type: str
     count: int  # number of messages
     rate_hz: float | None = None  # from the median time between receipts
-    first_s: float | None = (
-        None  # receipt of the first message, from the start of the bag
-    )
+    # receipt of the first message, from the start of the bag
+    first_s: float | None = None
     last_s: float | None = None
     gaps: int = 0  # number of silences of more than three usual periods
     longest_gap_s: float | None = None

@@ -53,15 +53,13 @@ LOOK_S = 0.25  # period of the search for new topics [s]
 FLUSH_S = 1.0  # greatest span that is lost if the process is killed [s]
 QUEUE = 1000
 CLOCK = "/clock"
-CLOCK_PERIOD_NS = (
-    10_000_000  # of wall time between messages; `/clock` also precedes each
-)
+# of wall time between messages; `/clock` also precedes each
+CLOCK_PERIOD_NS = 10_000_000
 USUAL_DEPTH = 100  # for a topic whose publishers' quality of service is not in the bag
 NAP_S = 0.05
 PATIENCE_S = 60.0
-DISCOVERY_S = (
-    1.0  # time for subscribers to discover the topics before the first message [s]
-)
+# time for subscribers to discover the topics before the first message [s]
+DISCOVERY_S = 1.0
 ALONE_S = 5.0  # longest wait for a first subscriber; after it, the bag is played without one [s]
 
 
@@ -71,9 +69,8 @@ class BagOrder:
 
     out: Path  # folder of the bag
     topics: tuple[str, ...] = ()  # their names; those of `ROBOT` and `SHARED` if empty
-    everything: bool = (
-        False  # records every topic; with a namespace, all of it and `SHARED`
-    )
+    # records every topic; with a namespace, all of it and `SHARED`
+    everything: bool = False
     namespace: str = ""  # of the robot; prefix of topic names without a leading slash
     duration: float | None = None  # stops after this time [s]; None for never
     storage: Storage = "mcap"  # format of the file

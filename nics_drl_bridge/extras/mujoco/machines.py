@@ -15,25 +15,21 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Parameters = dict[str, float]
 
-TORQUE_RESERVE = (
-    1.5  # torque limit of a motor, relative to that for the maximum acceleration
-)
+# torque limit of a motor, relative to that for the maximum acceleration
+TORQUE_RESERVE = 1.5
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
-STIFF_SERVO_LAG_S = (
-    0.001  # the same, of one that keeps its speed though its tyres are dragged
-)
+# the same, of one that keeps its speed though its tyres are dragged
+STIFF_SERVO_LAG_S = 0.001
 ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's
 # Resistance of tyres to skidding relative to that to being pressed in, MuJoCo's `impratio`: at 1,
 # its convex contacts lift what slides so far that wheels hop off the floor.
 SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
 MISFIT = 0.01  # greatest error of the angle to which a tie rod leads a wheel [rad]
-STEERING_TORQUE = (
-    1.0  # torque limit of a steering servo [N m], that of a small hobby servo
-)
-THICKNESS = (
-    0.25  # radius of a roller at its middle, relative to the radius of the wheel
-)
+# torque limit of a steering servo [N m], that of a small hobby servo
+STEERING_TORQUE = 1.0
+# radius of a roller at its middle, relative to the radius of the wheel
+THICKNESS = 0.25
 ROLLER_MASS = 0.005
 ROLLED = 1.0, 0.9884, 1.0  # by rollers under load, as drives sideways show
 
@@ -46,12 +42,10 @@ class Physics:
     mass: float = 4.0  # of the chassis with its load, without wheels [kg]
     wheel_mass: float = 0.15  # of a wheel [kg]
     friction: float = 1.0  # between tyre and floor
-    acceleration: float = (
-        5.0  # of the robot after the maximum step of a command [m/s^2]
-    )
-    softness: float = (
-        0.005  # time constant of a tyre that was pressed into the floor [s]
-    )
+    # of the robot after the maximum step of a command [m/s^2]
+    acceleration: float = 5.0
+    # time constant of a tyre that was pressed into the floor [s]
+    softness: float = 0.005
     bearing: float = 1e-6  # viscous friction of free wheels and rollers [N m s/rad]
     rollers: int = 12  # of a mecanum wheel
 

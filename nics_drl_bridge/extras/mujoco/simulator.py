@@ -30,9 +30,8 @@ from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator, Indices, Starts
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-ENCODER_PERIOD_S = (
-    0.01  # approximate period of encoder readings and of updates of moving obstacles
-)
+# approximate period of encoder readings and of updates of moving obstacles
+ENCODER_PERIOD_S = 0.01
 LARGEST_TILT_RAD = 0.5
 SETTLING_S = 0.5
 MOTION = ("pose", "twist", "state")

@@ -51,9 +51,8 @@ VALUE_WEIGHT = 0.5
 GRADIENT_LIMIT = 0.5
 SILENCE_S = 600.0  # without a step from any env runner, after which a run ends; it can be resumed
 TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
-PROBE_S = (
-    1.0  # time that a roll-out waits for a lost env runner [s]; later ones try again
-)
+# time that a roll-out waits for a lost env runner [s]; later ones try again
+PROBE_S = 1.0
 ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping_s"
 """Names of a runner's metrics: numbers of episodes, and time in the simulator [s]."""
 

@@ -31,9 +31,8 @@ NEEDED = {
     "ENTITY_STATE_SETTING": "SetEntityState",
     "ENTITY_STATE_GETTING": "GetEntityState",
 }
-TOLERANCE = (
-    1e-3  # of a control period, as a share of a step; and of stamps, of a period
-)
+# of a control period, as a share of a step; and of stamps, of a period
+TOLERANCE = 1e-3
 
 
 class StandardOptions(Schema):
@@ -41,15 +40,13 @@ class StandardOptions(Schema):
 
     services: str = ""  # what their names begin with: `/gzserver` for Gazebo
     entity: str = ""  # name of the robot's entity; that of the model's robot by default
-    step_s: PositiveFloat | None = (
-        None  # of a step of the simulator; None: measured on /clock
-    )
+    # of a step of the simulator; None: measured on /clock
+    step_s: PositiveFloat | None = None
     slack_s: float = Field(
         0.0, ge=0.0
     )  # by which data may be older than the end of a period
-    obstacles: bool = (
-        True  # puts those of the episode's scene, where entities have their names
-    )
+    # puts those of the episode's scene, where entities have their names
+    obstacles: bool = True
 
 
 def snake_case(name: str) -> str:

@@ -43,9 +43,8 @@ class Simulation:
         self._host = host
         self._stepping = False
         self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
-        self._halted = (
-            STOPPED  # or paused, or without a world, while the host is paused
-        )
+        # or paused, or without a world, while the host is paused
+        self._halted = STOPPED
         self._turn: Any = host.create_guard_condition(lambda: None)  # type: ignore[attr-defined]
         self.renew()
 
