@@ -1,4 +1,4 @@
-"""A body that is held: odometry shows motion, but the scans show none.
+"""Detects a held body: odometry shows motion, but the scans show none.
 
 A recent scan is moved as odometry says, which predicts the newest one. Where that prediction
 differs clearly from the recent scan, the newest scan must have changed; if it has not, the wheels
@@ -49,7 +49,8 @@ class Settings:
     least_path: float = 0.04
     least_turn: float = 0.05
     least_half: float = 0.25
-    # Turns beyond which the next younger scan is taken, and none is: a room may repeat itself.
+    # If the robot turned by more than the first since a scan, a younger one is preferred; by more
+    # than the second, the scan is never used, as a room may repeat itself.
     usual_turn: float = 0.6
     greatest_turn: float = 1.4
     # A sector tells something if its ranges must change by this [m], and by so many standard
@@ -71,7 +72,7 @@ class Settings:
     sector_share: float = 0.45
     held_share: float = 0.2
     greatest_changed: float = 0.5
-    # time over which scans must say so, without one that says otherwise
+    # time for which scans must contradict odometry, without one that agrees
     confirmed_s: float = 0.15
     # time after which an unconfirmed contradiction is forgotten
     forgotten_s: float = 1.0
@@ -127,7 +128,10 @@ def watch_scan(
 
 
 def _memory_s(config: GateConfig, settings: Settings) -> float:
-    """Returns for how long scans are kept [s]: three periods of a slow lidar, at least two."""
+    """Returns for how long scans are kept [s].
+
+    At least `longest_s`; up to 15 % longer to hold three periods of a slow lidar, and always two.
+    """
     three = min(3.1 / config.scan_rate, 1.15 * settings.longest_s)
     return max(settings.longest_s, three, 2.2 / config.scan_rate)
 
@@ -135,7 +139,7 @@ def _memory_s(config: GateConfig, settings: Settings) -> float:
 def _held_since(
     before_ns: int | None, verdict: Verdict, now_ns: int, settings: Settings
 ) -> int | None:
-    """Returns the stamp of the first scan that contradicted odometry, if none agreed since."""
+    """Returns the stamp of the first contradiction that is neither outdated nor refuted."""
     if before_ns is not None and (now_ns - before_ns) * S_PER_NS > settings.forgotten_s:
         before_ns = None
     if verdict.held:
@@ -228,7 +232,7 @@ def _motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
     """Returns the motion that odometry shows between two scans; 1 is the least that is judged."""
     path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
     turn = abs(_turn(old, new))
-    tiny = 1e-9  # of a control whose least motion is zero
+    tiny = 1e-9  # the benchmark has a control with least motions of zero
     return max(
         path / max(settings.least_path, tiny), turn / max(settings.least_turn, tiny)
     )

@@ -119,8 +119,9 @@ def compare_sectors(old, new, predicted, sector, noise, thresholds):  # type: ig
     """Compares the observed changes of ranges with the predicted ones, sector by sector.
 
     Ranges (K,) are those of an old scan, of a new one, and what the motion in between predicts.
-    A `sector` has so many directions. It is unknown if a third of them or fewer are, or if the root
-    mean square of its predicted changes is below the threshold of what tells something.
+    A `sector` has so many directions. Its share is NaN if at most a third of them have
+    finite ranges in all three scans, or if the root mean square of its predicted changes is below
+    the threshold of what tells something.
 
     Returns:
         shares: of the predicted change that was observed (S,), by least squares, with observed

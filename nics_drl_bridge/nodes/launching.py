@@ -89,7 +89,7 @@ def action_of(node: NodeStart) -> Node:
 
 
 def parameter_of(value: Any) -> Any:
-    """Returns a parameter; a text stays one, whatever it looks like."""
+    """Returns a parameter; a string stays a string, even if it looks like a number."""
     if isinstance(value, str):
         return ParameterValue(TextSubstitution(text=value), value_type=str)
     if isinstance(value, list) and all(isinstance(each, str) for each in value):

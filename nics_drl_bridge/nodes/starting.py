@@ -1,8 +1,8 @@
 """Which nodes `nics up` and the launch files start, and with which parameters; without ROS 2.
 
 A launch is a list of arguments and of functions, each of which yields the nodes of one part:
-`simulator`, `bridge`, `description`. An argument that is left empty leaves what the file of
-parameters says.
+`simulator`, `bridge`, `description`. An empty argument leaves the value of the parameter
+file, unless its description says otherwise.
 """
 
 import os
@@ -132,7 +132,7 @@ class Setup:
         return found
 
     def limits(self) -> str:
-        """Returns the gate's limits; where a model was given, those that are shipped for it."""
+        """Returns the gate's limits; if empty and a model was given, its shipped ones, if any."""
         if self["limits"] or not self["model"]:
             return self["limits"]
         robot = self.model if self._opened is None else self._opened.robot.name
@@ -393,7 +393,9 @@ def of_bridge() -> list[Argument]:
 def e_stop_required(default: str) -> Argument:
     """Returns the argument for the emergency stop."""
     return Argument(
-        "e_stop_required", default, "An e_stop that was never heard counts as pressed"
+        "e_stop_required",
+        default,
+        "An e_stop that was never heard counts as pressed; empty: true",
     )
 
 

@@ -23,7 +23,7 @@ from nics_drl_bridge.robot.taylor import BEYOND, TaylorModel
 
 # a robot that still moves after this time cannot be shown to stop [s]
 LONGEST_STOP_S = 60.0
-LONGEST_START_S = 30.0  # after which a held command has led to its steady motion [s]
+LONGEST_START_S = 30.0  # given to a held command to reach its steady motion [s]
 # a robot that moves no faster than this stands [m/s, of its whole footprint]
 CREEP = 0.05
 BIAS = 0.05  # share of its greatest speed at which a model may creep at rest, by a bias of its fit
@@ -45,7 +45,7 @@ NEGLIGIBLE = 0.02  # by which a lever may bound the stops less tightly than the 
 LEAST_SHARE = 0.05  # least share of its bound by which a component is said to move
 MISSED_M = 0.01  # by which two bounds of their own may miss a motion whose speed is a creep [m]
 MOST_MOTIONS = 2500
-INSTANT = 1e-6  # half the inverse of a deceleration [s^2/m] below which lags are all
+INSTANT = 1e-6  # 1/(2a) [s^2/m] below which the deceleration counts as infinite
 LEVELS: dict[int, tuple[float, ...]] = {
     1: (0.5, 1.0),
     2: (0.1, 0.25, 0.5, 0.75, 1.0),
@@ -53,7 +53,7 @@ LEVELS: dict[int, tuple[float, ...]] = {
 }
 """By the number of commands: shares of each range whose mixtures are stopped."""
 ALONE = tuple(k / 20 for k in range(1, 21))  # shares of the range of one command alone
-_KEPT: "OrderedDict[Any, Braking]" = OrderedDict()
+_KEPT: "OrderedDict[Any, Braking]" = OrderedDict()  # least recently used first
 MOST_KEPT = 32
 
 
@@ -167,7 +167,7 @@ def braking_of(
     high: Array | None = None,
     ramp: Array | None = None,
 ) -> Braking:
-    """Returns the bound of all stops of a model; it is computed once for each model.
+    """Returns the bound of all stops of a model; the last `MOST_KEPT` results are cached.
 
     Args:
         robot: whose model it is.
