@@ -228,7 +228,7 @@ def test_a_shipped_policy_brings_its_own_robot(tmp_path):
         (("dynamic_window", "--in", "gazebo"), "--in 'gazebo'"),
         (("dynamic_window", "--world", "areena", "--in", "fast"), "arena"),
         (("nowhere.onnx",), "nowhere.onnx"),
-        (("dynamic_window", "--hardware"), "--backend dds"),
+        (("dynamic_window", "--backend", "dds"), "add --hardware"),
         (("dynamic_window", "--backend", "sim"), "--backend 'sim'"),
         (("dynamic_window", "--shadow", "x", "--goal", "there"), "--goal 'there'"),
         (("dynamic_window", "--gate", "diferential", "--in", "fast"), "differential"),

@@ -11,7 +11,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NEEDS_ROS = "drive_over_dds"
-MOST_LINES = 60  # of an example
 MOST_BYTES = 100_000  # of a picture of the docs
 SAYS = {
     "compare_with_planner": r"differential: (8|9|10)\d%",
@@ -45,11 +44,10 @@ def test_every_example_runs_in_a_process_of_its_own(example, tmp_path):
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_every_example_is_short_has_a_main_and_stands_in_the_docs_with_its_picture(
+def test_every_example_has_a_main_and_stands_in_the_docs_with_its_picture(
     example,
 ):
     text = example.read_text(encoding="utf-8")
-    assert len(text.splitlines()) < MOST_LINES
     assert "\ndef main()" in text
     assert example.name in (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
     picture = ROOT / "docs" / "examples" / f"{example.stem}.png"

@@ -25,7 +25,7 @@ def arm(
         bool,
         Option("--reset", help="Release a latched stop first, as that of nics stop."),
     ] = False,
-    wait: WaitOption = 20.0,
+    wait: WaitOption = 60.0,
     as_json: console.JsonOption = False,
 ) -> None:
     """Arms command_gate; tells why it refuses."""
@@ -84,7 +84,7 @@ def goal(
         ),
     ] = "",
     namespace: NamespaceOption = "",
-    wait: WaitOption = 20.0,
+    wait: WaitOption = 60.0,
     as_json: console.JsonOption = False,
 ) -> None:
     """Sends a goal; tells whether policy_node takes it."""

@@ -137,6 +137,10 @@ class _Mailbox:
             return dict(self._mail)
 
 
+def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
+    return mail.put(topic, message)
+
+
 def _take_odometry(
     middleware: Middleware, stamp_ns: int, arrival_ns: int, message: bytes
 ) -> None:
@@ -195,8 +199,9 @@ class DdsBackend:
                 kind = LaserScan if topic == SCAN else Odometry
                 if topic in self._sensors:
                     kind = sensor_type(self._sensors[topic])
+                put = partial(_put, self._mail, topic)
                 self._link.node.create_subscription(
-                    kind, topic, partial(self._mail.put, topic), qos.SENSOR, raw=True
+                    kind, topic, put, qos.SENSOR, raw=True
                 )
             self._episodes = self._services(
                 model, world, simulator, options, randomisation

@@ -171,7 +171,7 @@ def test_a_held_body_is_stopped_and_ten_hours_of_free_driving_are_not():
 
 @pytest.mark.slow
 def test_a_held_body_is_stopped_and_free_driving_is_not():
-    few = ("--hours", "0.1", "--holds", "10", "--case", "0")
+    few = ("--hours", "0.1", "--holds", "20", "--case", "0")
     code, result = asked("gate_held.py", *few)
     assert (code, result["failures"]) == (0, [])
 

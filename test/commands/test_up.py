@@ -194,7 +194,7 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
         armed = up.tell("arm")
         assert armed.returncode == 0, armed.stderr
         assert "/command_gate is armed" in armed.stdout
-        goal = up.tell("goal", "1", "-0.5")
+        goal = up.tell("goal", "1", "-0.5", "--wait", 90)
         assert goal.returncode == 0, goal.stderr
         assert "drives to (1.00, -0.50) m in the map" in goal.stdout
         assert drives(up, witness, (1.0, -0.5)), up.text
