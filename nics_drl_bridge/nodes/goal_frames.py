@@ -74,6 +74,9 @@ class GoalFrames:
     def in_map(self, goal: PoseStamped) -> Array:
         """Returns x, y (2,) of a goal in the map, as the robot stands now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
+        if not np.isfinite(place).all():
+            told = f"({place[0]:g}, {place[1]:g})"
+            raise ConfigError(f"goal_pose: {told}: x and y must be finite numbers.")
         try:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:

@@ -51,6 +51,39 @@ class GoalRequest:
         return conversions.pose_to_ros([self.x, self.y, self.yaw], stamp_ns, self.frame)
 
 
+class _Call:
+    """A request to a service of a gate, which is sent once the service is there."""
+
+    def __init__(self, node: Node, gate: str, service: str) -> None:
+        self._node = node
+        self._gate = gate
+        self._client = node.create_client(Trigger, f"{gate}/{service}")
+        self._future: Any = None
+
+    def send_when_ready(self) -> None:
+        """Sends the request, unless it was sent or the service is not there yet."""
+        if self._future is None and self._client.service_is_ready():
+            self._future = self._client.call_async(Trigger.Request())
+
+    def wait_for_answer(self, seconds: float) -> GateAnswer:
+        """Returns the answer, or why there is none after so long; ends the call."""
+        try:
+            holds(self._is_answered, max(seconds, 0.0), POLL_S)
+            if self._future is None:
+                return GateAnswer(self._gate, False, "it has ended")
+            if not self._future.done():
+                told = "it did not answer in time; the request may still take effect"
+                return GateAnswer(self._gate, False, told)
+            answer = self._future.result()
+            return GateAnswer(self._gate, bool(answer.success), str(answer.message))
+        finally:
+            self._node.destroy_client(self._client)
+
+    def _is_answered(self) -> bool:
+        self.send_when_ready()
+        return self._future is not None and bool(self._future.done())
+
+
 class Operator(AbstractContextManager["Operator", None]):
     """A node that calls gates and sends goals; a context manager. Raises BackendError."""
 
@@ -95,17 +128,22 @@ class Operator(AbstractContextManager["Operator", None]):
         """Presses the e-stop of one gate, or of every one that is seen if no namespace is given."""
         if namespace is not None:
             return [self._call(self._wait_for_gate(namespace, seconds), "e_stop")]
-        answers: dict[str, GateAnswer] = {}
+        calls: dict[str, _Call] = {}
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
-            for gate in self._gates() - answers.keys():
-                if not answers:
+            for gate in self._gates() - calls.keys():
+                if not calls:
                     deadline = time.monotonic() + SETTLE_S
-                answers[gate] = self._call(gate, "e_stop")
+                calls[gate] = _Call(self._node, gate, "e_stop")
+            for call in calls.values():  # a gate that hangs holds up no other
+                call.send_when_ready()
             time.sleep(POLL_S)
-        if not answers:
+        if not calls:
             raise BackendError(f"{self._nobody(GATE, seconds)}; nothing was stopped.")
-        return list(answers.values())
+        deadline = time.monotonic() + ANSWER_S
+        return [
+            call.wait_for_answer(deadline - time.monotonic()) for call in calls.values()
+        ]
 
     def send_goal(
         self, namespace: str, goal: GoalRequest, seconds: float, tell: Tell
@@ -201,19 +239,7 @@ class Operator(AbstractContextManager["Operator", None]):
         )
 
     def _call(self, gate: str, service: str) -> GateAnswer:
-        client = self._node.create_client(Trigger, f"{gate}/{service}")
-        try:
-            if not client.wait_for_service(timeout_sec=ANSWER_S):
-                return GateAnswer(gate, False, "it has ended")
-            future = client.call_async(Trigger.Request())
-            if not holds(future.done, ANSWER_S, POLL_S):
-                return GateAnswer(
-                    gate, False, f"it does not answer within {ANSWER_S:g} s"
-                )
-            answer = future.result()
-            return GateAnswer(gate, bool(answer.success), str(answer.message))
-        finally:
-            self._node.destroy_client(client)
+        return _Call(self._node, gate, service).wait_for_answer(2.0 * ANSWER_S)
 
     def _take_diagnostics(self, message: Any) -> None:
         for status in message.status:

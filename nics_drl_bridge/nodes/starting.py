@@ -356,7 +356,10 @@ def common(use_sim_time: str) -> list[Argument]:
 def of_nodes() -> list[Argument]:
     """Returns the arguments of every launch that starts nodes of this package."""
     file = str(find_config("bridge", "nodes"))
-    stamped = "cmd_vel is a TwistStamped; empty: of params_file, or as usual"
+    stamped = (
+        "Use TwistStamped for cmd_vel; "
+        "empty: params_file, else TwistStamped on Kilted and newer"
+    )
     return [
         Argument("params_file", file, "Parameters of all nodes"),
         Argument("stamped", "", stamped),

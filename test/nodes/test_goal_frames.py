@@ -73,6 +73,12 @@ def test_a_goal_of_the_map_or_of_no_frame_is_taken_as_it_is(frames, frame):
     assert frames.in_map(goal(frame, 1.0, -2.0)) == pytest.approx([1.0, -2.0])
 
 
+@pytest.mark.parametrize("x", [float("nan"), float("inf")])
+def test_a_goal_that_is_no_place_is_refused(frames, x):
+    with pytest.raises(ConfigError, match="must be finite numbers"):
+        frames.in_map(goal("map", x, 0.0))
+
+
 @pytest.mark.parametrize("frame", ["base_link", "bot/base"])
 def test_a_goal_ahead_of_the_robot_lies_where_it_looks(frames, frame):
     assert frames.in_map(goal(frame, 2.0, 0.5)) == pytest.approx([2.5, 3.0])
