@@ -177,6 +177,8 @@ class PolicyNode(ManagedNode):
             "late": done.late,
             "longest inference [ms]": longest,
         }
+        if self._answer is not None:
+            facts.update(self._answer.to_facts())
         return runner.Condition(
             f"{self.state}; {done.late} late inferences", done.late > 0, facts
         )

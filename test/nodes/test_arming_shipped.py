@@ -109,7 +109,7 @@ def test_a_shipped_robot_is_armed_with_the_shipped_parameters(declared, robot):
 @pytest.mark.parametrize("node", NODES)
 def test_the_shipped_file_sets_nothing_that_a_node_derives_from_the_robot(node):
     content = yaml.safe_load(FILE.read_text(encoding="utf-8"))
-    given = content[f"/**/{node}"]["ros__parameters"]
+    given = content.get(f"/**/{node}", {"ros__parameters": {}})["ros__parameters"]
     derived = {row.name for row in NODES[node]().parameters if row.shown}
     assert not derived & given.keys()
 
@@ -121,7 +121,7 @@ def test_a_turtlebot_is_armed_as_it_is_launched(
     content = yaml.safe_load(Path(FILE).read_text(encoding="utf-8"))
 
     def start(node, **arguments):
-        own = content[f"/**/{node}"]["ros__parameters"]
+        own = content.get(f"/**/{node}", {"ros__parameters": {}})["ros__parameters"]
         launch_process(
             node, domain_id, **own | {"model": "turtlebot3_burger"} | arguments
         )
