@@ -98,7 +98,7 @@ def log(tmp_path, logger):
 
 
 def files(folder):
-    return sorted(path for path in folder.iterdir() if path.suffix == ".jsonl")
+    return sorted(folder.glob("*.jsonl"))
 
 
 def written(log, folder, count):
