@@ -149,8 +149,13 @@ format: setup ## let ruff repair what it can
 types: setup ## mypy
 	$(BIN)/mypy nics_drl_bridge
 
+# A test that waits for other processes may fail on a busy machine: what failed runs once more, alone.
 pytest: setup
-	$(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(PYTEST_ARGS)
+	@status=0; $(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(PYTEST_ARGS) || status=$$?; \
+	if [ $$status = 1 ]; then \
+		echo "make: once more, alone, the tests that failed:"; \
+		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none --maxfail 5 -m "not campaign" $(PYTEST_ARGS); \
+	else exit $$status; fi
 
 # Environments apart, of what clashes with .venv; what they share with it has the same pins.
 # $(1): folder. $(2): command that prints its constraints. $(3): what it holds.
