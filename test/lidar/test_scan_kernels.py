@@ -75,7 +75,7 @@ def looked_up(view: float, ahead: float, bearing: float) -> bool:
     here = LidarPose(0.0, 0.0, np.cos(0.7), np.sin(0.7))
     lanes = scan_kernels.scan_lanes()
     near = np.zeros(1, int)
-    found, computed = scan_kernels.select(
+    found, computed = scan_kernels.select_bodies(
         0, near, body, -1, here, 0.7, 0, scanner.arguments, lanes
     )
     assert computed == 0
