@@ -3,8 +3,9 @@
 `look_up` is Eq. 3 (the ranges of a body, from the table) and Eq. 4 (the minimum per beam). Its
 steps are those of `baked_kernels`, which are written for one body. Here each step runs over all
 waiting bodies in a loop without branches, which LLVM vectorises: a look-up's time goes into cache
-misses, mispredicted branches and latencies. Steps hand on their results in lanes: one array per type of
-number, with `LANES` places for each quantity. LLVM can prove that quantities do not overlap.
+misses, mispredicted branches and latencies. Steps hand on their results in lanes: one array per
+type of number, with `LANES` places for each quantity, so that LLVM can prove that they do not
+overlap.
 """
 
 import math
@@ -146,9 +147,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, la
 
 
 @kernel(contracts=True, inline=True)
-def select_bodies(
-    in_use, near, bodies, own_body, lidar_pose, heading, at, lidar, lanes
-):  # type: ignore[no-untyped-def]
+def select_bodies(in_use, near, bodies, own, lidar_pose, heading, at, lidar, lanes):  # type: ignore[no-untyped-def]
     """Put the visible ones of the bodies `near` into lanes; return lanes in use, bodies to compute.
 
     A body is computed instead of looked up where the table is too coarse, see `way_of`.
@@ -180,7 +179,7 @@ def select_bodies(
         is_behind = (behind[0, 0] * ahead + behind[0, 1] * aside >= radius) & (
             behind[1, 0] * ahead + behind[1, 1] * aside >= radius
         )
-        is_other = (radius > 0.0) & (near[j] != own_body)
+        is_other = (radius > 0.0) & (near[j] != own)
         is_visible = (d2 <= reach * reach) & is_other & (not is_behind)
         is_in_table = is_visible & (d2 >= radius * radius)
         is_in_table &= (d2 >= lidar.between[h, 0]) & (d2 <= lidar.between[h, 1])

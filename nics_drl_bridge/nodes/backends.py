@@ -1,4 +1,10 @@
-"""Backends over ROS 2: one robot or several in lock-step with a simulator behind topics."""
+"""Backends over ROS 2: one robot or several in lock-step with a simulator behind topics.
+
+A step of `DdsBackend` is `send` and `receive`. `send` publishes the command, and the simulator
+simulates one control period. `receive` waits until the scan and the odometry of the end of that
+period are in the inbox, hands them to the middleware, and returns its view. Two threads work: the
+caller's, and the executor's, which takes messages from ROS 2 and puts them into the inbox.
+"""
 
 import math
 import threading
@@ -44,107 +50,125 @@ T = TypeVar("T")
 SCAN = "scan"
 ODOM = "odom"
 TRUTH = "ground_truth"
-AGAIN_S = 0.05  # data that do not arrive within this time are requested again [s]
+# The simulator is asked to repeat data that do not arrive within this time [s].
+REPEAT_S = 0.05
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 
-class _Mail(NamedTuple):
-    stamp_ns: int = -1  # without a message
+class _Message(NamedTuple):
+    stamp_ns: int = -1  # before any message
     arrival_ns: int = 0
     content: bytes = b""
 
 
-class _Mailbox:
-    # The caller is woken once, when all its topics are there: each wake-up costs a good part of a
-    # step. The executor's thread gives awaited odometry to `work` while the scan is in transit.
+class _Inbox:
+    """The latest message of each topic, and the wait for those of one stamp.
+
+    The executor's thread puts messages in; the caller's thread waits. The caller is woken once,
+    when the messages of all topics are there, because each wake-up costs a good part of a step.
+    The executor's thread does not idle until then: it updates the estimator with the awaited
+    odometry while the scan is still in transit.
+    """
+
     def __init__(
         self,
         topics: tuple[str, ...],
-        work: Callable[[int, int, bytes], None],
-        slack_ns: int,
+        update_estimator: Callable[[int, int, bytes], None],
+        lag_ns: int,
     ) -> None:
-        self._slack_ns = slack_ns  # data may be so much older than what is awaited
-        self._mail = dict.fromkeys(topics, _Mail())
-        self._work = work
+        # Messages may be older than the awaited stamp by this much.
+        self._lag_ns = lag_ns
+        self._messages = dict.fromkeys(topics, _Message())
+        self._update_estimator = update_estimator
         self._lock = threading.Lock()
-        self._awaiting = threading.Lock()
-        self._awaited_ns = -1
-        self._worked_ns = -1
+        # Locked while the caller waits, released to wake it: cheaper than an Event.
+        self._caller_waits = threading.Lock()
+        self._awaited_ns = -1  # while nothing is awaited
+        self._estimated_ns = -1  # the awaited stamp of the last update of the estimator
         self._failure: Exception | None = None
 
-    def put(self, topic: str, message: bytes) -> object:
+    def put(self, topic: str, content: bytes) -> object:
+        """Store a message; returns HANDED_OVER if that woke the caller."""
         with self._lock:
             try:
-                stamp_ns = _read(topic, wire.stamp_of, message)
-                self._mail[topic] = _Mail(stamp_ns, time.monotonic_ns(), message)
-                self._work_in()
+                stamp_ns = _read(topic, wire.stamp_of, content)
+                self._messages[topic] = _Message(stamp_ns, time.monotonic_ns(), content)
+                self._estimate_if_due()
             except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
                 self._failure = error
-            if self._awaited_ns >= 0 and (
-                self._failure or not self._late(self._awaited_ns)
-            ):
-                if self._awaiting.locked():
-                    self._awaiting.release()
+            is_awaited = self._awaited_ns >= 0
+            if is_awaited and (self._failure or not self._find_late(self._awaited_ns)):
+                if self._caller_waits.locked():
+                    self._caller_waits.release()
                 return HANDED_OVER
         return None
 
-    def _work_in(self) -> None:
-        if self._worked_ns != (wanted := self._awaited_ns) >= 0 and (
-            wanted <= self._mail[ODOM].stamp_ns + self._slack_ns
-        ):
-            self._worked_ns = self._awaited_ns
-            self._work(*self._mail[ODOM])
+    def _estimate_if_due(self) -> None:
+        """Update the estimator, once, with the odometry that is awaited, if it is there."""
+        awaited_ns = self._awaited_ns
+        if awaited_ns < 0 or self._estimated_ns == awaited_ns:
+            return
+        if awaited_ns <= self._messages[ODOM].stamp_ns + self._lag_ns:
+            self._estimated_ns = awaited_ns
+            self._update_estimator(*self._messages[ODOM])
 
-    def _late(self, stamp_ns: int) -> str | None:
-        for topic, mail in self._mail.items():
-            if mail.stamp_ns + self._slack_ns < stamp_ns:
+    def _find_late(self, stamp_ns: int) -> str | None:
+        """Return the first topic whose message of a stamp is not there; None if all are."""
+        for topic, message in self._messages.items():
+            if message.stamp_ns + self._lag_ns < stamp_ns:
                 return topic
         return None
 
     def stamp_ns(self, topic: str) -> int:
-        return self._mail[topic].stamp_ns
+        """Stamp of the latest message of a topic [ns]."""
+        return self._messages[topic].stamp_ns
 
     def content(self, topic: str) -> bytes:
-        return self._mail[topic].content
+        """The latest message of a topic, serialized."""
+        return self._messages[topic].content
 
     def clear(self) -> None:
+        """Drop all messages."""
         with self._lock:
-            self._mail = dict.fromkeys(self._mail, _Mail())
-            self._worked_ns = -1
+            self._messages = dict.fromkeys(self._messages, _Message())
+            self._estimated_ns = -1
 
     def newest_ns(self) -> int:
-        return max(mail.stamp_ns for mail in self._mail.values())
+        """The newest stamp of any topic [ns]."""
+        return max(message.stamp_ns for message in self._messages.values())
 
-    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:
+    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Message]:
+        """Wait for the messages of a stamp. Raises StaleDataError if a topic is late."""
         with self._lock:
             self._awaited_ns = stamp_ns
             self._failure = None
-            self._awaiting.acquire(blocking=False)
-            self._work_in()
-            late = self._late(stamp_ns)
-        if late is not None:
-            self._awaiting.acquire(timeout=timeout_s)  # until `put` releases it
+            self._caller_waits.acquire(blocking=False)
+            self._estimate_if_due()
+            late_topic = self._find_late(stamp_ns)
+        if late_topic is not None:
+            self._caller_waits.acquire(timeout=timeout_s)  # until `put` releases it
         with self._lock:
             self._awaited_ns = -1
             if self._failure is not None:
                 raise self._failure
-            if (late := self._late(stamp_ns)) is not None:
-                mail = self._mail[late]
-                age_s = (time.monotonic_ns() - mail.arrival_ns) * S_PER_NS
-                raise StaleDataError(
-                    late, age_s if mail.content else math.inf, timeout_s
-                )
-            return dict(self._mail)
+            late_topic = self._find_late(stamp_ns)
+            if late_topic is None:
+                return dict(self._messages)
+            latest = self._messages[late_topic]
+            age_s = math.inf
+            if latest.content:
+                age_s = (time.monotonic_ns() - latest.arrival_ns) * S_PER_NS
+            raise StaleDataError(late_topic, age_s, timeout_s)
 
 
-def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
-    return mail.put(topic, message)
+def _put(inbox: _Inbox, topic: str, content: bytes) -> object:
+    return inbox.put(topic, content)
 
 
-def _take_odometry(
-    middleware: Middleware, stamp_ns: int, arrival_ns: int, message: bytes
+def _update_estimator(
+    middleware: Middleware, stamp_ns: int, arrival_ns: int, content: bytes
 ) -> None:
-    middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
+    middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, content))
 
 
 class DdsBackend:
@@ -177,29 +201,32 @@ class DdsBackend:
         self._sensors = {sensor.name: sensor for sensor in model.sensors}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
-        further = (*self._sensors, TRUTH) if truth else (*self._sensors,)
         self.timeout_s = timeout_s
-        self._topics = (ODOM, SCAN, *further)
-        # No reference to the backend, which may be garbage.
-        take = partial(_take_odometry, self._middleware)
+        self._topics = (ODOM, SCAN, *self._sensors)
+        if truth:
+            self._topics = (*self._topics, TRUTH)
         options = validate(dict(standard or {}), client.StandardOptions, "standard")
-        by_standard = (
-            simulator == STANDARD.name
-        )  # whose steps may be of a rounded length
-        self._grain_ns = round(client.TOLERANCE * self._period_ns) if by_standard else 0
-        self._slack_ns = max(round(options.slack_s * NS_PER_S), self._grain_ns)
-        self._now_ns, self._mail = 0, _Mailbox(self._topics, take, self._slack_ns)
-        self._known: BackendFacts = {}
+        # A simulator of the standard may round the length of its steps.
+        self._rounding_ns = 0
+        if simulator == STANDARD.name:
+            self._rounding_ns = round(client.TOLERANCE * self._period_ns)
+        self._lag_ns = max(round(options.slack_s * NS_PER_S), self._rounding_ns)
+        # Simulated time at the end of the last step.
+        self._now_ns = 0
+        # Callbacks hold no reference to the backend, so that it can be garbage-collected.
+        update_estimator = partial(_update_estimator, self._middleware)
+        self._inbox = _Inbox(self._topics, update_estimator, self._lag_ns)
+        self._facts: BackendFacts = {}
         if randomisation is not None:
             sampler = EpisodeSampler(model, world, randomisation=randomisation)
-            self._known["scenes"] = lambda seeds: sampler.draw(seeds)[0]
+            self._facts["scenes"] = lambda seeds: sampler.draw(seeds)[0]
         self._link = Link(namespace, domain_id, stamped=stamped, patience_s=timeout_s)
         try:
             for topic in self._topics:
                 kind = LaserScan if topic == SCAN else Odometry
                 if topic in self._sensors:
                     kind = sensor_type(self._sensors[topic])
-                put = partial(_put, self._mail, topic)
+                put = partial(_put, self._inbox, topic)
                 self._link.node.create_subscription(
                     kind, topic, put, qos.SENSOR, raw=True
                 )
@@ -225,7 +252,7 @@ class DdsBackend:
     ) -> EpisodeServices | client.StandardEpisodes:
         if simulator == STANDARD.name:
             return client.StandardEpisodes(
-                self._link, model, world, options, self._mail
+                self._link, model, world, options, self._inbox
             )
         return EpisodeServices(self._link, simulator, model, world, randomisation)
 
@@ -235,76 +262,87 @@ class DdsBackend:
         return self.first(self.begin(start), start.pose)
 
     def begin(self, start: Start) -> int:
-        """Begins an episode, the first part of a reset; returns the stamp of its data [ns]."""
+        """Begin an episode, the first half of a reset; return the stamp of its first data [ns]."""
         self._link.check_open()
         self._link.check_alone()
         return self._episodes.begin(start, self.timeout_s)
 
     def first(self, stamp_ns: int, pose: Array) -> RobotView:
-        """The second part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
+        """Wait for the first data of an episode, the second half of a reset.
+
+        stamp_ns: what `begin` returned; pose: (3,), where the robot stands.
+        """
         self._now_ns = stamp_ns
         self._middleware.reset(stamp_ns, pose)
         view = self.receive()[0]
-        self._link.frame = _read(ODOM, wire.frames_of, self._mail.content(ODOM))[1]
+        self._link.frame = _read(ODOM, wire.frames_of, self._inbox.content(ODOM))[1]
         return view
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command and waits for the data after it; see `interface.Backend`."""
+        """Publish a command and wait for the data at the end of its control period."""
         self.send(command)
         return self.receive()
 
     @halts_on_error
     def send(self, command: Array) -> None:
-        """The first half of a step: checks and publishes a command (C,)."""
+        """Check and publish a command (C,), the first half of a step."""
         self._link.check_open()
-        # Data that arrived before the command would be taken for its answer.
+        # If the simulator ran ahead, its data would be taken for the answer to this command.
         self._check_stamps()
         twist = self._robot.to_cmd_vel(command)
         self._link.send(twist)
         self._episodes.advance()
-        self._link.check_alone()  # while the simulator is at work
+        # Checked while the simulator is busy: this is free.
+        self._link.check_alone()
         self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
         self._now_ns += self._period_ns
 
     def _check_stamps(self) -> None:
+        """Raise BackendError unless the latest data are those of the last step."""
         for topic in self._topics:
-            off_ns = self._mail.stamp_ns(topic) - self._now_ns
-            if not -self._slack_ns <= off_ns <= self._grain_ns:
+            ahead_ns = self._inbox.stamp_ns(topic) - self._now_ns
+            if not -self._lag_ns <= ahead_ns <= self._rounding_ns:
                 self._link.check_alone()
-                off = f"stamped {off_ns / NS_PER_S:+.3f} s off the step"
+                off = f"stamped {ahead_ns / NS_PER_S:+.3f} s off the step"
                 fix = "start the simulator with mode:=lockstep, and move it from here alone."
                 raise BackendError(f"topic {topic!r}: {off}; {fix}")
 
     @halts_on_error
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
-        """The second half: waits for the data after the command; returns the view and `info`."""
-        mail = self._await(self._now_ns)
-        self._check_stamps()
-        off_ns = self._mail.stamp_ns(ODOM) - self._now_ns
-        now = self._now_ns = self._now_ns + (
-            off_ns if abs(off_ns) <= self._grain_ns else 0
-        )
-        ranges = from_device(
-            _read(SCAN, wire.ranges_of, mail[SCAN].content), self._lidar
-        )
-        self._middleware.scan(now, mail[SCAN].arrival_ns, ranges)
-        for name, sensor in self._sensors.items():
-            reading = _read(name, partial(sensor_from_ros, sensor), mail[name].content)
-            self._middleware.sense(name, now, mail[name].arrival_ns, reading)
-        facts = {"stamp_ns": now, **data_facts(self._middleware, time.monotonic_ns())}
-        if TRUTH in self._topics:
-            facts["true_pose"] = _read(TRUTH, wire.odometry_of, mail[TRUTH].content)[0]
-            self._known["true_pose"] = facts["true_pose"]
-        return self._middleware.view(now), facts
+        """Wait for the data at the end of the period, the second half of a step.
 
-    def _await(self, stamp_ns: int) -> dict[str, _Mail]:
+        Returns the view and `info`. The estimator has the odometry already, see `_Inbox`.
+        """
+        messages = self._wait_for_data(self._now_ns)
+        self._check_stamps()
+        rounded_by_ns = self._inbox.stamp_ns(ODOM) - self._now_ns
+        if abs(rounded_by_ns) <= self._rounding_ns:
+            self._now_ns += rounded_by_ns
+        scan = messages[SCAN]
+        ranges = from_device(_read(SCAN, wire.ranges_of, scan.content), self._lidar)
+        self._middleware.scan(self._now_ns, scan.arrival_ns, ranges)
+        for name, sensor in self._sensors.items():
+            message = messages[name]
+            read = partial(sensor_from_ros, sensor)
+            reading = _read(name, read, message.content)
+            self._middleware.sense(name, self._now_ns, message.arrival_ns, reading)
+        info: dict[str, Any] = {"stamp_ns": self._now_ns}
+        info |= data_facts(self._middleware, time.monotonic_ns())
+        if TRUTH in self._topics:
+            true_pose = _read(TRUTH, wire.odometry_of, messages[TRUTH].content)[0]
+            info["true_pose"] = true_pose
+            self._facts["true_pose"] = true_pose
+        return self._middleware.view(self._now_ns), info
+
+    def _wait_for_data(self, stamp_ns: int) -> dict[str, _Message]:
+        """Wait for the data of a stamp; have the simulator repeat what was lost on the way."""
         deadline = time.monotonic() + self.timeout_s
         while True:
+            remaining_s = max(0.0, deadline - time.monotonic())
             try:
-                left_s = max(0.0, deadline - time.monotonic())
-                return self._mail.wait(stamp_ns, min(AGAIN_S, left_s))
+                return self._inbox.wait(stamp_ns, min(REPEAT_S, remaining_s))
             except StaleDataError as error:
-                if left_s <= AGAIN_S:
+                if remaining_s <= REPEAT_S:
                     raise StaleDataError(
                         error.topic, error.age_s, self.timeout_s
                     ) from None
@@ -312,7 +350,7 @@ class DdsBackend:
 
     def facts(self) -> BackendFacts:
         """Returns the newest true pose, if it was asked for."""
-        return self._known
+        return self._facts
 
     def halt(self) -> None:
         """Publishes a zero command; the episode is over."""
@@ -323,9 +361,10 @@ class DdsBackend:
         self._link.close()
 
 
-def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
+def _read(topic: str, read: Callable[[bytes], T], content: bytes) -> T:
+    """Deserialize a message. Raises BackendError if it is damaged."""
     try:
-        return read(message)
+        return read(content)
     except wire.UNREADABLE as error:
         reason = f"a message can't be read ({error}); look at who publishes it."
         raise BackendError(f"topic {topic!r}: {reason}") from None
@@ -367,8 +406,8 @@ class FleetBackend:
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes all commands (M, C) and waits for all data after them."""
-        for robot, one in zip(self._robots, command, strict=True):
-            robot.send(one)
+        for robot, robot_command in zip(self._robots, command, strict=True):
+            robot.send(robot_command)
         views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
         return interface.stacked(views), together(facts)
 

@@ -25,7 +25,7 @@ from nics_drl_bridge.errors import BackendError, ConfigError, ModelError, StaleD
 from nics_drl_bridge.generator import builtin_model, open_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.backends import DdsBackend, _Mailbox, dds_backend
+from nics_drl_bridge.nodes.backends import DdsBackend, _Inbox, dds_backend
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.sim.scenes import member_of
 from nics_drl_bridge.sim.world import load_world
@@ -227,7 +227,7 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(
     drive(backend)
     whole = backend.step(np.array([0.5, 0.1]))
     drive(backend)
-    put = backend._mail.put
+    put = backend._inbox.put
     lost = []
 
     def lossy(kind, message):
@@ -236,7 +236,7 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(
         else:
             put(kind, message)
 
-    monkeypatch.setattr(backend._mail, "put", lossy)
+    monkeypatch.setattr(backend._inbox, "put", lossy)
     holed = backend.step(np.array([0.5, 0.1]))
     assert lost == [topic]
     for name in ("pose", "twist", "ranges"):
@@ -247,7 +247,7 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(
 def test_a_lost_asking_is_made_again(connect, monkeypatch):
     backend = connect()
     drive(backend)
-    put = backend._mail.put
+    put = backend._inbox.put
     ask = backend._episodes._repeat.call_async
     lost = []
 
@@ -264,7 +264,7 @@ def test_a_lost_asking_is_made_again(connect, monkeypatch):
         return ask(request)
 
     monkeypatch.setattr("nics_drl_bridge.nodes.link.LOST_S", 0.1)
-    monkeypatch.setattr(backend._mail, "put", lossy)
+    monkeypatch.setattr(backend._inbox, "put", lossy)
     monkeypatch.setattr(backend._episodes._repeat, "call_async", deaf)
     view, facts = backend.step(np.array([0.5, 0.1]))
     assert lost == ["scan", "asking"]
@@ -278,9 +278,9 @@ def test_a_message_that_cant_be_read_is_told_with_its_topic(
 ):
     backend = connect(truth=True)
     drive(backend)
-    put = backend._mail.put
+    put = backend._inbox.put
     monkeypatch.setattr(
-        backend._mail, "put", lambda kind, m: put(kind, m[:14] if kind == topic else m)
+        backend._inbox, "put", lambda kind, m: put(kind, m[:14] if kind == topic else m)
     )
     with pytest.raises(BackendError, match=f"topic '{topic}': a message can't be read"):
         backend.step(np.array([0.5, 0.1]))
@@ -294,21 +294,21 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
         message.header.stamp.sec = second
         return serialize_message(message)
 
-    worked = []
+    estimated = []
     got = []
-    mail = _Mailbox(
-        ("odom", "scan"), lambda stamp, *_: worked.append(stamp), slack_ns=0
+    inbox = _Inbox(
+        ("odom", "scan"), lambda stamp, *_: estimated.append(stamp), lag_ns=0
     )
-    assert mail.put("odom", stamped(1)) is mail.put("scan", stamped(1)) is None
+    assert inbox.put("odom", stamped(1)) is inbox.put("scan", stamped(1)) is None
     caller = threading.Thread(
-        target=lambda: got.append(mail.wait(2 * NS_PER_S, TIMEOUT_S))
+        target=lambda: got.append(inbox.wait(2 * NS_PER_S, TIMEOUT_S))
     )
     caller.start()
-    while mail._awaited_ns < 0:
+    while inbox._awaited_ns < 0:
         os.sched_yield()
-    assert mail.put("odom", stamped(2)) is None
-    assert worked == [2 * NS_PER_S]
-    assert mail.put("scan", stamped(2)) is HANDED_OVER
+    assert inbox.put("odom", stamped(2)) is None
+    assert estimated == [2 * NS_PER_S]
+    assert inbox.put("scan", stamped(2)) is HANDED_OVER
     caller.join(TIMEOUT_S)
     assert got[0].keys() == {"odom", "scan"}
 
@@ -373,7 +373,7 @@ def test_an_error_in_a_step_leaves_a_zero_command_and_wants_a_reset(
 
     def interrupted():
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):  # noqa: PT012
-            patch.setattr(env._backend, "_await", fails)
+            patch.setattr(env._backend, "_wait_for_data", fails)
             env.step(action)
 
     def fails(*_):
@@ -418,7 +418,7 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(
             backend.reset(START)
             intruder.publish(Twist())
             peer.until(
-                lambda: backend._mail.stamp_ns("odom") > backend._now_ns, "its effect"
+                lambda: backend._inbox.stamp_ns("odom") > backend._now_ns, "its effect"
             )
             with pytest.raises(
                 BackendError, match=r"'odom': stamped \+0\.100 s off the step"

@@ -79,13 +79,13 @@ class StandardEpisodes:
         model: SimulatorModel,
         world: AnyWorld,
         options: StandardOptions,
-        mail: Any,
+        inbox: Any,
     ) -> None:
         self._link = link
         self._model = model
         self._world = world
         self._options = options
-        self._mail = mail  # of the data, see `backends`
+        self._inbox = inbox  # of the data, see `backends`
         self._types = module("srv")
         self._messages = module("msg")
         self._entity = options.entity or model.robot.name
@@ -199,18 +199,18 @@ class StandardEpisodes:
         found = self._call("GetEntityState", timeout_s, entity=self._entity)
         time_ns = conversions.stamp_from_ros(found.state.header.stamp)
         self._link.halt()
-        self._mail.clear()  # of what is from before a reset that put time back
+        self._inbox.clear()  # of what is from before a reset that put time back
         self.advance()
         if time_ns:
             return time_ns + self._period_ns
         # An answer without a stamp: by the first data, of several steps the last.
         holds(
-            lambda: self._pending[-1].done() and self._mail.newest_ns() >= 0,
+            lambda: self._pending[-1].done() and self._inbox.newest_ns() >= 0,
             timeout_s,
             POLL_S,
         )
         time.sleep(POLL_S)
-        return max(0, int(self._mail.newest_ns()))
+        return max(0, int(self._inbox.newest_ns()))
 
     def _put_obstacles(self, start: Start, timeout_s: float) -> None:
         if not self._options.obstacles or not self._entities.service_is_ready():
