@@ -117,9 +117,12 @@ def watch_scan(
     oldest_ns = scan.stamp_ns - round(_memory_s(config, settings) / S_PER_NS)
     kept = tuple(one for one in before.views if one.stamp_ns >= oldest_ns)
     verdict = UNDECIDED
-    if state.push is not None:  # only a robot that is told to move can be held
+    since_ns = None
+    # Only a robot that is commanded to move can be held. Each push is judged alone: tyres that
+    # slip whenever the robot starts say nothing about the time in between.
+    if state.push is not None:
         verdict = judge_motion(config, kept, newest, settings)
-    since_ns = _held_since(before.held_since_ns, verdict, scan.stamp_ns, settings)
+        since_ns = _held_since(before.held_since_ns, verdict, scan.stamp_ns, settings)
     held = _contradiction(kept, newest, verdict, since_ns, settings)
     apart_ns = round(settings.kept_every_s / S_PER_NS)
     if not kept or newest.stamp_ns - kept[-1].stamp_ns >= apart_ns:

@@ -215,6 +215,17 @@ def test_wheels_that_slip_as_a_turn_begins_do_not_stop_the_robot():
     assert scene.run(1.0).cause is None
 
 
+def test_wheels_that_slip_in_each_of_many_short_pushes_do_not_stop_the_robot():
+    scene = started(twist=(0.1, 0.0, 0.02))
+    scene.scale = np.array([1.0, 1.0, 10.0])
+    push = scene.wish
+    for _ in range(8):
+        scene.wish = np.zeros(3)
+        scene.run(0.45)
+        scene.wish = push
+        assert scene.run(0.35).cause is None
+
+
 @pytest.mark.parametrize(
     "walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"]
 )
