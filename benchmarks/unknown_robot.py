@@ -34,6 +34,7 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 Array = NDArray[np.float64]
@@ -221,12 +222,22 @@ class Workshop:
                 "rover",
                 "--world",
                 "field.yaml",
+                "--settings",
+                "training.yaml",
                 "--seeds",
                 str(self._seed),
                 "--out",
                 "policies",
             )
         return self.folder / "policies" / f"seed_{self._seed}" / "policy.onnx"
+
+
+def training_settings() -> dict[str, Any]:
+    """Returns the shipped settings of a robot like this one, with a smaller goal."""
+    file = share_folder() / "config" / "training" / "own_differential.yaml"
+    settings: dict[str, Any] = yaml.safe_load(file.read_text())
+    settings["task_options"]["goal_radius"] = GOAL_RADIUS
+    return settings
 
 
 def is_moving(message: TwistStamped) -> bool:
