@@ -1,7 +1,10 @@
 """Compiled inner loops of the simulator: motion, and the step of some worlds.
 
-A world is bit-identical in any batch, part or thread: nothing is summed over worlds, and what is
-drawn at random is drawn by the world's own seed and counter.
+`_step` is one control period: queue the commands, steer what moves by itself, move all robots as if
+nothing were there, redo those that meet something carefully, measure odometry, scan.
+
+A world is bit-identical in any batch, part or thread: nothing is summed over worlds, and random
+numbers depend on the world's own seed and counter alone.
 """
 
 import math
@@ -33,7 +36,8 @@ from nics_drl_bridge.sim.state import (
     Surroundings,
 )
 
-TOGETHER = 48  # Robots whose scans, with their faults, are made together: they stay in the L2 cache
+# Robots that are scanned together, and their scans then distorted: these stay in the L2 cache.
+TOGETHER = 48
 
 
 @kernel(view=True)
@@ -57,7 +61,8 @@ def surroundings_of(n: int, members: Members) -> Surroundings:
 
 
 @kernel
-def _send(history: Array, commands: Array, begin: int, curves: Array) -> None:
+def _queue_commands(history: Array, commands: Array, begin: int, curves: Array) -> None:
+    """Put commands (n, M, C), by their input curves, in front of the latest ones (N, M, H, C)."""
     for i in range(commands.shape[0]):
         for m in range(commands.shape[1]):
             for h in range(history.shape[2] - 1, 0, -1):
@@ -71,90 +76,111 @@ def _send(history: Array, commands: Array, begin: int, curves: Array) -> None:
 def move_freely(
     begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes
 ) -> None:
-    """Moves robot m of world n of [begin, end) one period freely, in lane (n - begin) M + m."""
+    """Move the robots of worlds [begin, end) for one period, as if nothing stood in their way.
+
+    The result stands in the lanes: robot m of world n is in lane (n - begin) M + m. A command takes
+    effect after its delay, so that the period is integrated from one change to the next.
+    """
     robots = state.pose.shape[1]
     size = state.state.shape[2]
     substeps = motion.substeps
     history = state.history
-    where = lanes.pose
+    lane_pose = lanes.pose
     x = lanes.x
-    late = lanes.late
+    change = lanes.late
     for n in range(begin, end):
         for m in range(robots):
-            i = (n - begin) * robots + m
+            lane = (n - begin) * robots + m
             heading = state.pose[n, m, 2]
-            where[0, i], where[1, i] = state.pose[n, m, 0], state.pose[n, m, 1]
-            where[2, i], where[3, i] = math.cos(heading), math.sin(heading)
-            where[4, i] = heading
-            where[5, i] = 0.0
+            lane_pose[0, lane] = state.pose[n, m, 0]
+            lane_pose[1, lane] = state.pose[n, m, 1]
+            lane_pose[2, lane] = math.cos(heading)
+            lane_pose[3, lane] = math.sin(heading)
+            lane_pose[4, lane] = heading
+            lane_pose[5, lane] = 0.0
             for s in range(size):
-                x[s, i] = state.state[n, m, s]
+                x[s, lane] = state.state[n, m, s]
             for t in range(lanes.coefficient.shape[0]):
-                lanes.coefficient[t, i] = state.coefficient[n, m, t]
-            for c in range(late.shape[0]):  # each command changes once, after this many
-                late[c, i] = (state.delay[n, m] + motion.terms.late[c]) % substeps
+                lanes.coefficient[t, lane] = state.coefficient[n, m, t]
+            # Each command changes once in a period, at this substep.
+            for c in range(change.shape[0]):
+                change[c, lane] = (state.delay[n, m] + motion.terms.late[c]) % substeps
     terms = with_coefficients(motion.terms, lanes.coefficient)
-    at = 0
-    used = (end - begin) * robots
-    while at < substeps:
-        until = substeps
-        for c in range(late.shape[0]):
-            for i in range(used):
-                if late[c, i] > at:
-                    until = min(until, late[c, i])
-                if late[c, i] == at or at == 0:
-                    n = begin + i // robots
-                    m = i % robots
+    lane_count = (end - begin) * robots
+    substep = 0
+    while substep < substeps:
+        next_change = substeps
+        for c in range(change.shape[0]):
+            for lane in range(lane_count):
+                if change[c, lane] > substep:
+                    next_change = min(next_change, change[c, lane])
+                if change[c, lane] == substep or substep == 0:
+                    n = begin + lane // robots
+                    m = lane % robots
                     delay = state.delay[n, m] + motion.terms.late[c]
-                    row = delayed(at, delay, substeps, history.shape[2])
-                    x[size + c, i] = history[n, m, row, c]
-        run(where, x, lanes.dq, terms, motion.series, motion.dt, until - at)
-        at = until
+                    row = delayed(substep, delay, substeps, history.shape[2])
+                    x[size + c, lane] = history[n, m, row, c]
+        run(
+            lane_pose,
+            x,
+            lanes.dq,
+            terms,
+            motion.series,
+            motion.dt,
+            next_change - substep,
+        )
+        substep = next_change
 
 
 @kernel
 def _move_world(
     n: int,
-    skip: int,
+    first_lane: int,
     state: State,
     scene: Surroundings,
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
+    """Move robots and obstacles of world n, after `move_freely`.
+
+    A robot that can meet nothing in this period takes its free motion from the lanes. If any robot
+    may meet something, these robots and the obstacles are moved carefully, from contact to contact.
+    """
     lanes = scratch.lanes
     nearby = scratch.nearby
     single = scratch.single
     pose = state.pose
     period = motion.dt * motion.substeps
     robots = pose.shape[1]
-    first = state.velocity.shape[1]
+    obstacle_count = state.velocity.shape[1]
     for m in range(robots):
         drift = math.sqrt(3.0 * period) * (state.noise[n, m, 2] + state.noise[n, m, 3])
-        nearby.way[m] = lanes.pose[5, skip + m] + drift
-    longest, moving = contacts.reaches(n, state, scene, nearby, period)
+        nearby.way[m] = lanes.pose[5, first_lane + m] + drift
+    longest, obstacles_move = contacts.reaches(n, state, scene, nearby, period)
     if scene.crowded:
         cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
         scratch.cells.frame[n, cells.MOVED] = longest
-    tight = False
+    any_meets = False
     for m in range(robots):
         nearby.meets[m] = contacts.find_near(
             n, m, state.bodies, scene, nearby, scratch.cells
         )
-        tight = tight or nearby.meets[m] != contacts.FREE
+        any_meets = any_meets or nearby.meets[m] != contacts.FREE
     for m in range(robots):
         if nearby.meets[m] == contacts.FREE:
-            i = skip + m
-            pose[n, m, 0], pose[n, m, 1] = lanes.pose[0, i], lanes.pose[1, i]
-            pose[n, m, 2] = lanes.pose[4, i]
+            lane = first_lane + m
+            pose[n, m, 0] = lanes.pose[0, lane]
+            pose[n, m, 1] = lanes.pose[1, lane]
+            pose[n, m, 2] = lanes.pose[4, lane]
             for s in range(state.state.shape[2]):
-                state.state[n, m, s] = lanes.x[s, i]
-    if moving:
-        for k in range(first):
+                state.state[n, m, s] = lanes.x[s, lane]
+    if obstacles_move:
+        for k in range(obstacle_count):
             for i in range(3):
                 single.start[k, i] = single.began[k, i] = state.bodies[n, k, i]
-    if tight:
-        move_carefully(n, moving, state, scene, motion, nearby, single)
-    elif moving:
+    if any_meets:
+        move_carefully(n, obstacles_move, state, scene, motion, nearby, single)
+    elif obstacles_move:
         contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)
     for m in range(robots):
         pose[n, m, 2] = wrap(pose[n, m, 2])
@@ -163,7 +189,7 @@ def _move_world(
 
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
-    """Steps the worlds of a part, from `begin` on, under commands (n, M, C) for a period."""
+    """Step n worlds of a part, from world `begin` on, under commands (n, M, C) for one period."""
     part = packed.content
     _step(
         part.state, part.members, part.lidar, part.motion, part.scratch, commands, begin
@@ -180,54 +206,60 @@ def _step(
     commands: Array,
     begin: int,
 ) -> None:
-    """See `step_worlds`; without reference counts, which took longer than the step."""
-    many = state.pose.shape[1]
+    """Step some worlds, see `step_worlds`.
+
+    Worlds go through the period in blocks, as many as the lanes hold robots. Scans of several
+    worlds are made together, because one lidar's scan is too short to keep the processor busy.
+    A separate function from `step_worlds`: numba would count references to the part's arrays here,
+    which took longer than the step.
+    """
+    robots = state.pose.shape[1]
     end = begin + commands.shape[0]
-    _send(state.history, commands, begin, motion.terms.curves)
-    block = scratch.lanes.pose.shape[1] // many
-    for low in range(begin, end, block):
-        high = min(low + block, end)
-        _begin_period(low, high, state, members, motion, scratch)
-        move_freely(low, high, state, motion, scratch.lanes)
-        waiting = np.int64(0)
-        scanned = low
-        for n in range(low, high):
+    _queue_commands(state.history, commands, begin, motion.terms.curves)
+    worlds_per_block = scratch.lanes.pose.shape[1] // robots
+    for block_begin in range(begin, end, worlds_per_block):
+        block_end = min(block_begin + worlds_per_block, end)
+        _begin_period(block_begin, block_end, state, members, motion, scratch)
+        move_freely(block_begin, block_end, state, motion, scratch.lanes)
+        worlds_to_scan = np.int64(0)
+        first_to_distort = block_begin
+        for n in range(block_begin, block_end):
             state.steps[n] += 1
-            skip = (n - low) * many
+            first_lane = (n - block_begin) * robots
             scene = surroundings_of(n, members)
-            _move_world(n, skip, state, scene, motion, scratch)
-            _measure(n, skip, state, scene, motion, scratch)
-            waiting = sensing.scan_or_wait(
-                n, waiting, state, members, lidar, motion, scratch
+            _move_world(n, first_lane, state, scene, motion, scratch)
+            _measure(n, first_lane, state, scene, motion, scratch)
+            worlds_to_scan = sensing.scan_or_wait(
+                n, worlds_to_scan, state, members, lidar, motion, scratch
             )
-            if n + 1 == high or (n + 1 - scanned) * many >= TOGETHER:
-                sensing.scan_together(waiting, state, members, lidar, scratch)
-                sensing.distort(scanned, n + 1, state, lidar)
-                waiting = np.int64(0)
-                scanned = n + 1
+            is_last = n + 1 == block_end
+            if is_last or (n + 1 - first_to_distort) * robots >= TOGETHER:
+                sensing.scan_together(worlds_to_scan, state, members, lidar, scratch)
+                sensing.distort(first_to_distort, n + 1, state, lidar)
+                worlds_to_scan = np.int64(0)
+                first_to_distort = n + 1
 
 
 @kernel(inline=True)
 def _begin_period(
-    low: int,
-    high: int,
+    begin: int,
+    end: int,
     state: State,
     members: Members,
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
+    """Keep the poses of worlds [begin, end) before the period, and steer what moves by itself."""
     pose = state.pose
     before = scratch.scans.before
     speeds = scratch.nearby.speeds
-    for n in range(low, high):
+    for n in range(begin, end):
         for m in range(pose.shape[1]):
-            i = (n - low) * pose.shape[1] + m
+            lane = (n - begin) * pose.shape[1] + m
             row = state.steps[n] % state.past.shape[2]
-            before[i, 0], before[i, 1], before[i, 2] = (
-                pose[n, m, 0],
-                pose[n, m, 1],
-                pose[n, m, 2],
-            )
+            before[lane, 0] = pose[n, m, 0]
+            before[lane, 1] = pose[n, m, 1]
+            before[lane, 2] = pose[n, m, 2]
             if state.steps[n] == 0:
                 sensing.begin(n, m, state)
             if members.moves:
@@ -244,21 +276,23 @@ def _begin_period(
 @kernel(inline=True)
 def _measure(
     n: int,
-    skip: int,
+    first_lane: int,
     state: State,
     scene: Surroundings,
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
+    """Put the robots' bodies where they now stand, and measure their odometry."""
     frame = scratch.cells.frame
     pose = state.pose
-    first = state.velocity.shape[1]
+    obstacle_count = state.velocity.shape[1]
     for m in range(pose.shape[1]):
-        contacts.put_body(state.bodies, n, first + m, pose[n, m])
+        contacts.put_body(state.bodies, n, obstacle_count + m, pose[n, m])
         rates_at(n, m, motion.substeps - 1, state, motion, scratch.single)
-        before = scratch.scans.before[skip + m]
+        before = scratch.scans.before[first_lane + m]
         sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
-        if scene.crowded:  # the cells count how far the robots came, drift included
+        # The cells must know how far any body may be from where it was sorted.
+        if scene.crowded:
             dx = pose[n, m, 0] - before[0]
             dy = pose[n, m, 1] - before[1]
             frame[n, cells.MOVED] = max(
@@ -268,7 +302,7 @@ def _measure(
 
 @kernel
 def sort(n: int, state: State, scene: Surroundings, scratch: Scratch) -> None:
-    """Sorts the bodies of a world into its cells, if there are any."""
+    """Sort the bodies of a world into its cells, if it has any."""
     if scene.crowded:
         cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
     elif scene.standing:
@@ -279,7 +313,7 @@ def sort(n: int, state: State, scene: Surroundings, scratch: Scratch) -> None:
 
 @kernel(allocates=True)
 def sort_worlds(packed: Any, begin: int, end: int) -> None:
-    """Sorts the bodies of the worlds [begin, end) of a part into cells, as they stand."""
+    """Sort the bodies of the worlds [begin, end) of a part into cells, as they stand."""
     part = packed.content
     for n in range(begin, end):
         sort(n, part.state, surroundings_of(n, part.members), part.scratch)
@@ -287,7 +321,7 @@ def sort_worlds(packed: Any, begin: int, end: int) -> None:
 
 @kernel(allocates=True)
 def begin(packed: Any, chosen: records.Integers) -> None:
-    """Begins episodes in the worlds `chosen` (n,): all is in place and stands still."""
+    """Begin episodes in the worlds `chosen` (n,), where everything is in place and stands still."""
     part = packed.content
     state = part.state
     waiting = part.scratch.scans.waiting
@@ -306,7 +340,7 @@ def begin(packed: Any, chosen: records.Integers) -> None:
 
 @kernel(allocates=True)
 def begin_period(packed: Any) -> None:
-    """Begins a period of worlds whose robots are moved from outside, from where they stand."""
+    """Begin a period of worlds whose robots another engine moves."""
     part = packed.content
     count = part.state.pose.shape[0]
     _begin_period(0, count, part.state, part.members, part.motion, part.scratch)
@@ -316,9 +350,9 @@ def begin_period(packed: Any) -> None:
 def end_period(
     packed: Any, true: Array, before: Array, wheels: Array, counted: Array
 ) -> None:
-    """Measures what the robots sense at the end of a period in which they were moved from outside.
+    """Measure what the robots sense at the end of a period in which another engine moved them.
 
-    Robots and obstacles stand where the period ends. All others are (N, M, 3): the true twist at
+    Robots and obstacles stand where the period ends. The arguments are (N, M, 3): the true twist at
     the end, the pose by the wheels alone before and after, and the twist by the wheels at the end.
     """
     part = packed.content
@@ -347,7 +381,7 @@ def end_period(
 
 @kernel
 def propagate(covariance: Array, before: Array, after: Array, added: Array) -> None:
-    """Propagates covariances in place, see `device.propagate`: P' = F P F^T + Q."""
+    """Propagate covariances in place, see `device.propagate`: P' = F P F^T + Q."""
     for m in range(covariance.shape[0]):
         p = covariance[m]
         # F differs from the identity only in its last column.
