@@ -25,7 +25,7 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.robot.kernels import SERIES, rollout, run, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -108,7 +108,7 @@ def batched_speed(model: TaylorModel, spec: RobotSpec) -> float:
     low = spec.command_low[:, None]
     high = spec.command_high[:, None]
     commands = rng.uniform(low, high, (HOLDS, len(low), BATCH))
-    terms, per_hold = term_arrays(model), round(0.1 / model.dt)
+    terms, per_hold = make_terms(model), round(0.1 / model.dt)
     terms = terms._replace(
         coefficient=np.repeat(terms.coefficient[:, None], BATCH, axis=1)
     )
@@ -135,14 +135,14 @@ def single_speed(model: TaylorModel, spec: RobotSpec, steps: int = 50_000) -> fl
     held = rng.uniform(
         spec.command_low, spec.command_high, (1, steps // 10, len(spec.command))
     )
-    commands, terms = np.repeat(held, 10, axis=1), term_arrays(model)
+    commands, terms = np.repeat(held, 10, axis=1), make_terms(model)
     poses, states = (
         np.zeros((1, steps + 1, 3)),
         np.zeros((1, steps + 1, model.state_size)),
     )
 
     def drive() -> None:
-        rollout(poses, states, commands, terms, SERIES, model.dt)
+        simulate_rollouts(poses, states, commands, terms, SERIES, model.dt)
         require_finite(poses)
 
     return steps * model.dt / best_time(drive)

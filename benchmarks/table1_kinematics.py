@@ -117,7 +117,7 @@ def batch(
     model: TaylorModel, dtype: type, robots: int, robot: Subject
 ) -> tuple[Any, ...]:
     """Arguments of `kernels.run` for robots at the origin under random inputs."""
-    terms = kernels.term_arrays(model)
+    terms = kernels.make_terms(model)
     rng = np.random.default_rng(3)
     x = np.ones((len(model.variables) + 1, robots), dtype)
     low = robot.spec.command_low
@@ -157,9 +157,11 @@ def single_rate(model: TaylorModel, robot: Subject) -> float:
         np.zeros((1, SINGLE_STEPS + 1, 3)),
         np.zeros((1, SINGLE_STEPS + 1, 0)),
     )
-    terms = kernels.term_arrays(model)
+    terms = kernels.make_terms(model)
     return SINGLE_STEPS / best(
-        lambda: kernels.rollout(poses, states, commands, terms, kernels.SERIES, DT)
+        lambda: kernels.simulate_rollouts(
+            poses, states, commands, terms, kernels.SERIES, DT
+        )
     )
 
 

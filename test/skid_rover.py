@@ -12,7 +12,7 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.noise import Noise
-from nics_drl_bridge.robot.spec import RobotSpec, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim.world import World
 
@@ -40,7 +40,7 @@ commands:
 
 def rover() -> RobotSpec:
     """The robot as its YAML file tells it."""
-    return robot_from(
+    return build_robot(
         {
             "name": "skid_rover",
             "kind": "free",

@@ -23,13 +23,13 @@ from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.kernels import MotionModel
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.curve import InputCurve
-from nics_drl_bridge.robot.kernels import SERIES, rollout, run, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
 from nics_drl_bridge.robot.noise import Noise
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import build_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 from nics_drl_bridge.sim.simulator import CommandBox, FastSimulator
 
-CAR = robot_from(
+CAR = build_robot(
     {
         "kind": "ackermann_throttle",
         "footprint_radius": 0.2,
@@ -144,8 +144,8 @@ def test_the_drive_shows_every_stage(commands, path):
 def rolled(car, commands):
     poses = np.zeros((1, PERIODS * SUBSTEPS + 1, 3))
     states = np.zeros((1, 601, 2))
-    every = car.in_effect(late(car, commands))[None]
-    rollout(poses, states, every, term_arrays(car), SERIES, car.dt)
+    every = car.apply_curves(late(car, commands))[None]
+    simulate_rollouts(poses, states, every, make_terms(car), SERIES, car.dt)
     return poses[0, ::SUBSTEPS], states[0, ::SUBSTEPS]
 
 
@@ -215,7 +215,7 @@ def test_the_estimator_predicts_the_path_of_the_model(model, commands, path):
 def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(
     throttle,
 ):
-    motion = MotionModel(term_arrays(motors()), SERIES, 0, 0)
+    motion = MotionModel(make_terms(motors()), SERIES, 0, 0)
 
     def ahead(speed: float) -> tuple[float, float]:
         mean = np.array([0.0, 0.0, 0.0, speed, 0.0])
@@ -246,7 +246,7 @@ def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
 def test_a_batch_of_robots_moves_as_each_alone(commands, path):
     car = motors()
     count = 37
-    terms = term_arrays(car)
+    terms = make_terms(car)
     lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], count))
     pose = np.zeros((6, count))
     x = np.zeros((5, count))
@@ -254,7 +254,7 @@ def test_a_batch_of_robots_moves_as_each_alone(commands, path):
     pose[2] = 1.0
     x[4] = 1.0
     for command in late(car, commands):
-        x[2:4] = car.in_effect(command)[:, None]
+        x[2:4] = car.apply_curves(command)[:, None]
         run(pose, x, dq, lanes, SERIES, car.dt, 1)
     assert np.allclose(pose[:2, -1], path[0][-1, :2], rtol=0.0, atol=1e-9)
     assert (pose == pose[:, :1]).all()
@@ -263,7 +263,7 @@ def test_a_batch_of_robots_moves_as_each_alone(commands, path):
 def test_predictions_over_seconds_have_the_derivatives_that_differences_show(commands):
     car = motors()
     steps = 300
-    every = car.in_effect(late(car, commands))
+    every = car.apply_curves(late(car, commands))
     first = np.arange(0, 300, 50)
     state = rolled_states(car, every)[first]
     free = np.arange(car.terms_kept)
@@ -280,7 +280,7 @@ def test_predictions_over_seconds_have_the_derivatives_that_differences_show(com
         shoot(shot, terms, free, car.dt, tangent(2, 2, len(free), len(free)))
         return shot.end[:, 0], shot.slope[:, 0]
 
-    terms = term_arrays(car)
+    terms = make_terms(car)
     slight = 1e-7
     end, slope = ends(terms)
     for p in free:
@@ -292,7 +292,7 @@ def test_predictions_over_seconds_have_the_derivatives_that_differences_show(com
 def rolled_states(car, every):
     poses = np.zeros((1, len(every) + 1, 3))
     states = np.zeros((1, len(every) + 1, 2))
-    rollout(poses, states, every[None], term_arrays(car), SERIES, car.dt)
+    simulate_rollouts(poses, states, every[None], make_terms(car), SERIES, car.dt)
     return states[0]
 
 

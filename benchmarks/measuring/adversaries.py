@@ -13,7 +13,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.sim.collision_kernels import wall_distance
 
 Array = NDArray[np.float64]
@@ -105,7 +105,7 @@ class Adversary:
 
     def _nearest(self, truth: Truth, commands: Array) -> Array:
         """(n,) clearances [m] that commands (n, C) lead to, at the end or on the way."""
-        twist = steady_twist(self._robot, commands)
+        twist = compute_steady_twist(self._robot, commands)
         moved = geometry.exp(np.multiply.outer(np.array(HORIZON_S), twist))
         places = geometry.compose(truth.pose, moved)[..., :2]
         away = np.array(

@@ -21,7 +21,7 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.geometry import between, compose, exp
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import compute_steady_twist
 
 Array = NDArray[np.float64]
 RULE = "body_held"
@@ -246,7 +246,7 @@ class Drive:
         )
         for i in range(len(self.gates)):
             if self.held[i]:
-                told = steady_twist(robot, commands[i : i + 1])[0]
+                told = compute_steady_twist(robot, commands[i : i + 1])[0]
                 self.wheel[i] += (told - self.wheel[i]) * min(
                     1.0, self.period / WHEEL_LAG_S
                 )

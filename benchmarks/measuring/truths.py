@@ -10,7 +10,7 @@ import numpy as np
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 STANDARD_ERRORS = 3.0  # by how many a mounting may be off
@@ -98,6 +98,6 @@ def _per_command(model: TaylorModel, place: int) -> Array:
     command[1, :, place] = -SLOW
     poses = np.zeros((2, steps + 1, 3))
     states = np.zeros((2, steps + 1, size))
-    rollout(poses, states, command, term_arrays(model), SERIES, model.dt)
+    simulate_rollouts(poses, states, command, make_terms(model), SERIES, model.dt)
     twist = geometry.log(geometry.between(poses[:, -2], poses[:, -1])) / model.dt
     return np.asarray((twist[0] - twist[1]) / (2.0 * SLOW))

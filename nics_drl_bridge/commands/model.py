@@ -459,12 +459,12 @@ def urdf(
     """Writes a robot's URDF, for RViz and robot_state_publisher."""
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.robot.urdf import urdf_of
+    from nics_drl_bridge.robot.urdf import make_urdf
 
     opened = open_model(model)
     file = out or Path(f"{opened.robot.name}.urdf")
     lidar = opened.lidar
     further = {each.frame: each.mount for each in opened.sensors}
-    write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
+    write_text(file, make_urdf(opened.robot, lidar.mount, lidar.frame, further=further))
     name = opened.robot.name
     console.say(as_json, f"{file}: the URDF of {name}", file=str(file), robot=name)

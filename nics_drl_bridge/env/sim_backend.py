@@ -80,7 +80,7 @@ class SimBackend:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
         if self._middlewares:
-            command = self._robot.through_cmd_vel(
+            command = self._robot.pass_through_cmd_vel(
                 command
             )  # as over ROS 2: both round alike
         commands = command.reshape(data.pose.shape[1], -1)

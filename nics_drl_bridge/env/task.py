@@ -19,7 +19,7 @@ from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach
+from nics_drl_bridge.robot.kinds import find_command, has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Observation = NDArray[np.float32]
@@ -186,7 +186,9 @@ class Task(ABC):
         low, high = self.command_limits
         kernels.commands(out.reshape(rows.shape), rows, low, high)
         # What a vehicle can't do is not to be learnt: a car by turn rates does not steer at rest.
-        return self.robot.through_cmd_vel(out) if self.robot.takes_turn_rate else out
+        return (
+            self.robot.pass_through_cmd_vel(out) if self.robot.takes_turn_rate else out
+        )
 
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
@@ -359,9 +361,9 @@ def discrete_commands(robot: RobotSpec) -> Array:
     """(A, C) commands of the discrete actions, at limits: `DRIVES`, or each command by itself."""
     drives = np.array((*DRIVES, *SIDEWAYS) if robot.moves_sideways else DRIVES)
     if robot.takes_cmd_vel:
-        signs = robot.of_fields(drives)
+        signs = robot.from_fields(drives)
     elif has_textbook(robot):
-        return command_for(robot, drives * reach(robot))
+        return find_command(robot, drives * reach(robot))
     else:
         each = np.eye(len(robot.command))
         signs = np.concatenate([0.0 * each[:1], each, -each])

@@ -10,7 +10,7 @@ from nics_drl_bridge.gate.inputs import Command, Estimate, Odometry, Scan
 from nics_drl_bridge.gate.limits import Limits
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.robot.braking import NO_DRIFT, Drift, OwnTurn
+from nics_drl_bridge.robot.braking import NO_DRIFT, Drift, TurnBraking
 
 Ranges = NDArray[np.float32]
 Record = TypeVar("Record")
@@ -56,7 +56,7 @@ class ShieldConfig:
     lever: float = 0.0  # by which a turn rate adds to the speed that is braked [m]
     order: float = 2.0  # of the norm of ahead and sideways, see `Braking.order`
     drift: Drift = NO_DRIFT  # off its arc while it brakes; of no account for a car
-    turn: OwnTurn | None = None  # of a robot whose turn brakes apart from its speed
+    turn: TurnBraking | None = None  # of a robot whose turn brakes apart from its speed
 
 
 @dataclass(frozen=True)

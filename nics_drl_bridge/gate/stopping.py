@@ -13,7 +13,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
 from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.robot.braking import Braking, OwnTurn, braking_of
+from nics_drl_bridge.robot.braking import Braking, TurnBraking, find_braking
 from nics_drl_bridge.robot.spec import RobotSpec
 
 ANGLE = "rad"
@@ -113,7 +113,7 @@ def shield_config(
     return config, f"the shield is on: {listed} ({source})"
 
 
-def _turn_as_told(braking: Braking, told: Stopping) -> OwnTurn | None:
+def _turn_as_told(braking: Braking, told: Stopping) -> TurnBraking | None:
     """Returns the turn's own braking, which is worse if the speed is told to brake worse."""
     if braking.turn is None:
         return None
@@ -141,7 +141,7 @@ def braking_by(model: SimulatorModel, limits: Limits | None) -> Braking:
         high = limits.high
         rates = limits.rate
     ramp = np.where(linear, rates, np.inf)
-    braking = braking_of(robot, model.kinematics, low, high, ramp)
+    braking = find_braking(robot, model.kinematics, low, high, ramp)
     reaction = braking.reaction_s
     if not model.kinematics.state_size or braking == Braking(0.0, math.inf):
         reaction += UNKNOWN_LAG_S  # it shows no lag, and every robot has one

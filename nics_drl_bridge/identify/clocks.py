@@ -108,7 +108,7 @@ def response_residual(
 ) -> Left:
     """Returns the residual of a signal explained by commands, given lags and delays (S,) [s]."""
     (start, end, signal), moved = target, signals.moved_inputs(command, spec)
-    powers = taylor.exponents(len(moved), order)
+    powers = taylor.list_exponents(len(moved), order)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
@@ -155,7 +155,7 @@ def some_of(count: int, most: int) -> NDArray[np.intp]:
 def residual_by_shift(state: Stream, target: Target) -> Residual:
     """Returns the residual of the pose's rates, given a delay (1,) of the measured state [s]."""
     start, end, signal = target
-    chi = taylor.evaluate(state.values, taylor.exponents(state.values.shape[1], 2))
+    chi = taylor.evaluate(state.values, taylor.list_exponents(state.values.shape[1], 2))
 
     def residual(theta: Array) -> Array:
         means = signals.interval_means(state.t, chi, start - theta[0], end - theta[0])

@@ -10,7 +10,7 @@ from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.gyro import relative_to
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.verdict import Doubt, Mistake, missed
-from nics_drl_bridge.robot.kinds import overdriven
+from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.taylor import EndErrors
 
 OF_PATH = " of the path"
@@ -52,7 +52,7 @@ def conclude(identified: Identified) -> Conclusion:
         *doubts_of_commands(identified.judgement, identified.calibration),
         *assessment.reasons,
     )
-    beyond = *narrow(identified.recording, spec), overdriven(spec)
+    beyond = *narrow(identified.recording, spec), describe_overdrive(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)
     ready = (
         assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed

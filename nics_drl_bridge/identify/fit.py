@@ -133,7 +133,7 @@ def regress(
     samples = samples.rows(believed)
     excited = excitation.Excitation.of(samples, spec)
     names = spec.variable_names
-    every = taylor.exponents(len(names), order)
+    every = taylor.list_exponents(len(names), order)
     powers = excitation.moved_terms(samples, every, names, excited.unmoved)
     chi = taylor.evaluate(samples.x, powers)
     independent, dependent = excitation.independent_columns(chi)
@@ -172,7 +172,7 @@ def regress(
         used,
         moving,
         excited,
-        dependent=tuple(taylor.term_name(row, names) for row in powers[dependent]),
+        dependent=tuple(taylor.format_term(row, names) for row in powers[dependent]),
         terms_total=samples.dq.shape[1] * len(every),
         left_out=1.0 - float(believed.mean()),
     )
@@ -275,7 +275,9 @@ def _curve(
         by_weight(regression.beta[d], _floor(regression, d)),
         regression.rows(d),
     )
-    names = tuple(taylor.term_name(row, variables) for row in regression.powers[order])
+    names = tuple(
+        taylor.format_term(row, variables) for row in regression.powers[order]
+    )
     return statistics.curve(dofs[d], names, (chi / _scale(chi))[:, order], target)
 
 

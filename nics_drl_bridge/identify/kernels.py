@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.robot.kernels import bounds_of, emf_of, next_state
+from nics_drl_bridge.robot.kernels import advance_state, get_bounds, sum_back_emf
 
 # windows that are predicted at a time: vector instructions take some at once
 WIDTH = 16
@@ -250,7 +250,7 @@ def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
         slope = scratch.jacobian[3 + i, i]
         state = scratch.x[i]
         for lane in range(rate.shape[0]):
-            braking = emf_of(i, scratch.x[:, lane], terms)
+            braking = sum_back_emf(i, scratch.x[:, lane], terms)
             rate[lane] -= braking * state[lane]
             slope[lane] -= braking
 
@@ -343,9 +343,9 @@ def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped
             if moves:
                 now[k] += dt * scratch.value[free[k], lane]
             k += 1
-        bounds = bounds_of(terms, i)
+        bounds = get_bounds(terms, i)
         x = scratch.x[i]
-        moved = next_state(x[lane], rate[3 + i], dt, bounds)
+        moved = advance_state(x[lane], rate[3 + i], dt, bounds)
         if count > 0:
             _hold(now, x[lane], moved, rate[3 + i], dt, bounds)
         x[lane] = moved

@@ -19,7 +19,7 @@ from nics_drl_bridge.identify.terms import mirrored, tyres_slip
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import GREATEST_ORDER
-from nics_drl_bridge.robot.kinds import has_textbook, slips, steady_twist
+from nics_drl_bridge.robot.kinds import compute_steady_twist, has_textbook, slips
 from nics_drl_bridge.robot.spec import RobotSpec
 
 TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
@@ -104,7 +104,7 @@ def by_instruments(
     """Estimates the mounting by functions of the states (n, S); None if these are too weak."""
     # They know nothing of the noise of the twists, and whatever they do along x, they do nothing
     # along y: limited information maximum likelihood (Anderson, Rubin 1949).
-    powers = taylor.exponents(states.shape[1], GREATEST_ORDER)
+    powers = taylor.list_exponents(states.shape[1], GREATEST_ORDER)
     chi = taylor.evaluate(
         states / np.maximum(np.abs(states).max(axis=0), STILL), powers
     )
@@ -300,8 +300,8 @@ def _by_commands(
 def _response(spec: RobotSpec, command: Array) -> Array:
     """Returns twists (n, 3) up to factors; the third may be a steering angle."""
     if spec.takes_cmd_vel:
-        return spec.in_fields(command)
-    return steady_twist(spec, command)
+        return spec.to_fields(command)
+    return compute_steady_twist(spec, command)
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:

@@ -16,7 +16,7 @@ from nics_drl_bridge.robot.noise import (
     MEASURED,
     Level,
     Noise,
-    assumed,
+    assume_level,
 )
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -92,7 +92,9 @@ def claimed(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
     }
     found = {name: (getattr(sensor, name), std) for name, std in claims.items()}
     return {
-        name: assumed(std, at.unit) for name, (at, std) in found.items() if std > at.std
+        name: assume_level(std, at.unit)
+        for name, (at, std) in found.items()
+        if std > at.std
     }
 
 
@@ -178,7 +180,7 @@ def _state_drift(
     """Returns the drift of a measured state; assumed levels for an unmeasured one."""
     state = drive.recording.state
     nominal = {
-        v.name: assumed(ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
+        v.name: assume_level(ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
         for v in drive.spec.state
     }
     if state is None:

@@ -12,7 +12,7 @@ from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import follow
 from nics_drl_bridge.identify.signals import followed, taken
-from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 HORIZON_S = 5.0
@@ -166,11 +166,11 @@ def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Arra
     poses = np.zeros((count, steps + 1, 3))
     states = np.empty((count, steps + 1, state.shape[1]))
     states[:, 0] = state
-    rollout(
+    simulate_rollouts(
         poses,
         states,
         np.ascontiguousarray(command),
-        term_arrays(model),
+        make_terms(model),
         SERIES,
         model.dt,
     )
@@ -237,7 +237,7 @@ def relative_ends(
     used = (model.coefficients != 0.0) | free
     used[3:] = False
     dofs, places = np.nonzero(used)
-    terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
+    terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
     terms = terms._replace(coefficient=model.coefficients[dofs, places])
     moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
     ends = np.zeros((len(course.steps), 3))

@@ -49,7 +49,7 @@ def refined(
     linear: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration, str]:
     """Refines a linear fit by its predictions and removes terms; with a sentence on the result."""
-    model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
+    model, calibration = by_definition(linear.add_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
     why = (
         "The training part is too short to refine the model by its errors over seconds"
@@ -135,7 +135,7 @@ def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorMo
         )
         for term, error in refined.get(dof, {}).items():
             rows[dof][term] = max(error, known.get(term, 0.0))
-    return model.with_errors(rows)
+    return model.add_errors(rows)
 
 
 @dataclass(frozen=True)

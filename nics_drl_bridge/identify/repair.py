@@ -546,7 +546,7 @@ def _asked_and_driven(
         sent = held(command, spec, start - delay, end - delay)
         twist = np.zeros_like(driven)
         twist[:, places or [0, 1]] = (
-            sent if places else textbook(spec).steady(sent)[:, [0, 2]]
+            sent if places else textbook(spec).compute_twist(sent)[:, [0, 2]]
         )
         with np.errstate(invalid="ignore"):  # of what never changed
             alike = np.corrcoef(twist.T, driven.T)[:2, 2:]

@@ -17,7 +17,7 @@ from nics_drl_bridge.identify.kernels import Shot, shoot, tangent
 from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.kernels import term_arrays
+from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
@@ -142,7 +142,7 @@ class Shooting:
             free = free
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
-        terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
+        terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
         terms = terms._replace(coefficient=model.coefficients[dofs, places])
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
         command = self.commands(values)

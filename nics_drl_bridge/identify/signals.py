@@ -12,7 +12,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import limp
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.curve import InputCurve, bent, delays
+from nics_drl_bridge.robot.curve import InputCurve, apply_curves, delays
 from nics_drl_bridge.robot.spec import RobotSpec
 
 SMOOTHING_BATCH = 64
@@ -31,7 +31,7 @@ def taken(
 ) -> Array:
     """Returns means (..., C) of commands in effect over intervals (...) [s], by their curves."""
     names = [c.name for c in spec.command]
-    stream = replace(command, values=bent(command.values, names, curves))
+    stream = replace(command, values=apply_curves(command.values, names, curves))
     late = delays(names, curves)
     means = held(stream, spec, start, end)
     for c in np.flatnonzero(late):

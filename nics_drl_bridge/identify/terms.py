@@ -15,7 +15,7 @@ from nics_drl_bridge.identify import excitation
 from nics_drl_bridge.identify.fit import Fit, pruned, regress
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -31,9 +31,9 @@ def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
     reach = np.maximum(spec.command_high, -spec.command_low)
     some = rng.uniform(0.1, 0.9, (8, len(spec.command))) * reach
     try:
-        twist = steady_twist(spec, some) * np.array([1.0, -1.0, -1.0])
+        twist = compute_steady_twist(spec, some) * np.array([1.0, -1.0, -1.0])
         for signs in product((1.0, -1.0), repeat=len(spec.command)):
-            if np.allclose(steady_twist(spec, some * signs), twist):
+            if np.allclose(compute_steady_twist(spec, some * signs), twist):
                 break
         else:
             return None

@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.yardstick_kernels import (
     BicycleGeometry,
     roll_windows,
 )
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
 
@@ -253,7 +253,10 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     """Asks the textbook what each command moves (3, C), and for a bicycle; None without one."""
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
-        alone, together = steady_twist(spec, np.diag(half)), steady_twist(spec, half)
+        alone, together = (
+            compute_steady_twist(spec, np.diag(half)),
+            compute_steady_twist(spec, half),
+        )
         if (
             len(half) != 2
             or np.abs(alone[:, 2]).max() > NOTHING
@@ -264,7 +267,7 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
             ).T, STRAIGHT
         speed = int(np.argmax(np.abs(alone[:, 0])))
         less = np.where(np.arange(2) == speed, half, 0.5 * half)
-        forward, slower = alone[speed, 0], steady_twist(spec, less)
+        forward, slower = alone[speed, 0], compute_steady_twist(spec, less)
     except ConfigError:
         return None
     cosine = float(together[0] / forward)

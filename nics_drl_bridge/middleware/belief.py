@@ -52,7 +52,7 @@ def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
             list(product(*(np.linspace(*each, levels) for each in ranges)))
         )
     states = len(model.robot.state)
-    tried[:, states:] = model.kinematics.in_effect(tried[:, states:])
+    tried[:, states:] = model.kinematics.apply_curves(tried[:, states:])
     twist = model.kinematics.rates(tried)[:, :3]
     return float(np.hypot(twist[:, 0], twist[:, 1]).max()), float(
         np.abs(twist[:, 2]).max()

@@ -23,7 +23,7 @@ from nics_drl_bridge.middleware.turning import (
     take_rate,
     turn_odometry,
 )
-from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, wrap
 
 LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 1e-2, 2e-2
 """Lower bounds on the model's error after a second, of the pose [m or rad / sqrt(s)], and of the
@@ -70,7 +70,7 @@ class Estimator:
     def __init__(self, model: SimulatorModel) -> None:
         dt, _, delay = model.timing
         steps = round(dt * NS_PER_S), round(LONGEST_GAP_S * NS_PER_S)
-        self._motion = MotionModel(term_arrays(model.kinematics), SERIES, *steps)
+        self._motion = MotionModel(make_terms(model.kinematics), SERIES, *steps)
         self._delay_ns = round(dt * delay * NS_PER_S)
         size = len(model.robot.state)
         reach = np.array([v.max - v.min for v in model.robot.state])

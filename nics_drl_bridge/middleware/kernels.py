@@ -83,7 +83,7 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
                     product *= x[factors[k, other]]
             jacobian[dof[k], factors[k, f]] += product
     for i in range(terms.emf.shape[0]):
-        jacobian[3 + i, i] -= robot.emf_of(i, x, terms)
+        jacobian[3 + i, i] -= robot.sum_back_emf(i, x, terms)
 
 
 @kernel
@@ -132,8 +132,8 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
             transition[3 + i, 3 + size + i] += dt
         robot.advance(mean[:3], dq, dt, motion.series)
         for i in range(size):
-            bounds = robot.bounds_of(motion.terms, i)
-            mean[3 + i] = robot.next_state(mean[3 + i], dq[3 + i], dt, bounds)
+            bounds = robot.get_bounds(motion.terms, i)
+            mean[3 + i] = robot.advance_state(mean[3 + i], dq[3 + i], dt, bounds)
 
 
 @kernel(allocates=True)

@@ -57,7 +57,7 @@ class Judgement(NamedTuple):
     outcome: Acceptance
 
 
-def checked_covariance(
+def check_covariance(
     covariance: ArrayLike | None, size: int, least_std: float
 ) -> Array | None:
     """Returns a covariance that the filter can use, of at least `least_std` in any direction.

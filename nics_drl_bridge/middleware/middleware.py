@@ -275,7 +275,7 @@ class Middleware:
         if not np.isfinite(value).all():
             return self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
         try:
-            noise = measured.checked_covariance(about, len(value), LEAST_STD[kind])
+            noise = measured.check_covariance(about, len(value), LEAST_STD[kind])
         except ValueError as error:
             return self.cache.reject(f"{kind.topic}: {error}")
         return not self._measure(

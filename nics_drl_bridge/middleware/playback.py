@@ -74,11 +74,11 @@ def estimate(
     The estimate is identical on every machine with the same versions. Raises RecordingError if the
     bag is damaged, a topic missing or of a wrong type, or the data are stamped by several clocks.
     """
-    messages = played(path, topics, model.gyro)
+    messages = read_messages(path, topics, model.gyro)
     playback = Playback(model, POSE in messages)
     rows = []
     middleware = playback.middleware
-    for role, message in in_order(messages):
+    for role, message in merge_messages(messages):
         if playback.take(role, message) and role == ODOM:
             stamp_ns = max(stamp(message.content), middleware.estimator.time_ns)
             view = middleware.view(stamp_ns)
@@ -112,7 +112,7 @@ def with_gyro(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
     return topics
 
 
-def played(
+def read_messages(
     path: str | Path, topics: Mapping[str, str], use_gyro: bool = False
 ) -> dict[str, list[Message]]:
     """Returns the messages of each role that is played. Raises as `estimate` does."""
@@ -266,7 +266,9 @@ class Playback:
         return self.middleware.imu(stamp(message), arrival_ns, *measured)
 
 
-def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:
+def merge_messages(
+    messages: Mapping[str, list[Message]],
+) -> Iterator[tuple[str, Message]]:
     """Yields all messages with their roles, in the order of receipt."""
     every = [(role, message) for role in sorted(messages) for message in messages[role]]
     yield from sorted(

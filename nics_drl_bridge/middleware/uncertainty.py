@@ -22,7 +22,7 @@ class Uncertainty(NamedTuple):
         )
 
 
-def gained_uncertainty(before: Array, after: Array) -> Uncertainty:
+def compute_uncertainty_gain(before: Array, after: Array) -> Uncertainty:
     """Returns what a pose has lost in certainty between two of its covariances (3, 3)."""
     gained = after - before
     position = max(float(np.linalg.eigvalsh(gained[:2, :2])[-1]), 0.0)

@@ -246,7 +246,7 @@ class PathActions:
             )
             return
         if message.percentage:
-            limit *= 0.01 * float(self._robot.in_fields(self._robot.command_high)[0])
+            limit *= 0.01 * float(self._robot.to_fields(self._robot.command_high)[0])
         self._limit = limit or math.inf
 
     # A goal begins.
@@ -441,7 +441,7 @@ class PathActions:
             run.valid_s = time.monotonic()
         twist: Array = np.zeros(3) if drive.touched else drive.twist
         if turn is not None:  # on the spot
-            most = float(self._robot.in_fields(self._robot.command_high)[2])
+            most = float(self._robot.to_fields(self._robot.command_high)[2])
             rate = min(max(TURNING * abs(turn), LEAST_TURN), most)
             twist = np.array([0.0, 0.0, math.copysign(rate, turn)])
         # Slower, down to the speed limit; the robot's way stays the same.

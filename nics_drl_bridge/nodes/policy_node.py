@@ -15,7 +15,7 @@ from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.middleware.uncertainty import gained_uncertainty
+from nics_drl_bridge.middleware.uncertainty import compute_uncertainty_gain
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.follow_path import PathActions, Wish
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
@@ -201,7 +201,7 @@ class PolicyNode(ManagedNode):
 
     def _told_reached(self) -> str:
         now = self._topics.middleware.estimator.covariance[:3, :3]
-        gained = gained_uncertainty(self._covariance, now)
+        gained = compute_uncertainty_gain(self._covariance, now)
         return f"goal reached, as believed; {gained.told_since('it was set')}"
 
     def _toward(self, goal: Array) -> Wish:

@@ -349,7 +349,7 @@ class RecordNode(qos.QosWatch):
         robot = self._order.plan.robot
         if self._topic is not None:
             self._topic.publish(self._message(robot.to_cmd_vel(command)))
-        self._log.add("cmd_vel", 0, robot.through_cmd_vel(command))
+        self._log.add("cmd_vel", 0, robot.pass_through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), self._frame)

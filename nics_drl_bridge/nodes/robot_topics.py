@@ -194,7 +194,7 @@ class RobotTopics:
             )  # where nothing corrects it, it defines the map
             if self._posed:
                 covariance = conversions.pose_from_ros(message)[1]
-                given = measurement.checked_covariance(covariance, 3, START_STD)
+                given = measurement.check_covariance(covariance, 3, START_STD)
                 spread = spread if given is None else given
         except (ConfigError, ValueError) as error:
             logger.error(

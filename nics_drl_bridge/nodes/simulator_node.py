@@ -268,7 +268,7 @@ class CommandInlet:
     def _on_ackermann(self, message: Any) -> None:
         if self._is_fresh(conversions.stamp_from_ros(message.header.stamp)):
             angle = message.drive.steering_angle
-            self._obey((message.drive.speed, 0.0, angle), self._robot.of_fields)
+            self._obey((message.drive.speed, 0.0, angle), self._robot.from_fields)
 
     def _is_fresh(self, stamp_ns: int) -> bool:
         if not stamp_ns or not self._too_old(stamp_ns):

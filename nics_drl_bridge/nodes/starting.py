@@ -154,11 +154,11 @@ class Setup:
         shipped = base == BASE_FRAME.default and laser in ("", SHIPPED_LASER)
         if self["urdf"] or (self.urdf and shipped):
             return read_text(self.urdf)
-        from nics_drl_bridge.robot.urdf import urdf_of
+        from nics_drl_bridge.robot.urdf import make_urdf
 
         model = opened(self.model) if self._opened is None else self._opened
         further = {sensor.frame: sensor.mount for sensor in model.sensors}
-        return urdf_of(
+        return make_urdf(
             model.robot, model.lidar.mount, laser or model.lidar.frame, base, further
         )
 

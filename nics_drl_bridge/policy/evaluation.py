@@ -16,7 +16,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.middleware.uncertainty import Uncertainty, gained_uncertainty
+from nics_drl_bridge.middleware.uncertainty import Uncertainty, compute_uncertainty_gain
 from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
 
@@ -115,7 +115,7 @@ def drive(
         driven = np.array(paths), np.array(estimates), goal, bodies, total
         uncertain = None
         if covariances:
-            uncertain = gained_uncertainty(covariances[0], covariances[-1])
+            uncertain = compute_uncertainty_gain(covariances[0], covariances[-1])
         if "true_pose" not in info:
             return Episode(seed, believed, *driven, uncertain=uncertain)
         known = info.get("true_collision")

@@ -461,7 +461,7 @@ class Composer:
             if robot.steers:
                 speed, angle = robot.bicycle.command(rows)
                 commands = np.stack([speed, rows[:, 1], angle], axis=-1)
-            commands = robot.of_fields(commands)
+            commands = robot.from_fields(commands)
         chosen = build.add("Gather", build.constant(commands), index, axis=0)
         return build.add("Add", chosen, beyond) if beyond else chosen
 

@@ -24,9 +24,9 @@ from nics_drl_bridge.policy.local_map_kernels import (
 )
 from nics_drl_bridge.policy.stopping import longest_stop_s
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.robot.braking import braking_of
-from nics_drl_bridge.robot.kernels import SERIES, term_arrays, with_coefficients
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.braking import find_braking
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, replace_coefficients
+from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
@@ -109,7 +109,7 @@ class Mppi:
         else:
             ends = np.zeros((1, len(low)))
         half = (
-            math.hypot(*np.abs(steady_twist(robot, ends))[:, :2].max(axis=0))
+            math.hypot(*np.abs(compute_steady_twist(robot, ends))[:, :2].max(axis=0))
             * self.horizon
         )
         if self._halt.most > 0:
@@ -157,9 +157,9 @@ class Mppi:
         robot = self.task.robot
         ends = np.array(list(product(*zip(*self.task.command_limits, strict=True))))
         if robot.takes_cmd_vel:
-            return steady_twist(robot, ends)
+            return compute_steady_twist(robot, ends)
         state = ends @ self._plant.settled.T
-        x = np.concatenate([state, self._kinematics.in_effect(ends)], axis=-1)
+        x = np.concatenate([state, self._kinematics.apply_curves(ends)], axis=-1)
         return self._kinematics.rates(x)[:, :3]
 
     @cached_property
@@ -167,7 +167,7 @@ class Mppi:
         """The stop that follows on a roll-out; none where half a roll-out is long enough for it."""
         robot = self.task.robot
         angles = np.array([each.unit == "rad" for each in robot.command])
-        braking = braking_of(robot, self._kinematics, *self.task.command_limits)
+        braking = find_braking(robot, self._kinematics, *self.task.command_limits)
         longest = longest_stop_s(braking, self._top_twists)
         if longest <= 0.5 * self.horizon:
             return kernels.Halt(angles, still(robot), 0, math.inf)
@@ -180,7 +180,7 @@ class Mppi:
     def _reach(self) -> float:
         """Way of a roll-out at full speed, and of the stop that follows on it [m]."""
         fastest = np.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
-        braking = braking_of(
+        braking = find_braking(
             self.task.robot, self._kinematics, *self.task.command_limits
         )
         return float(fastest * self.horizon + braking.distance(fastest))
@@ -190,7 +190,7 @@ class Mppi:
         model = self._kinematics
         robot = self.task.robot
         period = self._period
-        terms = term_arrays(model)
+        terms = make_terms(model)
         latency = float(model.delays.max(initial=0.0))
         if self.model is not None:
             latency += max(0.0, self.model.calibration.command_latency_s)
@@ -205,7 +205,7 @@ class Mppi:
         )
         rows = np.repeat(terms.coefficient[:, None], self.samples, axis=1)
         return kernels.Plant(
-            with_coefficients(terms, rows),
+            replace_coefficients(terms, rows),
             terms,
             SERIES,
             period / substeps,

@@ -14,7 +14,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.policy import local_map_kernels as maps
 from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
-from nics_drl_bridge.robot.kernels import Terms, advance, bend, rates, run
+from nics_drl_bridge.robot.kernels import Terms, advance, apply_curve, rates, run
 
 HIT = 1e3  # cost of a touch at once; later ones cost less
 # offers are drawn over this much of the range and cut: many are at its ends
@@ -209,7 +209,7 @@ def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
         for c in range(count):
             x[s] += plant.settled[s, c] * command[c]
     for c in range(count):
-        x[states + c] = bend(command[c], plant.single.curves[c])
+        x[states + c] = apply_curve(command[c], plant.single.curves[c])
     x[states + count] = 1.0
 
 
@@ -230,7 +230,7 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
                 action = 0.0
                 for q in range(lanes.nominal.shape[0]):
                     action += sampling.between[t, q] * lanes.actions[k, q, c]
-                row[k] = bend(middle + half * action, curve)
+                row[k] = apply_curve(middle + half * action, curve)
         run(
             lanes.pose,
             lanes.x,
@@ -259,7 +259,9 @@ def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
     for t in range(halt.most):
         for c in range(plant.low.shape[0]):
             if not halt.holds[c]:
-                lanes.x[states + c, :] = bend(halt.rest[c], plant.single.curves[c])
+                lanes.x[states + c, :] = apply_curve(
+                    halt.rest[c], plant.single.curves[c]
+                )
         run(
             lanes.pose,
             lanes.x,

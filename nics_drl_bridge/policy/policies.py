@@ -27,7 +27,12 @@ from nics_drl_bridge.policy.local_map_kernels import (
 from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.policy.stateful import Policy, Stateful
 from nics_drl_bridge.policy.stopping import braking_for
-from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
+from nics_drl_bridge.robot.kinds import (
+    compute_steady_twist,
+    find_command,
+    has_textbook,
+    reach,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
@@ -66,7 +71,7 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
     and if its motors bend commands, of which its kind knows nothing.
     """
     if model is None or (task.robot.takes_cmd_vel and model.kinematics.is_plain):
-        return steady_twist(task.robot, commands)
+        return compute_steady_twist(task.robot, commands)
     kinematics = model.kinematics
     start = np.zeros((len(commands), 3))
     state = np.zeros((len(commands), kinematics.state_size))
@@ -106,7 +111,7 @@ class StraightToGoal:
         ahead = np.maximum(cosine, 0.0 if self._turns_in_place else CREEP)
         shares = np.stack([ahead, np.zeros_like(ahead), turn], axis=-1)
         if robot.takes_cmd_vel:
-            wanted = robot.of_fields(shares) * robot.command_high
+            wanted = robot.from_fields(shares) * robot.command_high
         else:
             wanted = self._command(shares)
         return actions_of(self.task, wanted)
@@ -115,7 +120,7 @@ class StraightToGoal:
         """Returns commands (..., C) for shares (..., 3) of the greatest twist."""
         robot = self.task.robot
         if has_textbook(robot):
-            return command_for(robot, shares * self._reach)
+            return find_command(robot, shares * self._reach)
         commands, twists = self._known
         apart = twists / self._reach - shares[..., None, :]
         return np.asarray(commands[(apart**2).sum(axis=-1).argmin(axis=-1)])

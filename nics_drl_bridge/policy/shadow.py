@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
-from nics_drl_bridge.middleware.playback import Playback, in_order, played
+from nics_drl_bridge.middleware.playback import Playback, merge_messages, read_messages
 from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.stateful import resume
@@ -87,7 +87,7 @@ def shadow(
     """
     if goal is None and not ahead_s > 0.0:
         raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")
-    messages = played(path, topics, model.gyro)
+    messages = read_messages(path, topics, model.gyro)
     for role in (SCAN, CMD_VEL):
         if role not in messages:
             reason = (
@@ -111,7 +111,7 @@ def _moments(
     moments = list[_Moment]()
     held: tuple[int, Array] | None = None
     acted_ns = 0
-    for role, message in in_order(messages):
+    for role, message in merge_messages(messages):
         playback.take(role, message)
         if role == CMD_VEL:
             row = commanded(message.content, model.robot)
@@ -172,7 +172,7 @@ def _answered(
         elif verdict.reached:
             skipped["at the goal"] += 1
         else:
-            wanted = robot.through_cmd_vel(command)
+            wanted = robot.pass_through_cmd_vel(command)
             rows.append(
                 (moment.stamp_ns, moment.view.pose, goal, wanted, moment.driven)
             )

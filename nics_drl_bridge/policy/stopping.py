@@ -7,7 +7,7 @@ import numpy as np
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.robot.braking import Braking, braking_of
+from nics_drl_bridge.robot.braking import Braking, find_braking
 
 
 def braking_for(task: Navigation, model: SimulatorModel | None) -> Braking:
@@ -22,7 +22,7 @@ def braking_for(task: Navigation, model: SimulatorModel | None) -> Braking:
             value for name, value in robot.parameters.items() if name.endswith("_lag")
         ]
         return Braking(max(lags, default=0.0), math.inf)
-    return braking_of(robot, model.kinematics, *task.command_limits)
+    return find_braking(robot, model.kinematics, *task.command_limits)
 
 
 def longest_stop_s(braking: Braking, twists: Array) -> float:

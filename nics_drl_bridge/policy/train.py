@@ -136,7 +136,7 @@ def make_train_env(
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot, settings.lidar)
     if margin := settings.teaching.margin:
-        model = replace(model, robot=model.robot.grown(margin))
+        model = replace(model, robot=model.robot.grow_footprint(margin))
     envs = [
         BridgeVectorEnv(
             count,

@@ -113,7 +113,7 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
             raise RecordingError(f"{fault}, but {other}; {advice}.")
     data = _table(bag, topic, msgs.command_row)
     if steered:
-        commands = spec.of_fields(data.values)
+        commands = spec.from_fields(data.values)
     else:
         commands = spec.from_cmd_vel(data.values)
     return replace(data, values=commands)

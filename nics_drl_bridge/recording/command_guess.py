@@ -17,7 +17,7 @@ from nics_drl_bridge.recording.names import words_of
 from nics_drl_bridge.recording.pose_guess import PoseGuess
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
 from nics_drl_bridge.robot.spec import find_kind, kind_names
-from nics_drl_bridge.robot.template import names_of
+from nics_drl_bridge.robot.template import list_names
 
 # Words that say that something was sent to the robot: beyond doubt, and of a goal of a controller.
 COMMANDING = {
@@ -528,11 +528,11 @@ def look_alikes(kind: str) -> list[str]:
     """Returns the other kinds of robots that have the same commands."""
     found = []
     own = find_kind(kind)
-    ways = [] if own is None else [{*names_of(way)} for way in own.template.commands]
+    ways = [] if own is None else [{*list_names(way)} for way in own.template.commands]
     for name in kind_names():
         other = find_kind(name)
         if name == kind or other is None:
             continue
-        if any({*names_of(way)} in ways for way in other.template.commands):
+        if any({*list_names(way)} in ways for way in other.template.commands):
             found.append(name)
     return found

@@ -120,7 +120,7 @@ def commanded(message: Any, spec: RobotSpec) -> Array:
     """Returns the command (C,) of a message for a robot; see `command_row`."""
     row = np.array(command_row(message))
     of_angles = hasattr(getattr(message, "drive", message), "steering_angle")
-    return spec.of_fields(row) if of_angles else spec.from_cmd_vel(row)
+    return spec.from_fields(row) if of_angles else spec.from_cmd_vel(row)
 
 
 def _place(message: Any) -> tuple[Any, Any]:

@@ -27,7 +27,7 @@ from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles, assign
 from nics_drl_bridge.recording.values import unit_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
-from nics_drl_bridge.robot.spec import RobotSpec, definition, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot, read_definition
 
 FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
 # what it has, may have
@@ -147,7 +147,7 @@ def _by_mapping(
     with open_source(path, given) as source:
         recording = read_mapped(source, given)
     if given.robot is not None:
-        recording = replace(recording, robot=definition(given.robot))
+        recording = replace(recording, robot=read_definition(given.robot))
     if spec is None:
         return recording
     _check_units(given, spec)
@@ -196,7 +196,7 @@ def robot_and_drive(
             not robot and _holds(path, FILES) and not is_bag(path)
         ):  # read by its shipped mapping
             own = load_mapping(find_config(FOLDER, "recordings")).robot
-        spec = robot_from(own or DEFAULT_ROBOT)
+        spec = build_robot(own or DEFAULT_ROBOT)
         return spec, read_recording(path, spec, topics)
     drive = read_recording(path, None, topics)
     spec = _ranged(robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables)
@@ -254,7 +254,7 @@ def _ranged(
     """Returns a robot; ranges of commands that it leaves out are those that were recorded."""
     low, high = (f(recording.command.values, axis=0).tolist() for f in (np.min, np.max))
     names = variables[-len(low) :]
-    return robot_from(
+    return build_robot(
         robot, dict(zip(names, zip(low, high, strict=True), strict=False))
     )
 

@@ -348,7 +348,7 @@ def _odometry(facts: Facts, robot: RobotSpec) -> Findings:
         fix = "fill in pose.covariance and twist.covariance: zeros mean unknown"
         yield odometry_warning(what, fix)
     corners = np.array([robot.command_low, robot.command_high])
-    fastest = max(float(np.hypot(*robot.in_fields(row)[:2])) for row in corners)
+    fastest = max(float(np.hypot(*robot.to_fields(row)[:2])) for row in corners)
     yield from _moves(facts, poses, twists, max(fastest, 0.1))
 
 

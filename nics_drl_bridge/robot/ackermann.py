@@ -14,7 +14,7 @@ from nics_drl_bridge.robot.template import (
     STEERED,
     STEERED_LAGS,
     Template,
-    names_of,
+    list_names,
     usual,
 )
 
@@ -32,14 +32,16 @@ GAINS = {
 
 def kinematics(spec: RobotSpec) -> kinds.Textbook:
     """Curvature tan(angle) / wheelbase."""
-    return kinds.steered(spec, Bicycle(spec.parameters["wheelbase"]), names_of(STEERED))
+    return kinds.steered(
+        spec, Bicycle(spec.parameters["wheelbase"]), list_names(STEERED)
+    )
 
 
 def by_throttle(spec: RobotSpec) -> kinds.Textbook:
     """The same, of shares of the greatest speed and steering angle."""
     p = spec.parameters
     gain = p["speed_gain"], p["greatest_steering"]
-    return kinds.steered(spec, Bicycle(p["wheelbase"]), names_of(THROTTLE), gain)
+    return kinds.steered(spec, Bicycle(p["wheelbase"]), list_names(THROTTLE), gain)
 
 
 def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:

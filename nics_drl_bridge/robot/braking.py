@@ -80,7 +80,7 @@ NO_DRIFT = Drift()
 
 
 @dataclass(frozen=True)
-class OwnTurn:
+class TurnBraking:
     """How a turn ends that brakes apart from the speed.
 
     The robot turns no further than if it kept its turn rate for the reaction time, and then braked
@@ -120,7 +120,7 @@ class Braking:
     # of the norm of ahead and sideways: infinite if the slower of both stops as if it were alone,
     # 1 if the brakes have to take away the sum, 2 otherwise
     order: float = 2.0
-    turn: OwnTurn | None = None  # None if the turn brakes as the speed does
+    turn: TurnBraking | None = None  # None if the turn brakes as the speed does
 
     def pace(self, twist: Array) -> Array:
         """Returns the speed that the brakes take away (...) from twists (..., 3) [m/s]."""
@@ -160,7 +160,7 @@ class Stops(NamedTuple):
     holds: NDArray[np.bool_]  # (K,) True where steering angles were held meanwhile
 
 
-def braking_of(
+def find_braking(
     robot: RobotSpec,
     model: TaylorModel,
     low: Array | None = None,
@@ -201,7 +201,7 @@ def _bound(
     robot: RobotSpec, model: TaylorModel, low: Array, high: Array, ramp: Array
 ) -> Braking:
     commands = motions(low, high)
-    slower = slowest_of(model)
+    slower = derive_slowest_model(model)
     variants = (model,) if slower is None else (model, slower)
     ramped = _together(
         [simulate_stops(robot, each, commands, ramp) for each in variants]
@@ -259,7 +259,7 @@ def _pairs(count: int) -> Array:
     return np.array(rows)
 
 
-def slowest_of(model: TaylorModel) -> TaylorModel | None:
+def derive_slowest_model(model: TaylorModel) -> TaylorModel | None:
     """Returns the model as slow as its standard errors allow; None if they tell nothing.
 
     Each state responds slower by the relative error of the term that draws it to rest; where a
@@ -310,7 +310,7 @@ def _steady(robot: RobotSpec, model: TaylorModel, commands: Array) -> Array:
     quick = replace(model, limits=np.zeros((0, 2)))
     count = model.state_size
     least, most = _range_of_states(robot, model)
-    effect = model.in_effect(commands)
+    effect = model.apply_curves(commands)
     state = np.zeros((len(commands), count))
     for _ in range(round(LONGEST_START_S / model.dt)):
         rates = quick.rates(np.concatenate([state, effect], axis=-1))
@@ -374,11 +374,11 @@ def _stop(
             since_told > 0.0, ramp * np.maximum(since_told, dt / 2.0), 0.0
         )
         moved = np.sign(gap) * np.minimum(np.abs(gap), changed)
-        x = np.concatenate([state, model.in_effect(commands + moved)], axis=-1)
+        x = np.concatenate([state, model.apply_curves(commands + moved)], axis=-1)
         rates = model.rates(x)
         twist = rates[:, :3]
         if step == 0:
-            held = np.concatenate([state, model.in_effect(commands)], axis=-1)
+            held = np.concatenate([state, model.apply_curves(commands)], axis=-1)
             first = model.rates(held)[:, :3]
         path += np.maximum(np.hypot(twist[:, 0], twist[:, 1]) - idle_speed, 0.0) * dt
         travel += np.maximum(np.abs(twist) - np.abs(idle), 0.0) * dt
@@ -393,7 +393,9 @@ def _stop(
 def _idle_twist(robot: RobotSpec, model: TaylorModel, rest: Array) -> Array:
     """Returns the twists (K, 3) by which a model at rest still drifts, by a bias of its fit."""
     state = _steady(robot, model, rest)
-    return model.rates(np.concatenate([state, model.in_effect(rest)], axis=-1))[:, :3]
+    return model.rates(np.concatenate([state, model.apply_curves(rest)], axis=-1))[
+        :, :3
+    ]
 
 
 def _require_rest(robot: RobotSpec, stops: Stops) -> None:
@@ -533,7 +535,7 @@ def fit_apart(stops: Stops, radius: float) -> Braking | None:
     turned = stops.travel[:, 2]
     _, reaction, inverse = _bound_alone(rate[turns], rate[turns], turned[turns])
     turn = _rounded(Braking(0.0, 1.0), reaction, inverse)
-    own = OwnTurn(turn.reaction_s, turn.deceleration)
+    own = TurnBraking(turn.reaction_s, turn.deceleration)
     most_path = _path_bound(bound, stops.twist)
     most_turn = rate * own.mean_time_s(rate)
     missed = np.maximum(stops.path - most_path, radius * (turned - most_turn))

@@ -53,7 +53,7 @@ class InputCurve(Schema):
         beyond = np.sign(held) * np.maximum(np.abs(held) - self.dead, 0.0)
         return np.where(beyond < 0.0, self.back * beyond, beyond)
 
-    def sent(self, effect: ArrayLike) -> Array:
+    def invert(self, effect: ArrayLike) -> Array:
         """Returns the commands (...) of effects; infinite where greater ones do no more."""
         effect = np.asarray(effect, dtype=np.float64)
         gain = np.where((effect < 0.0) & (self.back > 0.0), self.back, 1.0)
@@ -71,7 +71,7 @@ def ends(least: float, most: float, name: str = "") -> str:
     )
 
 
-def bent(
+def apply_curves(
     command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...]
 ) -> Array:
     """Returns the commands in effect (..., C) of commands with C names."""

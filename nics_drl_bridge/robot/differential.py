@@ -6,9 +6,15 @@ speeds of both wheels [rad/s].
 
 import numpy as np
 
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheeled, wheels_at
+from nics_drl_bridge.robot.kinds import (
+    Drawing,
+    RobotKind,
+    Textbook,
+    place_wheels,
+    wheeled,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
+from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, list_names
 
 MOVES = ("vx", "wz")
 LENGTHS = {"track": 1.4, "wheel_radius": 0.3}
@@ -20,7 +26,7 @@ def kinematics(spec: RobotSpec, slip: float = 1.0) -> Textbook:
     inverse = np.array([[1, -p["track"] / 2], [1, p["track"] / 2]]) / p["wheel_radius"]
     forward = np.zeros((3, 2))
     forward[[0, 2]] = np.linalg.inv(inverse)
-    return wheeled(spec, inverse, forward, ("vx", "wz"), names_of(WHEELS), slip)
+    return wheeled(spec, inverse, forward, ("vx", "wz"), list_names(WHEELS), slip)
 
 
 def drawing(spec: RobotSpec) -> Drawing:
@@ -29,7 +35,9 @@ def drawing(spec: RobotSpec) -> Drawing:
     radius = spec.parameters["wheel_radius"]
     places = ((0.0, 0.5 * track), (0.0, -0.5 * track))
     return Drawing(
-        0.4 * track, (0.0, radius), wheels_at(spec, places, radius, names_of(WHEELS))
+        0.4 * track,
+        (0.0, radius),
+        place_wheels(spec, places, radius, list_names(WHEELS)),
     )
 
 

@@ -62,7 +62,7 @@ class Bounds(NamedTuple):
     drag: float
 
 
-def term_arrays(model: TaylorModel) -> Terms:
+def make_terms(model: TaylorModel) -> Terms:
     """Returns the kept terms of a model. Raises ModelError if the order of one is too high."""
     one = len(model.variables)
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
@@ -103,7 +103,7 @@ def _curve_rows(model: TaylorModel) -> Array:
     return rows
 
 
-def scratch(model: TaylorModel) -> tuple[Array, Array]:
+def allocate_scratch(model: TaylorModel) -> tuple[Array, Array]:
     """Returns scratch memory for `x` and `dq` of one robot."""
     x = np.zeros(len(model.variables) + 1)
     x[-1] = 1.0
@@ -111,7 +111,7 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
 
 
 @kernel
-def bend(command, curve):  # type: ignore[no-untyped-def]
+def apply_curve(command, curve):  # type: ignore[no-untyped-def]
     """Returns the effect of a command by its curve (4,); see `InputCurve`."""
     held = min(max(command, curve[LEAST]), curve[MOST])
     if held < -curve[DEAD] and held < 0.0:
@@ -124,11 +124,11 @@ def put_command(x, command, terms):  # type: ignore[no-untyped-def]
     """Writes the effect of a command (C,) to `x`."""
     first = x.shape[0] - 1 - command.shape[0]
     for c in range(command.shape[0]):
-        x[first + c] = bend(command[c], terms.curves[c])
+        x[first + c] = apply_curve(command[c], terms.curves[c])
 
 
 @kernel
-def bounds_of(terms, i):  # type: ignore[no-untyped-def]
+def get_bounds(terms, i):  # type: ignore[no-untyped-def]
     """Returns the bounds of state variable i."""
     return Bounds(
         terms.low[i],
@@ -141,7 +141,7 @@ def bounds_of(terms, i):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def next_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
+def advance_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
     """Returns a state variable after dt [s]: rate limited, drag, dry friction, then held."""
     # Conditions on the bounds alone: a loop over robots is compiled once with them, once without.
     if bounds.fall > -math.inf or bounds.rise < math.inf:
@@ -156,7 +156,7 @@ def next_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def with_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
+def replace_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
     """Returns terms with other coefficients, those of a robot or of several."""
     return Terms(
         terms.dof,
@@ -185,11 +185,11 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
             product *= x[terms.factors[k, factor]]
         dq[terms.dof[k]] += product
     for i in range(terms.emf.shape[0]):
-        dq[3 + i] -= emf_of(i, x, terms) * x[i]
+        dq[3 + i] -= sum_back_emf(i, x, terms) * x[i]
 
 
 @kernel
-def emf_of(i, x, terms):  # type: ignore[no-untyped-def]
+def sum_back_emf(i, x, terms):  # type: ignore[no-untyped-def]
     """Returns the rate [1/s] at which the commands in effect brake state variable i."""
     total = 0.0
     states = terms.emf.shape[0]
@@ -264,9 +264,9 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
         for d in range(3, dq.shape[0]):
             state = x[d - 3]
             rate = dq[d]
-            bounds = bounds_of(terms, d - 3)
+            bounds = get_bounds(terms, d - 3)
             for i in range(state.shape[0]):
-                state[i] = next_state(state[i], rate[i], dt, bounds)
+                state[i] = advance_state(state[i], rate[i], dt, bounds)
 
 
 @kernel
@@ -360,7 +360,7 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
+def simulate_rollouts(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
     """Rolls out robots from the first of poses (W, T + 1, 3), commands in effect (W, T, C)."""
     size = states.shape[2]
     width = commands.shape[2]
@@ -379,7 +379,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
             px, py, c, s = move(px, py, c, s, dq[0], dq[1], turn, dt, series)
             heading += turn
             for i in range(size):
-                x[i] = next_state(x[i], dq[3 + i], dt, bounds_of(terms, i))
+                x[i] = advance_state(x[i], dq[3 + i], dt, get_bounds(terms, i))
                 states[w, n + 1, i] = x[i]
             poses[w, n + 1, 0] = px
             poses[w, n + 1, 1] = py
@@ -387,7 +387,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
 
 
 @kernel
-def delayed(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
+def find_delayed_command(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
     """Returns the index, newest first, of the one of the last `periods` commands in effect."""
     if delay <= substep:
         return 0

@@ -54,7 +54,7 @@ class Textbook:
     # gives the command (..., C), maybe out of range, that leads to a twist (..., 3), if known
     command: Callable[[Array], Array] | None = None
 
-    def steady(self, command: Array) -> Array:
+    def compute_twist(self, command: Array) -> Array:
         """Returns the body twist (..., 3) to which commands (..., C) lead when they are held."""
         return self.twist(self.target(command))
 
@@ -106,7 +106,7 @@ def disc(spec: RobotSpec) -> Drawing:
     return Drawing(spec.footprint_radius, (0.0, 0.02), ())
 
 
-def wheels_at(
+def place_wheels(
     spec: RobotSpec,
     places: Sequence[tuple[float, float]],
     radius: float,
@@ -212,7 +212,7 @@ def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
 
     names: dict[str, tuple[str, ...]] = dict.fromkeys(POSE_RATES, ())
     names |= {str(v.twist): (v.name,) for v in spec.state}
-    target = lambda command: book.steady(command)[..., dofs]  # noqa: E731
+    target = lambda command: book.compute_twist(command)[..., dofs]  # noqa: E731
     return Textbook(twist, target, lag, np.full(len(lag), np.inf), names, book.command)
 
 
@@ -251,25 +251,25 @@ def require_textbook(spec: RobotSpec) -> str:
     return spec.textbook
 
 
-def steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
+def compute_steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
     """Returns the body twist (..., 3) to which commands (..., C) lead when they are held.
 
     Raises ConfigError if neither kinematics nor wheelbase of a robot are known that needs them.
     """
-    if commands_twist(spec):
+    if is_twist_commanded(spec):
         return spec.to_cmd_vel(command)
     if spec.textbook is None and spec.steers:
         return _by_turn_rate(spec).to_cmd_vel(command)
-    return actuated(spec).steady(np.asarray(command, dtype=np.float64))
+    return actuated(spec).compute_twist(np.asarray(command, dtype=np.float64))
 
 
-def command_for(spec: RobotSpec, twist: ArrayLike) -> Array:
+def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
     """Returns the command (..., C) within its limits that leads to a body twist (..., 3), if any.
 
     A car that is to turn on the spot stands. Raises ConfigError as `steady_twist`.
     """
     twist = np.asarray(twist, dtype=np.float64)
-    if commands_twist(spec):
+    if is_twist_commanded(spec):
         command = spec.from_cmd_vel(twist)
     elif spec.textbook is None and spec.steers:
         command = _by_turn_rate(spec).from_cmd_vel(twist)
@@ -286,7 +286,7 @@ def command_for(spec: RobotSpec, twist: ArrayLike) -> Array:
 
 def reach(spec: RobotSpec) -> Array:
     """Returns the greatest steady twist (3,) of a robot's commands; ConfigError: see there."""
-    return np.asarray(np.abs(steady_twist(spec, _corners(spec))).max(axis=0))
+    return np.asarray(np.abs(compute_steady_twist(spec, _corners(spec))).max(axis=0))
 
 
 def _corners(spec: RobotSpec) -> Array:
@@ -297,7 +297,7 @@ def _corners(spec: RobotSpec) -> Array:
     return np.array(list(product(*ends.T))) if ends.shape[1] <= MOST_VARIED else ends
 
 
-def overdriven(spec: RobotSpec) -> str | None:
+def describe_overdrive(spec: RobotSpec) -> str | None:
     """A sentence if a robot's commands ask for more than a wheel's or a steering's own limit."""
     if not (has_textbook(spec) and spec.state and _own_state(spec)):
         return None
@@ -319,7 +319,7 @@ def _by_turn_rate(spec: RobotSpec) -> RobotSpec:
     return spec.model_copy(update={"angular_is": "turn_rate"})
 
 
-def commands_twist(spec: RobotSpec) -> bool:
+def is_twist_commanded(spec: RobotSpec) -> bool:
     """True if a robot's commands are the components of its body twist, but for their lags."""
     return all(command.is_twist for command in spec.command) and not slips(spec)
 

@@ -6,7 +6,13 @@ Its commands are the body twist: speeds forward and to the left [m/s], and the t
 
 import numpy as np
 
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheeled, wheels_at
+from nics_drl_bridge.robot.kinds import (
+    Drawing,
+    RobotKind,
+    Textbook,
+    place_wheels,
+    wheeled,
+)
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import (
     FOUR_WHEELS,
@@ -14,7 +20,7 @@ from nics_drl_bridge.robot.template import (
     SIDEWAYS,
     TWIST,
     Template,
-    names_of,
+    list_names,
 )
 
 TEMPLATE = Template(
@@ -34,7 +40,7 @@ def kinematics(spec: RobotSpec) -> Textbook:
         / p["wheel_radius"]
     )
     forward = np.asarray(np.linalg.pinv(inverse), dtype=np.float64)
-    return wheeled(spec, inverse, forward, POSE_RATES, names_of(FOUR_WHEELS))
+    return wheeled(spec, inverse, forward, POSE_RATES, list_names(FOUR_WHEELS))
 
 
 def drawing(spec: RobotSpec) -> Drawing:
@@ -44,7 +50,7 @@ def drawing(spec: RobotSpec) -> Drawing:
     width = p["half_width"]
     radius = p["wheel_radius"]
     places = ((length, width), (length, -width), (-length, width), (-length, -width))
-    wheels = wheels_at(spec, places, radius, names_of(FOUR_WHEELS))
+    wheels = place_wheels(spec, places, radius, list_names(FOUR_WHEELS))
     return Drawing((2.0 * length + radius, 1.4 * width), (0.0, radius), wheels)
 
 

@@ -28,7 +28,7 @@ class Level(Schema):
         return self.source == MEASURED
 
 
-def assumed(std: float, unit: str) -> Level:
+def assume_level(std: float, unit: str) -> Level:
     """Returns an assumed level."""
     return Level(std=std, unit=unit)
 
@@ -41,12 +41,12 @@ class Noise(Schema):
     for the estimator, which takes its R from odometry and pose, its Q from the drift.
     """
 
-    odom_linear: Level = assumed(0.01, "m/s")
-    odom_angular: Level = assumed(0.01, "rad/s")
-    pose_position: Level = assumed(0.01, "m")
-    pose_heading: Level = assumed(0.01, "rad")
-    position_drift: Level = assumed(0.02, "m/sqrt(s)")
-    heading_drift: Level = assumed(0.02, "rad/sqrt(s)")
+    odom_linear: Level = assume_level(0.01, "m/s")
+    odom_angular: Level = assume_level(0.01, "rad/s")
+    pose_position: Level = assume_level(0.01, "m")
+    pose_heading: Level = assume_level(0.01, "rad")
+    position_drift: Level = assume_level(0.02, "m/sqrt(s)")
+    heading_drift: Level = assume_level(0.02, "rad/sqrt(s)")
     state_drift: dict[str, Level] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -80,7 +80,7 @@ class Noise(Schema):
     def _drift(self, spec: RobotSpec) -> list[Level]:
         levels = [self.position_drift, self.position_drift, self.heading_drift]
         for v in spec.state:
-            unknown = assumed(
+            unknown = assume_level(
                 ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)"
             )
             levels.append(self.state_drift.get(v.name, unknown))

@@ -244,7 +244,7 @@ class RobotSpec(Schema):
                 )
         return self
 
-    def grown(self, margin: float) -> "RobotSpec":
+    def grow_footprint(self, margin: float) -> "RobotSpec":
         """The robot with a footprint that is larger all around by a margin [m].
 
         With an outline `footprint_radius` stays, by which worlds place robots: where the robot has
@@ -369,7 +369,7 @@ class RobotSpec(Schema):
 
         Raises ConfigError if a command has no field, or a robot steers with an unknown wheelbase.
         """
-        values = self.in_fields(command)
+        values = self.to_fields(command)
         if self.takes_turn_rate:
             return self.bicycle.twist(values[..., 0], values[..., 2])
         return values
@@ -381,15 +381,15 @@ class RobotSpec(Schema):
         """
         twist = np.asarray(twist, dtype=np.float64)
         if not self.takes_turn_rate:
-            return self.of_fields(twist)
+            return self.from_fields(twist)
         speed, angle = self.bicycle.command(twist)
-        command = self.of_fields(np.stack([speed, twist[..., 1], angle], axis=-1))
+        command = self.from_fields(np.stack([speed, twist[..., 1], angle], axis=-1))
         limits = np.array(
             [(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command]
         )
         return np.asarray(np.clip(command, *limits.T))
 
-    def through_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
+    def pass_through_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
         """Returns commands (..., C) as a robot that hears `cmd_vel` takes them; else as they are.
 
         They differ by rounding, and a car that takes turn rates does not steer at rest.
@@ -402,14 +402,14 @@ class RobotSpec(Schema):
         """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
         self.to_cmd_vel(self.command_low)
 
-    def in_fields(self, command: ArrayLike) -> NDArray[np.float64]:
+    def to_fields(self, command: ArrayLike) -> NDArray[np.float64]:
         """Returns commands (..., C) by field of `cmd_vel` (..., 3), a steering angle as it is."""
         command = np.asarray(command, dtype=np.float64)
         values = np.zeros((*command.shape[:-1], 3))
         values[..., self._cmd_vel_index] = command
         return values
 
-    def of_fields(self, values: ArrayLike) -> NDArray[np.float64]:
+    def from_fields(self, values: ArrayLike) -> NDArray[np.float64]:
         """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""
         return np.asarray(values, dtype=np.float64)[..., self._cmd_vel_index]
 
@@ -432,10 +432,10 @@ def _reach(outline: ArrayLike) -> float:
 
 def load_robot(name: str | Path) -> RobotSpec:
     """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file."""
-    return robot_from(name)
+    return build_robot(name)
 
 
-def robot_from(
+def build_robot(
     given: str | Path | Mapping[str, Any], ranges: Ranges | None = None
 ) -> RobotSpec:
     """Makes a robot of a shipped one's name, the path of a YAML file, or the content of such a one.
@@ -444,7 +444,7 @@ def robot_from(
     ranges of commands, state and parameters. `ranges` (least, greatest) of recorded commands, by
     name, are theirs unless given. Raises ConfigError.
     """
-    data = definition(given)
+    data = read_definition(given)
     if isinstance(given, Mapping):
         source = "robot"
     else:
@@ -466,7 +466,7 @@ def robot_from(
     return spec
 
 
-def definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:
+def read_definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:
     """Returns the content of a robot's YAML file, called as the file unless it says."""
     if isinstance(given, Mapping):
         return dict(given)

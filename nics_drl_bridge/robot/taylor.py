@@ -13,7 +13,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.robot.curve import InputCurve, bent, delays, ends
+from nics_drl_bridge.robot.curve import InputCurve, apply_curves, delays, ends
 
 BEYOND = 0.25  # share of its range by which a bounded state may leave it, on both ends
 
@@ -112,9 +112,9 @@ class TaylorModel:
             np.argmax(size @ (self.powers[:, self.state_size :] > 0), axis=1)
         )
 
-    def in_effect(self, command: ArrayLike) -> Array:
+    def apply_curves(self, command: ArrayLike) -> Array:
         """Returns what commands (..., C) come to after their delays, by the input curves."""
-        return bent(command, self.variables[self.state_size :], self.inputs)
+        return apply_curves(command, self.variables[self.state_size :], self.inputs)
 
     def rates(self, x: ArrayLike) -> Array:
         """Returns dQ/dt (..., D) in a step from X (..., V), whose commands are those in effect."""
@@ -145,7 +145,9 @@ class TaylorModel:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
         dq = (
-            self._free_rates(np.concatenate([state, self.in_effect(command)], axis=-1))
+            self._free_rates(
+                np.concatenate([state, self.apply_curves(command)], axis=-1)
+            )
             * self.dt
         )
         moved = np.clip(self._moved(state, dq[..., 3:]), *self.state_box)
@@ -154,12 +156,12 @@ class TaylorModel:
     @property
     def term_names(self) -> tuple[str, ...]:
         """Names of the K terms: `1`, `speed`, `speed*steering`."""
-        return tuple(term_name(row, self.variables) for row in self.powers)
+        return tuple(format_term(row, self.variables) for row in self.powers)
 
     @property
     def shown_terms(self) -> tuple[str, ...]:
         """Names of the K terms, those of commands in effect primed: `throttle'`."""
-        return tuple(term_name(row, self.shown_names) for row in self.powers)
+        return tuple(format_term(row, self.shown_names) for row in self.powers)
 
     @property
     def shown_names(self) -> tuple[str, ...]:
@@ -197,7 +199,7 @@ class TaylorModel:
             if known[d].any()
         }
 
-    def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> "TaylorModel":
+    def add_errors(self, errors: Mapping[str, Mapping[str, float]]) -> "TaylorModel":
         """Returns the model with standard errors by dof and term; NaN for kept terms without."""
         if not errors:
             return replace(self, std_errors=np.zeros((0, 0)))
@@ -271,7 +273,7 @@ class TaylorModel:
         )
 
 
-def exponents(variables: int, order: int) -> NDArray[np.int64]:
+def list_exponents(variables: int, order: int) -> NDArray[np.int64]:
     """Exponents (K, V) of the distinct products of up to `order` of V variables, constant first.
 
     `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product twice; here it occurs once.
@@ -294,7 +296,7 @@ def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
     return chi
 
 
-def term_name(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
+def format_term(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
     """Returns a term as text: `1`, `speed*steering`, `speed^2`."""
     factors = [
         names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)
@@ -442,7 +444,7 @@ class NamedTaylorModel(Schema):
             back_emf=np.array(
                 [[emf.get(s, {}).get(c, 0.0) for c in commands] for s in states]
             ),
-        ).with_errors(self.standard_errors or {})
+        ).add_errors(self.standard_errors or {})
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
         curved = [curve.command for curve in self.inputs]

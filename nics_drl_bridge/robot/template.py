@@ -50,7 +50,7 @@ FOUR_WHEELS = tuple(
 )
 
 
-def names_of(way: Sequence[Given]) -> tuple[str, ...]:
+def list_names(way: Sequence[Given]) -> tuple[str, ...]:
     """Returns the usual names of commands."""
     return tuple(one["name"] for one in way)
 
@@ -115,7 +115,7 @@ class Template:
             )
             raise ConfigError(f"robot {given.get('name', kind)!r}: {fault}; {fix}.")
         if own is None:
-            own = [{"name": name} for name in (names or names_of(way))]
+            own = [{"name": name} for name in (names or list_names(way))]
         if not own:
             fix = "name them under `command:` of the robot, or give a recording"
             raise ConfigError(

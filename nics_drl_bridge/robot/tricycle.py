@@ -11,7 +11,7 @@ from nics_drl_bridge.robot.template import (
     STEERED_LAGS,
     STEERED_STATE,
     Template,
-    names_of,
+    list_names,
 )
 
 TEMPLATE = Template(
@@ -26,7 +26,7 @@ TEMPLATE = Template(
 def kinematics(spec: RobotSpec) -> kinds.Textbook:
     """The front wheel pulls forward by its cosine, and turns the base by its sine."""
     bicycle = Bicycle(spec.parameters["wheelbase"], front_drive=True)
-    return kinds.steered(spec, bicycle, names_of(STEERED))
+    return kinds.steered(spec, bicycle, list_names(STEERED))
 
 
 def drawing(spec: RobotSpec) -> kinds.Drawing:

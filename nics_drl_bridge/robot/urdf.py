@@ -13,7 +13,7 @@ COLOURS = {"body": "0.2 0.4 0.7 1", "wheel": "0.1 0.1 0.1 1", "laser": "0.7 0.1 
 BODY_HEIGHT = 0.04
 
 
-def urdf_of(
+def make_urdf(
     spec: RobotSpec,
     mount: Place = (0.0, 0.0, 0.0),
     laser: str = "laser",

@@ -16,7 +16,7 @@ from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
-from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.sim import state as arrays
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
@@ -58,7 +58,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     bodies = sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
     # One row for the newest; an age within a period needs the end of the period before it, too.
-    terms = term_arrays(model.kinematics)
+    terms = make_terms(model.kinematics)
     longest = sizes.longest_delay + int(terms.late.max(initial=0))
     rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, longest))
     return arrays.State(
@@ -179,7 +179,7 @@ def part_of(
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     dt, substeps, _ = model.timing
     motion = arrays.Dynamics(
-        term_arrays(model.kinematics), SERIES, float(dt), int(substeps)
+        make_terms(model.kinematics), SERIES, float(dt), int(substeps)
     )
     own = _scratch(model, scanner, sizes, cells, part.stop - part.start)
     return arrays.Part(state, members, scanner.arguments, motion, own)
@@ -195,7 +195,7 @@ def _scratch(
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
     corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
-    x, dq = scratch(kinematics)
+    x, dq = allocate_scratch(kinematics)
     commands = len(kinematics.variables) - kinematics.state_size
     return arrays.Scratch(
         lanes=arrays.Lanes(

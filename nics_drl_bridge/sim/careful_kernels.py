@@ -52,12 +52,12 @@ def rates_at(
         single.x[s] = state.state[n, m, s]
     for c in range(state.history.shape[3]):
         delay = state.delay[n, m] + motion.terms.late[c]
-        row = robot.delayed(j, delay, motion.substeps, sent)
+        row = robot.find_delayed_command(j, delay, motion.substeps, sent)
         single.x[size + c] = state.history[n, m, row, c]
     robot.rates(
         single.dq,
         single.x,
-        robot.with_coefficients(motion.terms, state.coefficient[n, m]),
+        robot.replace_coefficients(motion.terms, state.coefficient[n, m]),
     )
 
 
@@ -328,8 +328,10 @@ def move_carefully(
                 flight[impact.FROM] = flight[impact.HOLDS] = 0.0
                 for s in range(state.state.shape[2]):
                     now = state.state[n, m, s]
-                    bounds = robot.bounds_of(motion.terms, s)
-                    state.state[n, m, s] = robot.next_state(now, dq[3 + s], dt, bounds)
+                    bounds = robot.get_bounds(motion.terms, s)
+                    state.state[n, m, s] = robot.advance_state(
+                        now, dq[3 + s], dt, bounds
+                    )
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)

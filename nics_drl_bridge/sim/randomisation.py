@@ -20,7 +20,7 @@ from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.faults import SKEW, TOO_CLOSE, Skew, TooClose
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.kernels import term_arrays
+from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import checked_seeds
 
@@ -368,7 +368,7 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
     spread[3:] /= ranges.response[::-1]
     _check_stable(model, spread, where)
     kept = np.nonzero(model.coefficients)
-    base = term_arrays(model).coefficient
+    base = make_terms(model).coefficient
     return base * spans[kept][:, 0], base * spans[kept][:, 1]
 
 
@@ -376,7 +376,9 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
     known = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
     with suppress(ValueError, KeyError):
         return known[
-            taylor.term_name(taylor.parse_term(name, model.variables), model.variables)
+            taylor.format_term(
+                taylor.parse_term(name, model.variables), model.variables
+            )
         ]
     hint = nearest(name, known) if known else "it has none at all: remove it."
     raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")

@@ -85,7 +85,7 @@ class CommandBox:
         edges = np.stack([model.low[first:], model.high[first:]])
         for curve in model.inputs:  # the model's box is of commands in effect
             place = self._names.index(curve.command)
-            edges[:, place] = curve.sent(edges[:, place])
+            edges[:, place] = curve.invert(edges[:, place])
         self._range = edges[0], edges[1]
         self._low: Array = self._range[0] - margin
         self._high: Array = self._range[1] + margin
@@ -125,7 +125,7 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
     """Raises ConfigError if a robot could cross a whole world in one step of its kinematics."""
     first = len(robot.state)
     most = np.maximum(np.abs(model.low), np.abs(model.high))
-    ends = model.in_effect([robot.command_low, robot.command_high])
+    ends = model.apply_curves([robot.command_low, robot.command_high])
     most[first:] = np.maximum(most[first:], np.abs(ends).max(axis=0))
     products = np.prod(most**model.powers, axis=1)
     step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)

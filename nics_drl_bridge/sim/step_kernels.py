@@ -16,7 +16,13 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import cell_kernels as cells
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.fixture_kernels import cells_of, walls_of
-from nics_drl_bridge.robot.kernels import bend, delayed, run, with_coefficients, wrap
+from nics_drl_bridge.robot.kernels import (
+    apply_curve,
+    find_delayed_command,
+    replace_coefficients,
+    run,
+    wrap,
+)
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
@@ -69,7 +75,7 @@ def _queue_commands(history: Array, commands: Array, begin: int, curves: Array) 
                 for c in range(commands.shape[2]):
                     history[begin + i, m, h, c] = history[begin + i, m, h - 1, c]
             for c in range(commands.shape[2]):
-                history[begin + i, m, 0, c] = bend(commands[i, m, c], curves[c])
+                history[begin + i, m, 0, c] = apply_curve(commands[i, m, c], curves[c])
 
 
 @kernel
@@ -105,7 +111,7 @@ def move_freely(
             # Each command changes once in a period, at this substep.
             for c in range(change.shape[0]):
                 change[c, lane] = (state.delay[n, m] + motion.terms.late[c]) % substeps
-    terms = with_coefficients(motion.terms, lanes.coefficient)
+    terms = replace_coefficients(motion.terms, lanes.coefficient)
     lane_count = (end - begin) * robots
     substep = 0
     while substep < substeps:
@@ -118,7 +124,9 @@ def move_freely(
                     n = begin + lane // robots
                     m = lane % robots
                     delay = state.delay[n, m] + motion.terms.late[c]
-                    row = delayed(substep, delay, substeps, history.shape[2])
+                    row = find_delayed_command(
+                        substep, delay, substeps, history.shape[2]
+                    )
                     x[size + c, lane] = history[n, m, row, c]
         run(
             lane_pose,

@@ -14,7 +14,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
-from nics_drl_bridge.middleware.playback import Playback, in_order, played
+from nics_drl_bridge.middleware.playback import Playback, merge_messages, read_messages
 from nics_drl_bridge.recording.messages import commanded
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -102,14 +102,14 @@ def _read(
     path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
 ) -> tuple[list[float], list[Snapshot], Any]:
     """Times from the first on [s], shots, and the lidar of the bag."""
-    messages = played(path, topics, model.gyro)
+    messages = read_messages(path, topics, model.gyro)
     playback = Playback(model, POSE in messages, any_lidar=True)
     stamps = list[int]()
     shots = list[Snapshot]()
     middleware = playback.middleware
     every = SCAN if SCAN in messages else ODOM
     command: Array | None = None
-    for role, message in in_order(messages):
+    for role, message in merge_messages(messages):
         used = playback.take(role, message)
         if role == CMD_VEL:
             command = commanded(message.content, model.robot)

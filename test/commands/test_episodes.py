@@ -25,11 +25,11 @@ from nics_drl_bridge.commands.episodes import (
 )
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
-from nics_drl_bridge.robot.spec import load_robot, robot_from
+from nics_drl_bridge.robot.spec import build_robot, load_robot
 from nics_drl_bridge.sim.world_set import load_worlds
 
 KART = SimpleNamespace(
-    robot=robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2})
+    robot=build_robot({"kind": "ackermann_throttle", "footprint_radius": 0.2})
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 from nics_drl_bridge.identify.identify import Identified, identify
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import build_robot
 
 from .projection import Found
 
@@ -22,7 +22,7 @@ def identify_robot(name: str) -> Identified:
 
     robot = ROBOTS[name]
     drive = foreign_drive(robot, SEED, DURATIONS_S[name])
-    spec = robot_from(robot.robot, robot.commands)
+    spec = build_robot(robot.robot, robot.commands)
     return identify(drive.recording(), spec)
 
 

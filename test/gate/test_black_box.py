@@ -21,7 +21,7 @@ from nics_drl_bridge.gate.black_box import (
 from nics_drl_bridge.gate.inputs import EStop
 from nics_drl_bridge.gate.state import ShieldConfig
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.robot.braking import Drift, OwnTurn
+from nics_drl_bridge.robot.braking import Drift, TurnBraking
 
 
 class Recorded(Rig):
@@ -60,7 +60,9 @@ def test_a_robot_that_leaves_its_arc_while_it_brakes_is_replayed(tmp_path):
 
 
 def test_a_robot_whose_turn_brakes_apart_from_its_speed_is_replayed(tmp_path):
-    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, turn=OwnTurn(0.4, 3.0, 0.6, 0.5))
+    shield = ShieldConfig(
+        0.2, 1.0, 0.05, 0.02, 0.15, turn=TurnBraking(0.4, 3.0, 0.6, 0.5)
+    )
     rig = Recorded(config(shield=shield), 30.0).drive()
     rig.command([np.nan, 1.0, -0.0])
     rig.run(0.3)

@@ -13,7 +13,7 @@ from nics_drl_bridge.gate.shield import STEP, body_of, sweeps
 from nics_drl_bridge.gate.shield_kernels import clearance, free
 from nics_drl_bridge.gate.stopping import shield_config
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.robot.braking import slowest_of
+from nics_drl_bridge.robot.braking import derive_slowest_model
 
 ARRIVED_M = 0.3
 HELD_S = 0.4
@@ -145,7 +145,7 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
 ):
     plant = kinematics()
     if responds != "as its model":
-        plant = slowest_of(plant)
+        plant = derive_slowest_model(plant)
         assert plant is not None
     # The command that the base heard last is followed for a period.
     poses = stopping_poses(plant, command, HELD_S + model.control_period)

@@ -13,7 +13,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.robot.spec import RobotSpec, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 
 TICKS_PER_METRE = 70.0
 TRACK = 0.16
@@ -77,7 +77,7 @@ def tricycle() -> RobotSpec:
         "footprint_radius": 0.6,
         "parameters": {"wheelbase": BASE},
     }
-    return robot_from(given | {"angular_is": "steering"}, STEERED)
+    return build_robot(given | {"angular_is": "steering"}, STEERED)
 
 
 def front_driven(state: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ def slipping_car(
     """A car by throttle that slips aside and turns less at speed; only its poses were seen."""
     limits = {"throttle": (-0.3, 0.6), "steering": (-1.0, 1.0)}
     given = {"kind": "ackermann_throttle", "footprint_radius": 0.25}
-    spec = robot_from(given | {"parameters": {"wheelbase": 0.26}}, limits)
+    spec = build_robot(given | {"parameters": {"wheelbase": 0.26}}, limits)
     rng = np.random.default_rng(seed)
     count = round(duration / COMMAND_S)
     draws = rng.uniform(*np.array(list(limits.values())).T, (count // 40 + 1, 2))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.robot.spec import RobotSpec, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 
 STEP_S = 0.005
 COMMAND_S = 0.05
@@ -32,7 +32,7 @@ def car() -> RobotSpec:
         "parameters": {"wheelbase": WHEELBASE_M},
     }
     limits = {"speed_command": (-1.0, 2.0), "steering_command": (-0.5, 0.5)}
-    return robot_from(given, limits)
+    return build_robot(given, limits)
 
 
 def held_values(
@@ -215,7 +215,7 @@ def wheeled() -> RobotSpec:
             },
         ],
     }
-    return robot_from(given, {})
+    return build_robot(given, {})
 
 
 def rounded(values: np.ndarray, low: float, high: float, levels: int) -> np.ndarray:

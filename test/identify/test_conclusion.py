@@ -12,7 +12,7 @@ from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import fit_report, opening
 from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.robot.spec import load_robot, robot_from
+from nics_drl_bridge.robot.spec import build_robot, load_robot
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 CAR = load_robot("ackermann")
@@ -106,7 +106,7 @@ def test_a_mistake_of_the_mapping_is_told_first_and_to_be_mended_before_a_traini
 
 @pytest.mark.parametrize("kind", ["ackermann", "skid_steer"])
 def test_a_robot_that_moves_ahead_alone_is_not_to_be_driven_aside(kind):
-    spec = robot_from({"kind": kind, "footprint_radius": 0.25})
+    spec = build_robot({"kind": kind, "footprint_radius": 0.25})
     found = identify(record(spec, np.random.default_rng(0), 30.0), spec)
     assert "vy" in found.fit.unmoved
     told = conclude(found)

@@ -18,7 +18,7 @@ from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import check_axes
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -332,11 +332,11 @@ def test_a_model_of_every_partial_drive_stays_finite(car):
         states = np.zeros((1, 501, 2))
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
-            rollout(
+            simulate_rollouts(
                 poses,
                 states,
                 random_commands(car, 500, seed=5)[None],
-                term_arrays(model),
+                make_terms(model),
                 SERIES,
                 model.dt,
             )

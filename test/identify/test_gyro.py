@@ -15,7 +15,7 @@ from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.joined import join_recordings
 from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import build_robot
 
 ROBOT = {
     "kind": "differential",
@@ -138,7 +138,7 @@ def test_each_of_several_recordings_turns_by_its_own_bias():
         drive_skid_steer(np.random.default_rng(k), duration=40.0, bias=0.02 * k)
         for k in (1, 2)
     ]
-    spec = robot_from(
+    spec = build_robot(
         ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)}
     )
     joined = join_recordings([recorded(each) for each in drives], spec)
@@ -171,7 +171,7 @@ def heading_errors(model, drive, latency_s):
 @pytest.mark.slow
 def test_the_model_turns_as_the_robot_truly_does(slipping):
     unseen = drive_skid_steer(np.random.default_rng(11))
-    spec = robot_from(
+    spec = build_robot(
         ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)}
     )
     by_wheels = identify(recorded(slipping, gyro=False), spec)

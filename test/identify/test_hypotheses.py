@@ -94,7 +94,7 @@ def test_a_latency_is_told_as_its_sums_with_the_lags():
 
 def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
     spec, _ = slipping_car(duration=1.0)
-    powers = taylor.exponents(len(spec.variable_names), 1)
+    powers = taylor.list_exponents(len(spec.variable_names), 1)
     allowed = by_textbook(powers, spec)
     model = taylor.TaylorModel(
         spec.variable_names,

@@ -14,8 +14,8 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import Identified, cut, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error, predict, windows
-from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 
@@ -55,7 +55,7 @@ def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
     states = np.empty((4, 31, 2))
     poses[:, 0] = pose
     states[:, 0] = state
-    rollout(poses, states, command, term_arrays(model), SERIES, model.dt)
+    simulate_rollouts(poses, states, command, make_terms(model), SERIES, model.dt)
     for n in range(30):
         pose, state = model.step(pose, state, command[:, n])
     assert np.allclose(poses[:, -1, :2], pose[:, :2], atol=1e-12)
@@ -223,7 +223,7 @@ def test_a_wheel_that_always_follows_from_the_others_is_named(name, request):
 def by_throttle(steering: float, **given) -> tuple[RobotSpec, TaylorModel]:
     """A car by throttle, and its model of a drive that held one steering."""
     names = ("vx", "vy", "wz", "throttle", "steering")
-    spec = robot_from(
+    spec = build_robot(
         {"kind": "ackermann_throttle", "footprint_radius": 0.2, **given}, {}
     )
     powers = np.eye(5, dtype=np.int64)[[0, 2, 3]]

@@ -22,9 +22,9 @@ from nics_drl_bridge.identify.report import fit_report
 from nics_drl_bridge.identify.shooting import Shooting
 from nics_drl_bridge.identify.verdict import about_gaps, time_without_pose
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import build_robot
 
-ROBOT = robot_from(
+ROBOT = build_robot(
     {"kind": "differential", "footprint_radius": 0.2},
     {"forward_command": (-0.8, 0.8), "turn_command": (-1.5, 1.5)},
 )

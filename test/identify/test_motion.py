@@ -24,7 +24,7 @@ from nics_drl_bridge.identify.motion import (
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.robot.spec import load_robot, robot_from
+from nics_drl_bridge.robot.spec import build_robot, load_robot
 
 MOUNTED = Calibration(rotation_rad=-0.1, lever_arm_m=(0.08, 0.0))
 
@@ -124,7 +124,7 @@ def test_commands_are_as_smooth_as_the_twist_so_that_they_begin_and_end_together
 
 @pytest.mark.slow
 def test_poses_ten_times_a_second_do_not_hide_when_a_robot_got_its_commands():
-    spec = robot_from({"kind": "differential", "footprint_radius": 0.15})
+    spec = build_robot({"kind": "differential", "footprint_radius": 0.15})
     drive = record(load_robot("differential"), np.random.default_rng(2), 30.0, dt=0.02)
     seen = [
         replace(s, t=s.t[::5], values=s.values[::5])

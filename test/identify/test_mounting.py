@@ -12,7 +12,7 @@ from nics_drl_bridge.identify.mounting import (
     mounting_without_lateral_motion,
     with_slip,
 )
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import build_robot
 
 
 def mean_of_twists(_, twists: TwistIntervals) -> Mounting:
@@ -145,7 +145,7 @@ def skidded(slip: float, slowest: float, seed: int = 0) -> TwistIntervals:
 
 @pytest.mark.parametrize("slip", [0.0, -0.12])
 def test_a_lever_is_told_from_the_slip_of_a_robot_that_skids_both_ways(slip):
-    spec = robot_from({"kind": "skid_steer", "footprint_radius": 0.4}, {})
+    spec = build_robot({"kind": "skid_steer", "footprint_radius": 0.4}, {})
     motion = skidded(slip, -0.6)
     plain = mounting_without_lateral_motion(motion, motion.twist[:, 0])
     found = with_slip(motion, plain, spec)
@@ -155,7 +155,7 @@ def test_a_lever_is_told_from_the_slip_of_a_robot_that_skids_both_ways(slip):
 
 @pytest.mark.parametrize("slip", [0.0, -0.12])
 def test_slip_of_a_robot_that_skids_forwards_only_is_no_lever(slip):
-    spec = robot_from({"kind": "skid_steer", "footprint_radius": 0.4}, {})
+    spec = build_robot({"kind": "skid_steer", "footprint_radius": 0.4}, {})
     motion = skidded(slip, 0.2)
     plain = mounting_without_lateral_motion(motion, motion.twist[:, 0])
     assert plain.lever_sigma[0] < 0.005  # as if it were certain

@@ -31,7 +31,7 @@ from nics_drl_bridge.recording.recording import (
     samples_on_one_clock,
 )
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
 JUMPING = ROOT.parent / "shared" / "recordings" / "f110_frictionmaps" / "DS1"
@@ -142,7 +142,7 @@ def test_steering_in_degrees_is_refused_though_the_limits_are_those_recorded():
     plain = drive(tricycle(), duration=5.0)
     command = replace(plain.command, values=np.stack([0.0 * angles, angles], axis=1))
     limits = {"speed_command": (-1.0, 1.0), "steering_command": (-64.0, 64.0)}
-    spec = robot_from({"kind": "tricycle", "footprint_radius": 0.6}, limits)
+    spec = build_robot({"kind": "tricycle", "footprint_radius": 0.6}, limits)
     with pytest.raises(
         RecordingError, match=r"write `steering_command: {from: ..., unit: deg}`"
     ):
@@ -274,7 +274,7 @@ def test_the_speed_and_steering_of_a_real_car_are_refused_if_they_are_swapped(na
 def test_a_throttle_and_a_steering_that_are_swapped_are_refused_beyond_their_limits():
     limits = {"throttle": (-1.0, 1.0), "steering": (-1.0, 1.0)}
     kind = {"kind": "ackermann_throttle", "footprint_radius": 0.2}
-    spec = robot_from(kind, limits)
+    spec = build_robot(kind, limits)
     plain = drive(load_robot("ackermann"), measured_state=False)
     assert check_commands(Drive(plain, spec)) == ()
     swapped = replace(plain.command, values=100.0 * plain.command.values[:, ::-1])
@@ -306,8 +306,8 @@ def test_commands_in_volts_and_poses_with_gaps_are_compared_without_harm(differe
 def test_wheels_in_rpm_are_told_if_their_radius_is_known():
     parameters = {"wheel_radius": 0.05, "track": 0.3, "wheel_lag": 0.1}
     wheels = {"kind": "differential_wheels", "footprint_radius": 0.2}
-    known = robot_from(wheels | {"parameters": parameters})
-    unknown = robot_from(wheels)
+    known = build_robot(wheels | {"parameters": parameters})
+    unknown = build_robot(wheels)
     plain = drive(known, measured_state=False)
     assert check_commands(Drive(plain, known)) == ()
     other = replace(

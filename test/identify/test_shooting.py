@@ -11,7 +11,7 @@ from identify.drives import slipping_car
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.shooting import NOTHING_FREE, Inputs, Shooting, fitted
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 DT = 0.02
@@ -50,7 +50,7 @@ def problem(car) -> Shooting:
     late = np.roll(command, round(DELAY / DT), axis=0)
     poses = np.zeros((1, STEPS + 1, 3))
     states = np.zeros((1, STEPS + 1, 3))
-    rollout(poses, states, late[None], term_arrays(car), SERIES, DT)
+    simulate_rollouts(poses, states, late[None], make_terms(car), SERIES, DT)
     q = np.concatenate([poses[0], states[0]], axis=1)
     x = np.concatenate([states[0, :-1], command], axis=1)
     samples = Samples(t, q, np.vstack([x, x[-1:]]), np.gradient(q, DT, axis=0), DT)

@@ -28,7 +28,7 @@ from nics_drl_bridge.identify.terms import (
 )
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import build_robot
 
 BASE = 0.9
 
@@ -94,9 +94,9 @@ def test_a_dead_zone_is_not_taken_for_a_mounting(seed):
 
 def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
     spec = tricycle()
-    powers = taylor.exponents(4, 4)
+    powers = taylor.list_exponents(4, 4)
     allowed = through_state(powers, spec, centred=True)
-    names = [taylor.term_name(row, spec.variable_names) for row in powers]
+    names = [taylor.format_term(row, spec.variable_names) for row in powers]
     along, across = (
         [n for n, each in zip(names, allowed[d], strict=True) if each] for d in (0, 2)
     )
@@ -116,11 +116,11 @@ def test_a_mirror_turns_the_steering_and_what_it_moves_aside():
 
 def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acceleration():
     spec, _ = slipping_car(duration=1.0)
-    powers = taylor.exponents(len(spec.variable_names), 3)
+    powers = taylor.list_exponents(len(spec.variable_names), 3)
 
     def terms(dof: str, **given: object) -> set[str]:
         allowed = by_textbook(powers, spec, **given)[spec.dof_names.index(dof)]
-        return {taylor.term_name(row, spec.variable_names) for row in powers[allowed]}
+        return {taylor.format_term(row, spec.variable_names) for row in powers[allowed]}
 
     assert terms("d_vx") == {"vx", "throttle"}
     assert terms("d_vx", held=("throttle",)) == {"1", "vx", "throttle"}
@@ -141,7 +141,7 @@ def test_two_models_are_put_together_over_the_terms_of_both():
     one, other = (model_of(spec, names) for names in (["vx", "throttle"], ["wz", "vx"]))
     base, first = together(one, other)
     at = {
-        taylor.term_name(row, spec.variable_names): k
+        taylor.format_term(row, spec.variable_names): k
         for k, row in enumerate(base.powers)
     }
     assert set(at) == {"vx", "throttle", "wz"}
@@ -201,7 +201,7 @@ def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
 def test_wheels_that_always_move_together_share_what_they_do():
     four = {"kind": "mecanum", "footprint_radius": 0.4, "state": []}
     names = ("front_left", "front_right", "rear_left", "rear_right")
-    spec = robot_from(
+    spec = build_robot(
         four, dict.fromkeys((f"{name}_wheel" for name in names), (-9.0, 9.0))
     )
     rng = np.random.default_rng(2)

@@ -20,13 +20,13 @@ from nics_drl_bridge.identify.verdict import (
     refuse_unexcited,
     unlearnt,
 )
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import build_robot
 
 
 @pytest.fixture(scope="module")
 def throttled():
     """A car by throttle, whose state is its twist."""
-    return robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2}, {})
+    return build_robot({"kind": "ackermann_throttle", "footprint_radius": 0.2}, {})
 
 
 def told(spec, *unmoved: str) -> str:
@@ -45,7 +45,7 @@ def test_a_driver_is_asked_to_move_commands_and_no_states(throttled):
 
 def test_only_a_robot_that_moves_sideways_is_told_that_it_never_did(throttled):
     assert told(throttled, "vy") == ""
-    aside = robot_from({"kind": "omnidirectional", "footprint_radius": 0.2})
+    aside = build_robot({"kind": "omnidirectional", "footprint_radius": 0.2})
     assert "no terms of body_vy, which" in told(aside, "body_vy")
 
 

@@ -17,7 +17,7 @@ from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.kernels import Log, MotionModel
 from nics_drl_bridge.middleware.measurement import Acceptance, Kind, Measurement
-from nics_drl_bridge.robot.kernels import SERIES, rates, scratch, term_arrays
+from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms, rates
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -52,9 +52,9 @@ def random_command(model, rng):
 def test_the_derivative_of_the_rates_is_the_numerical_one(robot):
     model = builtin_model(robot)
     rng = np.random.default_rng(0)
-    terms = term_arrays(model.kinematics)
+    terms = make_terms(model.kinematics)
     for _ in range(10):
-        x, dq = scratch(model.kinematics)
+        x, dq = allocate_scratch(model.kinematics)
         x[:-1] = rng.uniform(-1.0, 1.0, len(x) - 1)
 
         def of(inputs, dq=dq):
@@ -71,7 +71,7 @@ def test_the_derivative_of_the_rates_is_the_numerical_one(robot):
 def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, steps):
     model = builtin_model(robot)
     rng = np.random.default_rng(1)
-    motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
+    motion = MotionModel(make_terms(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
         mean = random_mean(model, rng)
         command = random_command(model, rng)
@@ -98,7 +98,7 @@ def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, ste
 def test_the_expected_twist_has_the_numerical_derivative(robot):
     model = builtin_model(robot)
     rng = np.random.default_rng(2)
-    motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
+    motion = MotionModel(make_terms(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
         mean = random_mean(model, rng)
         command = random_command(model, rng)

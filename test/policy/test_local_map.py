@@ -21,7 +21,7 @@ from nics_drl_bridge.policy.local_map_kernels import (
     touching,
     way_at,
 )
-from nics_drl_bridge.robot.spec import load_robot, robot_from
+from nics_drl_bridge.robot.spec import build_robot, load_robot
 
 CLOSE = Clearance(margin=0.05, soft=0.3)
 GOAL = np.array([3.0, 0.0])
@@ -95,7 +95,7 @@ def box(length, width):
     x = length / 2.0
     y = width / 2.0
     corners = [[x, y], [-x, y], [-x, -y], [x, -y]]
-    return robot_from({"name": "box", "kind": "differential", "footprint": corners})
+    return build_robot({"name": "box", "kind": "differential", "footprint": corners})
 
 
 @pytest.mark.parametrize(

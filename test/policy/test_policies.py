@@ -29,7 +29,7 @@ from nics_drl_bridge.policy.policies import (
 )
 from nics_drl_bridge.policy.stateful import Stateful, begin, resume
 from nics_drl_bridge.robot.curve import InputCurve
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
@@ -189,7 +189,7 @@ def test_a_car_turns_by_its_own_wheelbase(changes):
     speed, angle = long.command_high
     assert not long.takes_turn_rate  # a copy of it that does is made of it
     twist = [speed, 0.0, speed * np.tan(angle) / 2.5]
-    assert steady_twist(long, long.command_high) == pytest.approx(twist)
+    assert compute_steady_twist(long, long.command_high) == pytest.approx(twist)
     planner = DynamicWindow(Navigation(long, lidar()))
     assert np.abs(planner._search[0]).max(axis=0) == pytest.approx(np.abs(twist))
 

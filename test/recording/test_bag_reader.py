@@ -13,7 +13,7 @@ from nics_drl_bridge.recording.bag_reader import gather, latency_of, state_of, w
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import load_robot, robot_from
+from nics_drl_bridge.robot.spec import build_robot, load_robot
 
 CAR = load_robot("ackermann")
 CART = load_robot("differential")
@@ -320,7 +320,7 @@ def test_a_state_that_follows_its_command_need_not_be_measured():
 
 
 def test_a_component_of_the_twist_is_told_by_the_pose():
-    husky = robot_from({"kind": "skid_steer", "footprint_radius": 0.6})
+    husky = build_robot({"kind": "skid_steer", "footprint_radius": 0.6})
     assert (
         state_of(table((("elbow",), (0.0,), (1.0,))), husky, roles(), "drive") is None
     )

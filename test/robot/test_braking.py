@@ -17,15 +17,15 @@ from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.braking import (
     Braking,
     Drift,
-    OwnTurn,
+    TurnBraking,
     _least_share,
-    braking_of,
+    derive_slowest_model,
+    find_braking,
     motions,
-    slowest_of,
 )
 from nics_drl_bridge.robot.curve import InputCurve
-from nics_drl_bridge.robot.spec import robot_from
-from nics_drl_bridge.robot.taylor import TaylorModel, exponents
+from nics_drl_bridge.robot.spec import build_robot
+from nics_drl_bridge.robot.taylor import TaylorModel, list_exponents
 
 SHIPPED = (
     "ackermann",
@@ -83,7 +83,7 @@ OWN = {
 @cache
 def own(name):
     """A robot that a YAML file alone describes, and its model."""
-    robot = robot_from({"name": f"own_{name}", **OWN[name]})
+    robot = build_robot({"name": f"own_{name}", **OWN[name]})
     drive = textbook.record(robot, np.random.default_rng(0))
     return robot, identify(drive, robot).model
 
@@ -149,7 +149,7 @@ def straight_ways(robot):
 
 def assert_bounds(robot, model, factor=1.3, late_s=0.0):
     """The bound is above the stops on straight ways, and not far above the worst of a speed."""
-    braking = braking_of(robot, model)
+    braking = find_braking(robot, model)
     ways = np.array(list(straight_ways(robot)))
     commands = np.concatenate([share * ways for share in SHARES])
     speeds, _, paths, _ = run_stops(model, commands)
@@ -171,7 +171,7 @@ def direction_of(robot, command):
     """Unit vector (2,) in which a robot drives straight."""
     if not robot.takes_cmd_vel:
         return np.array([1.0, 0.0])
-    along = robot.in_fields(command)[:2]
+    along = robot.to_fields(command)[:2]
     return along / np.hypot(*along)
 
 
@@ -192,8 +192,8 @@ def test_so_is_that_of_wheels_that_brake_weakly(name, at_the_rim):
 def test_a_jackal_whose_wheels_brake_by_0_2_needs_two_and_a_half_metres_from_1_m_s():
     robot, model = shipped("jackal")
     weak = limited(model, 0.2 / 0.098)
-    assert 2.4 < braking_of(robot, weak).distance(1.0) < 2.7
-    assert braking_of(robot, model).distance(1.0) == pytest.approx(0.2, abs=0.01)
+    assert 2.4 < find_braking(robot, weak).distance(1.0) < 2.7
+    assert find_braking(robot, model).distance(1.0) == pytest.approx(0.2, abs=0.01)
 
 
 @pytest.mark.parametrize("rate", [None, 3.0])
@@ -206,7 +206,7 @@ def test_so_is_that_of_a_robot_that_yaml_alone_describes(name, rate):
 
 def throttle_car(pull=2.0, decay=0.5, bias=0.0, **changes):
     """A car that is driven by a throttle, without a brake: it rolls until drag has slowed it."""
-    robot = robot_from(
+    robot = build_robot(
         {
             "name": "throttle",
             "kind": "free",
@@ -223,7 +223,7 @@ def throttle_car(pull=2.0, decay=0.5, bias=0.0, **changes):
             ],
         }
     )
-    powers = exponents(2, 1)
+    powers = list_exponents(2, 1)
     coefficients = np.zeros((4, 3))
     speed = int(np.flatnonzero((powers == [1, 0]).all(axis=1))[0])
     throttle = int(np.flatnonzero((powers == [0, 1]).all(axis=1))[0])
@@ -271,7 +271,7 @@ def test_a_turn_that_ends_later_is_counted():
     """Wheels that brake weakly stop one after the other: the whole footprint is bounded."""
     robot, model = shipped("jackal")
     weak = limited(model, 0.2 / 0.098)
-    braking = braking_of(robot, weak)
+    braking = find_braking(robot, weak)
     radius = robot.footprint_radius
     commands = [
         [2.0, 2.5],
@@ -297,8 +297,8 @@ def test_a_turn_that_ends_apart_from_the_speed_makes_no_mixture_look_slow():
     """Each motion of the range is bounded, by little more than what its slower response needs."""
     robot = rover()
     plant = skid_steer_kinematics()
-    slower = slowest_of(plant)
-    braking = braking_of(robot, plant)
+    slower = derive_slowest_model(plant)
+    braking = find_braking(robot, plant)
     assert braking.turn is not None
     shares = [(ahead, turn) for ahead in SHARES for turn in (*SHARES, 0.0)]
     shares += [(0.0, turn) for turn in SHARES]
@@ -316,7 +316,7 @@ def test_a_turn_that_ends_apart_from_the_speed_makes_no_mixture_look_slow():
 
 
 def test_a_mixture_takes_as_long_as_the_slower_of_its_parts():
-    turn = OwnTurn(reaction_s=0.4, deceleration=2.0)
+    turn = TurnBraking(reaction_s=0.4, deceleration=2.0)
     braking = Braking(0.2, 0.5, turn=turn)
     assert braking.time_s(np.array([1.0, 0.0, 0.0])) == pytest.approx(2.2)
     assert braking.time_s(np.array([0.1, 0.0, 2.0])) == pytest.approx(1.4)
@@ -325,7 +325,7 @@ def test_a_mixture_takes_as_long_as_the_slower_of_its_parts():
 
 def test_a_robot_that_stays_on_its_arc_has_no_drift():
     for name in ("differential", "jackal", "mecanum", "turtlebot3_burger"):
-        braking = braking_of(*shipped(name))
+        braking = find_braking(*shipped(name))
         assert braking.drift == Drift()
         assert braking.lever_m == 0.0
         assert braking.turn is None
@@ -333,7 +333,7 @@ def test_a_robot_that_stays_on_its_arc_has_no_drift():
 
 def test_a_ramp_of_the_commands_is_added():
     robot, model = shipped("differential")
-    braking = braking_of(robot, model, ramp=np.array([0.5, np.inf]))
+    braking = find_braking(robot, model, ramp=np.array([0.5, np.inf]))
     assert braking.deceleration == pytest.approx(0.5, rel=0.01)
     assert braking.reaction_s == pytest.approx(0.1, abs=2e-3)
 
@@ -341,18 +341,20 @@ def test_a_ramp_of_the_commands_is_added():
 def test_delays_of_commands_are_added():
     robot, model = shipped("differential")
     late = replace(model, inputs=(InputCurve(command="forward_command", delay=0.25),))
-    sooner = braking_of(robot, model).reaction_s
-    assert braking_of(robot, late).reaction_s == pytest.approx(sooner + 0.25, abs=0.02)
+    sooner = find_braking(robot, model).reaction_s
+    assert find_braking(robot, late).reaction_s == pytest.approx(
+        sooner + 0.25, abs=0.02
+    )
 
 
 def test_standard_errors_make_the_response_slower():
     robot, model = throttle_car()
     decay = model.coefficients == -0.5
     unsure = replace(model, std_errors=np.where(decay, 0.05, 0.0))
-    slower = slowest_of(unsure)
+    slower = derive_slowest_model(unsure)
     assert slower.coefficients[decay] == pytest.approx(-0.4)
-    assert braking_of(robot, unsure).distance(2.0) == pytest.approx(5.0, rel=0.05)
-    assert braking_of(robot, model).distance(2.0) == pytest.approx(4.0, rel=0.05)
+    assert find_braking(robot, unsure).distance(2.0) == pytest.approx(5.0, rel=0.05)
+    assert find_braking(robot, model).distance(2.0) == pytest.approx(4.0, rel=0.05)
 
 
 @pytest.mark.parametrize("changes", [{"decay": 0.0}, {"decay": -0.2}, {"bias": 0.4}])
@@ -363,16 +365,16 @@ def test_a_model_that_does_not_stop_is_refused_in_a_sentence_that_says_what_to_g
     with pytest.raises(
         ConfigError, match=r"'throttle'.* does not stop.* generate .* from a drive"
     ):
-        braking_of(robot, model)
+        find_braking(robot, model)
 
 
 def test_a_bound_is_computed_once_for_each_model(monkeypatch):
     robot, model = throttle_car()
-    first = braking_of(robot, model)
+    first = find_braking(robot, model)
     monkeypatch.setattr("nics_drl_bridge.robot.braking._bound", lambda *_: 1 / 0)
-    assert braking_of(robot, replace(model)) is first
+    assert find_braking(robot, replace(model)) is first
     with pytest.raises(ZeroDivisionError):
-        braking_of(robot, limited(model, 0.77))
+        find_braking(robot, limited(model, 0.77))
 
 
 def test_many_commands_are_tried_alone_and_in_pairs():

@@ -8,11 +8,11 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import (
     SERIES,
     advance,
-    delayed,
+    allocate_scratch,
+    find_delayed_command,
+    make_terms,
     rates,
     run,
-    scratch,
-    term_arrays,
 )
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -21,7 +21,7 @@ def random_model(state_size, command_size, order, seed):
     """A model of which half of the terms were pruned."""
     rng = np.random.default_rng(seed)
     variables = tuple(f"v{i}" for i in range(state_size + command_size))
-    powers = taylor.exponents(len(variables), order)
+    powers = taylor.list_exponents(len(variables), order)
     coefficients = rng.normal(size=(3 + state_size, len(powers)))
     coefficients[rng.random(coefficients.shape) < 0.5] = 0.0
     box = np.ones(len(variables))
@@ -35,8 +35,8 @@ def random_model(state_size, command_size, order, seed):
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
 def test_compiled_rates_are_those_of_the_model(state_size, command_size, order):
     model = random_model(state_size, command_size, order, seed=order)
-    x, dq = scratch(model)
-    terms = term_arrays(model)
+    x, dq = allocate_scratch(model)
+    terms = make_terms(model)
     assert len(terms[0]) == model.terms_kept
     for row in np.random.default_rng(1).normal(size=(50, state_size + command_size)):
         x[:-1] = row
@@ -76,7 +76,7 @@ def test_robots_side_by_side_move_as_the_model_steps_each(order):
     pose[2], pose[3] = np.cos(start[:, 2]), np.sin(start[:, 2])
     x = np.ones((5, 37))
     x[:4] = inputs.T
-    terms = term_arrays(model)
+    terms = make_terms(model)
     lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], 37))
     run(pose, x, np.zeros((5, 37)), lanes, SERIES, model.dt, 10)
     moved = start
@@ -101,6 +101,6 @@ def test_a_delayed_command_takes_effect_after_exactly_its_delay(delay):
         for substep in range(substeps):
             now = period * substeps + substep
             assert (
-                sent[delayed(substep, delay, substeps, periods)]
+                sent[find_delayed_command(substep, delay, substeps, periods)]
                 == (now - delay) // substeps
             )

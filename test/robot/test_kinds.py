@@ -22,16 +22,16 @@ from nics_drl_bridge.generator import generate
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.kinds import (
-    command_for,
+    compute_steady_twist,
+    find_command,
     find_kind,
     has_textbook,
     kind_names,
     reach,
-    steady_twist,
     textbook,
 )
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
-from nics_drl_bridge.robot.urdf import urdf_of
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
+from nics_drl_bridge.robot.urdf import make_urdf
 
 PACKAGE = Path(__file__).resolve().parents[2] / "nics_drl_bridge"
 NEW = "tricycle"
@@ -104,11 +104,13 @@ def test_a_held_command_leads_to_its_steady_twist(name):
     book = textbook(robot)
     command = 0.6 * robot.command_high
     _, state = integrate(book, np.zeros(3), np.zeros(len(robot.state)), command, 5.0)
-    assert steady_twist(robot, command) == pytest.approx(book.twist(state), abs=1e-9)
+    assert compute_steady_twist(robot, command) == pytest.approx(
+        book.twist(state), abs=1e-9
+    )
 
 
 def made(kind, **given):
-    return robot_from({"kind": kind, "footprint_radius": 0.2, **given})
+    return build_robot({"kind": kind, "footprint_radius": 0.2, **given})
 
 
 KNOWN = [kind for kind in KINDS if kind != "free"]
@@ -119,10 +121,10 @@ def test_the_command_for_a_twist_leads_to_it(kind):
     robot = made(kind)
     for share in np.random.default_rng(0).uniform(-1.0, 1.0, (20, len(robot.command))):
         command = share * robot.command_high
-        assert command_for(robot, steady_twist(robot, command)) == pytest.approx(
-            command
-        )
-    far = command_for(robot, np.full((2, 3), 1e3))
+        assert find_command(
+            robot, compute_steady_twist(robot, command)
+        ) == pytest.approx(command)
+    far = find_command(robot, np.full((2, 3), 1e3))
     assert (far <= robot.command_high).all()
 
 
@@ -133,42 +135,44 @@ def test_a_robot_known_by_its_twist_comes_to_that_of_its_actuators(kind):
     start = np.zeros(len(textbook(robot).lag))
     _, state = integrate(textbook(robot), np.zeros(3), start, command, 5.0)
     assert textbook(robot).twist(state) == pytest.approx(
-        steady_twist(robot, command), abs=1e-3
+        compute_steady_twist(robot, command), abs=1e-3
     )
 
 
 def test_a_skid_steer_robot_turns_less_than_it_is_commanded():
     sizes = {"track": 0.4, "effective_track": 0.8, "wheel_radius": 0.1}
     robot = made("skid_steer", parameters=sizes)
-    assert steady_twist(robot, [0.5, 1.0]) == pytest.approx([0.5, 0.0, 0.5])
+    assert compute_steady_twist(robot, [0.5, 1.0]) == pytest.approx([0.5, 0.0, 0.5])
     sides = [{"name": "left_wheel"}, {"name": "right_wheel"}]
     robot = made("skid_steer", parameters=sizes, command=sides)
-    assert steady_twist(robot, [-4.0, 4.0]) == pytest.approx([0.0, 0.0, 1.0])
+    assert compute_steady_twist(robot, [-4.0, 4.0]) == pytest.approx([0.0, 0.0, 1.0])
 
 
 def test_a_throttle_comes_to_a_speed_and_a_share_to_an_angle():
     sizes = {"wheelbase": 0.2, "speed_gain": 4.0, "greatest_steering": 0.5}
-    twist = steady_twist(made("ackermann_throttle", parameters=sizes), [0.5, -1.0])
+    twist = compute_steady_twist(
+        made("ackermann_throttle", parameters=sizes), [0.5, -1.0]
+    )
     assert twist == pytest.approx([2.0, 0.0, -2.0 * np.tan(0.5) / 0.2])
 
 
 def test_wheels_turn_a_differential_robot_by_their_difference():
     robot = made("differential_wheels", parameters={"track": 0.5, "wheel_radius": 0.1})
-    assert steady_twist(robot, [3.0, 5.0]) == pytest.approx([0.4, 0.0, 0.4])
-    assert command_for(robot, [0.4, 0.0, 0.4]) == pytest.approx([3.0, 5.0])
+    assert compute_steady_twist(robot, [3.0, 5.0]) == pytest.approx([0.4, 0.0, 0.4])
+    assert find_command(robot, [0.4, 0.0, 0.4]) == pytest.approx([3.0, 5.0])
 
 
 def test_a_car_that_is_to_turn_on_the_spot_stands():
     for kind in ("ackermann", "ackermann_throttle", "tricycle"):
-        assert not command_for(made(kind), [0.0, 0.0, 1.0]).any()
+        assert not find_command(made(kind), [0.0, 0.0, 1.0]).any()
     assert reach(made("ackermann")) == pytest.approx([1.0, 0.0, np.tan(0.5) / 0.26])
 
 
 def test_where_the_commands_of_a_free_robot_lead_is_not_known():
-    robot = robot_from({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
+    robot = build_robot({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
     assert not has_textbook(robot)
     assert robot.moves_sideways
-    for ask in (textbook, reach, lambda robot: command_for(robot, np.zeros(3))):
+    for ask in (textbook, reach, lambda robot: find_command(robot, np.zeros(3))):
         with pytest.raises(
             ConfigError, match="no textbook tells where the commands of the kind"
         ):
@@ -248,7 +252,7 @@ def test_robots_without_cmd_vel_reach_goals_by_their_kind(unnamed, name):
 def test_a_free_robot_reaches_goals_by_its_model_and_not_without(name):
     car = made("ackermann_throttle")
     ranges = {c.name: (c.min, c.max) for c in car.command}
-    robot = robot_from({"kind": "free", "footprint_radius": 0.2}, ranges)
+    robot = build_robot({"kind": "free", "footprint_radius": 0.2}, ranges)
     model = generate(record(car, np.random.default_rng(0)), robot, lidar(), ())[0]
     env = BridgeEnv(model=model, world="empty")
     assert successes(env, make_policy(name, env.task, model)) == 3
@@ -275,7 +279,7 @@ def test_their_discrete_actions_drive_ahead_and_turn():
     )
     car = discrete_commands(made("ackermann_throttle"))
     assert car[1:4] == pytest.approx(np.array([[1.0, 0.0], [1.0, 1.0], [1.0, -1.0]]))
-    free = robot_from({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
+    free = build_robot({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
     assert discrete_commands(free).tolist() == [[0.0], [1.0], [0.0]]
 
 
@@ -324,7 +328,7 @@ def test_it_reaches_goals_by_the_planner(model):
 def test_it_has_limits_and_is_drawn_on_three_wheels():
     robot = load_robot(NEW)
     assert load_limits(NEW, robot).linear.tolist() == [True, False]
-    root = ElementTree.fromstring(urdf_of(robot))
+    root = ElementTree.fromstring(make_urdf(robot))
     wheels = [
         link.attrib["name"]
         for link in root.iter("link")
@@ -374,7 +378,7 @@ def test_an_unknown_kind_is_refused_with_all_that_there_are():
 
 
 def textbook_and_drawing(robot):
-    return textbook(robot), urdf_of(robot)
+    return textbook(robot), make_urdf(robot)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -6,7 +6,7 @@ import pytest
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import require_textbook
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 
@@ -103,11 +103,16 @@ def test_a_car_at_rest_holds_its_wheels_straight_and_one_that_can_turn_no_furthe
 
 def test_what_goes_through_cmd_vel_is_what_the_robot_takes():
     given = np.array([[0.5, 0.3], [0.0, 0.3]])
-    assert car().through_cmd_vel(given) == pytest.approx(
+    assert car().pass_through_cmd_vel(given) == pytest.approx(
         np.array([[0.5, 0.3], [0.0, 0.0]])
     )
-    assert car(assumed=["wheelbase"]).through_cmd_vel(given).tolist() == given.tolist()
-    assert load_robot("ackermann").through_cmd_vel(given).tolist() == given.tolist()
+    assert (
+        car(assumed=["wheelbase"]).pass_through_cmd_vel(given).tolist()
+        == given.tolist()
+    )
+    assert (
+        load_robot("ackermann").pass_through_cmd_vel(given).tolist() == given.tolist()
+    )
 
 
 @pytest.mark.parametrize("changes", [{"parameters": {}}, {"assumed": ["wheelbase"]}])
@@ -213,10 +218,10 @@ def test_a_steering_in_degrees_is_refused_where_the_robot_is_read_but_not_one_th
     with pytest.raises(
         ConfigError, match=r"steering_command reaches -24 rad, .* are in radians"
     ):
-        robot_from(kind | {"command": [speed, angle]})
+        build_robot(kind | {"command": [speed, angle]})
     ranges = {"speed_command": (-1.0, 1.0), "steering_command": (-24.0, 22.0)}
     assert (
-        robot_from(kind, ranges).command[1].min == -24.0
+        build_robot(kind, ranges).command[1].min == -24.0
     )  # its mapping can turn it into radians
 
 
@@ -231,14 +236,14 @@ def test_a_grown_robot_keeps_the_margin_from_each_edge_of_its_outline_and_around
         given = data(
             footprint=corners[::order], footprint_radius=float(np.hypot(0.3, 0.1))
         )
-        grown = RobotSpec.model_validate(given).grown(0.05)
-        assert np.abs(np.array(grown.footprint)).max(axis=0) == pytest.approx(
+        grow_footprint = RobotSpec.model_validate(given).grow_footprint(0.05)
+        assert np.abs(np.array(grow_footprint.footprint)).max(axis=0) == pytest.approx(
             [0.35, 0.15]
         )
-        assert grown.footprint_radius == pytest.approx(
+        assert grow_footprint.footprint_radius == pytest.approx(
             np.hypot(0.3, 0.1)
         )  # where it may stand
-    assert RobotSpec.model_validate(data()).grown(
+    assert RobotSpec.model_validate(data()).grow_footprint(
         0.05
     ).footprint_radius == pytest.approx(0.25)
 

@@ -8,7 +8,12 @@ import pytest
 from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import find_kind, kind_names, textbook
-from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
+from nics_drl_bridge.robot.spec import (
+    RobotSpec,
+    build_robot,
+    load_robot,
+    read_definition,
+)
 
 WHEELED = "differential_wheels"
 SLIPPING = (
@@ -27,7 +32,7 @@ WIDE = {"kind": "mecanum", "footprint_radius": 0.3}
 def made(kind, ranges=None, **given):
     if kind == "free" and ranges is None:
         ranges = {"valve": (-1.0, 0.5)}
-    return robot_from({"kind": kind, "footprint_radius": 0.3, **given}, ranges)
+    return build_robot({"kind": kind, "footprint_radius": 0.3, **given}, ranges)
 
 
 def commands(robot):
@@ -97,7 +102,7 @@ def test_commands_stand_in_the_order_of_the_recording():
     ranges = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
     robot = made("ackermann_throttle", ranges, parameters={"wheelbase": 0.2})
     assert [c.name for c in robot.command] == ["steering", "throttle"]
-    assert textbook(robot).steady(np.array([0.0, 1.0])) == pytest.approx(
+    assert textbook(robot).compute_twist(np.array([0.0, 1.0])) == pytest.approx(
         [3.0, 0.0, 0.0]
     )
 
@@ -153,7 +158,7 @@ def test_parameters_and_a_state_that_are_given_stand():
 
 def test_sizes_come_from_a_footprint_too():
     corners = [[0.3, 0.4], [-0.3, 0.4], [-0.3, -0.4], [0.3, -0.4]]
-    robot = robot_from({"kind": "mecanum", "footprint": corners})
+    robot = build_robot({"kind": "mecanum", "footprint": corners})
     assert robot.parameters["half_width"] == pytest.approx(0.6 * 0.5)
 
 
@@ -162,22 +167,23 @@ def test_a_file_may_say_it_in_a_few_words_too(tmp_path):
     file.write_text("kind: skid_steer\nname: husky\nfootprint_radius: 0.6\n")
     robot = load_robot(file)
     assert (robot.name, robot.textbook) == ("husky", "skid_steer")
-    assert robot_from(str(file)) == robot
+    assert build_robot(str(file)) == robot
 
 
 def test_a_file_without_a_name_is_a_robot_of_the_files_name(tmp_path):
     file = tmp_path / "husky.yaml"
     file.write_text("kind: skid_steer\nfootprint_radius: 0.6\n")
-    assert load_robot(file).name == definition(file)["name"] == "husky"
+    assert load_robot(file).name == read_definition(file)["name"] == "husky"
     assert (
-        robot_from({"kind": "skid_steer", "footprint_radius": 0.6}).name == "skid_steer"
+        build_robot({"kind": "skid_steer", "footprint_radius": 0.6}).name
+        == "skid_steer"
     )
     shipped = [load_robot(name).name for name in shipped_names("robots")]
     assert shipped == shipped_names("robots")
 
 
 def test_the_content_of_a_file_is_a_robot_too():
-    assert robot_from(load_robot("mecanum").model_dump()) == load_robot("mecanum")
+    assert build_robot(load_robot("mecanum").model_dump()) == load_robot("mecanum")
 
 
 @pytest.mark.parametrize(
@@ -234,7 +240,7 @@ def test_the_content_of_a_file_is_a_robot_too():
 )
 def test_what_is_no_robot_is_refused_in_one_sentence(given, ranges, sentence):
     with pytest.raises(ConfigError) as caught:
-        robot_from(given, ranges)
+        build_robot(given, ranges)
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
 

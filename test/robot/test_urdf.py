@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.generator import lidar_of
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
-from nics_drl_bridge.robot.urdf import urdf_of
+from nics_drl_bridge.robot.urdf import make_urdf
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOTS = ("ackermann", "differential", "mecanum", "jackal")
@@ -53,7 +53,7 @@ def wheels(text: str) -> dict[str, float]:
 def test_the_shipped_files_are_those_of_the_shipped_robots(name: str) -> None:
     lidar = lidar_of(load_robot(name))
     file = ROOT / "urdf" / f"{name}.urdf"
-    assert file.read_text(encoding="utf-8") == urdf_of(
+    assert file.read_text(encoding="utf-8") == make_urdf(
         load_robot(name), lidar.mount, lidar.frame
     )
 
@@ -67,7 +67,7 @@ def test_the_command_tells_the_file_that_it_wrote(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_it_is_one_tree_below_base_link(name: str) -> None:
-    text = urdf_of(load_robot(name))
+    text = make_urdf(load_robot(name))
     root = ElementTree.fromstring(text)
     links = [link.attrib["name"] for link in root.iter("link")]
     children = [joint.find("child").attrib["link"] for joint in root.iter("joint")]
@@ -81,7 +81,7 @@ def test_it_is_one_tree_below_base_link(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_wheels_stand_on_the_ground_and_move_as_joint_states_says(name: str) -> None:
     spec = load_robot(name)
-    text = urdf_of(spec)
+    text = make_urdf(spec)
     assert wheels(text)
     for link, radius in wheels(text).items():
         assert place(text, link)[2] == pytest.approx(radius)
@@ -97,20 +97,20 @@ def test_wheels_stand_on_the_ground_and_move_as_joint_states_says(name: str) -> 
 
 
 def test_a_differential_robot_has_its_track_and_its_left_wheel_at_positive_y() -> None:
-    text = urdf_of(load_robot("differential"))
+    text = make_urdf(load_robot("differential"))
     assert place(text, "left_wheel_link") == pytest.approx([0.0, 0.1, 0.05])
     assert place(text, "right_wheel_link") == pytest.approx([0.0, -0.1, 0.05])
 
 
 def test_a_mecanum_robot_has_four_wheels_in_the_order_of_its_state() -> None:
-    text = urdf_of(load_robot("mecanum"))
+    text = make_urdf(load_robot("mecanum"))
     assert place(text, "front_left_wheel_link") == pytest.approx([0.1, 0.1, 0.05])
     assert place(text, "rear_right_wheel_link") == pytest.approx([-0.1, -0.1, 0.05])
     assert set(wheels(text).values()) == {0.05}
 
 
 def test_a_jackal_stands_on_its_wheels_not_on_the_track_of_its_drive() -> None:
-    text = urdf_of(load_robot("jackal"))
+    text = make_urdf(load_robot("jackal"))
     assert place(text, "front_left_wheel_link") == pytest.approx([0.131, 0.188, 0.098])
     assert place(text, "rear_right_wheel_link") == pytest.approx(
         [-0.131, -0.188, 0.098]
@@ -119,7 +119,7 @@ def test_a_jackal_stands_on_its_wheels_not_on_the_track_of_its_drive() -> None:
 
 def test_a_car_has_its_wheelbase_and_steers_within_its_limits() -> None:
     spec = load_robot("ackermann")
-    text = urdf_of(spec)
+    text = make_urdf(spec)
     gap = place(text, "front_left_wheel_link") - place(text, "rear_left_wheel_link")
     assert gap == pytest.approx([spec.parameters["wheelbase"], 0.0, 0.0])
     limit = joints(text)["steering"].find("limit").attrib
@@ -127,7 +127,9 @@ def test_a_car_has_its_wheelbase_and_steers_within_its_limits() -> None:
 
 
 def test_the_laser_stands_at_its_mount() -> None:
-    text = urdf_of(load_robot("differential"), (0.1, -0.02, 1.5), "front_laser", "car")
+    text = make_urdf(
+        load_robot("differential"), (0.1, -0.02, 1.5), "front_laser", "car"
+    )
     origin = joints(text)["laser_mount"].find("origin").attrib
     assert (origin["xyz"], origin["rpy"]) == ("0.1 -0.02 0", "0 0 1.5")
     assert joints(text)["laser_mount"].find("child").attrib["link"] == "front_laser"
@@ -136,6 +138,6 @@ def test_the_laser_stands_at_its_mount() -> None:
 
 def test_a_robot_without_textbook_kinematics_has_a_body_and_a_laser() -> None:
     data = load_robot("differential").model_dump() | {"textbook": None}
-    text = urdf_of(RobotSpec(**data))
+    text = make_urdf(RobotSpec(**data))
     assert not wheels(text)
     assert set(joints(text)) == {"laser_mount"}

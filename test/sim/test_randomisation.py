@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
-from nics_drl_bridge.robot.kernels import term_arrays
+from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
 from nics_drl_bridge.sim.randomisation import (
     LidarRanges,
@@ -46,7 +46,7 @@ def test_nothing_named_is_exactly_the_model():
     assert drawn.count is None
     assert drawn.size is None
     for array, value in (
-        (drawn.coefficient, term_arrays(model().kinematics).coefficient),
+        (drawn.coefficient, make_terms(model().kinematics).coefficient),
         (drawn.noise, [0.05, 0.03, 0.0, 0.0, 0.0]),
         (drawn.faults, model().lidar.fault_parameters),
         (drawn.delay, 7),
@@ -62,7 +62,7 @@ def test_nothing_named_is_exactly_the_model():
 def test_the_shipped_ranges_fit_every_shipped_robot(name, robot):
     sampler = Sampler(load_randomisation(name), builtin_model(robot), 2)
     drawn = sampler.draw(SEEDS)
-    nominal = term_arrays(builtin_model(robot).kinematics).coefficient
+    nominal = make_terms(builtin_model(robot).kinematics).coefficient
     low, high = load_randomisation(name).kinematics.scale
     factor = drawn.coefficient / nominal
     assert factor.min() >= low * (1.0 - 1e-12)
@@ -127,7 +127,7 @@ def test_each_coefficient_is_scaled_evenly_and_on_its_own():
     drawn = Sampler(
         given(kinematics={"scale": [0.5, 2.0]}), builtin_model("ackermann")
     ).draw(SEEDS)
-    nominal = term_arrays(builtin_model("ackermann").kinematics).coefficient
+    nominal = make_terms(builtin_model("ackermann").kinematics).coefficient
     factor = (drawn.coefficient / nominal)[:, 0]
     for column in factor.T:
         assert_even(column, 0.5, 2.0)
@@ -148,7 +148,7 @@ def test_a_slower_response_scales_all_time_constants_alike_and_leads_to_the_same
     drawn = sampler.draw(SEEDS[:50])
     kept = np.nonzero(nominal.coefficients)
     size = nominal.state_size
-    factor = term_arrays(nominal).coefficient / drawn.coefficient
+    factor = make_terms(nominal).coefficient / drawn.coefficient
     assert np.allclose(factor[..., kept[0] < 3], 1.0)
     assert np.allclose(
         factor[..., kept[0] >= 3], drawn.named()["kinematics.response"][..., None]
@@ -156,7 +156,7 @@ def test_a_slower_response_scales_all_time_constants_alike_and_leads_to_the_same
     assert drawn.response.min() < 1.2
     assert drawn.response.max() > 2.8
     settled = []
-    for coefficient in (term_arrays(nominal).coefficient, drawn.coefficient[0, 0]):
+    for coefficient in (make_terms(nominal).coefficient, drawn.coefficient[0, 0]):
         coefficients = nominal.coefficients.copy()
         coefficients[kept] = coefficient
         state = np.zeros(size)
