@@ -20,7 +20,7 @@ from nics_drl_bridge.commands.episodes import LABELS, PLACES, drive_in
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.rendering import WorldPicture
 from nics_drl_bridge.policy.evaluation import Episode
-from nics_drl_bridge.watch.record import Pixels, beside, write_gif
+from nics_drl_bridge.watch.record import Pixels, join_side_by_side, write_gif
 
 POLICY = "differential"
 WORLD = "clutter"
@@ -73,7 +73,7 @@ def main() -> None:
                     one if one is not None else end
                     for one, end in zip(shown, last, strict=True)
                 ]
-                frames.append(beside(held))
+                frames.append(join_side_by_side(held))
     write_gif(OUT, frames, FPS)
 
 

@@ -8,7 +8,7 @@ from onnx import TensorProto, helper, numpy_helper, save
 from nics_drl_bridge import load_world, make, open_model
 from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.report.pictures import draw_trajectories
 
 MAPPING = """
 kind: foreign policy
@@ -53,7 +53,9 @@ def main():
     policy, task = open_policy("theirs.yaml", model)
     episode = drive(make(model=model, world=world, task=task), policy, seed=0)
     print(episode.result)
-    picture = trajectories({"theirs": [episode]}, world, model.robot.footprint_radius)
+    picture = draw_trajectories(
+        {"theirs": [episode]}, world, model.robot.footprint_radius
+    )
     Path("drive_foreign_policy.png").write_bytes(picture)
 
 

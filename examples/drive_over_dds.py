@@ -10,7 +10,7 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.report.pictures import draw_trajectories
 from nics_drl_bridge.sim.world import load_world
 
 ENV = "NicsBridge/Navigation-v0"
@@ -42,7 +42,7 @@ def main() -> None:
     difference = np.abs(inside.estimate - outside.estimate).max()
     print(f"{outside.result} over DDS; the estimates are {difference:g} apart")
     runs = {"in process": [inside], "over DDS": [outside]}
-    picture = trajectories(runs, load_world(WORLD), model.robot.footprint_radius)
+    picture = draw_trajectories(runs, load_world(WORLD), model.robot.footprint_radius)
     Path("drive_over_dds.png").write_bytes(picture)
 
 

@@ -10,7 +10,7 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, summarise
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.train import line_of
-from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.report.pictures import draw_trajectories
 from nics_drl_bridge.sim.world import load_world
 
 FIRST_SEED = 1_000_000  # which no training draws
@@ -29,7 +29,9 @@ def main() -> None:
         "NicsBridge/Navigation-v0", model=model, world=world, task=task
     )
     episodes = drive_all(env, policy, range(FIRST_SEED, FIRST_SEED + 6))
-    picture = trajectories({"policy": episodes}, world, model.robot.footprint_radius)
+    picture = draw_trajectories(
+        {"policy": episodes}, world, model.robot.footprint_radius
+    )
     Path("evaluate_policy.png").write_bytes(picture)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.report.fit_pictures import held_out_paths
+from nics_drl_bridge.report.fit_pictures import draw_held_out_paths
 from nics_drl_bridge.robot.spec import load_robot
 
 
@@ -20,7 +20,7 @@ def main() -> None:
     )  # or read_recording(path)
     found = identify(recording, robot)
     print("\n".join(found.model.equations()))
-    Path("fit_model.png").write_bytes(held_out_paths(found.trial))
+    Path("fit_model.png").write_bytes(draw_held_out_paths(found.trial))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import numpy as np
 from nics_drl_bridge import load_robot, load_world, make
 from nics_drl_bridge.env.task import Task, bearing, distance
 from nics_drl_bridge.policy.evaluation import drive
-from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.report.pictures import draw_trajectories
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def main():  # by a policy that turns to the goal, and drives where that is ahea
     run = drive(make(task=Patrol, model="differential", world=world), policy, seed=1)
     print(f"{run.result} after {run.steps} steps")
     Path("own_task.png").write_bytes(
-        trajectories({"path": [run]}, world, robot.footprint_radius)
+        draw_trajectories({"path": [run]}, world, robot.footprint_radius)
     )
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from nics_drl_bridge.policy import train
 from nics_drl_bridge.policy.training_settings import chosen_settings
-from nics_drl_bridge.report.pictures import Point, training_curve
+from nics_drl_bridge.report.pictures import Point, draw_training_curve
 
 STEPS = 120_000  # half a minute; `nics demo` takes 800,000
 OUT = Path("runs/example")
@@ -25,7 +25,7 @@ def main() -> None:
     )[0]
     print(f"{result.trained.steps} steps: {train.line_of(result.summaries['arena'])}")
     print(f"the policy is {OUT}/seed_0/policy.onnx")
-    Path("train_policy.png").write_bytes(training_curve(curve))
+    Path("train_policy.png").write_bytes(draw_training_curve(curve))
 
 
 if __name__ == "__main__":

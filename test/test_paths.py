@@ -29,7 +29,7 @@ from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.topic_roles import topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
-from nics_drl_bridge.report.doctor_facts import facts_of_bag
+from nics_drl_bridge.report.doctor_facts import collect_facts_of_bag
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.world import load_world
@@ -89,7 +89,7 @@ def test_a_bag_is_written_told_and_looked_through_at_either(tmp_path, kind):
     write_bag(record(CAR, np.random.default_rng(0), duration=5.0), place, CAR)
     assert is_bag(place)
     assert bag_info(place).messages > 0
-    assert "/cmd_vel" in facts_of_bag(place).topics
+    assert "/cmd_vel" in collect_facts_of_bag(place).topics
 
 
 @KINDS

@@ -16,7 +16,7 @@ from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Command, Odometry, Scan, Tick
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.state import GateConfig, GateState, Push, begin
-from nics_drl_bridge.gate.stopping import gate_config
+from nics_drl_bridge.gate.stopping import make_gate_config
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.geometry import between, compose, exp
 from nics_drl_bridge.interface import NS_PER_S
@@ -191,7 +191,7 @@ class Drive:
         self.env = BridgeVectorEnv(
             worlds, model, case.world, task, None, EPISODE_STEPS, "SameStep"
         )
-        config = gate_config(
+        config = make_gate_config(
             model,
             load_limits(case.robot, model.robot),
             None,

@@ -40,9 +40,9 @@ from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.report import html, pictures
 from nics_drl_bridge.report.fit_page import (
     fit_tile,
+    make_path_blocks,
+    make_verdict_blocks,
     model_blocks,
-    path_blocks,
-    verdict_blocks,
 )
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -136,7 +136,8 @@ def run(plan: DemoPlan, say: Say) -> str:
     radius = model.robot.footprint_radius
     paths = "paths.png"
     write_bytes(
-        plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius)
+        plan.out / paths,
+        pictures.draw_trajectories({LABELS[FAST]: here}, world, radius),
     )
     say(
         f"  the paths are drawn in {plan.out / paths}"
@@ -153,14 +154,17 @@ def run(plan: DemoPlan, say: Say) -> str:
     ]
     episodes = DemoEpisodes(summaries, here, there, live)
     sections = sections_of(plan, model, identified, learned, episodes)
-    folded = html.details("Wall time", [html.table(("part", "wall time [s]"), times)])
+    folded = html.make_details(
+        "Wall time", [html.make_table(("part", "wall time [s]"), times)]
+    )
     file = plan.out / "report.html"
     lead = (
         f"Robot {model.robot.name!r} in the world {plan.world!r}, policy {learned.policy!r}, "
         f"simulator generated from {plan.recording or 'a textbook drive'}."
     )
     write_text(
-        file, html.page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])])
+        file,
+        html.make_page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])]),
     )
     over = f"over DDS {successes(there)}/{plan.episodes}, " if topics else ""
     return f"demo: in process {successes(here)}/{plan.episodes}, {over}report {file}"
@@ -388,7 +392,7 @@ def sections_of(
         ("Verdict", _verdict(plan, learned, identified, of)),
         ("Paths in the world", _episodes(plan, model, of)),
         ("The policy", _policy(plan, learned, of)),
-        ("Paths of the model", path_blocks(identified)),
+        ("Paths of the model", make_path_blocks(identified)),
         ("The model", model_blocks(model.robot, identified, model.report)),
     ]
 
@@ -423,7 +427,7 @@ def _verdict(
         more = "drive more episodes, or use a recording of your own robot"
         next_step = more if share.value >= GOOD else "train longer, with --train-steps"
         conclusion = conclusion._replace(advice=f"Next: {next_step}.")
-    return verdict_blocks(
+    return make_verdict_blocks(
         tiles,
         conclusion,
         f"nics watch {learned.policy} --model {plan.model} --world {plan.world}",
@@ -437,11 +441,11 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
     drawn = list[tuple[bytes, str]]()
     if learned.curve:
         caption = "Success and collisions during exploration; every episode is new."
-        drawn.append((pictures.training_curve(learned.curve), caption))
+        drawn.append((pictures.draw_training_curve(learned.curve), caption))
     caption = f"Success unperturbed, and with each perturbation of {PERTURBED!r} alone (95 %)."
     shares = {what: each.success for what, each in of.summaries.items()}
-    drawn.append((pictures.robustness(shares), caption))
-    blocks = [html.paragraph(learned.how), html.gallery(drawn)]
+    drawn.append((pictures.draw_robustness(shares), caption))
+    blocks = [html.make_paragraph(learned.how), html.make_gallery(drawn)]
     rows = list[tuple[str, ...]]()
     for name, share in summary.shares.items():
         rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
@@ -456,8 +460,8 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
     )
     return [
         *blocks,
-        html.paragraph(text),
-        html.table(("", "value", "95 % from", "to"), rows),
+        html.make_paragraph(text),
+        html.make_table(("", "value", "95 % from", "to"), rows),
     ]
 
 
@@ -465,8 +469,8 @@ def _paths_gallery(
     shown: Sequence[Mapping[str, Episode]], world: AnyWorld, radius: float
 ) -> str:
     """Draws the paths of each seed, with panels of the same size."""
-    return html.gallery(
-        [(png, "") for png in pictures.trajectory_gallery(shown, world, radius)]
+    return html.make_gallery(
+        [(png, "") for png in pictures.draw_trajectory_gallery(shown, world, radius)]
     )
 
 
@@ -481,7 +485,7 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
         alone = [{both[0]: episode} for episode in here[:PANELS]]
-        return [html.paragraph(text), _paths_gallery(alone, world, radius)]
+        return [html.make_paragraph(text), _paths_gallery(alone, world, radius)]
     rows = [
         (
             f"{a.seed}",
@@ -509,9 +513,11 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
         f"its goal, that of seed {live.seed}."
     )
     about = "Deviation is the greatest distance between the two true paths at the same step."
-    table = html.table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows)
+    table = html.make_table(
+        ("seed", both[0], *each, both[1], *each, "deviation [m]"), rows
+    )
     return [
-        html.paragraph(text),
+        html.make_paragraph(text),
         _paths_gallery(shown, world, radius),
-        html.details("Episode by episode", [html.paragraph(about), table]),
+        html.make_details("Episode by episode", [html.make_paragraph(about), table]),
     ]

@@ -53,19 +53,22 @@ def doctor(
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.foreign import load_any
     from nics_drl_bridge.report.doctor import examine
-    from nics_drl_bridge.report.doctor_facts import expected_of, facts_of_bag
+    from nics_drl_bridge.report.doctor_facts import (
+        collect_facts_of_bag,
+        derive_expected,
+    )
 
     if policy is None:
-        expected = expected_of(open_model(model or DEFAULT_ROBOT))
+        expected = derive_expected(open_model(model or DEFAULT_ROBOT))
     elif model is not None:
         raise ConfigError(
             "--model and --policy: give one of them, what the robot must fit."
         )
     else:
         contract = load_any(policy).contract
-        expected = expected_of(contract, contract.scan)
+        expected = derive_expected(contract, contract.scan)
     if bag is not None:
-        facts = facts_of_bag(bag, namespace, imu)
+        facts = collect_facts_of_bag(bag, namespace, imu)
     else:
         with console.needs_ros("nics doctor"):
             from nics_drl_bridge.nodes.listen import listen

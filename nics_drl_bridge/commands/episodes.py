@@ -32,8 +32,8 @@ from nics_drl_bridge.policy.pace import pace_of
 from nics_drl_bridge.policy.policies import is_policy_file, open_policy
 from nics_drl_bridge.policy.stateful import Policy
 from nics_drl_bridge.report.doctor import examine
-from nics_drl_bridge.report.doctor_facts import expected_of
-from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.report.doctor_facts import derive_expected
+from nics_drl_bridge.report.pictures import draw_trajectories
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import checked_seeds
@@ -316,7 +316,7 @@ def judged(
 ) -> Evaluated:
     """Judges the runs of a policy by place, and draws their first episodes into a folder."""
     shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
-    picture = trajectories(shown, world, model.robot.footprint_radius)
+    picture = draw_trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(out / f"trajectories_{short_name(policy, among)}.png", picture)
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
 
@@ -461,7 +461,7 @@ def drive_vehicle(
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
     errors = []
     heard = listen(LISTEN_S, namespace, imu=options.get("imu", "auto"))
-    for finding in examine(heard, expected_of(model)):
+    for finding in examine(heard, derive_expected(model)):
         sentence = f"{finding.where}: {finding.what} ({finding.fix})"
         say(f"  {finding.severity}: {sentence}")
         errors += [sentence] if finding.severity == "error" else []

@@ -229,7 +229,7 @@ def _shadow(
     from nics_drl_bridge.commands.episodes import contracts_of, model_name, short_name
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
-    from nics_drl_bridge.report.pictures import shadow_picture
+    from nics_drl_bridge.report.pictures import draw_shadow
 
     rows = list[tuple[str, ...]]()
     lines = list[str]()
@@ -241,7 +241,7 @@ def _shadow(
         )
         place = out / f"shadow_{short_name(policy, policies)}"
         differences = made.differences()
-        write_bytes(place.with_suffix(".png"), shadow_picture(made))
+        write_bytes(place.with_suffix(".png"), draw_shadow(made))
         data = {
             "bag": str(bag),
             "policy": policy,

@@ -79,4 +79,4 @@ def _drive(model: Any) -> None:
     for name in ("dynamic_window", "mppi"):
         policy, task = open_policy(name, model)
         policy.act(task.observation(rehearse(model), {"goal": np.ones(2)}))
-    shield.rehearse()
+    shield.warm_up()

@@ -306,7 +306,7 @@ def draw(
     """
     with console.progress_bar():
         from nics_drl_bridge.files import write_bytes
-        from nics_drl_bridge.report.pictures import world_picture
+        from nics_drl_bridge.report.pictures import draw_seeded_world
         from nics_drl_bridge.robot.spec import load_robot
         from nics_drl_bridge.sim.scenes import member_of
         from nics_drl_bridge.sim.world_set import load_worlds
@@ -321,7 +321,7 @@ def draw(
     if file.suffix != ".png":
         raise ConfigError(f"--out {file}: must end in .png.")
     _spare(worlds, Path(name), file)
-    write_bytes(file, world_picture(opened, radius, seed, outline))
+    write_bytes(file, draw_seeded_world(opened, radius, seed, outline))
     facts = {"file": str(file), "world": opened.name, "seed": seed}
     console.say(as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts)
 

@@ -17,7 +17,7 @@ from nics_drl_bridge.files import sha256, write_parts
 from nics_drl_bridge.gate import inputs, limits, state
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Input
-from nics_drl_bridge.gate.seal import SEAL, sealed
+from nics_drl_bridge.gate.seal import SEAL, append_checksum
 from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
 
 FORMAT = "nics_drl_bridge/black_box/4"
@@ -60,27 +60,29 @@ class BlackBox:
 
 def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> None:
     """Writes entries (at least one) to a file, completely or not at all."""
-    write_parts(path, _lines_of(config, entries))
+    write_parts(path, generate_lines(config, entries))
 
 
-def _lines_of(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]:
+def generate_lines(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]:
     """Yields the lines one by one: memory must not grow at a stop."""
-    yield from sealed(
-        chain([head_line(config, entries[0].before)], map(entry_line, entries))
+    yield from append_checksum(
+        chain([format_head(config, entries[0].before)], map(format_entry, entries))
     )
 
 
-def head_line(config: GateConfig, state: GateState) -> bytes:
+def format_head(config: GateConfig, state: GateState) -> bytes:
     """Returns the first line of a file: the state before the first entry."""
-    return _line({"format": FORMAT, "config": config, "state": state})
+    return _format_record({"format": FORMAT, "config": config, "state": state})
 
 
-def entry_line(entry: Entry) -> bytes:
+def format_entry(entry: Entry) -> bytes:
     """Returns the line of an entry."""
-    return _line({"now": entry.now, "given": entry.given, "decision": entry.decision})
+    return _format_record(
+        {"now": entry.now, "given": entry.given, "decision": entry.decision}
+    )
 
 
-def _line(record: dict[str, Any]) -> bytes:
+def _format_record(record: dict[str, Any]) -> bytes:
     return (
         json.dumps({key: to_plain(part) for key, part in record.items()}).encode()
         + b"\n"
@@ -121,7 +123,7 @@ class Replay(NamedTuple):
 
 def replay(path: str | Path) -> Replay:
     """Decides again on every input in a file; ConfigError if it is no whole black box."""
-    head, *lines = _lines(path)
+    head, *lines = _read_records(path)
     try:
         config, state = from_plain(head["config"]), from_plain(head["state"])
         given = [
@@ -130,7 +132,7 @@ def replay(path: str | Path) -> Replay:
         recorded = [from_plain(decision) for *_, decision in given]
         _check_kinds(config, state, given, recorded)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
-        raise _damaged(path, error) from None
+        raise _explain_damage(path, error) from None
     entries = []
     differing = []
     for index, ((now, event, plain), decision) in enumerate(
@@ -140,13 +142,13 @@ def replay(path: str | Path) -> Replay:
         try:
             state, anew = decide(config, state, event, now)
         except Exception as error:  # noqa: BLE001 - false records break the rules in any way
-            raise _damaged(path, error) from None
+            raise _explain_damage(path, error) from None
         if json.dumps(to_plain(anew)) != json.dumps(plain):
             differing.append(index)
     return Replay(tuple(entries), tuple(differing))
 
 
-def _damaged(path: str | Path, error: Exception) -> ConfigError:
+def _explain_damage(path: str | Path, error: Exception) -> ConfigError:
     return ConfigError(
         f"{path}: is damaged ({shortened(str(error), 120)}); it can't be replayed."
     )
@@ -175,7 +177,7 @@ def _check_kinds(
             raise TypeError(f"a {type(event).__name__} is no input")
 
 
-def _lines(path: str | Path) -> list[dict[str, Any]]:
+def _read_records(path: str | Path) -> list[dict[str, Any]]:
     text = read_text(path, MOST_BYTES)
     values = sum(map(text.count, ",[{"))
     if values > MOST_VALUES:

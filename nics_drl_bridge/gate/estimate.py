@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.gate.inputs import Estimate
-from nics_drl_bridge.gate.limits import greatest_speeds
+from nics_drl_bridge.gate.limits import get_maximum_speeds
 from nics_drl_bridge.gate.state import (
     Cause,
     EstimateMark,
@@ -39,7 +39,7 @@ class Growth(NamedTuple):
     heading: float  # [rad]
 
 
-def growth_since(mark: EstimateMark, estimate: Estimate) -> Growth:
+def compute_growth(mark: EstimateMark, estimate: Estimate) -> Growth:
     """Returns the uncertainty of an estimate's pose relative to an earlier one."""
     # An old error of the heading moves the pose by the way since, at right angles.
     x, y = (estimate.pose[:2] - mark.pose[:2]).tolist()
@@ -58,8 +58,8 @@ def track_estimate(
     marks = tuple(mark for mark in track.marks if now - mark.time_s <= WINDOW_S)
     if state.estimate is None or not marks:  # nothing to compare it with
         return EstimateTrack((newest,), "", track.last_fault)
-    fault = _jump(config, state.estimate, estimate, now - state.estimate_s)
-    fault = fault or _uncertain(config, marks[0], estimate, now)
+    fault = _find_jump(config, state.estimate, estimate, now - state.estimate_s)
+    fault = fault or _explain_uncertainty(config, marks[0], estimate, now)
     if fault:
         return EstimateTrack((newest,), fault, fault)
     if now - marks[-1].time_s >= MARK_S:
@@ -67,14 +67,14 @@ def track_estimate(
     return EstimateTrack(marks, "", track.last_fault)
 
 
-def _jump(
+def _find_jump(
     config: GateConfig, before: Estimate, after: Estimate, passed_s: float
 ) -> str:
     """Returns what is wrong with a pose that the robot can't have driven to, or nothing."""
     x, y, turn = between(before.pose, after.pose).tolist()
     path = math.hypot(x, y)
     speed, turn_rate = (
-        greatest_speeds(config.limits) if config.limits else (math.inf, math.inf)
+        get_maximum_speeds(config.limits) if config.limits else (math.inf, math.inf)
     )
     far = config.estimate_position + SLIP * speed * passed_s
     round_ = config.estimate_heading + SLIP * turn_rate * passed_s
@@ -83,11 +83,11 @@ def _jump(
     return f"it jumped by {path:.3g} m and {abs(turn):.3g} rad in {passed_s:.2f} s"
 
 
-def _uncertain(
+def _explain_uncertainty(
     config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float
 ) -> str:
     """Returns by how much an estimate has become too uncertain; empty if it has not."""
-    grown = growth_since(origin, estimate)
+    grown = compute_growth(origin, estimate)
     if (
         grown.position <= config.estimate_position
         and grown.heading <= config.estimate_heading
@@ -110,7 +110,7 @@ def begin_anew(state: GateState) -> EstimateTrack:
     return EstimateTrack((newest,))
 
 
-def unsteady(config: GateConfig, state: GateState, now: float) -> str:
+def explain_unsteadiness(config: GateConfig, state: GateState, now: float) -> str:
     """Returns why the gate can't be armed yet: the estimate was at fault a moment ago."""
     track = state.estimates
     if not track.last_fault or now - track.marks[0].time_s >= config.settle_s:

@@ -39,7 +39,9 @@ def look(
     # Bit for bit; one without returns is ignored. The pose (3,) is None before the first odometry.
     if not np.isfinite(ranges).any():
         return seen, ""
-    known = next((one for one in reversed(seen) if same(one.ranges, ranges)), None)
+    known = next(
+        (one for one in reversed(seen) if is_same_scan(one.ranges, ranges)), None
+    )
     if known is None:
         return (*seen[1 - PICTURES :], Sameness(ranges, 1, pose)), ""
     others = tuple(one for one in seen if one is not known)
@@ -52,7 +54,9 @@ def look(
     if path <= config.frozen_distance:
         return (*others, known), ""
     telling = must_differ(config, known.ranges, moved)
-    still = _but_for_one((known.ranges == ranges) & telling, telling, TELLING_SHARE)
+    still = _match_but_for_one(
+        (known.ranges == ranges) & telling, telling, TELLING_SHARE
+    )
     if np.count_nonzero(telling) >= LEAST_BEAMS and still:
         why = f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
         return (*others, known), why
@@ -62,7 +66,7 @@ def look(
     ), ""  # the scene may really look the same
 
 
-def stands_still(config: GateConfig, twist: Array) -> bool:
+def is_at_rest(config: GateConfig, twist: Array) -> bool:
     """True if a body twist (3,) is that of a robot at rest, within the noise of odometry."""
     linear, turn = (NOISE * std for std in config.odom_std)
     slow = np.hypot(twist[0], twist[1]) < STILL_LINEAR + linear
@@ -145,13 +149,13 @@ NEIGHBOURS = 1.5
 LEAST_BEAMS = 3
 
 
-def same(one: Ranges, other: Ranges) -> bool:
+def is_same_scan(one: Ranges, other: Ranges) -> bool:
     """True if two scans (B,) are bit-identical, but for a few of the beams that return in one."""
     returned = np.isfinite(one) | np.isfinite(other)
-    return _but_for_one((one == other) & returned, returned, SAME_SHARE)
+    return _match_but_for_one((one == other) & returned, returned, SAME_SHARE)
 
 
-def _but_for_one(same: Flags, counted: Flags, share: float) -> bool:
+def _match_but_for_one(same: Flags, counted: Flags, share: float) -> bool:
     """True if this share of the counted beams is the same, or all but one of them."""
     equal = int(np.count_nonzero(same))
     count = int(np.count_nonzero(counted))
@@ -173,11 +177,11 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> Flags:
     changed = np.isfinite(ranges)
     for error in HEADINGS:
         seen = between(moved + np.array([0.0, 0.0, error]), ends)
-        changed &= _changed(config.beam_angles, ranges, seen, open_[known])
+        changed &= _find_changed(config.beam_angles, ranges, seen, open_[known])
     return np.asarray(changed)
 
 
-def _changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
+def _find_changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
     """Returns which beams (B,) differ from moved old ends (K, 2); of open ones, the nearer."""
     bearing = np.arctan2(seen[:, 1], seen[:, 0])
     order = np.argsort(bearing)

@@ -19,7 +19,7 @@ from nics_drl_bridge.gate.state import (
     ScanMotion,
     replace,
 )
-from nics_drl_bridge.gate.stops import ODOM, SCAN, settled
+from nics_drl_bridge.gate.stops import ODOM, SCAN, reset_envelope
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
 
@@ -60,9 +60,7 @@ def decide(
         if latches and state.armed:
             state = replace(state, latched=cause)
         publish = was_moving or isinstance(given, inputs.Tick)
-        state = _stopped(
-            config, state, now if publish else state.moved_s, disarm=latches
-        )
+        state = _stop(config, state, now if publish else state.moved_s, disarm=latches)
     elif (
         isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S
     ):
@@ -74,10 +72,10 @@ def decide(
             motion = shape(config, state, motion, now)
         if motion.fault:
             cause = Cause("motion_unfit", "", motion.fault)
-            state = _stopped(config, replace(state, latched=cause), now, disarm=True)
+            state = _stop(config, replace(state, latched=cause), now, disarm=True)
         else:
             value = motion.value
-            recent = _recent(config, state, motion.value, now)
+            recent = _append_recent(config, state, motion.value, now)
             state = replace(
                 state,
                 value=value,
@@ -103,20 +101,23 @@ def _serve(
         if failed := [f"{name}: {answer}" for name, answer in answers if answer]:
             return state, "; ".join(failed), False
         sensors = tuple(
-            replace(each, arrivals=settled(each.arrivals)) for each in state.sensors
+            replace(each, arrivals=reset_envelope(each.arrivals))
+            for each in state.sensors
         )
-        ground = shield.ground_of(
+        ground = shield.update_ground(
             config, state.views, None
         )  # it may have been carried here
         if ground is not None:
-            seen = shield.obstacles(config, state.views[-1].ranges, state.views, ground)
+            seen = shield.find_obstacles(
+                config, state.views[-1].ranges, state.views, ground
+            )
             state = replace(state, ground=ground, obstacles=seen)
         return (
             replace(
                 state,
                 armed=True,
-                scans=settled(state.scans),
-                odometries=settled(state.odometries),
+                scans=reset_envelope(state.scans),
+                odometries=reset_envelope(state.odometries),
                 sensors=sensors,
                 seen=(),
                 frozen="",
@@ -137,7 +138,7 @@ def _serve(
     return state, "", False
 
 
-def _stopped(
+def _stop(
     config: GateConfig, state: GateState, moved_s: float, disarm: bool
 ) -> GateState:
     zero = np.zeros_like(state.value)
@@ -149,12 +150,14 @@ def _stopped(
         moved_s=moved_s,
         push=None,
         shielded=False,
-        recent=_recent(config, state, zero, moved_s) if published else state.recent,
+        recent=_append_recent(config, state, zero, moved_s)
+        if published
+        else state.recent,
         armed=state.armed and not disarm,
     )
 
 
-def _recent(
+def _append_recent(
     config: GateConfig, state: GateState, value: Array, now: float
 ) -> tuple[tuple[float, Array], ...]:
     """Returns a new command after those since the newest scan, or within the latency before it."""
@@ -178,14 +181,14 @@ def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
     return "scan: every range is NaN" if np.isnan(scan.ranges).all() else ""
 
 
-def reading_malformed(config: GateConfig, reading: inputs.SensorReading) -> str:
+def check_reading(config: GateConfig, reading: inputs.SensorReading) -> str:
     """The reading is of an unknown sensor, or not finite."""
     if reading.name not in config.sensors:
         return f"{reading.name}: there is no such sensor"
     return "" if np.isfinite(reading.points).all() else f"{reading.name}: NaN or inf"
 
 
-def odom_malformed(config: GateConfig, odometry: inputs.Odometry) -> str:
+def check_odometry(config: GateConfig, odometry: inputs.Odometry) -> str:
     """The odometry is not finite, or too fast for a mobile robot."""
     if not (np.isfinite(odometry.pose).all() and np.isfinite(odometry.twist).all()):
         return "odom: NaN, inf, or no rotation"
@@ -202,27 +205,27 @@ def estimate_malformed(config: GateConfig, estimate: inputs.Estimate) -> str:
     return "odometry/filtered: a variance is negative" if negative else ""
 
 
-def command_not_finite(config: GateConfig, command: inputs.Command) -> str:
+def check_finite(config: GateConfig, command: inputs.Command) -> str:
     """The command is not finite."""
     return "" if np.isfinite(command.twist).all() else "cmd_vel_raw: NaN or inf"
 
 
-def command_implausible(config: GateConfig, command: inputs.Command) -> str:
+def check_plausible(config: GateConfig, command: inputs.Command) -> str:
     """The command is so far out of range that the policy must be broken."""
     bounds = config.limits
     twist = command.twist
-    if bounds is None or not limits.implausible(config.command(twist), bounds):
+    if bounds is None or not limits.is_implausible(config.command(twist), bounds):
         return ""
     return f"cmd_vel_raw: {twist.tolist()} is far out of range"
 
 
 REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
     (inputs.Scan, scan_malformed),
-    (inputs.Odometry, odom_malformed),
-    (inputs.SensorReading, reading_malformed),
+    (inputs.Odometry, check_odometry),
+    (inputs.SensorReading, check_reading),
     (inputs.Estimate, estimate_malformed),
-    (inputs.Command, command_not_finite),
-    (inputs.Command, command_implausible),
+    (inputs.Command, check_finite),
+    (inputs.Command, check_plausible),
 )
 """By the type of the input, in order: what is wrong with it; empty if nothing is."""
 
@@ -287,7 +290,7 @@ def _take_command(state: GateState, command: inputs.Command, now: float) -> Gate
 def _take_scan(
     config: GateConfig, state: GateState, scan: inputs.Scan, now: float
 ) -> Taken:
-    arrivals, fault = stops.arrived(
+    arrivals, fault = stops.account_for_arrival(
         config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
     )
     if fault:
@@ -295,8 +298,8 @@ def _take_scan(
         return replace(state, scans=arrivals, jumped=jumped), f"scan: its stamp {fault}"
     pose = None if state.odometry is None else state.odometry.pose
     seen, why = frozen.look(config, state.seen, scan.ranges, pose)
-    views = shield.remember(config, state, scan)
-    ground = shield.ground_of(config, views, state.ground)
+    views = shield.add_view(config, state, scan)
+    ground = shield.update_ground(config, views, state.ground)
     state = replace(
         state,
         scans=arrivals,
@@ -306,7 +309,7 @@ def _take_scan(
         views=views,
         ground=ground,
         scan_motion=scan_motion.watch_scan(config, state, scan),
-        obstacles=shield.obstacles(config, scan.ranges, views, ground),
+        obstacles=shield.find_obstacles(config, scan.ranges, views, ground),
     )
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
         state = _take_command(state, state.pending, now)
@@ -316,7 +319,7 @@ def _take_scan(
 def _take_odometry(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
 ) -> Taken:
-    arrivals, fault = stops.arrived(
+    arrivals, fault = stops.account_for_arrival(
         config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
     )
     if fault:
@@ -324,11 +327,11 @@ def _take_odometry(
         return replace(
             state, odometries=arrivals, jumped=jumped
         ), f"odom: its stamp {fault}"
-    leap = _leap(config, state, odometry, now)
+    leap = _find_leap(config, state, odometry, now)
     if leap:  # later poses are judged relative to this one
         state = replace(state, odometry=odometry, leap=leap, push=None, seen=())
         return replace(state, scan_motion=ScanMotion()), f"odom: {leap}"
-    restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
+    restless = state.restless_s if frozen.is_at_rest(config, odometry.twist) else now
     return replace(
         state, odometries=arrivals, odometry=odometry, restless_s=restless
     ), ""
@@ -340,7 +343,7 @@ def _take_reading(
     place = config.sensors.index(reading.name)
     before = state.sensors[:place]
     after = state.sensors[place + 1 :]
-    arrivals, fault = stops.arrived(
+    arrivals, fault = stops.account_for_arrival(
         config,
         state.sensors[place].arrivals,
         reading.stamp_ns,
@@ -358,7 +361,7 @@ def _take_reading(
     return state, ""
 
 
-def _leap(
+def _find_leap(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
 ) -> str:
     """Returns what is wrong with a pose that the robot can't have reached; empty if nothing is."""
@@ -369,7 +372,7 @@ def _leap(
     stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
     passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
     slip, turned = (frozen.NOISE * std * passed for std in config.odom_std)
-    speed, turn = limits.greatest_speeds(bounds)
+    speed, turn = limits.get_maximum_speeds(bounds)
     far = LEAP + (SLIP * speed + SLIP_SPEED) * passed + slip
     round_ = LEAP_TURN + (SLIP * turn + SLIP_TURN) * passed + turned
     x, y, heading = between(before.pose, odometry.pose)
@@ -381,7 +384,7 @@ def _leap(
     )
 
 
-def _fresh(
+def _check_fresh(
     topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float
 ) -> str:
     unbroken = now - arrivals.unbroken_s >= config.settle_s
@@ -390,22 +393,22 @@ def _fresh(
     return f"{topic} has not been fresh for {config.settle_s} s"
 
 
-def _sensors(
+def _check_sensors(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     both = zip(config.sensors, state.sensors, strict=True)
     wrong = (
-        _fresh(name, each.arrivals, config.scan_age_s, config, now)
+        _check_fresh(name, each.arrivals, config.scan_age_s, config, now)
         for name, each in both
     )
     return next(filter(None, wrong), "")
 
 
-def _rate(
+def _check_rate(
     topic: str, arrivals: Arrivals, declared: float, config: GateConfig, now: float
 ) -> str:
     """Judges a rate: by stamps too few and too many data are wrong, by arrival only too few."""
-    arriving, stamped = stops.rate(arrivals, now, config.settle_s)
+    arriving, stamped = stops.measure_rate(arrivals, now, config.settle_s)
     low = declared * (1.0 - config.rate_tolerance)
     high = declared * (1.0 + config.rate_tolerance)
     if arriving >= low and low <= stamped <= high:
@@ -414,14 +417,14 @@ def _rate(
     return f"{topic} comes at {rates}, declared are {declared:.1f} Hz"
 
 
-def _odom_rate(
+def _check_odometry_rate(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     """Odometry comes at its rate; where none was declared, at least as often as is needed."""
     arrivals = state.odometries
     if config.odom_rate_declared:
-        return _rate(ODOM, arrivals, config.odom_rate, config, now)
-    arriving, stamped = stops.rate(arrivals, now, config.settle_s)
+        return _check_rate(ODOM, arrivals, config.odom_rate, config, now)
+    arriving, stamped = stops.measure_rate(arrivals, now, config.settle_s)
     if min(arriving, stamped) >= config.odom_rate * (1.0 - config.rate_tolerance):
         return ""
     rates = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz"
@@ -429,7 +432,7 @@ def _odom_rate(
     return f"odom comes at {rates}, {needed}, unless the parameter 'odom_rate' declares less"
 
 
-def _clocks(
+def _check_clocks(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     """The clocks that stamp scan and odometry agree, and keep pace with this machine's clock."""
@@ -444,7 +447,7 @@ def _clocks(
     if abs(apart) > config.clock_jump_s:
         return f"the stamps of scan are {apart:.3f} s ahead of those of odom"
     for topic, arrivals in ((SCAN, scans), (ODOM, odometries)):
-        ahead = stops.creep(arrivals)
+        ahead = stops.measure_creep(arrivals)
         behind = 0.0 if config.simulated else -ahead
         if ahead > stops.AHEAD_S or behind > BEHIND_S:
             away = f"run away from this machine's clock, by {ahead:+.3f} s in a moment"
@@ -455,7 +458,7 @@ def _clocks(
     return ""
 
 
-def _estimator(
+def _check_estimator(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     """The middleware knows where the robot is, and that it stands still."""
@@ -464,34 +467,34 @@ def _estimator(
         return ""
     if estimate is None or now - state.estimate_s > config.estimate_silence_s:
         return "odometry/filtered is silent, start the middleware_node"
-    if doubt := estimates.unsteady(config, state, now):
+    if doubt := estimates.explain_unsteadiness(config, state, now):
         return doubt
-    if frozen.stands_still(config, estimate.twist):
+    if frozen.is_at_rest(config, estimate.twist):
         return ""
     return "odometry/filtered shows motion"
 
 
-def _publishers(
+def _check_publishers(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     count = request.publishers
     return "" if count == 1 else f"cmd_vel has {count} publishers, not this gate alone"
 
 
-def _policies(
+def _check_policies(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     return state.last_mixed if now - state.mixed_s < config.settle_s else ""
 
 
-def _standing(
+def _check_standing(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     still = state.odometry is not None and now - state.restless_s >= config.settle_s
     return "" if still else f"the robot has not stood still for {config.settle_s} s"
 
 
-def _e_stop(
+def _check_e_stop(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
     cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(
@@ -517,20 +520,23 @@ CHECKS: tuple[tuple[str, Check], ...] = (
             "" if s.latched is None else f"call ~/reset first: {s.latched.line}"
         ),
     ),
-    ("e_stop_released", _e_stop),
-    ("scan_fresh", lambda c, s, _, now: _fresh(SCAN, s.scans, c.scan_age_s, c, now)),
-    ("scan_rate", lambda c, s, _, now: _rate(SCAN, s.scans, c.scan_rate, c, now)),
-    ("sensors_fresh", _sensors),
+    ("e_stop_released", _check_e_stop),
+    (
+        "scan_fresh",
+        lambda c, s, _, now: _check_fresh(SCAN, s.scans, c.scan_age_s, c, now),
+    ),
+    ("scan_rate", lambda c, s, _, now: _check_rate(SCAN, s.scans, c.scan_rate, c, now)),
+    ("sensors_fresh", _check_sensors),
     (
         "odom_fresh",
-        lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now),
+        lambda c, s, _, now: _check_fresh(ODOM, s.odometries, c.odom_age_s, c, now),
     ),
-    ("odom_rate", _odom_rate),
-    ("clocks_agree", _clocks),
-    ("estimator_converged", _estimator),
-    ("one_publisher", _publishers),
-    ("standing_still", _standing),
-    ("one_policy", _policies),
+    ("odom_rate", _check_odometry_rate),
+    ("clocks_agree", _check_clocks),
+    ("estimator_converged", _check_estimator),
+    ("one_publisher", _check_publishers),
+    ("standing_still", _check_standing),
+    ("one_policy", _check_policies),
 )
 
 
@@ -598,12 +604,12 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     return replace(motion, value=value, slope=slope)
 
 
-def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+def bound(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
     """Replaces a motion that is not finite or beyond its limits by zero, whatever came before.
 
     What is denormal becomes zero as well.
     """
-    good = config.limits is None or limits.within(motion.value, config.limits)
+    good = config.limits is None or limits.is_within(motion.value, config.limits)
     if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
         value = limits.flush_denormals(motion.value)
         return replace(motion, value=value, slope=limits.flush_denormals(motion.slope))
@@ -618,5 +624,5 @@ SHAPERS: tuple[Callable[[GateConfig, GateState, Motion, float], Motion], ...] = 
     saturate,
     follow,
     shield.shield,
-    bounded,
+    bound,
 )

@@ -10,7 +10,7 @@ from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.state import Decision, GateConfig, begin, replace
-from nics_drl_bridge.gate.stopping import gate_config, shield_config
+from nics_drl_bridge.gate.stopping import make_gate_config, shield_config
 from nics_drl_bridge.generator import SimulatorModel
 
 FIRST_NS = interface.NS_PER_S  # the clock at the beginning of an episode
@@ -33,7 +33,7 @@ class GatedBackend:
         self._backend = backend
         self._model = model
         self._period_ns = round(model.control_period * interface.NS_PER_S)
-        self._config = gate_config(
+        self._config = make_gate_config(
             model,
             given,
             shield,

@@ -45,20 +45,20 @@ def look(
         times = np.full((CELLS, CELLS), -np.inf, np.float32)
         disc = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0), radius=0.0)
         shield_kernels.cover(
-            times, place, disc, min(room, _nearest(view.ranges, lidar)), 0.0
+            times, place, disc, min(room, _find_nearest(view.ranges, lidar)), 0.0
         )
     else:
         since = before.since_ns
         moved = np.subtract(corner, before.corner)
-        times = shield_kernels.shifted(before.times, *moved.tolist())
+        times = shield_kernels.shift_cells(before.times, *moved.tolist())
     now = (view.stamp_ns - since) * S_PER_NS
     given = Look(now, now - REMEMBERED_S, far, tolerance)
-    sees = shield_kernels.survey(times, place, view.ranges, lidar, room, given)
+    sees = shield_kernels.mark_seen_cells(times, place, view.ranges, lidar, room, given)
     shield_kernels.cover(times, place, body, 0.0, now)
-    return Ground(since, corner, times, shield_kernels.unseen(times, sees, place))
+    return Ground(since, corner, times, shield_kernels.find_unseen(times, sees, place))
 
 
-def _nearest(ranges: Ranges, lidar: MountedBeams) -> float:
+def _find_nearest(ranges: Ranges, lidar: MountedBeams) -> float:
     """Distance [m] to the nearest end of the beams (B,): the middle one of five, as one may err."""
     angles = lidar.first + lidar.step * np.arange(len(ranges)) + lidar.heading
     short = np.where(np.isneginf(ranges), 0.0, ranges)  # too close to be measured

@@ -114,7 +114,7 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     units = np.array([variable.unit for variable in robot.command])
     limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
     speeds = limits.linear | limits.turn
-    if (speeds.any() or robot.takes_cmd_vel) and greatest(
+    if (speeds.any() or robot.takes_cmd_vel) and get_maximum(
         limits, speeds
     ) < LEAST_MOTION:
         fault = f"none of its speeds and turn rates may reach {LEAST_MOTION:g}"
@@ -154,26 +154,26 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
             raise ConfigError(f"{key}.{name}': {fault}; raise it.")
 
 
-def greatest(limits: Limits, which: NDArray[np.bool_]) -> float:
+def get_maximum(limits: Limits, which: NDArray[np.bool_]) -> float:
     """Returns the greatest magnitude allowed for some commands (C,); 0 if there are none."""
     return float(np.maximum(-limits.low, limits.high)[which].max(initial=0.0))
 
 
-def greatest_speeds(limits: Limits) -> tuple[float, float]:
+def get_maximum_speeds(limits: Limits) -> tuple[float, float]:
     """Returns the greatest speed [m/s] and turn rate [rad/s] that the commands allow."""
     each = np.maximum(-limits.low, limits.high)
-    turn = greatest(limits, limits.turn) if limits.turn.any() else CAR_TURN
+    turn = get_maximum(limits, limits.turn) if limits.turn.any() else CAR_TURN
     return float(np.hypot.reduce(each[limits.linear])), turn
 
 
-def implausible(command: Array, limits: Limits) -> bool:
+def is_implausible(command: Array, limits: Limits) -> bool:
     """True if a command (C,) is so far out of range that it must be a fault."""
     return bool(
         (np.abs(command) / IMPLAUSIBLE > np.maximum(-limits.low, limits.high)).any()
     )
 
 
-def within(value: Array, limits: Limits) -> bool:
+def is_within(value: Array, limits: Limits) -> bool:
     """True if every value (C,) is a number within its limits."""
     return bool(((value >= limits.low) & (value <= limits.high)).all())  # False for NaN
 
@@ -214,7 +214,7 @@ def follow(
     given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
     for turning in (False, True):
         if turning and waits:
-            wanted[limits.turn] *= _progress(
+            wanted[limits.turn] *= _compute_progress(
                 after[limits.linear], target[limits.linear]
             )
         for i in np.flatnonzero(limits.turn == turning):
@@ -222,7 +222,7 @@ def follow(
     return after, change
 
 
-def _progress(speed: Array, wanted: Array) -> float:
+def _compute_progress(speed: Array, wanted: Array) -> float:
     """Returns the share of the wanted speed that is reached, along its direction, in [0, 1]."""
     most = float(np.abs(wanted).max(initial=0.0))
     if most < STILL:

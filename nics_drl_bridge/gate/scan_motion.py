@@ -92,7 +92,7 @@ class Verdict(NamedTuple):
 UNDECIDED = Verdict(0, math.nan, False)
 
 
-def pose_at(odometry: Odometry, stamp_ns: int, longest_s: float) -> Array:
+def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Array:
     """Returns the pose (3,) at a stamp near the newest odometry, extrapolated by its twist."""
     late = np.clip((stamp_ns - odometry.stamp_ns) * S_PER_NS, -longest_s, longest_s)
     return compose(odometry.pose, exp(late * odometry.twist))
@@ -111,10 +111,10 @@ def watch_scan(
         return ScanMotion()
     newest = ReducedScan(
         scan.stamp_ns,
-        pose_at(state.odometry, scan.stamp_ns, settings.longest_s),
+        extrapolate_pose(state.odometry, scan.stamp_ns, settings.longest_s),
         _reduce(config, scan.ranges, settings),
     )
-    oldest_ns = scan.stamp_ns - round(_memory_s(config, settings) / S_PER_NS)
+    oldest_ns = scan.stamp_ns - round(_compute_memory_s(config, settings) / S_PER_NS)
     kept = tuple(one for one in before.views if one.stamp_ns >= oldest_ns)
     verdict = UNDECIDED
     since_ns = None
@@ -122,15 +122,17 @@ def watch_scan(
     # slip whenever the robot starts say nothing about the time in between.
     if state.push is not None:
         verdict = judge_motion(config, kept, newest, settings)
-        since_ns = _held_since(before.held_since_ns, verdict, scan.stamp_ns, settings)
-    held = _contradiction(kept, newest, verdict, since_ns, settings)
+        since_ns = _update_held_since(
+            before.held_since_ns, verdict, scan.stamp_ns, settings
+        )
+    held = _explain_contradiction(kept, newest, verdict, since_ns, settings)
     apart_ns = round(settings.kept_every_s / S_PER_NS)
     if not kept or newest.stamp_ns - kept[-1].stamp_ns >= apart_ns:
         kept = (*kept, newest)
     return ScanMotion(kept, since_ns, held, verdict.share)
 
 
-def _memory_s(config: GateConfig, settings: Settings) -> float:
+def _compute_memory_s(config: GateConfig, settings: Settings) -> float:
     """Returns for how long scans are kept [s].
 
     At least `longest_s`; up to 15 % longer to hold three periods of a slow lidar, and always two.
@@ -139,7 +141,7 @@ def _memory_s(config: GateConfig, settings: Settings) -> float:
     return max(settings.longest_s, three, 2.2 / config.scan_rate)
 
 
-def _held_since(
+def _update_held_since(
     before_ns: int | None, verdict: Verdict, now_ns: int, settings: Settings
 ) -> int | None:
     """Returns the stamp of the first contradiction that is neither outdated nor refuted."""
@@ -150,7 +152,7 @@ def _held_since(
     return before_ns if math.isnan(verdict.share) else None
 
 
-def _contradiction(
+def _explain_contradiction(
     kept: tuple[ReducedScan, ...],
     newest: ReducedScan,
     verdict: Verdict,
@@ -175,12 +177,12 @@ def judge_motion(
     settings: Settings,
 ) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
-    old = _reference(kept, newest, settings)
+    old = _select_reference(kept, newest, settings)
     if old is None:
         return UNDECIDED
     mount = np.array(config.mount)
     moved = between(compose(old.pose, mount), compose(newest.pose, mount))
-    directions = directions_of(config, settings)
+    directions = get_directions(config, settings)
     predicted = np.empty_like(old.ranges)
     kernels.predict_scan(old.ranges, directions, moved, settings.gap, predicted)
     sector = round(settings.sector / directions.step) or 1
@@ -190,7 +192,7 @@ def judge_motion(
         settings.visible_change,
         settings.visible_deviations,
     )
-    noise = noise_of(config, directions)
+    noise = compute_noise(config, directions)
     shares, changed = kernels.compare_sectors(
         old.ranges, newest.ranges, predicted, sector, noise, thresholds
     )
@@ -208,13 +210,13 @@ def judge_motion(
     return Verdict(sectors, share, bool(held))
 
 
-def _reference(
+def _select_reference(
     kept: tuple[ReducedScan, ...], newest: ReducedScan, settings: Settings
 ) -> ReducedScan | None:
     """Returns the scan to compare the newest one with; None if odometry shows too little motion."""
     chosen = None
     for index, old in enumerate(kept[:-1]):
-        turn = abs(_turn(old, newest))
+        turn = abs(_measure_turn(old, newest))
         if turn > settings.greatest_turn:
             continue
         chosen = index
@@ -225,38 +227,41 @@ def _reference(
     old = kept[chosen]
     half_ns = (old.stamp_ns + newest.stamp_ns) // 2
     middle = min(kept[chosen + 1 :], key=lambda one: abs(one.stamp_ns - half_ns))
-    whole = _motion(old, newest, settings)
-    halves = min(_motion(old, middle, settings), _motion(middle, newest, settings))
+    whole = _measure_motion(old, newest, settings)
+    halves = min(
+        _measure_motion(old, middle, settings),
+        _measure_motion(middle, newest, settings),
+    )
     enough = whole >= 1.0 and halves >= settings.least_half * whole
     return old if enough else None
 
 
-def _motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
+def _measure_motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
     """Returns the motion that odometry shows between two scans; 1 is the least that is judged."""
     path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
-    turn = abs(_turn(old, new))
+    turn = abs(_measure_turn(old, new))
     tiny = 1e-9  # the benchmark has a control with least motions of zero
     return max(
         path / max(settings.least_path, tiny), turn / max(settings.least_turn, tiny)
     )
 
 
-def _turn(old: ReducedScan, new: ReducedScan) -> float:
+def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
     """Returns the turn that odometry shows between two scans, of at most half a circle."""
     return math.remainder(float(new.pose[2] - old.pose[2]), FULL_CIRCLE)
 
 
 def _reduce(config: GateConfig, ranges: Ranges, settings: Settings) -> Ranges:
-    directions = directions_of(config, settings)
+    directions = get_directions(config, settings)
     out = np.empty(round(len(ranges) / directions.beams), np.float32)
     kernels.reduce_scan(ranges, directions, out)
     return out
 
 
-def directions_of(config: GateConfig, settings: Settings = SETTINGS) -> Directions:
+def get_directions(config: GateConfig, settings: Settings = SETTINGS) -> Directions:
     """Returns the directions of a lidar's reduced scans."""
     angles = config.beam_angles
-    return _directions(
+    return _make_directions(
         len(angles),
         float(angles[0]),
         float(angles[1] - angles[0]),
@@ -266,7 +271,7 @@ def directions_of(config: GateConfig, settings: Settings = SETTINGS) -> Directio
 
 
 @cache
-def _directions(
+def _make_directions(
     beams: int, first: float, step: float, spacing: float, window: float
 ) -> Directions:
     count = min(beams, max(1, round(beams * step / spacing)))
@@ -279,7 +284,7 @@ def _directions(
     return Directions(middle, each * step, each, reach, full_circle)
 
 
-def noise_of(config: GateConfig, directions: Directions) -> Noise:
+def compute_noise(config: GateConfig, directions: Directions) -> Noise:
     """Returns the standard deviation of the change of a reduced range."""
     # Of the difference of two medians of n normal numbers each.
     count = 2 * directions.reach + 1
@@ -294,7 +299,7 @@ def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
     return Cause("body_held", SCAN, held) if held else None
 
 
-def rehearse(config: GateConfig) -> None:
+def warm_up(config: GateConfig) -> None:
     """Compiles what a new scan calls: that takes seconds, which a moving robot does not have."""
     view = ReducedScan(
         0,

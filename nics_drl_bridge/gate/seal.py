@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 SEAL = b'{"sha256": "%b"}\n'
 
 
-def sealed(lines: Iterable[bytes]) -> Iterator[bytes]:
+def append_checksum(lines: Iterable[bytes]) -> Iterator[bytes]:
     """Yields lines, and then the line with their checksum: memory must not grow at a stop."""
     digest = hashlib.sha256()
     for line in lines:

@@ -15,7 +15,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.gate import ground, shield_kernels
 from nics_drl_bridge.gate import state as records
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.scan_motion import pose_at
+from nics_drl_bridge.gate.scan_motion import extrapolate_pose
 from nics_drl_bridge.gate.state import (
     GateConfig,
     GateState,
@@ -24,7 +24,7 @@ from nics_drl_bridge.gate.state import (
     ShieldConfig,
     View,
 )
-from nics_drl_bridge.gate.stops import age
+from nics_drl_bridge.gate.stops import compute_age
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.sim.collision_kernels import Outline
 
@@ -46,11 +46,11 @@ TOLERANCE_M, DEVIATIONS = 0.03, 3.0
 """Margin before the end of an old beam [m], plus this many standard deviations of its range."""
 
 
-def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
+def add_view(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
     """Returns the earlier views that still count, oldest first, then that of a new scan."""
     if config.shield is None or state.odometry is None:
         return ()
-    pose = pose_at(state.odometry, scan.stamp_ns, MEMORY_S)
+    pose = extrapolate_pose(state.odometry, scan.stamp_ns, MEMORY_S)
     kept: list[View] = []
     for view in state.views:
         young = (scan.stamp_ns - view.stamp_ns) * S_PER_NS <= MEMORY_S
@@ -61,18 +61,20 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
     return (*kept, View(scan.stamp_ns, pose, scan.ranges))
 
 
-def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) -> Flags:
+def find_movers(
+    config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]
+) -> Flags:
     """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
     newest = views[-1]
     angles = config.beam_angles
     marked = np.zeros(len(newest.ranges), np.bool_)
     if len(angles) < 2 or shield.obstacle_speed == 0.0:
         return marked
-    lidar = _beams(config)
+    lidar = _get_beams(config)
     noise, share = (DEVIATIONS * std for std in shield.range_noise)
     for view in views[:-1]:
         moved = geometry.between(view.pose, newest.pose)
-        shield_kernels.entered(
+        shield_kernels.mark_entered(
             marked,
             newest.ranges,
             view.ranges,
@@ -98,7 +100,7 @@ def returns(
     )
 
 
-def too_close(
+def place_too_close(
     config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
 ) -> Array:
     """Returns points (P, 3) at the least range for beams too close to measure (`-inf`) [m]."""
@@ -108,15 +110,16 @@ def too_close(
     )
 
 
-def unknown(
+def place_unknown(
     config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
 ) -> Array:
     """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown."""
-    bearings, wall = _sides(shield, config.mount, len(ranges))
+    bearings, wall = _sample_footprint(shield, config.mount, len(ranges))
     angles = config.beam_angles + config.mount[2]
     half = shield.unknown_width / 2.0
     known, every = (
-        _within(bearings, some, half) for some in (angles[~np.isnan(ranges)], angles)
+        _count_within(bearings, some, half)
+        for some in (angles[~np.isnan(ranges)], angles)
     )
     spacing = angles[1] - angles[0] if len(ranges) > 1 else 2.0 * np.pi
     whole = (
@@ -127,7 +130,7 @@ def unknown(
 
 
 @cache
-def _sides(
+def _sample_footprint(
     shield: ShieldConfig, mount: tuple[float, float, float], count: int
 ) -> tuple[Array, Array]:
     """Returns places (M, 2) around the footprint, and their bearings (M,) from the lidar."""
@@ -142,7 +145,7 @@ def _sides(
     return np.arctan2(wall[:, 1] - mount[1], wall[:, 0] - mount[0]), wall
 
 
-def _within(bearings: Array, angles: Array, half: float) -> NDArray[np.int64]:
+def _count_within(bearings: Array, angles: Array, half: float) -> NDArray[np.int64]:
     """Returns how many angles (B,) lie around each bearing (M,), up to an angle [rad] beside it."""
     angles = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
     around = np.concatenate([angles - 2.0 * np.pi, angles, angles + 2.0 * np.pi])
@@ -151,7 +154,7 @@ def _within(bearings: Array, angles: Array, half: float) -> NDArray[np.int64]:
     )
 
 
-EVIDENCE = (returns, too_close, unknown)
+EVIDENCE = (returns, place_too_close, place_unknown)
 
 
 def _ends(
@@ -165,7 +168,7 @@ def _ends(
     )
 
 
-def ground_of(
+def update_ground(
     config: GateConfig, views: tuple[View, ...], before: Ground | None
 ) -> Ground | None:
     """Returns what is known after the newest view of where the lidar never looks, if anywhere."""
@@ -173,16 +176,16 @@ def ground_of(
     angles = config.beam_angles
     if given is None or not views or len(angles) < 2:
         return None
-    lidar = _beams(config)
+    lidar = _get_beams(config)
     seen = abs(lidar.step) * len(angles)
     if 2.0 * np.pi - seen < given.unknown_share * given.unknown_width:
         return None
     return ground.look(
-        before, views[-1], lidar, body_of(given), given.range_max, TOLERANCE_M
+        before, views[-1], lidar, get_body(given), given.range_max, TOLERANCE_M
     )
 
 
-def obstacles(
+def find_obstacles(
     config: GateConfig,
     ranges: Ranges,
     views: tuple[View, ...],
@@ -192,20 +195,22 @@ def obstacles(
     given = config.shield
     if given is None:
         return None
-    moves = movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
+    moves = (
+        find_movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
+    )
     found = [evidence(config, given, ranges, moves) for evidence in EVIDENCE]
     unseen = [] if known is None else [np.pad(known.unseen, ((0, 0), (0, 1)))]
     return np.concatenate([*found, *unseen])
 
 
-def _beams(config: GateConfig) -> shield_kernels.MountedBeams:
+def _get_beams(config: GateConfig) -> shield_kernels.MountedBeams:
     angles = config.beam_angles
     step = float(angles[1] - angles[0])
     return shield_kernels.MountedBeams(float(angles[0]), step, *config.mount)
 
 
 @cache
-def body_of(shield: ShieldConfig) -> shield_kernels.Body:
+def get_body(shield: ShieldConfig) -> shield_kernels.Body:
     """Returns the footprint that is swept."""
     corners = np.array(shield.outline, np.float64).reshape(-1, 2)
     reach = float(np.hypot(*corners.T).max(initial=0.0))
@@ -216,14 +221,14 @@ def body_of(shield: ShieldConfig) -> shield_kernels.Body:
     )
 
 
-def rehearse() -> None:
+def warm_up() -> None:
     """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
-    shield_kernels.grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
-    body = body_of(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
-    shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
+    shield_kernels.fill_grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
+    body = get_body(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
+    shield_kernels.is_free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
     lidar = shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0)
     scan = np.ones(1, np.float32)
-    shield_kernels.entered(
+    shield_kernels.mark_entered(
         np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0)
     )
     view = View(0, np.zeros(3), scan)
@@ -247,7 +252,7 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
         return motion.value * np.where(linear, ahead, np.where(turn, about, 1.0))
 
     def safe(ahead: float, about: float) -> bool:
-        return _safe(config, state, part(ahead, about), now)
+        return _is_safe(config, state, part(ahead, about), now)
 
     on_the_spot = bool(turning) and config.shield.wheelbase == 0.0
     creeps = on_the_spot and 0.0 < speed < CREEP
@@ -255,14 +260,14 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
         return motion
     # A way that is barred bars no turn on the spot: else a robot could not turn away from it.
     turns = bool(turning) and safe(0.0, 1.0)
-    low = _greatest(lambda share: safe(share, 1.0 if turns else share))
+    low = _find_maximum(lambda share: safe(share, 1.0 if turns else share))
     if on_the_spot and low * speed < CREEP:
         if turns:
             low = 0.0
         elif speed and safe(
             CREEP / speed, 0.0
         ):  # nor does a turn that is barred bar the way back
-            value = part(_greatest(lambda share: safe(share, 0.0)), 0.0)
+            value = part(_find_maximum(lambda share: safe(share, 0.0)), 0.0)
             return records.replace(
                 motion, value=value, slope=0.0 * value, shielded=True
             )
@@ -271,7 +276,7 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     return records.replace(motion, value=value, slope=slope, shielded=True)
 
 
-def _greatest(safe: Callable[[float], bool]) -> float:
+def _find_maximum(safe: Callable[[float], bool]) -> float:
     """Greatest safe share of a motion, found by bisection."""
     if safe(1.0):
         return 1.0
@@ -283,7 +288,7 @@ def _greatest(safe: Callable[[float], bool]) -> float:
     return low
 
 
-def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
+def _is_safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
     """True if the robot could still stop, and could do so without a jolt."""
     given = config.shield
     points = state.obstacles
@@ -292,10 +297,12 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     # What further sensors show counts as standing.
     seen_further = [np.pad(sensor.points, ((0, 0), (0, 1))) for sensor in state.sensors]
     points = np.concatenate([points, *seen_further])
-    body = body_of(given)
+    body = get_body(given)
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
     old = max(
-        0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors)
+        0.0,
+        compute_age(state.scans, now),
+        *(compute_age(s.arrivals, now) for s in state.sensors),
     )
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
     if given.turn is None:
@@ -321,14 +328,14 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
         (standing, [value], None, calm, CALM, 2.0),
         (points, [*past, state.value, value], odometry, hard, 1.0, 1.0),
     ):
-        twists = _family(config, given, np.array(commands), twist)
-        for stop in sweeps(given, body, blind, share, latencies):
-            if not shield_kernels.free(seen, twists, *stop, STEP):
+        twists = _span_twists(config, given, np.array(commands), twist)
+        for stop in list_sweeps(given, body, blind, share, latencies):
+            if not shield_kernels.is_free(seen, twists, *stop, STEP):
                 return False
     return True
 
 
-def sweeps(
+def list_sweeps(
     given: ShieldConfig,
     body: shield_kernels.Body,
     blind: float,
@@ -370,24 +377,24 @@ def sweeps(
     return stops
 
 
-def _family(
+def _span_twists(
     config: GateConfig, given: ShieldConfig, commands: Array, odometry: Array | None
 ) -> Array:
     """Returns body twists (K, 3) between those of commands (n, C) and of odometry (3,), if any."""
     twists = np.zeros((len(commands), 3))
     twists[:, list(config.fields)] = commands
     if given.wheelbase > 0.0:
-        return _car_family(given.wheelbase, twists, odometry)
+        return _span_car_twists(given.wheelbase, twists, odometry)
     if odometry is not None:
         twists = np.concatenate([twists, odometry[None]])
-    twists = _with_drift(given, twists)
+    twists = _add_drift(given, twists)
     low = twists.min(axis=0)
     high = twists.max(axis=0)
     counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
-    return np.asarray(shield_kernels.grid(low, high, counts))
+    return np.asarray(shield_kernels.fill_grid(low, high, counts))
 
 
-def _with_drift(given: ShieldConfig, twists: Array) -> Array:
+def _add_drift(given: ShieldConfig, twists: Array) -> Array:
     """Returns twists (n, 3), and those of the arcs between which the robot leaves theirs."""
     drift = given.drift
     if drift.is_none:
@@ -403,7 +410,9 @@ def _with_drift(given: ShieldConfig, twists: Array) -> Array:
     return np.concatenate(rows)
 
 
-def _car_family(wheelbase: float, commands: Array, odometry: Array | None) -> Array:
+def _span_car_twists(
+    wheelbase: float, commands: Array, odometry: Array | None
+) -> Array:
     """Returns a car's twists: curvature does not depend on speed; braking steers it straight."""
     bends = [0.0, *np.tan(commands[:, 2]) / wheelbase]
     speeds = list(commands[:, 0])

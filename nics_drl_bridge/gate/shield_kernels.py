@@ -31,7 +31,7 @@ def place(twist, time):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def grid(low, high, counts):  # type: ignore[no-untyped-def]
+def fill_grid(low, high, counts):  # type: ignore[no-untyped-def]
     """Returns twists (K, 3) evenly between two (3,), so many along each axis."""
     out = np.empty((counts[0] * counts[1] * counts[2], 3))
     for k in range(out.shape[0]):
@@ -71,7 +71,7 @@ class Body(NamedTuple):
 
 
 @kernel
-def clearance(x, y, body):  # type: ignore[no-untyped-def]
+def compute_clearance(x, y, body):  # type: ignore[no-untyped-def]
     """Returns the signed distance from a point to a footprint [m]; negative inside."""
     if body.outline.begin == body.outline.end:
         return math.sqrt(x * x + y * y) - body.radius
@@ -79,7 +79,7 @@ def clearance(x, y, body):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-untyped-def]
+def is_free(points, twists, body, blind, deceleration, step):  # type: ignore[no-untyped-def]
     """True if no point (P, 3) comes within the margin of twists (K, 3) until the robot rests."""
     # One that is already that near must not come nearer. Points are x, y [m] and greatest speed
     # [m/s]; the robot keeps its twist for `blind` [s], then brakes, a turn as the speed of what it
@@ -88,14 +88,14 @@ def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-un
     rest = 0.0
     most = 0
     for k in range(twists.shape[0]):
-        path, pace = _path(twists[k], body, blind, deceleration)
+        path, pace = _bound_path(twists[k], body, blind, deceleration)
         longest = max(longest, path)
-        rest = max(rest, _rest(twists[k], pace, body, blind, deceleration))
+        rest = max(rest, _compute_rest_time(twists[k], pace, body, blind, deceleration))
         most = max(most, math.ceil(path / step))
-    near = _near(points, body, longest, rest)
+    near = _select_near(points, body, longest, rest)
     places = np.empty((most + 1, 5))
     for k in range(twists.shape[0]):
-        path, pace = _path(twists[k], body, blind, deceleration)
+        path, pace = _bound_path(twists[k], body, blind, deceleration)
         steps = math.ceil(path / step)
         if steps == 0:
             continue
@@ -124,7 +124,7 @@ def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-un
                 dy = near[p, 1] - places[s, 1]
                 c = places[s, 2]
                 sine = places[s, 3]
-                away = clearance(c * dx + sine * dy, c * dy - sine * dx, body)
+                away = compute_clearance(c * dx + sine * dy, c * dy - sine * dx, body)
                 spare = away - near[p, 3] - near[p, 2] * places[s, 4]
                 if spare < 0.0:
                     return False
@@ -139,7 +139,7 @@ def _steps_apart(spare, each, steps):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
+def _bound_path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns the longest path of a point of the footprint [m], and the speed that brakes [m/s]."""
     speed = math.hypot(twist[0], twist[1])
     turn = abs(twist[2]) * body.reach
@@ -159,7 +159,7 @@ def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _rest(twist, pace, body, blind, deceleration):  # type: ignore[no-untyped-def]
+def _compute_rest_time(twist, pace, body, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns the time until a braking robot rests [s]."""
     rest = blind + pace / deceleration
     if body.turn_deceleration > 0.0:
@@ -170,7 +170,7 @@ def _rest(twist, pace, body, blind, deceleration):  # type: ignore[no-untyped-de
 
 
 @kernel(allocates=True)
-def _near(points, body, longest, rest):  # type: ignore[no-untyped-def]
+def _select_near(points, body, longest, rest):  # type: ignore[no-untyped-def]
     """Returns points that may come too near (Q, 5), with the distances to keep and of now."""
     near = np.empty((points.shape[0], 5))
     count = 0
@@ -181,7 +181,7 @@ def _near(points, body, longest, rest):  # type: ignore[no-untyped-def]
         room = body.margin + longest + speed * rest
         if math.hypot(x, y) - body.radius >= room:
             continue
-        away = clearance(x, y, body)
+        away = compute_clearance(x, y, body)
         if away < room:
             near[count, 0] = x
             near[count, 1] = y
@@ -203,11 +203,11 @@ def _follow(places, twist, duration, pace, blind, deceleration):  # type: ignore
         places[s, 1] = y
         places[s, 2] = cosine
         places[s, 3] = sine
-        places[s, 4] = _reached(part, pace, blind, deceleration)
+        places[s, 4] = _compute_arrival(part, pace, blind, deceleration)
 
 
 @kernel
-def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
+def _compute_arrival(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns when a braking robot is where it would be at `part` at its initial speed [s]."""
     if part <= blind:
         return part
@@ -216,7 +216,7 @@ def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _full_speed_time(time, speed, blind, deceleration):  # type: ignore[no-untyped-def]
+def _compute_full_speed_time(time, speed, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns the time at full speed in which a robot gets as far as in a time of braking [s]."""
     if time <= blind or speed == 0.0:
         return min(time, blind)
@@ -233,7 +233,7 @@ def _follow_apart(places, twist, path, pace, body, blind, deceleration):  # type
     speed = math.hypot(twist[0], twist[1])
     rate = abs(twist[2])
     turn_blind = blind + body.turn_later
-    rest = _rest(twist, pace, body, blind, deceleration)
+    rest = _compute_rest_time(twist, pace, body, blind, deceleration)
     steps = len(places) - 1
     places[0, 0] = 0.0
     places[0, 1] = 0.0
@@ -249,14 +249,16 @@ def _follow_apart(places, twist, path, pace, body, blind, deceleration):  # type
         high = rest
         for _ in range(BISECTIONS if s < steps else 0):
             middle = 0.5 * (low + high)
-            straight = _full_speed_time(middle, pace, blind, deceleration)
-            about = _full_speed_time(middle, rate, turn_blind, body.turn_deceleration)
+            straight = _compute_full_speed_time(middle, pace, blind, deceleration)
+            about = _compute_full_speed_time(
+                middle, rate, turn_blind, body.turn_deceleration
+            )
             if speed * straight + rate * body.reach * about < path * s / steps:
                 low = middle
             else:
                 high = middle
-        straight = _full_speed_time(high, pace, blind, deceleration)
-        about = _full_speed_time(high, rate, turn_blind, body.turn_deceleration)
+        straight = _compute_full_speed_time(high, pace, blind, deceleration)
+        about = _compute_full_speed_time(high, rate, turn_blind, body.turn_deceleration)
         along = straight - moved
         step = (twist[0] * along, twist[1] * along, twist[2] * (about - turned))
         x, y, cosine, sine = place(step, 1.0)
@@ -285,7 +287,7 @@ class MountedBeams(NamedTuple):
 
 
 @kernel(allocates=True)
-def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
+def mark_entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
     """Marks in `out` (B,) the beams of a scan (B,) that end where an old one saw free space."""
     # The robot's own motion, `moved` (3,), is compensated; hidden or unknown places, and other
     # flags, stay. `far` is the greatest range [m]; the tolerance is in metres and of the range.
@@ -351,7 +353,7 @@ class Look(NamedTuple):
 
 
 @kernel
-def _middle(i, j, cells):  # type: ignore[no-untyped-def]
+def _locate_cell(i, j, cells):  # type: ignore[no-untyped-def]
     """Returns the middle of a cell in the robot's frame [m]."""
     dx = cells.x + (j + 0.5) * cells.width
     dy = cells.y + (i + 0.5) * cells.width
@@ -359,7 +361,7 @@ def _middle(i, j, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def shifted(times, across, up):  # type: ignore[no-untyped-def]
+def shift_cells(times, across, up):  # type: ignore[no-untyped-def]
     """Returns times (n, n) of cells that moved by so many columns and rows; -inf of new ones."""
     out = np.full(times.shape, -np.inf, times.dtype)
     rows, columns = times.shape
@@ -374,27 +376,27 @@ def cover(times, cells, body, away, now):  # type: ignore[no-untyped-def]
     """Notes in times (n, n) that cells up to a distance from the footprint are free."""
     for i in range(times.shape[0]):
         for j in range(times.shape[1]):
-            x, y = _middle(i, j, cells)
+            x, y = _locate_cell(i, j, cells)
             far = x * x + y * y > (body.radius + away) ** 2
-            if not far and clearance(x, y, body) <= away:
+            if not far and compute_clearance(x, y, body) <= away:
                 times[i, j] = now
 
 
 @kernel(allocates=True)
-def survey(times, cells, ranges, lidar, room, look):  # type: ignore[no-untyped-def]
+def mark_seen_cells(times, cells, ranges, lidar, room, look):  # type: ignore[no-untyped-def]
     """Notes in times (n, n) what a scan (B,) shows; returns which cells it sees as a whole."""
     # What is older is forgotten, but for cells within `room` [m] of the robot.
     sees = np.zeros(times.shape, np.bool_)
     beams = len(ranges)
     for i in range(times.shape[0]):
         for j in range(times.shape[1]):
-            x, y = _middle(i, j, cells)
+            x, y = _locate_cell(i, j, cells)
             if times[i, j] >= look.oldest and x * x + y * y <= room * room:
                 times[i, j] = look.now
             dx = x - lidar.x
             dy = y - lidar.y
             away = max(math.sqrt(dx * dx + dy * dy), cells.width)
-            middle = _beam(x, y, lidar)
+            middle = _find_beam(x, y, lidar)
             beside = math.ceil(0.5 * cells.width / (away * abs(lidar.step)))
             if middle - beside >= 0 and middle + beside < beams:
                 sees[i, j], least = True, look.far
@@ -424,7 +426,7 @@ def _note_returns(times, cells, ranges, lidar):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _beam(x, y, lidar):  # type: ignore[no-untyped-def]
+def _find_beam(x, y, lidar):  # type: ignore[no-untyped-def]
     """Returns the number of the beam towards a point, beyond those of a scan if there is none."""
     circle = 2.0 * math.pi / abs(lidar.step)
     at = (
@@ -434,7 +436,7 @@ def _beam(x, y, lidar):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def unseen(times, sees, cells):  # type: ignore[no-untyped-def]
+def find_unseen(times, sees, cells):  # type: ignore[no-untyped-def]
     """Returns the middles (Q, 2) of the cells in which free or seen ground ends [m]."""
     # What lies beyond the outermost cells is not known.
     last_i = times.shape[0] - 1
@@ -452,6 +454,6 @@ def unseen(times, sees, cells):  # type: ignore[no-untyped-def]
                 m = min(max(j + across, 0), last_j)
                 known = known or sees[k, m] or times[k, m] > -np.inf
             if known:
-                out[count, 0], out[count, 1] = _middle(i, j, cells)
+                out[count, 0], out[count, 1] = _locate_cell(i, j, cells)
                 count += 1
     return out[:count].copy()

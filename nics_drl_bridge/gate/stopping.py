@@ -30,7 +30,7 @@ HARDEST = SHIELD_SPANS["deceleration"][1]
 LEAST_DATA = 2
 
 
-def gate_config(
+def make_gate_config(
     model: SimulatorModel,
     limits: Limits | None,
     shield: ShieldConfig | None,
@@ -70,7 +70,7 @@ def shield_config(
     measured = load_yaml(path, LimitsFile).shield if path else None
     told = set() if given is None else set(given)
     try:
-        braking = braking_by(model, limits)
+        braking = derive_braking(model, limits)
     except ConfigError as error:  # how it stops has to be told
         if measured is None and not told >= {"latency", "deceleration"}:
             advice = "or tell it: `shield: {latency: .., deceleration: ..}` in the file of limits"
@@ -94,7 +94,7 @@ def shield_config(
         margin=values.margin,
         hold_s=GateConfig.gap_s,
         footprint_radius=model.robot.footprint_radius,
-        wheelbase=wheelbase(model.robot),
+        wheelbase=get_wheelbase(model.robot),
         obstacle_speed=values.obstacle_speed,
         range_max=lidar.range_max,
         range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
@@ -124,7 +124,7 @@ def _turn_as_told(braking: Braking, told: Stopping) -> TurnBraking | None:
     return replace(own, reaction_s=own.reaction_s + later, deceleration=deceleration)
 
 
-def braking_by(model: SimulatorModel, limits: Limits | None) -> Braking:
+def derive_braking(model: SimulatorModel, limits: Limits | None) -> Braking:
     """Returns how a robot stops by its model, when it is told to by its gate.
 
     Its base looks for one command per period, and brakes no harder than its limits allow.
@@ -152,7 +152,7 @@ def braking_by(model: SimulatorModel, limits: Limits | None) -> Braking:
     return replace(braking, reaction_s=round(reaction + late, 9), turn=turn)
 
 
-def wheelbase(robot: RobotSpec) -> float:
+def get_wheelbase(robot: RobotSpec) -> float:
     """Returns the wheelbase [m] of a car, else 0; ConfigError without it or for unknown units."""
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
@@ -192,7 +192,7 @@ def require_possible(config: GateConfig) -> None:
             raise ConfigError(f"{fault}, so the robot could never move; {needed}.")
 
 
-def doubtful(config: GateConfig, control_period_s: float) -> str:
+def warn_of_age_limit(config: GateConfig, control_period_s: float) -> str:
     """Returns a warning about an age limit that only suits a policy with a shorter period [s]."""
     age = f"{config.command_age_s:g} s"
     period = f"{control_period_s:g}"

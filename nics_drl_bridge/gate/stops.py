@@ -32,7 +32,7 @@ SOURCE_S = 1.0  # time after which another publisher's first command is no turn,
 FROZEN_INPUTS = 20
 
 
-def arrived(
+def account_for_arrival(
     config: GateConfig,
     arrivals: Arrivals,
     stamp_ns: int,
@@ -63,7 +63,7 @@ def arrived(
     lead = (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
         return fresh, "jumped"
-    marks = _marked(arrivals, stamp_ns, now, lead, config.settle_s)
+    marks = _append_mark(arrivals, stamp_ns, now, lead, config.settle_s)
     passed = now - arrivals.times[-1]
     envelope = max(mark[3] for mark in marks)
     if armed:
@@ -83,7 +83,7 @@ def arrived(
     ), ""
 
 
-def _marked(
+def _append_mark(
     arrivals: Arrivals, stamp_ns: int, now: float, lead: float, settle_s: float
 ) -> tuple[Mark, ...]:
     *before, (time, stamp, number, greatest) = arrivals.marks
@@ -93,18 +93,18 @@ def _marked(
     return (*kept, (now, stamp_ns, arrivals.count + 1, lead))
 
 
-def settled(arrivals: Arrivals) -> Arrivals:
+def reset_envelope(arrivals: Arrivals) -> Arrivals:
     """Returns the arrivals with the envelope of the marked data alone, whatever it was before."""
     leads = [mark[3] for mark in arrivals.marks]
     return replace(arrivals, envelope=max(leads, default=arrivals.envelope))
 
 
-def age(arrivals: Arrivals, now: float) -> float:
+def compute_age(arrivals: Arrivals, now: float) -> float:
     """Returns the age of the newest datum with its delay [s]; inf if there is none."""
     return now - arrivals.times[-1] + arrivals.late[-1] if arrivals.times else math.inf
 
 
-def _too_old(
+def _judge_age(
     rule: str, topic: str, detail: str, old: float, limit: float
 ) -> Cause | None:
     return None if old <= limit else Cause(rule, topic, detail, old, limit)
@@ -112,8 +112,12 @@ def _too_old(
 
 def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest scan is too old: the lidar has stopped."""
-    return _too_old(
-        "scan_silent", SCAN, "no fresh data", age(state.scans, now), config.scan_age_s
+    return _judge_age(
+        "scan_silent",
+        SCAN,
+        "no fresh data",
+        compute_age(state.scans, now),
+        config.scan_age_s,
     )
 
 
@@ -121,15 +125,16 @@ def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | N
     """The newest reading of a further sensor is too old: it has stopped."""
     both = zip(config.sensors, state.sensors, strict=True)
     old, name = max(
-        ((age(each.arrivals, now), name) for name, each in both), default=(0.0, "")
+        ((compute_age(each.arrivals, now), name) for name, each in both),
+        default=(0.0, ""),
     )
-    return _too_old("sensor_silent", name, "no fresh data", old, config.scan_age_s)
+    return _judge_age("sensor_silent", name, "no fresh data", old, config.scan_age_s)
 
 
 def odom_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest odometry is too old: it has stopped."""
-    old = age(state.odometries, now)
-    return _too_old("odom_silent", ODOM, "no fresh data", old, config.odom_age_s)
+    old = compute_age(state.odometries, now)
+    return _judge_age("odom_silent", ODOM, "no fresh data", old, config.odom_age_s)
 
 
 def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -138,7 +143,9 @@ def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | N
     return Cause("stamps_jumped", state.jumped, detail) if state.jumped else None
 
 
-def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]:
+def measure_rate(
+    arrivals: Arrivals, now: float, settle_s: float
+) -> tuple[float, float]:
     """Returns the rate by arrival and by stamps over the settling time [Hz]; 0 if unknown."""
     first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
     if first is None or arrivals.count <= first[2]:
@@ -149,7 +156,7 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
     return (count / passed if passed > 0.0 else math.inf), count / stamped
 
 
-def creep(arrivals: Arrivals) -> float:
+def measure_creep(arrivals: Arrivals) -> float:
     """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
     leads = [mark[3] for mark in arrivals.marks]
     half = len(arrivals.marks) // 2
@@ -233,7 +240,7 @@ def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | 
     if state.command is None:
         return None
     old = now - state.command_s
-    return _too_old(
+    return _judge_age(
         "command_silent", RAW, "no fresh command", old, config.command_age_s
     )
 
@@ -256,7 +263,7 @@ def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause |
         return None
     detail = f"the scan behind {RAW} is old"
     old = now - state.behind_s
-    return _too_old("scan_behind_old", SCAN, detail, old, config.scan_age_s)
+    return _judge_age("scan_behind_old", SCAN, detail, old, config.scan_age_s)
 
 
 def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -272,6 +279,6 @@ def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | N
         return None
     old = math.inf if heard is None else now - heard
     limit = config.e_stop_silence_s
-    return _too_old(
+    return _judge_age(
         "e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit
     )

@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from nics_drl_bridge.files import write_parts
-from nics_drl_bridge.gate.seal import sealed
+from nics_drl_bridge.gate.seal import append_checksum
 
 STATE = b"S"
 ENTRY = b"E"
@@ -136,7 +136,7 @@ class Disk:
             self._answer(path, failed)
 
     def _parts(self, lines: list[bytes]) -> Iterator[bytes]:
-        for line in sealed(lines):
+        for line in append_checksum(lines):
             if self._given_up.is_set():
                 raise TimeoutError("it took too long")
             yield line

@@ -32,10 +32,10 @@ from nics_drl_bridge.gate.state import (
     replace,
 )
 from nics_drl_bridge.gate.stopping import (
-    doubtful,
-    gate_config,
+    make_gate_config,
     require_possible,
     shield_config,
+    warn_of_age_limit,
 )
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
@@ -80,7 +80,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
         raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
     file = str(runner.declare_row(node, parameters.LIMITS))
     limits = load_limits(file, model.robot) if file else None
-    config = gate_config(
+    config = make_gate_config(
         model,
         limits,
         _declare_shield(node, model, limits, file),
@@ -89,7 +89,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     )
     node.add_on_set_parameters_callback(partial(_keep_clock, config.simulated))
     require_possible(config)
-    if doubt := doubtful(config, model.control_period):
+    if doubt := warn_of_age_limit(config, model.control_period):
         node.get_logger().warning(doubt)
     return config
 
@@ -237,8 +237,8 @@ class CommandGate(qos.QosWatch):
             risk = "an e_stop that was never heard does not stop the robot. That is for simulations"
             logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
         if self._config.shield is not None:
-            shield.rehearse()
-        scan_motion.rehearse(self._config)
+            shield.warm_up()
+        scan_motion.warm_up(self._config)
         self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))

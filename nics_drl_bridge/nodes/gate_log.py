@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from nics_drl_bridge.gate.black_box import Entry, entry_line, head_line
+from nics_drl_bridge.gate.black_box import Entry, format_entry, format_head
 from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import (
@@ -108,10 +108,10 @@ class GateLog:
             or passed >= STATE_S
             or self._entries >= MOST_ENTRIES
         ):
-            self._writer.state(entry.now, head_line(self._config, entry.before))
+            self._writer.state(entry.now, format_head(self._config, entry.before))
             self._state_s = entry.now
             self._entries = 0
-        self._writer.entry(entry_line(entry))
+        self._writer.entry(format_entry(entry))
         self._entries += 1
 
     def refuse(self, reason: str) -> None:

@@ -71,26 +71,26 @@ gyro_warning = partial(warning, "gyro", GYRO)
 
 def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
     """Runs all checks and returns their findings, errors first."""
-    expected = doctor_facts.seen(facts, expected)
+    expected = doctor_facts.expect_present_lidar(facts, expected)
     checks = (
-        presence,
-        quality,
-        speakers,
-        frames,
-        rates,
-        latency,
-        clock,
-        layout,
-        ranges,
-        motion,
-        turning,
+        check_presence,
+        check_quality_of_service,
+        check_publishers,
+        check_frames,
+        check_rates,
+        check_latency,
+        check_clock,
+        check_layout,
+        check_ranges,
+        check_motion,
+        check_turning,
     )
     found = [finding for check in checks for finding in check(facts, expected)]
     named = [replace(finding, where=facts.names[finding.where]) for finding in found]
     return sorted(named, key=lambda finding: finding.severity)
 
 
-def presence(facts: Facts, _: Expected) -> Findings:
+def check_presence(facts: Facts, _: Expected) -> Findings:
     """Finds missing and silent topics, and wrong types."""
     for role in (SCAN, ODOM, CMD_VEL):
         there = facts.topics.get(facts.names[role])
@@ -127,7 +127,7 @@ def presence(facts: Facts, _: Expected) -> Findings:
             yield warning("type", role, "is a TwistStamped, not a Twist", fix)
 
 
-def quality(facts: Facts, _: Expected) -> Findings:
+def check_quality_of_service(facts: Facts, _: Expected) -> Findings:
     """Finds pairs of publisher and subscriber with incompatible quality of service."""
     for role, name in facts.names.items():
         if (there := facts.topics.get(name)) is None:
@@ -143,7 +143,7 @@ def quality(facts: Facts, _: Expected) -> Findings:
             yield no_match(role, what, "let both be volatile")
 
 
-def speakers(facts: Facts, _: Expected) -> Findings:
+def check_publishers(facts: Facts, _: Expected) -> Findings:
     """Finds several publishers on topics that must have a single one."""
     for role in (CMD_VEL, ODOM, SCAN, CLOCK):
         there = facts.topics.get(facts.names[role])
@@ -153,7 +153,7 @@ def speakers(facts: Facts, _: Expected) -> Findings:
             yield error("publishers", role, what, fix)
 
 
-def frames(facts: Facts, expected: Expected) -> Findings:
+def check_frames(facts: Facts, expected: Expected) -> Findings:
     """Checks names of frames against REP-105 and the lidar's frame."""
     wanted = (
         (SCAN, "frames", (expected.lidar.frame,), "header.frame_id"),
@@ -171,10 +171,10 @@ def frames(facts: Facts, expected: Expected) -> Findings:
             yield finding("frame", role, f"{place} is {frame!r}, not {good[0]!r}", fix)
 
 
-def rates(facts: Facts, expected: Expected) -> Findings:
+def check_rates(facts: Facts, expected: Expected) -> Findings:
     """Checks rates: the scan's as declared, odometry at least one message per command."""
     for role, wanted in ((SCAN, expected.lidar.rate), (ODOM, 1.0 / expected.period_s)):
-        rate = _rate(facts, role)
+        rate = _measure_rate(facts, role)
         if rate is None:
             continue
         slow = rate < (1 - RATE_TOLERANCE) * wanted
@@ -189,7 +189,7 @@ def rates(facts: Facts, expected: Expected) -> Findings:
             yield finding("rate", role, what, fix)
 
 
-def _rate(facts: Facts, role: str) -> float | None:
+def _measure_rate(facts: Facts, role: str) -> float | None:
     if (heard := facts.heard.get(role)) is None or len(heard.arrivals_ns) <= 2:
         return None
     stamps = heard.stamps_ns
@@ -200,7 +200,7 @@ def _rate(facts: Facts, role: str) -> float | None:
     return (len(times) - 1) / (span * S_PER_NS) if span else None
 
 
-def latency(facts: Facts, _: Expected) -> Findings:
+def check_latency(facts: Facts, _: Expected) -> Findings:
     """Checks arrival minus stamp, by `/clock` if there is one."""
     for role in (SCAN, ODOM):
         if (heard := facts.heard.get(role)) is None:
@@ -216,7 +216,10 @@ def latency(facts: Facts, _: Expected) -> Findings:
                 "look for a second publisher, or for a clock that is set while it runs"
             )
             yield error("stamp", role, what, fix)
-        age = float(np.median(_here(facts, heard.arrivals_ns) - stamps)) * S_PER_NS
+        age = (
+            float(np.median(_select_present(facts, heard.arrivals_ns) - stamps))
+            * S_PER_NS
+        )
         if -FUTURE_S <= age <= LATE_S:
             continue
         side = "after" if age < 0 else "before"
@@ -228,7 +231,7 @@ def latency(facts: Facts, _: Expected) -> Findings:
         )
 
 
-def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
+def _select_present(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
     times = np.array(arrivals, dtype=np.int64)
     if not facts.clock_ns:
         return times
@@ -238,7 +241,7 @@ def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
     return np.asarray(np.array(facts.clock_ns, dtype=np.int64)[place])
 
 
-def clock(facts: Facts, _: Expected) -> Findings:
+def check_clock(facts: Facts, _: Expected) -> Findings:
     """Checks that `/clock`, if it has a publisher, advances."""
     there = facts.topics.get(CLOCK)
     heard = facts.heard.get(CLOCK)
@@ -258,16 +261,16 @@ def clock(facts: Facts, _: Expected) -> Findings:
         yield error("clock", CLOCK, "stands still", fix)
 
 
-def motion(facts: Facts, expected: Expected) -> Findings:
+def check_motion(facts: Facts, expected: Expected) -> Findings:
     """Checks odometry and commands: numbers, units and signs."""
-    yield from _odometry(facts, expected.robot)
+    yield from _check_odometry(facts, expected.robot)
     ratio = _scale(facts)
     if ratio is not None and ratio < 0.0:
         fix = "swap the wheels or turn the sign of angular.z: counter-clockwise is positive"
         yield error("command", CMD_VEL, "the robot turns against its commands", fix)
 
 
-def turning(facts: Facts, expected: Expected) -> Findings:
+def check_turning(facts: Facts, expected: Expected) -> Findings:
     """Compares how odometry and the gyro turn, and checks that a gyro is there if one is needed."""
     if GYRO not in facts.names:
         return
@@ -282,7 +285,7 @@ def turning(facts: Facts, expected: Expected) -> Findings:
             "says that it measures no yaw rate", "choose another topic by --imu"
         )
         return
-    found = _compared_turns(facts)
+    found = _compare_turns(facts)
     if found is None:
         return
     if found.mirrored:
@@ -306,7 +309,7 @@ def turning(facts: Facts, expected: Expected) -> Findings:
         yield gyro_warning(what, fix)
 
 
-def _compared_turns(facts: Facts) -> Turning | None:
+def _compare_turns(facts: Facts) -> Turning | None:
     """Compares the turns of both; None if the robot turned too little."""
     stamps = facts.heard[ODOM].stamps_ns if ODOM in facts.heard else []
     if not facts.poses or len(stamps) != len(facts.poses):
@@ -328,7 +331,7 @@ def _compared_turns(facts: Facts) -> Turning | None:
     return None
 
 
-def _odometry(facts: Facts, robot: RobotSpec) -> Findings:
+def _check_odometry(facts: Facts, robot: RobotSpec) -> Findings:
     poses, twists, length = (
         np.array(n) for n in (facts.poses, facts.twists, facts.lengths)
     )
@@ -376,23 +379,25 @@ def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Finding
     middle = poses[:-1, 2] + 0.5 * turn
     ahead = np.cos(middle) * step[:, 0] + np.sin(middle) * step[:, 1]
     if far[keep].sum() > LEAST_PATH_M or np.abs(moves[keep, 0]).sum() > 1.0:
-        yield from _compared("linear.x", ahead[keep], moves[keep, 0], UNITS[:3], "m/s")
+        yield from _compare_rates(
+            "linear.x", ahead[keep], moves[keep, 0], UNITS[:3], "m/s"
+        )
     if np.abs(turn[keep]).sum() > LEAST_TURN_RAD or np.abs(moves[keep, 2]).sum() > 2.0:
-        yield from _compared(
+        yield from _compare_rates(
             "angular.z", turn[keep], moves[keep, 2], UNITS[3:], "rad/s"
         )
 
 
-def _compared(
+def _compare_rates(
     field: str,
     real: Array,
     claimed: Array,
     units: Sequence[tuple[float, str]],
     good: str,
 ) -> Findings:
-    ratio = _slope(real, claimed)
+    ratio = _fit_slope(real, claimed)
     size = float(np.sqrt((real @ real) * (claimed @ claimed)))
-    if _alike(ratio):
+    if _is_alike(ratio):
         return
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
         fix = "free the robot if it is stuck; else let both come from the same odometry"
@@ -400,15 +405,15 @@ def _compared(
         return
     what = f"twist.{field} is {ratio:.3g} times what the pose does"
     fix = "let both come from the same odometry, the twist in the body's frame"
-    if _alike(-ratio):
+    if _is_alike(-ratio):
         what = f"twist.{field} has the sign opposite to what the pose does"
         fix = "turn the sign: forward and counter-clockwise are positive (REP-103)"
     for factor, name in units:
-        if _alike(ratio / factor):
+        if _is_alike(ratio / factor):
             what = f"{what}: {name}"
             fix = f"let the twist be in {good}"
             break
-        if _alike(ratio * factor):
+        if _is_alike(ratio * factor):
             what = (
                 f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
             )
@@ -417,11 +422,11 @@ def _compared(
     yield odometry_error(what, fix)
 
 
-def _alike(ratio: float) -> bool:
+def _is_alike(ratio: float) -> bool:
     return 1.0 / TOLERANCE < ratio < TOLERANCE
 
 
-def _slope(x: Array, y: Array) -> float:
+def _fit_slope(x: Array, y: Array) -> float:
     power = float(x @ x)
     return float(x @ y) / power if power > 0.0 else float("inf")
 
@@ -441,10 +446,10 @@ def _scale(facts: Facts) -> float | None:
     if np.abs(turn).sum() < LEAST_TURN_RAD or np.abs(wish).sum() < 1.0:
         return None
     alike = abs(wish @ turn) / np.sqrt((wish @ wish) * (turn @ turn))
-    return _slope(wish, turn) if alike > LEAST_ALIKE else None
+    return _fit_slope(wish, turn) if alike > LEAST_ALIKE else None
 
 
-def layout(facts: Facts, expected: Expected) -> Findings:
+def check_layout(facts: Facts, expected: Expected) -> Findings:
     """Checks number and directions of the beams, and the limits of their ranges."""
     if len(facts.layouts) > 1:
         counts = ", ".join(map(str, sorted({one.beams for one in facts.layouts})))
@@ -465,15 +470,15 @@ def layout(facts: Facts, expected: Expected) -> Findings:
             yield error("unit", SCAN, what, "let the driver send radians")
         try:
             if expected.scan is not None:
-                doctor_facts.filling(have, expected.lidar, expected.scan)
+                doctor_facts.fit_lidar_to_header(have, expected.lidar, expected.scan)
         except ConfigError as fault:
             fix = "turn or set the lidar, or train a policy with what it sees"
             yield layout_error(str(fault), fix)
         else:
-            yield from _beams(have, expected)
+            yield from _check_beams(have, expected)
 
 
-def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
+def _check_beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
     want = expected.lidar.header
     header = have.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
@@ -501,7 +506,7 @@ def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
             yield warning("range limits", SCAN, what, fix)
 
 
-def ranges(facts: Facts, expected: Expected) -> Findings:
+def check_ranges(facts: Facts, expected: Expected) -> Findings:
     """Checks the lidar's values for no return, and the unit of its ranges."""
     if not facts.ranges:
         return

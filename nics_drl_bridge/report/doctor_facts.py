@@ -164,7 +164,9 @@ def name_of_gyro(
     return second if second in near else next(iter(near), usual)
 
 
-def facts_of_bag(path: str | Path, namespace: str = "", imu: str = "auto") -> Facts:
+def collect_facts_of_bag(
+    path: str | Path, namespace: str = "", imu: str = "auto"
+) -> Facts:
     """Collects the facts of a robot from a bag. Raises RecordingError if it is damaged."""
     facts = Facts(str(path), False, names_in(namespace, imu))
     with opened(path) as bag:
@@ -206,7 +208,7 @@ class Expected:
     gyro: bool = False  # the model was made with one
 
 
-def expected_of(
+def derive_expected(
     source: SimulatorModel | Contract, scan: ScanLayout | None = None
 ) -> Expected:
     """Expectations of a model, or of a policy file with the sectors of its scan."""
@@ -214,18 +216,18 @@ def expected_of(
     return Expected(source.robot, source.lidar, source.control_period, scan, gyro)
 
 
-def seen(facts: Facts, expected: Expected) -> Expected:
+def expect_present_lidar(facts: Facts, expected: Expected) -> Expected:
     """Replaces the expected lidar by the present one if that fills the required sectors."""
     if expected.scan is None or not facts.layouts:
         return expected
     try:
-        lidar = filling(facts.layouts[0], expected.lidar, expected.scan)
+        lidar = fit_lidar_to_header(facts.layouts[0], expected.lidar, expected.scan)
     except ConfigError:
         return expected
     return replace(expected, lidar=lidar)
 
 
-def filling(have: Layout, like: LidarSpec, scan: ScanLayout) -> LidarSpec:
+def fit_lidar_to_header(have: Layout, like: LidarSpec, scan: ScanLayout) -> LidarSpec:
     """The lidar of a scan header, mounted like another one. Raises ConfigError if it fills less."""
     lidar = reader_of(have.header, have.beams, like).lidar
     plan_of(lidar, scan)

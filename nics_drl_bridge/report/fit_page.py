@@ -37,57 +37,61 @@ def fit_tile(identified: Identified) -> Tile:
     return "untested", "on unseen data, as the drive is too short", False
 
 
-def verdict_blocks(
+def make_verdict_blocks(
     tiles: Sequence[Tile], conclusion: Conclusion, *commands: str
 ) -> Blocks:
     """Figures in large type, doubts, what could not be learnt, and what to do next."""
     blocks = [
-        html.paragraph(f"This model is: {conclusion.verdict}."),
-        html.tiles(tiles),
+        html.make_paragraph(f"This model is: {conclusion.verdict}."),
+        html.make_tiles(tiles),
     ]
     if conclusion.doubts:
-        blocks.append(html.bullets(conclusion.doubts))
+        blocks.append(html.make_bullets(conclusion.doubts))
     if conclusion.gaps:
         blocks += [
-            html.paragraph("What the drive could not teach:"),
-            html.bullets(conclusion.gaps),
+            html.make_paragraph("What the drive could not teach:"),
+            html.make_bullets(conclusion.gaps),
         ]
     elif conclusion.verdict is Verdict.GOOD:
-        blocks.append(html.paragraph("The drive taught everything the model needs."))
-    blocks.append(html.paragraph(conclusion.advice))
-    return [*blocks, html.code("\n".join(commands))] if commands else blocks
+        blocks.append(
+            html.make_paragraph("The drive taught everything the model needs.")
+        )
+    blocks.append(html.make_paragraph(conclusion.advice))
+    return [*blocks, html.make_code("\n".join(commands))] if commands else blocks
 
 
-def path_blocks(identified: Identified) -> Blocks:
+def make_path_blocks(identified: Identified) -> Blocks:
     """Predicted paths beside the measured ones, and errors beside those of the yardsticks."""
     if identified.held_out is None or not identified.judgement:
-        return [html.paragraph("The drive is too short to hold data out.")]
+        return [html.make_paragraph("The drive is too short to hold data out.")]
     drawn = [
-        (each, "") for each in fit_pictures.unseen_paths(identified.trial, PATHS_SHOWN)
+        (each, "")
+        for each in fit_pictures.draw_unseen_paths(identified.trial, PATHS_SHOWN)
     ]
     caption = "Mean prediction errors on unseen data: those of a good model lie below the others."
     if any(at.band_m for at in identified.judgement):
         caption += " Bars: distances within which 95 % of its predictions should end."
-    rows = html.table(HEADS, judgement_rows(identified.judgement))
+    rows = html.make_table(HEADS, judgement_rows(identified.judgement))
     return [
-        html.gallery(drawn),
-        html.picture(fit_pictures.yardsticks(identified), caption),
-        html.details("The same in numbers", [html.paragraph(COMPARED), rows]),
+        html.make_gallery(drawn),
+        html.make_picture(fit_pictures.draw_yardsticks(identified), caption),
+        html.make_details("The same in numbers", [html.make_paragraph(COMPARED), rows]),
     ]
 
 
 def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks:
     """The equations, and folded all figures and pictures of fit and calibration."""
     fit = fit_pictures.fit_pictures(spec, identified, paths=False)
-    drawn = {**fit, **fit_pictures.calibration_pictures(spec, identified)}
+    drawn = {**fit, **fit_pictures.draw_calibration(spec, identified)}
     pictures = [
-        html.picture(png, fit_pictures.CAPTIONS[name]) for name, png in drawn.items()
+        html.make_picture(png, fit_pictures.CAPTIONS[name])
+        for name, png in drawn.items()
     ]
     equations = "\n".join(equations_with_errors(identified.model))
     return [
-        html.code(equations),
-        html.details("All figures of the fit", [html.code(report)]),
-        html.details("Pictures of the fit and of the calibration", pictures),
+        html.make_code(equations),
+        html.make_details("All figures of the fit", [html.make_code(report)]),
+        html.make_details("Pictures of the fit and of the calibration", pictures),
     ]
 
 
@@ -121,9 +125,9 @@ def write_fit_page(
     train = f"nics train --robot {folder} --world arena --seeds 0 --out runs/first"
     commands = (train,) if conclusion.ready else ()
     sections = [
-        ("Verdict", verdict_blocks(figures, conclusion, *commands)),
-        ("Paths", path_blocks(identified)),
+        ("Verdict", make_verdict_blocks(figures, conclusion, *commands)),
+        ("Paths", make_path_blocks(identified)),
         ("Model", model_blocks(spec, identified, report)),
     ]
     lead = f"Robot {spec.name!r}, from {source}."
-    write_text(file, html.page("nics_drl_bridge: fit", lead, sections))
+    write_text(file, html.make_page("nics_drl_bridge: fit", lead, sections))

@@ -69,7 +69,7 @@ def write_pictures(
     spec = (
         identified.drive.spec
     )  # of a textbook that was written, which may have another state
-    drawn = {**fit_pictures(spec, identified), **calibration_pictures(spec, identified)}
+    drawn = {**fit_pictures(spec, identified), **draw_calibration(spec, identified)}
     files = {Path(folder) / f"{name}.png": picture for name, picture in drawn.items()}
     for file, picture in files.items():
         write_bytes(file, picture)
@@ -84,20 +84,20 @@ def fit_pictures(
         identified.findings.replaced
     )
     # then pruning did not choose its terms
-    pictures = {} if by_motion else {"accuracy": accuracy(identified)}
+    pictures = {} if by_motion else {"accuracy": draw_accuracy(identified)}
     if paths and identified.held_out is not None:
-        pictures["paths"] = held_out_paths(identified.trial)
+        pictures["paths"] = draw_held_out_paths(identified.trial)
     if (
         identified.unseen is not None
         and np.abs(identified.unseen.dq).max() > LEAST_RATE
     ):
-        pictures["residuals"] = residuals(identified.trial, identified.unseen)
+        pictures["residuals"] = draw_residuals(identified.trial, identified.unseen)
     if (np.ptp(identified.recording.command.values, axis=0) > 0.0).any():
-        pictures["alignment"] = alignment(spec, identified)
+        pictures["alignment"] = draw_alignment(spec, identified)
     return pictures
 
 
-def accuracy(identified: Identified) -> bytes:
+def draw_accuracy(identified: Identified) -> bytes:
     """Draws the cross-validated error over the number of terms, a line per degree of freedom."""
     figure, (axes,) = panels(1, 1, (7.5, 4.5))
     circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
@@ -120,28 +120,28 @@ def accuracy(identified: Identified) -> bytes:
     return png(figure)
 
 
-def held_out_paths(identified: Identified) -> bytes:
+def draw_held_out_paths(identified: Identified) -> bytes:
     """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
-    paths = _unseen_paths(identified)
+    paths = _collect_unseen_paths(identified)
     rows = -(-len(paths) // 3)
     columns = min(len(paths), 3)
     figure, grid = panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
     for axes, path in zip(grid, paths, strict=False):
-        _unseen_path(axes, path)
+        _draw_unseen_path(axes, path)
     return png(figure, grid[0])
 
 
-def unseen_paths(identified: Identified, most: int) -> list[bytes]:
-    """Draws some of the panels of `held_out_paths`, each as a PNG of its own."""
+def draw_unseen_paths(identified: Identified, most: int) -> list[bytes]:
+    """Draws some of the panels of `draw_held_out_paths`, each as a PNG of its own."""
     drawn = []
-    for path in _unseen_paths(identified)[:most]:
+    for path in _collect_unseen_paths(identified)[:most]:
         figure, (axes,) = panels(1, 1)
-        _unseen_path(axes, path)
+        _draw_unseen_path(axes, path)
         drawn.append(png(figure, axes, UNSEEN_PANEL))
     return drawn
 
 
-def _unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
+def _collect_unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
     """Returns measured and predicted paths, and the distance between their ends [m]."""
     drive = identified.drive
     calibration = identified.calibration
@@ -150,7 +150,7 @@ def _unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
     span = identified.train_until_s, drive.duration_s
     chosen = windows(drive, calibration, *span, HORIZON_S, free / PATHS)
     paths = []
-    for n, path in enumerate(_predicted(identified, chosen)[:PATHS]):
+    for n, path in enumerate(_predict_rates(identified, chosen)[:PATHS]):
         during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
         paths.append(
             (
@@ -162,7 +162,7 @@ def _unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
     return paths
 
 
-def _unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
+def _draw_unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
     truth, path, apart = paths
     axes.plot(
         *truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured"
@@ -174,7 +174,7 @@ def _unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
     axes.set(xlabel="x [m]", ylabel="y [m]")
 
 
-def yardsticks(identified: Identified) -> bytes:
+def draw_yardsticks(identified: Identified) -> bytes:
     """Draws mean errors on unseen data over the horizon, beside those of the yardsticks."""
     figure, (axes,) = panels(1, 1, (5.0, 3.6))
     judgement = identified.judgement
@@ -215,7 +215,7 @@ def yardsticks(identified: Identified) -> bytes:
     return png(figure, axes)
 
 
-def residuals(identified: Identified, unseen: Samples) -> bytes:
+def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
     """Draws rates on unseen data, those of the model, and the residuals, over time."""
     model = identified.model
     predicted = model.rates(unseen.x)
@@ -239,7 +239,7 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
     return png(figure, grid[0])
 
 
-def alignment(spec: RobotSpec, identified: Identified) -> bytes:
+def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
     """Draws each changing command, as stamped and as it takes effect, with its main response."""
     samples = identified.samples
     calibration = identified.calibration
@@ -261,7 +261,7 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
             value = held(command, spec, t - late, t - late + samples.dt)[:, c]
             axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
         axes.set_ylabel(f"{name} [{unit}]", color=MODEL)
-        _response(axes, samples, shown, len(spec.state) + int(c), identified)
+        _draw_response(axes, samples, shown, len(spec.state) + int(c), identified)
     grid[-1].set_xlabel("time on the commands' clock [s]")
     grid[0].plot([], [], color=MEASURED, linewidth=2.5, alpha=0.55, label="response")
     title = f"clock offset {calibration.clock_offset_s:.4g} s, command latency {latency:.4g} s"
@@ -269,7 +269,7 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
     return png(figure, grid[0])
 
 
-def _response(
+def _draw_response(
     axes: Axes,
     samples: Samples,
     shown: NDArray[np.bool_],
@@ -294,7 +294,7 @@ def _response(
     other.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", color=MEASURED)
 
 
-def _predicted(identified: Identified, chosen: Windows) -> Array:
+def _predict_rates(identified: Identified, chosen: Windows) -> Array:
     shares = np.linspace(0.02, 1.0, POINTS)
     ends = [
         chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares
@@ -308,18 +308,20 @@ def _predicted(identified: Identified, chosen: Windows) -> Array:
     return np.stack([chosen.start, *poses], axis=1)
 
 
-def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
+def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """The pictures of a calibration by name, as far as the recording shows them, each a PNG."""
     found = estimates(identified)
     drawn = {
-        "mounting": mounting(identified, found),
-        "inputs": inputs(spec, identified),
-        "noise": noise(identified),
+        "mounting": draw_mounting(identified, found),
+        "inputs": draw_inputs(spec, identified),
+        "noise": draw_noise(identified),
     }
     return {name: picture for name, picture in drawn.items() if picture is not None}
 
 
-def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+def draw_mounting(
+    identified: Identified, found: dict[str, CalibratedValue]
+) -> bytes | None:
     """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
     rotation = found["rotation_rad"]
     lever_x = found["lever_arm_x_m"]
@@ -334,7 +336,7 @@ def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes
     base = turned + tracked[:, 2:] * np.array([y, -x])
     count = 1 if lever_x.value is None else 2
     figure, grid = panels(1, count, (5.2 * count, 4.4))
-    _points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
+    _draw_points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
     grid[0].set_aspect("equal", adjustable="datalim")
     grid[0].set(
         xlabel="velocity along x of its own frame [m/s]",
@@ -342,18 +344,18 @@ def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes
     )
     _finish(grid[0], rotation.text)
     for axes in grid[1:]:
-        _points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
+        _draw_points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
         axes.set(xlabel="yaw rate [rad/s]", ylabel="lateral velocity [m/s]")
         _finish(axes, f"{lever_x.text}\n{lever_y.text}")
     return png(figure)
 
 
-def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
+def _draw_points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
     axes.plot(*tracked, ".", markersize=3, color=OTHER, label="tracked body")
     axes.plot(*base, ".", markersize=3, color=MODEL, label="base_link")
 
 
-def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
+def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     """Draws the curve of each command that has one, and what becomes of the rates of states."""
     model = identified.model
     curves = [curve for curve in model.inputs if curve.bends]
@@ -362,7 +364,7 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
         return None
     figure, grid = panels(1, count, (4.2 * count, 3.8))
     for axes, dof in zip(grid[len(curves) :], restrained, strict=True):
-        _restraint(axes, identified, dof)
+        _draw_restraint(axes, identified, dof)
     names = [command.name for command in spec.command]
     for axes, curve in zip(grid, curves, strict=False):
         place = names.index(curve.command)
@@ -387,7 +389,7 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     return png(figure)
 
 
-def _restraint(axes: Axes, identified: Identified, dof: str) -> None:
+def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
     """Draws the rates of a state as measured, and as limits, drag and friction let them be."""
     model = identified.model
     samples = identified.samples
@@ -418,7 +420,7 @@ def _finish(axes: Axes, title: str) -> None:
     axes.legend()
 
 
-def noise(identified: Identified) -> bytes | None:
+def draw_noise(identified: Identified) -> bytes | None:
     """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
     levels = identified.noise
     histograms = []
@@ -463,16 +465,18 @@ def noise(identified: Identified) -> bytes | None:
         axes.plot(edges, normal, "--", color=MODEL)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
-        axes.set_title(f"noise of the {name}\n{_value(level)}")
+        axes.set_title(f"noise of the {name}\n{_format_value(level)}")
     if drifts and grown is not None:
         horizon, position, heading = grown
         after = grid[len(histograms) :]
-        _growth(after[0], horizon, "position", levels.position_drift, position, "m")
-        _growth(after[1], horizon, "heading", levels.heading_drift, heading, "rad")
+        _draw_growth(
+            after[0], horizon, "position", levels.position_drift, position, "m"
+        )
+        _draw_growth(after[1], horizon, "heading", levels.heading_drift, heading, "rad")
     return png(figure)
 
 
-def _growth(
+def _draw_growth(
     axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str
 ) -> None:
     axes.plot(
@@ -491,9 +495,9 @@ def _growth(
         label="the drift alone",
     )
     axes.set(xlabel="horizon [s]", ylabel=f"root mean square [{unit}]")
-    _finish(axes, f"drift of the {name}\n{_value(level)}")
+    _finish(axes, f"drift of the {name}\n{_format_value(level)}")
 
 
-def _value(level: Level) -> str:
+def _format_value(level: Level) -> str:
     spread = "" if level.uncertainty is None else f" ± {level.uncertainty:.1g}"
     return f"{level.std:.3g}{spread} {level.unit}"

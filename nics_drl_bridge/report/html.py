@@ -43,7 +43,9 @@ img { max-width: 100%; height: auto }
 WIDE = 700  # width of a picture [pixels] above which a phone scrolls it sideways
 
 
-def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]) -> str:
+def make_page(
+    title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]
+) -> str:
     """Builds a page of sections, each a heading and HTML blocks, below a lead sentence."""
     body = "".join(
         f"<h2>{escape(heading)}</h2>{''.join(blocks)}" for heading, blocks in sections
@@ -56,22 +58,22 @@ def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]) -
     )
 
 
-def paragraph(text: str) -> str:
+def make_paragraph(text: str) -> str:
     """Returns a paragraph as HTML, as the next ones."""
     return f"<p>{escape(text)}</p>"
 
 
-def code(text: str) -> str:
+def make_code(text: str) -> str:
     """Preformatted text."""
     return f"<pre>{escape(text)}</pre>"
 
 
-def bullets(sentences: Sequence[str]) -> str:
+def make_bullets(sentences: Sequence[str]) -> str:
     """A list of sentences."""
     return "<ul>" + "".join(f"<li>{escape(each)}</li>" for each in sentences) + "</ul>"
 
 
-def tiles(figures: Sequence[tuple[str, str, bool]]) -> str:
+def make_tiles(figures: Sequence[tuple[str, str, bool]]) -> str:
     """Figures in large type, each with its meaning, and false if it is a reason for doubt."""
     each = (
         f'<div class="tile{"" if good else " doubtful"}"><b>{"" if good else "⚠ "}{escape(figure)}'
@@ -81,35 +83,37 @@ def tiles(figures: Sequence[tuple[str, str, bool]]) -> str:
     return f'<div class="tiles">{"".join(each)}</div>'
 
 
-def picture(png: bytes, caption: str) -> str:
+def make_picture(png: bytes, caption: str) -> str:
     """A PNG with its caption."""
     data = base64.b64encode(png).decode()
     caption = escape(caption)
-    kind = ' class="wide"' if _width(png) > WIDE else ""
+    kind = ' class="wide"' if _read_width(png) > WIDE else ""
     return (
         f'<figure{kind}><img src="data:image/png;base64,{data}" alt="{caption}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
 
-def _width(png: bytes) -> int:
+def _read_width(png: bytes) -> int:
     """Returns the width of a PNG [pixels]."""
     return int.from_bytes(png[16:20], "big")
 
 
-def gallery(pictures: Sequence[tuple[bytes, str]]) -> str:
+def make_gallery(pictures: Sequence[tuple[bytes, str]]) -> str:
     """Pictures with captions side by side; below each other on a phone, or where they are wide."""
-    wide = any(_width(png) > WIDE for png, _ in pictures)
+    wide = any(_read_width(png) > WIDE for png, _ in pictures)
     kind = "gallery wide" if wide else "gallery"
-    return f'<div class="{kind}">{"".join(picture(*each) for each in pictures)}</div>'
+    return (
+        f'<div class="{kind}">{"".join(make_picture(*each) for each in pictures)}</div>'
+    )
 
 
-def details(summary: str, blocks: Sequence[str]) -> str:
+def make_details(summary: str, blocks: Sequence[str]) -> str:
     """Blocks that are folded below a summary, and open in print."""
     return f"<details><summary>{escape(summary)}</summary>{''.join(blocks)}</details>"
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def make_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Rows of text under a heading row."""
 
     def cells(kind: str, row: Sequence[str]) -> str:

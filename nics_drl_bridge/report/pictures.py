@@ -68,7 +68,7 @@ class View(NamedTuple):
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 
-def view_of(low: Array, high: Array, side: float) -> View:
+def make_view(low: Array, high: Array, side: float) -> View:
     """Returns the view of a field between two corners (2,) [m].
 
     The panel has the proportion of the field and the area of a square of a side [inch], so that a
@@ -86,19 +86,19 @@ def view_of(low: Array, high: Array, side: float) -> View:
     return View(centre - shown / 2.0, centre + shown / 2.0, Panel(*panel.tolist()))
 
 
-def _view_of_episodes(world: AnyWorld, episodes: Iterable[Episode]) -> View:
+def _make_view_of_episodes(world: AnyWorld, episodes: Iterable[Episode]) -> View:
     """Returns the view of a world that holds the paths of some episodes, too."""
     corners = np.reshape(world.extent, (2, 2))
     paths = [episode.path[:, :2] for episode in episodes]
     points = np.concatenate([corners, *paths])
-    return view_of(np.nanmin(points, axis=0), np.nanmax(points, axis=0), EPISODE_SIDE)
+    return make_view(np.nanmin(points, axis=0), np.nanmax(points, axis=0), EPISODE_SIDE)
 
 
-def trajectories(
+def draw_trajectories(
     runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footprint: float
 ) -> bytes:
     """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
-    view = _view_of_episodes(world, chain.from_iterable(runs.values()))
+    view = _make_view_of_episodes(world, chain.from_iterable(runs.values()))
     by_seed = [
         {
             name: episode
@@ -110,15 +110,15 @@ def trajectories(
     columns = min(len(by_seed), max(1, int(GREATEST_WIDTH / view.panel.width)))
     figure, grid = panels(-(-len(by_seed) // columns), columns)
     for axes, episodes in zip(grid, by_seed, strict=False):
-        _panel(axes, episodes, world, footprint, view)
+        _draw_panel(axes, episodes, world, footprint, view)
     return png(figure, grid[0], view.panel)
 
 
-def trajectory_gallery(
+def draw_trajectory_gallery(
     shown: Sequence[Mapping[str, Episode]], world: AnyWorld, footprint: float
 ) -> list[bytes]:
     """Draws a picture per seed with the path of each run, all with panels of the same size."""
-    view = _view_of_episodes(
+    view = _make_view_of_episodes(
         world, [each for episodes in shown for each in episodes.values()]
     )
     runs = dict.fromkeys(name for episodes in shown for name in episodes)
@@ -126,12 +126,12 @@ def trajectory_gallery(
     drawn = []
     for episodes in shown:
         figure, (axes,) = panels(1, 1)
-        _panel(axes, episodes, world, footprint, view)
+        _draw_panel(axes, episodes, world, footprint, view)
         drawn.append(png(figure, axes, view.panel, rows))
     return drawn
 
 
-def _panel(
+def _draw_panel(
     axes: Axes,
     episodes: Mapping[str, Episode],
     world: AnyWorld,
@@ -195,7 +195,7 @@ class Point(NamedTuple):
     collision: float
 
 
-def training_curve(points: Sequence[Point]) -> bytes:
+def draw_training_curve(points: Sequence[Point]) -> bytes:
     """Draws success and collisions [%] over the environment steps."""
     figure, (axes,) = panels(1, 1)
     steps, *shares = np.array(points, np.float64).T
@@ -212,7 +212,7 @@ def training_curve(points: Sequence[Point]) -> bytes:
     return png(figure, panel=CURVE_PANEL)
 
 
-def robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
+def draw_robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
     """Draws success [%] with its interval, by what was perturbed."""
     figure, (axes,) = panels(1, 1)
     value, low, high = 100.0 * np.array([astuple(share) for share in shares.values()]).T
@@ -224,7 +224,7 @@ def robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
     return png(figure, panel=CURVE_PANEL)
 
 
-def shadow_picture(shadow: Shadow) -> bytes:
+def draw_shadow(shadow: Shadow) -> bytes:
     """Draws each command over time, as driven and as chosen by the policy."""
     count = len(shadow.names)
     figure, grid = panels(count, 2, (11.0, 2.4 * count + 0.6), width_ratios=(4.0, 1.0))
@@ -254,7 +254,7 @@ def shadow_picture(shadow: Shadow) -> bytes:
     return png(figure, grid[0])
 
 
-def world_picture(
+def draw_seeded_world(
     world: World,
     footprint: float,
     seed: int,
@@ -275,7 +275,7 @@ def world_picture(
     scene = sampler.draw([seed])[0]
     low, high = np.array(world.extent).reshape(2, 2)
     size = high - low
-    view = view_of(low, high, WORLD_SIDE)
+    view = make_view(low, high, WORLD_SIDE)
     figure, (axes,) = panels(1, 1)
     draw_world(axes, world, scene.bodies)
     for kind, places, colour in (
@@ -290,7 +290,7 @@ def world_picture(
             }
             area["label"] = None if number else f"region of {kind}"
             axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **area))
-    _movers(axes, sampler.motions, scene)
+    _draw_movers(axes, sampler.motions, scene)
     look: dict[str, Any] = {
         "facecolor": MEASURED,
         "edgecolor": DARK,
@@ -311,7 +311,7 @@ def world_picture(
     return png(figure, axes, view.panel)
 
 
-def _movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
+def _draw_movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
     """Draws rings around obstacles that move, and the ways of those that patrol."""
     moving = [
         k

@@ -128,27 +128,27 @@ class WorldFrame:
             "place": self.place,
             "state": self.state,
             "gate": shot.gate,
-            "poses": thousandths(shot.poses),
-            "ranges": thousandths(ranges),
-            "bodies": thousandths(bodies),
+            "poses": round_to_thousandths(shot.poses),
+            "ranges": round_to_thousandths(ranges),
+            "bodies": round_to_thousandths(bodies),
             "kinds": kinds,
-            "goals": thousandths(shot.goals),
-            "velocities": thousandths(moving.robots),
-            "body_velocities": thousandths(moving.bodies[exist]),
-            "trails": [thousandths(trail) for trail in self.trails],
+            "goals": round_to_thousandths(shot.goals),
+            "velocities": round_to_thousandths(moving.robots),
+            "body_velocities": round_to_thousandths(moving.bodies[exist]),
+            "trails": [round_to_thousandths(trail) for trail in self.trails],
             "estimates": None
             if shot.estimates is None
-            else thousandths(shot.estimates),
+            else round_to_thousandths(shot.estimates),
             "ellipses": None
             if shot.covariance is None
-            else [_ellipse(c) for c in shot.covariance],
+            else [_compute_ellipse(c) for c in shot.covariance],
             "commands": None
             if shot.commands is None
             else np.round(shot.commands, 3).tolist(),
         }
 
 
-def _ellipse(covariance: Array) -> list[float]:
+def _compute_ellipse(covariance: Array) -> list[float]:
     """Half axes [m] and turn [rad] of the ellipse that holds the position with 95 %."""
     values, vectors = np.linalg.eigh(covariance[:2, :2])
     scale = -2.0 * math.log(0.05)  # quantile of chi squared with two degrees of freedom
@@ -160,7 +160,7 @@ def _ellipse(covariance: Array) -> list[float]:
     ]
 
 
-def thousandths(values: ArrayLike) -> Any:
+def round_to_thousandths(values: ArrayLike) -> Any:
     """Numbers as whole thousandths in lists; what is not finite becomes 0."""
     scaled = np.nan_to_num(np.asarray(values, np.float64) * MM, posinf=0.0, neginf=0.0)
     return np.rint(scaled).astype(np.int64).tolist()

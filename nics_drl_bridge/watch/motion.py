@@ -67,12 +67,14 @@ def _velocities(before: _Seen, time_s: float, shot: Snapshot) -> Velocities:
         return Velocities.unknown(shot)
     places = [X, Y]
     return Velocities(
-        _rates(last.poses[:, :2], shot.poses[:, :2], passed_s, known.robots),
-        _rates(last.bodies[:, places], shot.bodies[:, places], passed_s, known.bodies),
+        _compute_rates(last.poses[:, :2], shot.poses[:, :2], passed_s, known.robots),
+        _compute_rates(
+            last.bodies[:, places], shot.bodies[:, places], passed_s, known.bodies
+        ),
     )
 
 
-def _rates(before: Array, now: Array, passed_s: float, known: Array) -> Array:
+def _compute_rates(before: Array, now: Array, passed_s: float, known: Array) -> Array:
     """Returns velocities (n, 2) by points (n, 2); those that are known if no time has passed."""
     if before.shape != now.shape:
         return np.zeros_like(now)

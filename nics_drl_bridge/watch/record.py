@@ -22,7 +22,7 @@ ALIKE = 12  # difference of two colours of which a GIF has one
 SAMPLES = 12  # frames that its colours are taken from
 
 
-def pictures(stage: Stage, frames: Iterable[Frame]) -> Iterator[Pixels]:
+def draw_frames(stage: Stage, frames: Iterable[Frame]) -> Iterator[Pixels]:
     """Draws frames, their worlds side by side."""
     drawn: dict[int, WorldPicture] = {}
     first = np.cumsum([0, *(len(world.members) for world in stage.worlds)])
@@ -33,10 +33,10 @@ def pictures(stage: Stage, frames: Iterable[Frame]) -> Iterator[Pixels]:
             if n not in drawn:
                 drawn[n] = WorldPicture(stage.model, stage.worlds[n])
             row.append(drawn[n].draw(world.shot, world.trails))
-        yield beside(row)
+        yield join_side_by_side(row)
 
 
-def beside(row: list[Pixels]) -> Pixels:
+def join_side_by_side(row: list[Pixels]) -> Pixels:
     """Pictures side by side, of even sides, as videos need."""
     height = -(-max(len(each) for each in row) // 2) * 2
     width = -(-sum(each.shape[1] for each in row) // 2) * 2
@@ -51,7 +51,7 @@ def beside(row: list[Pixels]) -> Pixels:
 def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     """Writes a GIF that repeats for ever."""
     every = list(shown)
-    palette = palette_of(
+    palette = choose_palette(
         every[:: -(-len(every) // SAMPLES)]
     )  # one for all, or colours flicker
     first, *rest = [
@@ -66,7 +66,7 @@ def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def palette_of(some: list[Pixels]) -> Image.Image:
+def choose_palette(some: list[Pixels]) -> Image.Image:
     """Palette of the most frequent colours that differ: means would lose those of small things."""
     parts = np.concatenate([each.reshape(-1, 3) for each in some]).astype(np.int64)
     colours, counts = np.unique(
@@ -108,10 +108,10 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
 LIBRARIES = {".mp4": ("imageio_ffmpeg",)}
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
     ".gif": lambda path, stage, frames, fps: write_gif(
-        path, pictures(stage, frames), fps
+        path, draw_frames(stage, frames), fps
     ),
     ".mp4": lambda path, stage, frames, fps: write_mp4(
-        path, pictures(stage, frames), fps
+        path, draw_frames(stage, frames), fps
     ),
 }
 

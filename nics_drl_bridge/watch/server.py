@@ -102,7 +102,7 @@ class PageServer:
         self.closed = False
         try:
             self._server = serve(
-                self._talk,
+                self._serve_page,
                 HOST,
                 port,
                 process_request=self._answer,
@@ -188,7 +188,7 @@ class PageServer:
         }
         return Response(200, "OK", Headers(about), body)
 
-    def _talk(self, page: Any) -> None:
+    def _serve_page(self, page: Any) -> None:
         """Serves one page: a thread of its own sends, this one receives."""
         from websockets.exceptions import ConnectionClosed
 
@@ -223,11 +223,11 @@ class PageServer:
 
         seen = [0, self._numbers[1], 0]
         with suppress(ConnectionClosed):
-            while texts := self._due(page, seen):
+            while texts := self._wait_for_news(page, seen):
                 for text in texts:
                     page.send(text)
 
-    def _due(self, page: Any, seen: list[int]) -> list[str]:
+    def _wait_for_news(self, page: Any, seen: list[int]) -> list[str]:
         """Waits for news since the numbers `seen`, which it updates; none once a page is closed."""
         with self._news:
             while page in self._pages and self._numbers == seen:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gate.rig import Rig, config, driving
-from nics_drl_bridge.gate.estimate import WINDOW_S, growth_since
+from nics_drl_bridge.gate.estimate import WINDOW_S, compute_growth
 from nics_drl_bridge.gate.inputs import (
     Arm,
     Command,
@@ -131,9 +131,9 @@ def test_what_an_uncertain_heading_does_over_the_way_driven_is_no_growth():
     carried = np.array([[1.0, 0.0, -away[1]], [0.0, 1.0, away[0]], [0.0, 0.0, 1.0]])
     pose = np.array([*(mark.pose[:2] + away), 1.0])
     grown = carried @ mark.covariance @ carried.T + np.diag([0.04, 0.01, 0.09])
-    found = growth_since(mark, Estimate(np.zeros(3), pose, grown))
+    found = compute_growth(mark, Estimate(np.zeros(3), pose, grown))
     assert found == pytest.approx((0.2, 0.3))
-    assert growth_since(mark, Estimate(np.zeros(3), mark.pose, 1e-4 * np.eye(3))) == (
+    assert compute_growth(mark, Estimate(np.zeros(3), mark.pose, 1e-4 * np.eye(3))) == (
         0.0,
         0.0,
     )

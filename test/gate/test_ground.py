@@ -11,8 +11,8 @@ import shapely
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
 from nics_drl_bridge.gate.ground import CELL, CELLS, REMEMBERED_S
-from nics_drl_bridge.gate.shield import STEP, body_of, ground_of, obstacles
-from nics_drl_bridge.gate.shield_kernels import free
+from nics_drl_bridge.gate.shield import STEP, find_obstacles, get_body, update_ground
+from nics_drl_bridge.gate.shield_kernels import is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
 from nics_drl_bridge.interface import NS_PER_S
 
@@ -22,7 +22,7 @@ SHIELD = ShieldConfig(
 )
 ANGLES = np.deg2rad(np.linspace(-135.0, 135.0, 541))
 BLIND = config(shield=SHIELD, beam_angles=ANGLES, mount=(0.12, 0.0, 0.0))
-BODY = body_of(SHIELD)
+BODY = get_body(SHIELD)
 PERIOD_S = 0.1
 REACT_S = 0.2
 SEEDS = 8
@@ -63,12 +63,14 @@ class Robot:
 
     def looks(self):
         view = View(round(self.time * NS_PER_S), self.pose, scan(self.pose, self.walls))
-        self.known = ground_of(self.given, (view,), self.known)
-        self.seen = obstacles(self.given, view.ranges, (view,), self.known)
+        self.known = update_ground(self.given, (view,), self.known)
+        self.seen = find_obstacles(self.given, view.ranges, (view,), self.known)
 
     def may(self, twist):
         twists = np.array([twist], dtype=float)
-        return free(self.seen, twists, body_of(self.given.shield), REACT_S, 2.0, STEP)
+        return is_free(
+            self.seen, twists, get_body(self.given.shield), REACT_S, 2.0, STEP
+        )
 
     def moves(self, twist, seconds=PERIOD_S):
         for _ in range(round(seconds / PERIOD_S)):
@@ -171,7 +173,7 @@ def test_unknown_beams_show_no_free_ground():
     for _ in range(10):
         robot.pose = geometry.compose(robot.pose, (0.03, 0.0, 0.0))
         view = View(0, robot.pose, np.full(len(ANGLES), np.nan, np.float32))
-        robot.known = ground_of(BLIND, (view,), robot.known)
+        robot.known = update_ground(BLIND, (view,), robot.known)
     beside = geometry.compose(robot.pose, (0.0, 0.6, 0.0))
     i, j = (int(beside[axis] // CELL) - robot.known.corner[axis] for axis in (1, 0))
     assert robot.known.times[i, j] == 0.0  # when the first scan saw it
@@ -188,8 +190,8 @@ def test_what_lies_beyond_the_cells_is_not_known():
 
 def test_a_lidar_that_sees_all_around_needs_no_memory():
     view = View(0, np.zeros(3), np.full(LIDAR.beams, np.inf, np.float32))
-    assert ground_of(config(shield=SHIELD), (view,), None) is None
-    assert ground_of(config(beam_angles=ANGLES), (view,), None) is None
+    assert update_ground(config(shield=SHIELD), (view,), None) is None
+    assert update_ground(config(beam_angles=ANGLES), (view,), None) is None
 
 
 def test_a_circle_whose_lidar_is_blind_behind_backs_up_as_far_as_it_came_too():

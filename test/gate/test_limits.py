@@ -16,10 +16,10 @@ from nics_drl_bridge.gate.inputs import Command
 from nics_drl_bridge.gate.limits import (
     Limits,
     follow,
-    implausible,
+    is_implausible,
+    is_within,
     load_limits,
     saturate,
-    within,
 )
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.spec import load_robot
@@ -56,7 +56,7 @@ def test_a_command_within_the_limits_stays_as_it_is(robot):
     limits = LIMITS[robot]
     command = limits.low + 0.6 * (limits.high - limits.low)
     assert saturate(command, limits).tolist() == command.tolist()
-    assert not implausible(command, limits)
+    assert not is_implausible(command, limits)
 
 
 @settings(max_examples=30, deadline=None)
@@ -263,7 +263,7 @@ def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_
             value, slope = follow(
                 value, slope, saturate(np.array(wish), limits), dt, limits
             )
-            assert within(value, limits)
+            assert is_within(value, limits)
             assert np.isfinite(slope).all()
 
 
@@ -282,7 +282,7 @@ def test_a_gate_with_absurd_limits_publishes_numbers_within_them(limits, wish, d
             )
             rig.now += dt
             value = rig.tick().twist[[0, 2]]
-            assert within(value, limits)
+            assert is_within(value, limits)
 
 
 @pytest.mark.parametrize("jerk", [1e308, 1e300, 1e16])
@@ -353,7 +353,7 @@ def test_a_denormal_that_the_shield_leaves_of_a_speed_is_exactly_zero(monkeypatc
         return replace(motion, value=np.full_like(motion.value, 1e-310))
 
     rig = driving()
-    monkeypatch.setattr(gate, "SHAPERS", (*gate.SHAPERS[:-1], leave, gate.bounded))
+    monkeypatch.setattr(gate, "SHAPERS", (*gate.SHAPERS[:-1], leave, gate.bound))
     rig.speed = 0.0
     rig.run(0.1)
     assert rig.decision.publish

@@ -8,7 +8,7 @@ import pytest
 from gate.rig import PERIOD_S, TICK_S, Rig, config
 from nics_drl_bridge.gate.black_box import BlackBox, Entry, replay, write
 from nics_drl_bridge.gate.inputs import Reset, Scan
-from nics_drl_bridge.gate.scan_motion import SETTINGS, directions_of
+from nics_drl_bridge.gate.scan_motion import SETTINGS, get_directions
 from nics_drl_bridge.gate.scan_motion_kernels import (
     Noise,
     Thresholds,
@@ -297,7 +297,7 @@ def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_
 def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
     lidar = load_lidar("hokuyo_ust_10lx")
     given = config("mecanum", beam_angles=lidar.angles)
-    directions = directions_of(given)
+    directions = get_directions(given)
     ranges = np.full(lidar.beams, 2.0, np.float32)
     ranges[::7] = np.nan
     ranges[3::11] = 0.5
@@ -316,7 +316,7 @@ def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
 @pytest.mark.parametrize("name", ["paper_12m", "hokuyo_ust_10lx"])
 def test_a_predicted_scan_is_what_is_seen_after_the_motion(moved, name):
     lidar = load_lidar(name)
-    directions = directions_of(config("mecanum", beam_angles=lidar.angles))
+    directions = get_directions(config("mecanum", beam_angles=lidar.angles))
     count = round(lidar.beams / directions.beams)
     angles = directions.first + directions.step * np.arange(count)
     walls = ROOM[:4]  # without corners that hide something

@@ -16,13 +16,13 @@ from nics_drl_bridge.gate.shield import (
     CREEP,
     MEMORY_S,
     SPACING_S,
-    body_of,
-    movers,
-    obstacles,
-    rehearse,
-    remember,
+    add_view,
+    find_movers,
+    find_obstacles,
+    get_body,
+    warm_up,
 )
-from nics_drl_bridge.gate.shield_kernels import entered, free, place
+from nics_drl_bridge.gate.shield_kernels import is_free, mark_entered, place
 from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
 
@@ -79,10 +79,10 @@ def test_without_a_shield_nothing_is_cut():
 @pytest.mark.slow
 @pytest.mark.parametrize("wheelbase", [CAR.wheelbase, 0.0])
 def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase, monkeypatch):
-    fresh = {"free": njit(free.py_func), "entered": njit(entered.py_func)}
-    monkeypatch.setattr(shield_kernels, "free", fresh["free"])
-    monkeypatch.setattr(shield_kernels, "entered", fresh["entered"])
-    rehearse()
+    fresh = {"free": njit(is_free.py_func), "entered": njit(mark_entered.py_func)}
+    monkeypatch.setattr(shield_kernels, "is_free", fresh["free"])
+    monkeypatch.setattr(shield_kernels, "mark_entered", fresh["entered"])
+    warm_up()
     known = {name: list(kernel.signatures) for name, kernel in fresh.items()}
     assert all(known.values())
     Faced(ranges(0.3), replace(CAR, wheelbase=wheelbase, obstacle_speed=1.0)).settles(
@@ -176,7 +176,7 @@ def test_a_scan_shows_its_returns_where_they_are():
     given = config(shield=CAR, mount=(0.1, 0.0, np.pi / 2))
     seen = np.full(LIDAR.beams, np.inf, np.float32)
     seen[LIDAR.beams // 2] = 2.0  # straight ahead of the lidar, left of the robot
-    assert obstacles(given, seen, ()) == pytest.approx(
+    assert find_obstacles(given, seen, ()) == pytest.approx(
         np.array([[0.1, 2.0, 0.0]]), abs=1e-6
     )
 
@@ -194,7 +194,7 @@ def test_unknown_beams_are_a_wall_on_the_outline_and_blind_directions_are_none()
         )
         seen = np.full(360, np.inf, np.float32)
         seen[unseen] = np.nan
-        wall = obstacles(given, seen, ())[:, :2]
+        wall = find_obstacles(given, seen, ())[:, :2]
         assert (np.abs(wall) == (0.25, 0.2)).any(axis=1).all()
         assert (len(wall) > 0) == (unseen != slice(0))
         assert (wall[:, 0] == 0.25).any() == front
@@ -204,7 +204,7 @@ def test_unknown_beams_are_a_wall_on_the_outline_and_blind_directions_are_none()
 
 def disc(room):
     """A robot that is a circle with its margin."""
-    return body_of(replace(CAR, footprint_radius=0.75 * room, margin=0.25 * room))
+    return get_body(replace(CAR, footprint_radius=0.75 * room, margin=0.25 * room))
 
 
 def test_the_sweep_agrees_with_geometry():
@@ -224,7 +224,7 @@ def test_the_sweep_agrees_with_geometry():
         if abs(away - room) < step or np.hypot(*point) <= room:
             unclear += 1
             continue
-        swept_free = free(
+        swept_free = is_free(
             np.array([[*point, 0.0]]), twist[None], disc(room), blind, BRAKE, step
         )
         assert swept_free == (away > room)
@@ -234,7 +234,9 @@ def test_the_sweep_agrees_with_geometry():
 @pytest.mark.parametrize(("speed", "may"), [(0.3, False), (-0.3, True)])
 def test_a_robot_in_the_margin_may_leave_and_not_come_nearer(speed, may):
     near = np.array([[0.17, 0.02, 0.0]])
-    assert free(near, np.array([[speed, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02) == may
+    assert (
+        is_free(near, np.array([[speed, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02) == may
+    )
 
 
 @pytest.mark.parametrize(("away", "may"), [(1.19, False), (1.21, True)])
@@ -243,16 +245,18 @@ def test_what_comes_on_is_met_no_sooner_than_the_robot_is_at_rest(away, may):
     near = 0.2 + 0.2625 + 0.65
     twists = np.array([[0.5, 0.0, 0.0]])
     comes = np.array([[near + away - 1.2, 0.0, 1.0]])
-    assert free(comes, twists, disc(0.2), 0.4, 2.0, 0.005) == may
-    assert free(comes * (1.0, 1.0, 0.0), twists, disc(0.2), 0.4, 2.0, 0.005)
+    assert is_free(comes, twists, disc(0.2), 0.4, 2.0, 0.005) == may
+    assert is_free(comes * (1.0, 1.0, 0.0), twists, disc(0.2), 0.4, 2.0, 0.005)
 
 
 @pytest.mark.parametrize(("away", "may"), [(0.3, False), (0.6, False), (1.5, True)])
 def test_who_catches_up_from_behind_finds_the_robot_at_rest(away, may):
     """At 0.3 m/s it is no faster than who comes on, and would be met in motion."""
     behind = np.array([[-away, 0.1, 1.0]])
-    assert free(behind, np.array([[0.3, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02) == may
-    assert free(
+    assert (
+        is_free(behind, np.array([[0.3, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02) == may
+    )
+    assert is_free(
         behind * (1.0, 1.0, 0.0),
         np.array([[0.3, 0.0, 0.0]]),
         disc(0.2),
@@ -359,14 +363,14 @@ def facing(views, bearing, width=0.05):
 )
 def test_what_stands_does_not_move_however_the_robot_does(twist):
     discs = [(1.5, 0.4, 0.2), (1.0, -0.9, 0.15), (-0.8, 0.3, 0.25), (2.4, -0.2, 0.2)]
-    assert not movers(GIVEN, SHIELD, drive(twist, lambda _: discs)).any()
+    assert not find_movers(GIVEN, SHIELD, drive(twist, lambda _: discs)).any()
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.5, 1.0, 1.6])
 @pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (0.5, 0.0, 1.0)])
 def test_somebody_who_comes_on_moves(speed, twist):
     views = drive(twist, lambda t: [(2.0 - speed * t, 0.3, 0.2)])
-    found = movers(GIVEN, SHIELD, views)
+    found = find_movers(GIVEN, SHIELD, views)
     pose = views[-1].pose
     where = geometry.between(pose, np.array([2.0 - speed * 0.3, 0.3, 0.0]))
     assert found[facing(views, np.arctan2(where[1], where[0]))].all()
@@ -376,17 +380,19 @@ def test_somebody_who_comes_on_moves(speed, twist):
 def test_the_leading_edge_of_somebody_who_crosses_moves():
     views = drive((0.0, 0.0, 0.0), lambda t: [(1.5, -0.6 + 0.8 * t, 0.2)])
     edge = np.arctan2(-0.6 + 0.24 + 0.19, 1.5)
-    assert movers(GIVEN, SHIELD, views)[facing(views, edge, 0.02)].any()
+    assert find_movers(GIVEN, SHIELD, views)[facing(views, edge, 0.02)].any()
 
 
 def test_who_walks_away_and_what_was_hidden_does_not():
     away = drive((0.0, 0.0, 0.0), lambda t: [(1.0 + 0.8 * t, -0.3, 0.2)])
-    assert not movers(GIVEN, SHIELD, away).any()
+    assert not find_movers(GIVEN, SHIELD, away).any()
     behind = [
         (1.0, 0.0, 0.15),
         (2.0, -0.1, 0.2),
     ]  # the second comes out from behind the first
-    assert not movers(GIVEN, SHIELD, drive((0.0, 0.7, 0.0), lambda _: behind)).any()
+    assert not find_movers(
+        GIVEN, SHIELD, drive((0.0, 0.7, 0.0), lambda _: behind)
+    ).any()
 
 
 def test_noise_that_is_declared_is_no_motion():
@@ -394,7 +400,7 @@ def test_noise_that_is_declared_is_no_motion():
     noisy = replace(SHIELD, range_noise=(0.03, 0.0))
     discs = [(1.5, 0.4, 0.2)]
     found = [
-        movers(
+        find_movers(
             GIVEN, noisy, drive((0.3, 0.0, 0.0), lambda _: discs, noise=0.03, rng=rng)
         ).sum()
         for _ in range(20)
@@ -407,7 +413,7 @@ def test_one_beam_alone_is_noise():
     alone = views[-1].ranges.copy()
     alone[100] = 1.0
     views[-1] = replace(views[-1], ranges=alone)
-    assert not movers(GIVEN, SHIELD, tuple(views)).any()
+    assert not find_movers(GIVEN, SHIELD, tuple(views)).any()
 
 
 def test_where_nothing_was_known_nothing_moves():
@@ -416,12 +422,12 @@ def test_where_nothing_was_known_nothing_moves():
         views[index] = replace(
             views[index], ranges=np.full(LIDAR.beams, np.nan, np.float32)
         )
-    assert not movers(GIVEN, SHIELD, tuple(views)).any()
+    assert not find_movers(GIVEN, SHIELD, tuple(views)).any()
 
 
 def test_where_all_is_taken_to_stand_nothing_moves():
     still = replace(SHIELD, obstacle_speed=0.0)
-    assert not movers(
+    assert not find_movers(
         GIVEN, still, drive((0, 0, 0), lambda t: [(2.0 - t, 0.0, 0.2)])
     ).any()
 
@@ -434,7 +440,7 @@ def test_the_views_of_the_last_moments_are_kept_apart_from_each_other():
             state, odometry=Odometry(index * step, np.zeros(3), np.zeros(3))
         )
         scan = Scan(index * step, np.full(LIDAR.beams, 1.0, np.float32), (0.0, 0.01))
-        state = replace(state, views=remember(GIVEN, state, scan))
+        state = replace(state, views=add_view(GIVEN, state, scan))
     stamps = np.array([view.stamp_ns for view in state.views])
     assert stamps[-1] == 39 * step
     assert (np.diff(stamps[:-1]) >= SPACING_S * NS_PER_S).all()
@@ -450,8 +456,8 @@ def test_a_view_is_from_where_the_robot_was_when_it_was_scanned():
     scan = Scan(
         5 * NS_PER_S + NS_PER_S // 10, np.ones(LIDAR.beams, np.float32), (0.0, 0.01)
     )
-    assert remember(GIVEN, state, scan)[-1].pose == pytest.approx([1.0, 2.1, np.pi / 2])
-    assert remember(config(), state, scan) == ()
+    assert add_view(GIVEN, state, scan)[-1].pose == pytest.approx([1.0, 2.1, np.pi / 2])
+    assert add_view(config(), state, scan) == ()
 
 
 def test_a_robot_is_at_rest_before_somebody_who_walks_up_to_it_is_there():

@@ -9,8 +9,8 @@ import pytest
 import shapely
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate.shield import body_of
-from nics_drl_bridge.gate.shield_kernels import clearance, free, grid
+from nics_drl_bridge.gate.shield import get_body
+from nics_drl_bridge.gate.shield_kernels import compute_clearance, fill_grid, is_free
 from nics_drl_bridge.gate.state import ShieldConfig
 
 BRAKE = 1.5
@@ -22,7 +22,7 @@ FORK = ((0.4, 0.2), (0.1, 0.15), (0.1, -0.15), (0.4, -0.2), (-0.2, -0.2), (-0.2,
 
 def body(outline, margin=MARGIN):
     radius = 0.2 if not outline else float(np.hypot(*np.array(outline).T).max())
-    return body_of(ShieldConfig(0.2, BRAKE, margin, 0.2, radius, outline=outline))
+    return get_body(ShieldConfig(0.2, BRAKE, margin, 0.2, radius, outline=outline))
 
 
 def star(rng):
@@ -74,7 +74,7 @@ def test_the_sweep_is_that_of_a_fine_one_by_exact_distances(make, speed):
         leaves = now < MARGIN and least > -1e-12
         if abs(least) < STEP and not leaves:
             continue
-        found = free(point[None], twist[None], body(outline), blind, BRAKE, STEP)
+        found = is_free(point[None], twist[None], body(outline), blind, BRAKE, STEP)
         assert found == (least > 0.0 or leaves), (outline, point, twist, blind)
         told.append(found)
     assert 10 < sum(told) < len(told) - 10
@@ -85,17 +85,17 @@ def test_the_distance_from_an_outline_is_that_of_geometry():
     for _ in range(50):
         outline = star(rng)
         points = rng.uniform(-0.6, 0.6, (20, 2))
-        found = [clearance(x, y, body(outline)) for x, y in points]
+        found = [compute_clearance(x, y, body(outline)) for x, y in points]
         assert found == pytest.approx(signed(outline, points), abs=1e-12)
 
 
 def test_one_point_among_many_and_one_twist_among_many_are_found():
     many = np.array([[3.0, y, 0.0] for y in np.linspace(-1.0, 1.0, 400)])
     twists = np.array([[0.3, 0.0, turn] for turn in np.linspace(-0.5, 0.5, 20)])
-    assert free(many, twists, body(LONG), 0.5, BRAKE, STEP)
+    assert is_free(many, twists, body(LONG), 0.5, BRAKE, STEP)
     many[250] = (0.32, 0.26, 0.0)  # beside the way of all but those that turn left
-    assert not free(many, twists, body(LONG), 0.5, BRAKE, STEP)
-    assert free(many, twists[:10], body(LONG), 0.5, BRAKE, STEP)
+    assert not is_free(many, twists, body(LONG), 0.5, BRAKE, STEP)
+    assert is_free(many, twists[:10], body(LONG), 0.5, BRAKE, STEP)
 
 
 @pytest.mark.parametrize(("outline", "may"), [(LONG, True), ((), False)])
@@ -103,15 +103,15 @@ def test_a_robot_passes_where_its_outline_does_and_its_circle_does_not(outline, 
     beside = np.array(
         [[x, side, 0.0] for x in np.linspace(0.3, 2.0, 60) for side in (-0.26, 0.26)]
     )
-    round_ = body_of(ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=outline))
-    assert free(beside, np.array([[0.5, 0.0, 0.0]]), round_, 0.5, BRAKE, STEP) == may
+    round_ = get_body(ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=outline))
+    assert is_free(beside, np.array([[0.5, 0.0, 0.0]]), round_, 0.5, BRAKE, STEP) == may
 
 
 @pytest.mark.parametrize(("outline", "may"), [(LONG, False), ((), True)])
 def test_a_turn_on_the_spot_sweeps_corners_but_no_circle(outline, may):
     beside = np.array([[0.0, 0.26, 0.0]])
     assert (
-        free(beside, np.array([[0.0, 0.0, 1.5]]), body(outline), 0.5, BRAKE, STEP)
+        is_free(beside, np.array([[0.0, 0.0, 1.5]]), body(outline), 0.5, BRAKE, STEP)
         == may
     )
 
@@ -126,7 +126,7 @@ def test_a_turn_brakes_as_its_corners_do(turn):
             [np.cos(angle + further), np.sin(angle + further), 0.0]
         )
         there = corner * (1.0, np.sign(turn), 1.0)
-        swept = free(
+        swept = is_free(
             there[None], np.array([[0.0, 0.0, turn]]), body(LONG), 0.5, BRAKE, STEP
         )
         assert swept == may
@@ -136,7 +136,8 @@ def test_a_turn_brakes_as_its_corners_do(turn):
 def test_between_the_tines_a_robot_may_leave_and_not_go_on(speed, may):
     within = np.array([[0.12, 0.0, 0.0]])
     assert (
-        free(within, np.array([[speed, 0.0, 0.0]]), body(FORK), 0.5, BRAKE, STEP) == may
+        is_free(within, np.array([[speed, 0.0, 0.0]]), body(FORK), 0.5, BRAKE, STEP)
+        == may
     )
 
 
@@ -144,15 +145,16 @@ def test_between_the_tines_a_robot_may_leave_and_not_go_on(speed, may):
 def test_what_noise_puts_inside_the_outline_must_not_get_deeper(speed, may):
     inside = np.array([[0.24, 0.0, 0.0]])
     assert (
-        free(inside, np.array([[speed, 0.0, 0.0]]), body(LONG), 0.5, BRAKE, STEP) == may
+        is_free(inside, np.array([[speed, 0.0, 0.0]]), body(LONG), 0.5, BRAKE, STEP)
+        == may
     )
 
 
 def test_a_speed_next_to_nothing_is_swept():
     twist = np.array([[1e-300, 0.0, 0.0]])
     ahead = np.array([[0.29, 0.0, 0.0], [9.0, 0.0, 1e-9]])
-    assert free(ahead, twist, body(LONG), 0.5, BRAKE, STEP)
-    assert free(ahead, 0.0 * twist, body(LONG), 0.5, BRAKE, STEP)
+    assert is_free(ahead, twist, body(LONG), 0.5, BRAKE, STEP)
+    assert is_free(ahead, 0.0 * twist, body(LONG), 0.5, BRAKE, STEP)
 
 
 def test_a_grid_of_twists_has_both_ends_and_what_lies_evenly_between():
@@ -160,18 +162,18 @@ def test_a_grid_of_twists_has_both_ends_and_what_lies_evenly_between():
     high = np.array([0.5, 0.0, 0.3])
     axes = [np.linspace(*ends) for ends in zip(low, high, (3, 1, 9), strict=True)]
     expected = {(x, y, turn) for x in axes[0] for y in axes[1] for turn in axes[2]}
-    assert set(map(tuple, grid(low, high, np.array([3, 1, 9])))) == expected
+    assert set(map(tuple, fill_grid(low, high, np.array([3, 1, 9])))) == expected
 
 
 def test_a_margin_is_kept_around_the_outline():
     ahead = np.array([[0.25 + 0.3, 0.0, 0.0]])
     twist = np.array([[0.3, 0.0, 0.0]])  # 0.15 m, and 0.03 m to brake
-    assert free(ahead, twist, body(LONG, 0.10), 0.5, BRAKE, STEP)
-    assert not free(ahead, twist, body(LONG, 0.13), 0.5, BRAKE, STEP)
+    assert is_free(ahead, twist, body(LONG, 0.10), 0.5, BRAKE, STEP)
+    assert not is_free(ahead, twist, body(LONG, 0.13), 0.5, BRAKE, STEP)
 
 
 def test_a_body_is_kept_as_long_as_its_shield_is():
     shield = ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=LONG)
-    assert body_of(shield) is body_of(replace(shield))
-    assert body_of(shield).reach == pytest.approx(np.hypot(0.25, 0.2))
-    assert body_of(replace(shield, outline=())).reach == 0.0
+    assert get_body(shield) is get_body(replace(shield))
+    assert get_body(shield).reach == pytest.approx(np.hypot(0.25, 0.2))
+    assert get_body(replace(shield, outline=())).reach == 0.0

@@ -9,8 +9,8 @@ from skid_rover import kinematics, limits_in, pillars, rover, rover_model
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.shield import STEP, body_of, sweeps
-from nics_drl_bridge.gate.shield_kernels import clearance, free
+from nics_drl_bridge.gate.shield import STEP, get_body, list_sweeps
+from nics_drl_bridge.gate.shield_kernels import compute_clearance, is_free
 from nics_drl_bridge.gate.stopping import shield_config
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.robot.braking import derive_slowest_model
@@ -151,14 +151,14 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
     poses = stopping_poses(plant, command, HELD_S + model.control_period)
     state = np.array(command) * (10.6 / 10.7, 3.21 / 4.45)
     twist = np.array([[state[0], 0.0, state[1]]])
-    body = body_of(shield)
-    stops = sweeps(shield, body, HELD_S + shield.latency_s, 1.0, 1.0)
+    body = get_body(shield)
+    stops = list_sweeps(shield, body, HELD_S + shield.latency_s, 1.0, 1.0)
     count = 0
     for x, y in np.random.default_rng(0).uniform(-1.5, 1.5, (1500, 2)):
-        if clearance(x, y, body) < shield.margin:
+        if compute_clearance(x, y, body) < shield.margin:
             continue
         point = np.array([[x, y, 0.0]])
-        if not all(free(point, twist, *stop, STEP) for stop in stops):
+        if not all(is_free(point, twist, *stop, STEP) for stop in stops):
             continue
         count += 1
         c = np.cos(poses[:, 2])
@@ -166,7 +166,9 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
         dx = x - poses[:, 0]
         dy = y - poses[:, 1]
         seen = zip(c * dx + s * dy, c * dy - s * dx, strict=True)
-        assert min(clearance(*each, body) for each in seen) > 0.5 * shield.margin
+        assert (
+            min(compute_clearance(*each, body) for each in seen) > 0.5 * shield.margin
+        )
     assert count > 100
 
 

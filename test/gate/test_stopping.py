@@ -11,10 +11,10 @@ from nics_drl_bridge.config import find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.stopping import (
-    doubtful,
+    get_wheelbase,
     require_possible,
     shield_config,
-    wheelbase,
+    warn_of_age_limit,
 )
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.robot.noise import Noise
@@ -204,7 +204,7 @@ def test_a_car_that_does_not_tell_its_wheelbase_needs_it_or_no_shield():
     with pytest.raises(
         ConfigError, match=r"'wheelbase' of a car; add it .* `shield: false`"
     ):
-        wheelbase(car)
+        get_wheelbase(car)
 
 
 def test_a_robot_that_is_told_volts_has_no_shield():
@@ -213,7 +213,7 @@ def test_a_robot_that_is_told_volts_has_no_shield():
     with pytest.raises(
         ConfigError, match=r"'forward_command' is in 'V'; .* `shield: false`"
     ):
-        wheelbase(robot.model_copy(update={"command": (volts, robot.command[1])}))
+        get_wheelbase(robot.model_copy(update={"command": (volts, robot.command[1])}))
 
 
 @pytest.mark.parametrize(
@@ -242,8 +242,8 @@ def test_a_setting_with_which_the_gate_is_never_armed_is_one_sentence(
 
 def test_the_settings_of_a_robot_that_drives_are_possible():
     require_possible(config())
-    assert doubtful(config(), 0.1) == ""
+    assert warn_of_age_limit(config(), 0.1) == ""
 
 
 def test_commands_that_are_too_old_before_the_next_one_comes_are_warned_of():
-    assert "give more than 0.1" in doubtful(config(command_age_s=0.05), 0.1)
+    assert "give more than 0.1" in warn_of_age_limit(config(command_age_s=0.05), 0.1)

@@ -11,7 +11,7 @@ from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.report import estimates, fit_report
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report import fit_pictures
-from nics_drl_bridge.report.fit_pictures import CAPTIONS, calibration_pictures
+from nics_drl_bridge.report.fit_pictures import CAPTIONS, draw_calibration
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.style import png
@@ -53,7 +53,7 @@ def listed(found: Found):
 
 
 def test_every_estimate_of_a_disturbed_drive_has_its_picture(disturbed):
-    pictures = calibration_pictures(*disturbed)
+    pictures = draw_calibration(*disturbed)
     assert set(pictures) == {"mounting", "noise"}
     of_fit = {"accuracy", "residuals", "alignment"}
     assert set(CAPTIONS) == {*pictures, *of_fit, "inputs"}  # its motors have no curves
@@ -117,7 +117,7 @@ def test_titles_stay_within_their_pictures(exact, disturbed, monkeypatch):
 
     monkeypatch.setattr(fit_pictures, "png", drawn)
     for spec, identified in (disturbed, (exact[0], with_half_a_lever(exact[1])[0])):
-        calibration_pictures(spec, identified)
+        draw_calibration(spec, identified)
     axes = [each for figure in figures for each in figure.axes]
     assert any("lever arm y: not estimated" in each.get_title() for each in axes)
     for each in axes:
@@ -133,7 +133,7 @@ def test_the_text_has_value_uncertainty_and_unit(disturbed):
 
 def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
     spec, found = exact
-    assert "inputs" not in calibration_pictures(spec, found)
+    assert "inputs" not in draw_calibration(spec, found)
     name = spec.command[0].name
     state = spec.state[0].name
     size = len(spec.state)
@@ -160,7 +160,7 @@ def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
     assert f"{state:<24} dry friction: 0.2 rad/s/s" in report
     assert "saturates" in report
     assert model.equations()[0] == curve.equation
-    assert calibration_pictures(spec, motors)["inputs"].startswith(PNG)
+    assert draw_calibration(spec, motors)["inputs"].startswith(PNG)
 
 
 def test_a_robot_whose_motors_do_no_more_than_its_terms_has_no_section_on_them(exact):

@@ -18,7 +18,7 @@ from nics_drl_bridge.report.doctor_facts import (
     Endpoints,
     Expected,
     Facts,
-    facts_of_bag,
+    collect_facts_of_bag,
     names_in,
 )
 from nics_drl_bridge.robot.spec import load_robot
@@ -414,8 +414,8 @@ def test_the_gyro_of_a_bag_is_found_by_its_type(tmp_path):
         ],
     }
     bag = bags.write(tmp_path / "bag", rows)
-    assert only(facts_of_bag(bag)).where == "/gyroscope"
-    assert examine(facts_of_bag(bag, imu="none"), EXPECTED) == []
+    assert only(collect_facts_of_bag(bag)).where == "/gyroscope"
+    assert examine(collect_facts_of_bag(bag, imu="none"), EXPECTED) == []
 
 
 def test_a_bag_is_judged_like_the_robot(tmp_path):
@@ -425,9 +425,9 @@ def test_a_bag_is_judged_like_the_robot(tmp_path):
         "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
     }
     good = bags.write(tmp_path / "good", rows)
-    assert examine(facts_of_bag(good), EXPECTED) == []
+    assert examine(collect_facts_of_bag(good), EXPECTED) == []
     rows["/odom"] = [
         (t + 0.002, odometry(t, turn=-1.0)) for t in bags.times(0.02, SECONDS)
     ]
     bad = bags.write(tmp_path / "bad", rows)
-    assert "sign opposite" in only(facts_of_bag(bad)).what
+    assert "sign opposite" in only(collect_facts_of_bag(bad)).what

@@ -7,15 +7,15 @@ from html.parser import HTMLParser
 import pytest
 
 from nics_drl_bridge.report.html import (
-    bullets,
-    code,
-    details,
-    gallery,
-    page,
-    paragraph,
-    picture,
-    table,
-    tiles,
+    make_bullets,
+    make_code,
+    make_details,
+    make_gallery,
+    make_page,
+    make_paragraph,
+    make_picture,
+    make_table,
+    make_tiles,
 )
 
 VOID = {"meta", "img", "br"}
@@ -52,11 +52,11 @@ def parsed(html):
 
 def test_a_page_is_well_formed_and_holds_what_it_was_given():
     blocks = [
-        paragraph("a paragraph"),
-        table(["name", "value"], [["speed", "1.5"]]),
-        code("x = 1\ny = 2"),
+        make_paragraph("a paragraph"),
+        make_table(["name", "value"], [["speed", "1.5"]]),
+        make_code("x = 1\ny = 2"),
     ]
-    found = parsed(page("Title", "a lead", [("First", blocks), ("Second", [])]))
+    found = parsed(make_page("Title", "a lead", [("First", blocks), ("Second", [])]))
     for text in (
         "Title",
         "a lead",
@@ -74,13 +74,17 @@ def test_a_page_is_well_formed_and_holds_what_it_was_given():
 def test_text_is_never_taken_for_markup():
     evil = "<script>alert('1 & 2')</script>"
     blocks = [
-        paragraph(evil),
-        code(evil),
-        table([evil], [[evil]]),
-        picture(b"png", evil + '"'),
+        make_paragraph(evil),
+        make_code(evil),
+        make_table([evil], [[evil]]),
+        make_picture(b"png", evil + '"'),
     ]
-    blocks += [bullets([evil]), tiles([(evil, evil, True)]), details(evil, [])]
-    html = page(evil, evil, [(evil, blocks)])
+    blocks += [
+        make_bullets([evil]),
+        make_tiles([(evil, evil, True)]),
+        make_details(evil, []),
+    ]
+    html = make_page(evil, evil, [(evil, blocks)])
     found = parsed(html)
     assert "script" not in found.tags
     assert (
@@ -90,7 +94,7 @@ def test_text_is_never_taken_for_markup():
 
 
 def test_a_page_needs_no_other_file():
-    html = page("t", "l", [("s", [picture(b"\x89PNG", "c")])])
+    html = make_page("t", "l", [("s", [make_picture(b"\x89PNG", "c")])])
     source = re.search(r'src="data:image/png;base64,([^"]+)"', html)
     assert base64.b64decode(source[1]) == b"\x89PNG"
     assert "http" not in html
@@ -98,7 +102,9 @@ def test_a_page_needs_no_other_file():
 
 
 def test_what_is_folded_is_open_in_print():
-    html = page("t", "l", [("s", [details("All figures", [code("1 2 3")])])])
+    html = make_page(
+        "t", "l", [("s", [make_details("All figures", [make_code("1 2 3")])])]
+    )
     found = parsed(html)
     assert found.tags.count("details") == found.tags.count("summary") == 1
     assert "<details open" not in html
@@ -108,11 +114,11 @@ def test_what_is_folded_is_open_in_print():
 
 @pytest.mark.parametrize(("good", "sign"), [(True, False), (False, True)])
 def test_a_doubtful_figure_is_told_by_a_sign_and_not_by_its_colour_alone(good, sign):
-    assert ("⚠" in parsed(tiles([("93 %", "of the episodes", good)])).text) is sign
+    assert ("⚠" in parsed(make_tiles([("93 %", "of the episodes", good)])).text) is sign
 
 
 def test_a_page_is_as_wide_as_a_phone_and_light_or_dark_as_its_reader_wants():
-    html = page("t", "l", [])
+    html = make_page("t", "l", [])
     assert 'name="viewport" content="width=device-width' in html
     assert "screen and (prefers-color-scheme: dark)" in html
 
@@ -120,5 +126,5 @@ def test_a_page_is_as_wide_as_a_phone_and_light_or_dark_as_its_reader_wants():
 @pytest.mark.parametrize(("width", "wide"), [(700, False), (701, True)])
 def test_a_phone_scrolls_a_picture_that_it_can_not_show_in_whole(width, wide):
     png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + width.to_bytes(4, "big") + bytes(9)
-    assert ('<figure class="wide">' in picture(png, "c")) is wide
-    assert gallery([(png, "one"), (png, "two")]).count("<img") == 2
+    assert ('<figure class="wide">' in make_picture(png, "c")) is wide
+    assert make_gallery([(png, "one"), (png, "two")]).count("<img") == 2

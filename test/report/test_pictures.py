@@ -16,13 +16,13 @@ from nics_drl_bridge.policy.evaluation import Episode, rate
 from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.report.pictures import (
     Point,
+    draw_robustness,
+    draw_seeded_world,
+    draw_training_curve,
+    draw_trajectories,
+    draw_trajectory_gallery,
     draw_world,
     drive_picture,
-    robustness,
-    training_curve,
-    trajectories,
-    trajectory_gallery,
-    world_picture,
 )
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.world import World, load_world
@@ -65,14 +65,14 @@ def decoded(png):
 @pytest.mark.parametrize("count", [1, 4])
 def test_there_is_one_panel_per_episode(count):
     episodes = [episode(seed) for seed in range(count)]
-    image = decoded(trajectories({"one": episodes, "two": episodes}, WORLD, 0.2))
+    image = decoded(draw_trajectories({"one": episodes, "two": episodes}, WORLD, 0.2))
     assert image.shape[0] > 400 * -(-count // 3)
     assert image.std() > 5.0
 
 
 def test_another_path_gives_another_picture():
     pictures = [
-        trajectories({"run": [episode(seed)]}, WORLD, 0.2) for seed in (0, 0, 1)
+        draw_trajectories({"run": [episode(seed)]}, WORLD, 0.2) for seed in (0, 0, 1)
     ]
     assert np.array_equal(decoded(pictures[0]), decoded(pictures[1]))
     assert not np.array_equal(decoded(pictures[0]), decoded(pictures[2]))
@@ -81,9 +81,11 @@ def test_another_path_gives_another_picture():
 @pytest.mark.slow
 def test_a_run_that_ended_early_is_drawn_as_far_as_it_went():
     runs = {"all": [episode(0), episode(1)], "short": [episode(0)]}
-    drawn_short = decoded(trajectories(runs, WORLD, 0.2))
+    drawn_short = decoded(draw_trajectories(runs, WORLD, 0.2))
     whole = {"all": runs["all"], "short": runs["all"]}
-    assert not np.array_equal(drawn_short, decoded(trajectories(whole, WORLD, 0.2)))
+    assert not np.array_equal(
+        drawn_short, decoded(draw_trajectories(whole, WORLD, 0.2))
+    )
 
 
 def pixels_of(image, colour, off=8):
@@ -95,7 +97,7 @@ def pixels_of(image, colour, off=8):
 @pytest.mark.slow
 def test_the_picture_of_a_world_shows_the_episode_of_its_seed():
     first, again, other = (
-        decoded(world_picture(WORLD, 0.2, seed)) for seed in (0, 0, 1)
+        decoded(draw_seeded_world(WORLD, 0.2, seed)) for seed in (0, 0, 1)
     )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -104,7 +106,7 @@ def test_the_picture_of_a_world_shows_the_episode_of_its_seed():
 def test_a_robot_with_an_outline_is_drawn_with_it():
     outline = ((0.4, 0.2), (-0.4, 0.2), (-0.4, -0.2), (0.4, -0.2))
     disc, box = (
-        pixels_of(decoded(world_picture(WORLD, 0.45, 0, given)), MEASURED, off=60)
+        pixels_of(decoded(draw_seeded_world(WORLD, 0.45, 0, given)), MEASURED, off=60)
         for given in (None, outline)
     )
     disc, box = (np.count_nonzero(one[:, 0] > 60) for one in (disc, box))
@@ -118,7 +120,7 @@ def test_the_picture_of_an_open_field_is_as_wide_and_deep_as_its_bounds():
         "bounds": [8.0, 0.0, 10.0, 8.0],
         "goal_distance": [1.0, 9.0],
     }
-    image = decoded(world_picture(World.model_validate(bounds | places), 0.3, 0))
+    image = decoded(draw_seeded_world(World.model_validate(bounds | places), 0.3, 0))
     robot, goal = (pixels_of(image, colour) for colour in (MEASURED, GOAL))
     robot, goal = (
         one[one[:, 0] > 60].mean(axis=0) for one in (robot, goal)
@@ -134,7 +136,7 @@ def test_obstacles_that_move_are_marked_with_the_ways_of_those_that_patrol():
     rings = []
     for motion in (None, {"kind": "pedestrian", "speed": [0.1, 0.2]}, patrol):
         world = field(count=1, obstacles=[circles(1) | {"motion": motion}])
-        image = decoded(world_picture(world, 0.2, 0))
+        image = decoded(draw_seeded_world(world, 0.2, 0))
         rings.append(len(pixels_of(image, MODEL, off=30)))
     assert rings[0] < 20
     assert rings[0] + 100 < rings[1] < rings[2] - 20
@@ -196,15 +198,15 @@ def test_a_drive_is_drawn(name):
     ],
 )
 def test_a_training_is_drawn_from_its_first_rollout_on(points):
-    assert training_curve(points).startswith(b"\x89PNG")
+    assert draw_training_curve(points).startswith(b"\x89PNG")
 
 
 def test_success_under_each_perturbation_is_drawn_as_low_as_it_is():
     best = rate(500, 500)
     worst = rate(10, 500)
-    drawn = robustness({"as it is": best, "action_latency": worst})
+    drawn = draw_robustness({"as it is": best, "action_latency": worst})
     assert drawn.startswith(b"\x89PNG")
-    assert drawn != robustness({"as it is": best, "action_latency": best})
+    assert drawn != draw_robustness({"as it is": best, "action_latency": best})
 
 
 def field_of(width, height):
@@ -236,11 +238,11 @@ def short_episode(seed=0):
 
 
 DRAWINGS = {
-    "world": lambda world: world_picture(world, 0.1, 0),
-    "episodes": lambda world: trajectories({"run": [short_episode()]}, world, 0.1),
-    "gallery": lambda world: trajectory_gallery([{"run": short_episode()}], world, 0.1)[
-        0
-    ],
+    "world": lambda world: draw_seeded_world(world, 0.1, 0),
+    "episodes": lambda world: draw_trajectories({"run": [short_episode()]}, world, 0.1),
+    "gallery": lambda world: draw_trajectory_gallery(
+        [{"run": short_episode()}], world, 0.1
+    )[0],
 }
 
 
@@ -281,7 +283,7 @@ def test_panels_are_equal_whatever_their_titles_legends_and_paths_are():
         {"in process": far, "over DDS": far},
         {"in process": lost},
     ]
-    drawn = trajectory_gallery(shown, field_of(6.0, 6.0), 0.1)
+    drawn = draw_trajectory_gallery(shown, field_of(6.0, 6.0), 0.1)
     assert len({shape_of(png) for png in drawn}) == 1
     assert len({walls_in(png) for png in drawn}) == 1
 
@@ -289,16 +291,16 @@ def test_panels_are_equal_whatever_their_titles_legends_and_paths_are():
 def test_an_episode_that_only_one_run_has_is_drawn_too():
     world = field_of(6.0, 6.0)
     both = {"one": [short_episode(0), short_episode(1)], "two": [short_episode(0)]}
-    width, height = shape_of(trajectories(both, world, 0.1))
+    width, height = shape_of(draw_trajectories(both, world, 0.1))
     assert width > 1.5 * height
-    drawn = decoded(trajectories(both, world, 0.1))
+    drawn = decoded(draw_trajectories(both, world, 0.1))
     second = drawn[:, width // 2 :]
     assert len(pixels_of(second, GOAL, off=60)) > 20
 
 
 def test_the_curves_of_a_page_have_equal_panels():
-    curve = training_curve([Point(8192, 0.1, 0.9), Point(16384, 0.6, 0.4)])
-    bars = robustness(
+    curve = draw_training_curve([Point(8192, 0.1, 0.9), Point(16384, 0.6, 0.4)])
+    bars = draw_robustness(
         {"as it is": rate(500, 500), "observation_latency": rate(10, 500)}
     )
     assert shape_of(curve) == shape_of(bars)

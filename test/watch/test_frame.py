@@ -8,7 +8,13 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.sim.world_set import load_worlds
-from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame, thousandths
+from nics_drl_bridge.watch.frame import (
+    Frame,
+    Stage,
+    Track,
+    WorldFrame,
+    round_to_thousandths,
+)
 from watch.rig import shot
 
 
@@ -34,7 +40,7 @@ def test_beams_without_a_return_are_minus_one_and_absent_bodies_are_left_out():
 
 
 def test_what_is_not_finite_never_becomes_text_that_is_no_json():
-    assert thousandths([np.nan, np.inf, -np.inf]) == [0, 0, 0]
+    assert round_to_thousandths([np.nan, np.inf, -np.inf]) == [0, 0, 0]
 
 
 def test_the_ellipse_holds_95_percent_of_the_positions():

@@ -10,7 +10,7 @@ from PIL import Image, ImageColor
 from nics_drl_bridge.env.rendering import ROBOTS
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.style import GOAL
-from nics_drl_bridge.watch.record import beside, check_file, write
+from nics_drl_bridge.watch.record import check_file, join_side_by_side, write
 from watch.rig import source
 
 
@@ -55,7 +55,9 @@ def test_an_mp4_has_each_frame(made, tmp_path):
 
 
 def test_worlds_stand_side_by_side_in_a_picture_of_even_sides():
-    whole = beside([np.zeros((5, 3, 3), np.uint8), np.ones((2, 4, 3), np.uint8)])
+    whole = join_side_by_side(
+        [np.zeros((5, 3, 3), np.uint8), np.ones((2, 4, 3), np.uint8)]
+    )
     assert whole.shape == (6, 8, 3)
     assert (whole[:5, :3] == 0).all()
     assert (whole[:2, 3:7] == 1).all()
