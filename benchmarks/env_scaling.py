@@ -236,7 +236,7 @@ def judge(result: dict[str, Any]) -> list[str]:
 
 def draw(result: dict[str, Any], file: Path) -> None:
     """The curves side by side, on logarithmic axes."""
-    figure, grid = style.panels(1, len(SWEEPS), (12.0, 3.2), sharey=True)
+    figure, grid = style.make_panels(1, len(SWEEPS), (12.0, 3.2), sharey=True)
     for axes, name in zip(grid, SWEEPS, strict=True):
         costs = result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
         axes.loglog(result[name], costs, "o-")
@@ -245,7 +245,7 @@ def draw(result: dict[str, Any], file: Path) -> None:
             "us per robot and step" if name == "robots" else "us per env step"
         )
         axes.grid(visible=True, which="both")
-    write_bytes(file, style.png(figure))
+    write_bytes(file, style.render_png(figure))
 
 
 def table_of(result: dict[str, Any]) -> str:

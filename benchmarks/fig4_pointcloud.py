@@ -26,7 +26,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.lidar.scanner import Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
-from nics_drl_bridge.style import DARK, MEASURED, MODEL, OTHER, panels, png
+from nics_drl_bridge.style import DARK, MEASURED, MODEL, OTHER, make_panels, render_png
 
 CONTROLS = {
     "shifted": "the baked scans are taken 0.1 m beside",
@@ -205,7 +205,7 @@ def picture(
     truth: Array, clouds: dict[str, Array | None], titles: dict[str, str], mapped: Any
 ) -> Figure:
     """Four panels."""
-    figure, grid = panels(2, 2, (11.0, 8.6), sharex=True, sharey=True)
+    figure, grid = make_panels(2, 2, (11.0, 8.6), sharex=True, sharey=True)
     for axes, (name, points) in zip(grid, clouds.items(), strict=False):
         panel(axes, titles[name], truth)
         if points is not None:
@@ -277,7 +277,7 @@ def measure(
     titles = titles_of(result)
     panels = {name: clouds.get(name) for name in ("exact", "baked", "mujoco")}
     figure = picture(truth, panels, titles, mapped)
-    write_bytes(out, png(figure))
+    write_bytes(out, render_png(figure))
     return {**result, "missing": missing, "picture": str(out)}
 
 

@@ -281,7 +281,9 @@ def draw(
     )
     rows = -(-len(perturbations) // 3)
     where = np.array([0.0, *multiples])
-    figure, grid = style.panels(rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True)
+    figure, grid = style.make_panels(
+        rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True
+    )
     for axes, each in zip(grid, perturbations, strict=False):
         for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
             share = 100.0 * np.array(
@@ -304,7 +306,7 @@ def draw(
     ]
     least = 100.0 * np.nanmin(np.array(shares, np.float64))
     grid[0].set_ylim(max(0.0, 5.0 * np.floor(least / 5.0) - 5.0), 102.0)
-    write_bytes(file, style.png(figure, grid[0]))
+    write_bytes(file, style.render_png(figure, grid[0]))
 
 
 def measured_in(results: Path) -> dict[str, dict[str, list[float]]]:

@@ -71,9 +71,9 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
     except ImportError as error:
-        from nics_drl_bridge.extensions import unmet
+        from nics_drl_bridge.extensions import explain_unmet
 
-        if (clause := unmet(error)) is None:
+        if (clause := explain_unmet(error)) is None:
             raise
         raise type(error)(f"{__name__}.{name} {clause}", name=error.name) from error
 

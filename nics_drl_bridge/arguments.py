@@ -11,7 +11,7 @@ from inspect import Parameter, signature
 from os import PathLike
 from typing import Any, ParamSpec, TypeVar
 
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,14 +29,14 @@ _SHORT.maxstring = 80
 _SHORT.maxother = 80
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Returns the number of a numpy scalar, and other values as they are; it loads no numpy."""
     return value.item() if getattr(value, "shape", None) == () else value
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Returns a value as a message quotes it: a number or text itself, else its type."""
-    value = plain(value)
+    value = to_plain(value)
     if value is None or isinstance(value, str | bool | int | float | PathLike):
         return _SHORT.repr(value)
     if isinstance(value, list | tuple | dict | set) and len(value) == 0:
@@ -55,13 +55,13 @@ def check_kind(what: str, value: Any, annotation: Any) -> None:
     if kind not in KINDS or (optional and value is None):
         return
     types, name = KINDS[kind]
-    number = plain(value)
+    number = to_plain(value)
     fits = kind == "bool" if isinstance(number, bool) else isinstance(number, types)
     if fits and isinstance(number, float):
         fits = math.isfinite(number)
     if not fits:
         needed = f"{name}, or None" if optional else name
-        raise ConfigError(f"{what}={shown(value)}: must be {needed}.")
+        raise ConfigError(f"{what}={format_value(value)}: must be {needed}.")
 
 
 def check_count(what: str, value: Any) -> None:
@@ -69,7 +69,7 @@ def check_count(what: str, value: Any) -> None:
     check_kind(what, value, int)
     if not 1 <= value <= LARGEST_COUNT:
         raise ConfigError(
-            f"{what}={shown(value)}: must be a whole number of at least 1."
+            f"{what}={format_value(value)}: must be a whole number of at least 1."
         )
 
 
@@ -77,24 +77,26 @@ def check_options(what: str, value: Any) -> None:
     """Raises ConfigError unless a value is a dictionary whose keys are names, or None."""
     if value is not None and not isinstance(value, Mapping):
         raise ConfigError(
-            f"{what}={shown(value)}: must be a dict of options by name, or None."
+            f"{what}={format_value(value)}: must be a dict of options by name, or None."
         )
     for name in value or ():
         if not isinstance(name, str):
             raise ConfigError(
-                f"{what}: the key {shown(name)} must be the name of an option."
+                f"{what}: the key {format_value(name)} must be the name of an option."
             )
 
 
 def check_path(what: str, value: Any) -> None:
     """Raises ConfigError unless a value is a path: text, or an object that stands for one."""
     if not isinstance(value, str | PathLike):
-        raise ConfigError(f"{what}={shown(value)}: must be a name or a path.")
+        raise ConfigError(f"{what}={format_value(value)}: must be a name or a path.")
     if "\0" in str(value):
-        raise ConfigError(f"{what}={shown(value)}: a path holds no null character.")
+        raise ConfigError(
+            f"{what}={format_value(value)}: a path holds no null character."
+        )
 
 
-def keywords_of(function: Callable[..., Any]) -> set[str]:
+def list_keywords(function: Callable[..., Any]) -> set[str]:
     """Returns the names of a function's arguments, without `self` and `**others`."""
     several = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)
     known = signature(function).parameters.values()
@@ -106,11 +108,11 @@ def refuse_unknown(place: str, given: Iterable[str], known: Iterable[str]) -> No
     valid = set(known)
     for name in given:
         if name not in valid:
-            hint = nearest(name, valid)
+            hint = suggest(name, valid)
             raise ConfigError(f"{place}: unknown argument {name!r}; {hint}")
 
 
-def in_own_word(
+def rename_robot_argument(
     place: str, own: str, named: dict[str, Any], positional: Any = None
 ) -> None:
     """Renames the argument `robot` or `model`, in place, to a function's own word for it.
@@ -125,8 +127,8 @@ def in_own_word(
     first = named.get(own, positional)
     if value is None:
         return
-    if first is not None and not _same(first, value):
-        both = f"{own}={shown(first)} and {other}={shown(value)}"
+    if first is not None and not _is_same(first, value):
+        both = f"{own}={format_value(first)} and {other}={format_value(value)}"
         raise ConfigError(
             f"{place}: {both} name two robots by two words for one thing; give one."
         )
@@ -134,11 +136,11 @@ def in_own_word(
         named[own] = value
 
 
-def _same(one: Any, other: Any) -> bool:
+def _is_same(one: Any, other: Any) -> bool:
     return one is other or (isinstance(one, str | PathLike) and str(one) == str(other))
 
 
-def checked_arguments(
+def check_arguments(
     place: str, passes_to: Callable[..., Any] | None = None, without: Iterable[str] = ()
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Makes a function, called `place` in messages, refuse arguments that it can't mean.
@@ -152,11 +154,11 @@ def checked_arguments(
         parameters = signature(function).parameters
         order = list(parameters)
         own = next((word for word in ROBOT_WORDS if word in parameters), None)
-        known = keywords_of(function)
+        known = list_keywords(function)
         annotations = {name: each.annotation for name, each in parameters.items()}
         if passes_to is not None:
             further = signature(passes_to).parameters
-            known |= keywords_of(passes_to) - set(without)
+            known |= list_keywords(passes_to) - set(without)
             annotations = {
                 name: each.annotation for name, each in further.items()
             } | annotations
@@ -166,7 +168,7 @@ def checked_arguments(
             named: dict[str, Any] = dict(kwargs)
             given = dict(zip(order, args, strict=False))
             if own is not None:
-                in_own_word(place, own, named, given.get(own))
+                rename_robot_argument(place, own, named, given.get(own))
             refuse_unknown(place, named, known)
             for name, value in {**given, **named}.items():
                 check_kind(f"{place}: {name}", value, annotations[name])

@@ -16,7 +16,7 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from yaml.composer import Composer
 
-from nics_drl_bridge.errors import ConfigError, nearest, shortened
+from nics_drl_bridge.errors import ConfigError, shorten, suggest
 
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
@@ -26,7 +26,7 @@ MAX_VALUES = 50_000
 _LONGEST_PROBLEM = 200
 
 
-def namespace_of(given: str) -> str:
+def parse_namespace(given: str) -> str:
     """A namespace of ROS 2 as `/robot_1`, or empty. Raises ConfigError for what can't be one."""
     space = given.strip("/")
     if space and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", space, re.ASCII):
@@ -69,17 +69,15 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
     try:
         found = schema.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_sentence(error, schema)}") from None
-    for place, given in _coerced_to_numbers(data, found):
+        raise ConfigError(f"{source}: {_explain_error(error, schema)}") from None
+    for place, given in _find_coerced(data, found):
         raise ConfigError(
             f"{source}: key {place!r}: should be a number, not {given!r}."
         )
     return found
 
 
-def _coerced_to_numbers(
-    given: Any, found: Any, place: str = ""
-) -> Iterator[tuple[str, Any]]:
+def _find_coerced(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
     pairs: list[tuple[Any, Any, Any]] = []
     if isinstance(given, dict):
@@ -92,7 +90,7 @@ def _coerced_to_numbers(
     elif isinstance(given, (str, bool)) and type(found) in (int, float):
         yield place.removeprefix("."), given
     for key, value, made in pairs:
-        yield from _coerced_to_numbers(value, made, f"{place}.{key}")
+        yield from _find_coerced(value, made, f"{place}.{key}")
 
 
 _UNKNOWN = (
@@ -106,19 +104,19 @@ _SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory 
 _SHORT.maxstring = _SHORT.maxother = 80
 
 
-def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
+def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
     details = error.errors(include_url=False)
     wrong = [d for d in details if d["type"] != "missing"] or details
     first = next((d for d in wrong if d["type"] in _UNKNOWN), wrong[0])
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] in _UNKNOWN:
-        known = _fields_at(schema, first["loc"][:-1])
-        hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
+        known = _locate_fields(schema, first["loc"][:-1])
+        hint = suggest(str(first["loc"][-1]), known) if known else "remove it"
         return f"unknown key {key!r}; {hint}"
     if first["type"] == "union_tag_invalid":
         tag = first["ctx"]["tag"]
         known = re.findall("'([^']*)'", first["ctx"]["expected_tags"])
-        return f"key {key!r}: unknown kind {tag!r}; {nearest(tag, known)}"
+        return f"key {key!r}: unknown kind {tag!r}; {suggest(tag, known)}"
     if first["type"] == "union_tag_not_found":
         return f"the key '{key}.kind' is missing; add it."
     if first["type"] == "missing" and isinstance(place := first["loc"][-1], int):
@@ -143,14 +141,16 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     return f"key {key!r}: {message}, not {_SHORT.repr(first['input'])}."
 
 
-def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+def _locate_fields(
+    schema: type[BaseModel], location: tuple[int | str, ...]
+) -> list[str]:
     """Field names at a location, which in a union of models names the `kind` that is present."""
     current: Any = schema
     candidates: list[type] = []
     for part in location:
-        fields = _annotations_of(current)
+        fields = _get_annotations(current)
         if part in fields:
-            candidates = _inner_models(fields[part])
+            candidates = _find_inner_models(fields[part])
             current = candidates[0] if candidates else None
         else:
             kinds = (getattr(one, "model_fields", {}).get("kind") for one in candidates)
@@ -158,24 +158,24 @@ def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list
             current = next(
                 (one for one, kind in named if kind and kind.default == part), current
             )
-    return list(_annotations_of(current))
+    return list(_get_annotations(current))
 
 
-def _annotations_of(model: Any) -> dict[Any, Any]:
+def _get_annotations(model: Any) -> dict[Any, Any]:
     if is_dataclass(model):
         return dict(get_type_hints(model))
     fields: dict[str, Any] = getattr(model, "model_fields", {})
     return {field.alias or name: field.annotation for name, field in fields.items()}
 
 
-def _inner_models(annotation: Any) -> list[type]:
-    if _annotations_of(annotation):
+def _find_inner_models(annotation: Any) -> list[type]:
+    if _get_annotations(annotation):
         return [annotation]
     arguments = getattr(annotation, "__args__", ())
-    return [model for argument in arguments for model in _inner_models(argument)]
+    return [model for argument in arguments for model in _find_inner_models(argument)]
 
 
-def no_device(path: Path) -> Path:
+def check_no_device(path: Path) -> Path:
     """Returns the path. Raises ConfigError for a device or a pipe, which may never end."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
@@ -186,7 +186,7 @@ def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
     """Reads a UTF-8 file of at most `most` bytes. Raises ConfigError if that fails."""
     path = Path(path)
     try:
-        size = no_device(path).stat().st_size
+        size = check_no_device(path).stat().st_size
         if size > most and path.is_file():
             reason = f"is larger than {most // 2**20} MB, which no such file is"
             raise ConfigError(f"{path}: {reason}; give another.")
@@ -218,7 +218,7 @@ def share_folder() -> Path:
     )
 
 
-def shipped_names(kind: str) -> list[str]:
+def list_shipped(kind: str) -> list[str]:
     """Names of the YAML files, or policies, in `config/KIND`, sorted."""
     files = (share_folder() / "config" / kind).glob("*.*")
     return sorted(file.stem for file in files if file.suffix in (".yaml", ".onnx"))
@@ -232,7 +232,7 @@ def find_config(name: str | Path, kind: str, also: Iterable[str] = ()) -> Path:
     path = share_folder() / "config" / kind / f"{name}.yaml"
     if path.is_file():
         return path
-    hint = nearest(name, (*shipped_names(kind), *also))
+    hint = suggest(name, (*list_shipped(kind), *also))
     word = {"training": "settings", "limits": "limits"}.get(
         kind, kind.removesuffix("s")
     )
@@ -307,7 +307,7 @@ class _Loader(*_BASES):  # type: ignore[misc]
         raise yaml.constructor.ConstructorError(None, None, problem, place.start_mark)
 
 
-def _whole(loader: _Loader, node: Any) -> int:
+def _parse_whole(loader: _Loader, node: Any) -> int:
     try:
         return int(loader.construct_scalar(node))
     except ValueError:
@@ -315,7 +315,7 @@ def _whole(loader: _Loader, node: Any) -> int:
         raise
 
 
-_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
+_Loader.add_constructor("tag:yaml.org,2002:int", _parse_whole)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -359,7 +359,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         line = f", line {min(mark.line, last) + 1}" if mark else ""
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
         raise ConfigError(
-            f"{source}{line}: {shortened(problem, _LONGEST_PROBLEM)}."
+            f"{source}{line}: {shorten(problem, _LONGEST_PROBLEM)}."
         ) from None
     if data is None:
         raise ConfigError(
@@ -374,11 +374,11 @@ class _QuotingDumper(_Dumper):
     """Dumper that quotes every text, for readers with other rules of what looks like a number."""
 
 
-def _quoted(dumper: _QuotingDumper, text: str) -> Any:
+def _quote(dumper: _QuotingDumper, text: str) -> Any:
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"')
 
 
-_QuotingDumper.add_representer(str, _quoted)
+_QuotingDumper.add_representer(str, _quote)
 
 
 def dump_yaml(data: Any, quote_text: bool = False) -> str:

@@ -10,7 +10,7 @@ LONGEST = 800
 LONGEST_NAME = 100  # characters of a name that are compared with the known names
 
 
-def shortened(text: str, most: int) -> str:
+def shorten(text: str, most: int) -> str:
     """One printable line of about `most` characters: messages quote whatever users gave."""
     if len(text) > most:
         text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
@@ -24,7 +24,7 @@ class BridgeError(Exception):
     """Base of all errors caused by the user's input; one line of at most `LONGEST` characters."""
 
     def __init__(self, sentence: str = "") -> None:
-        super().__init__(shortened(sentence, LONGEST))
+        super().__init__(shorten(sentence, LONGEST))
 
 
 class ConfigError(BridgeError):
@@ -52,8 +52,8 @@ class PolicyError(BridgeError):
 
     def __init__(self, source: str, field: str, reason: str) -> None:
         self.source = source
-        self.field = shortened(field, LONGEST_NAME)
-        self.reason = shortened(reason, LONGEST // 2)
+        self.field = shorten(field, LONGEST_NAME)
+        self.reason = shorten(reason, LONGEST // 2)
         super().__init__(f"{source}: field {self.field!r}: {self.reason}")
 
     def __reduce__(self) -> "tuple[type[PolicyError], tuple[str, str, str]]":
@@ -86,9 +86,9 @@ class StaleDataError(BackendError):
         )  # so that it can be pickled
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def suggest(name: str, known: Iterable[str]) -> str:
     """Returns a clause: `did you mean 'x'?`, or `valid are: 'x', 'y'` if none is close."""
     names = sorted(known)
-    for close in difflib.get_close_matches(shortened(name, LONGEST_NAME), names, n=1):
+    for close in difflib.get_close_matches(shorten(name, LONGEST_NAME), names, n=1):
         return f"did you mean {close!r}?"
     return "valid are: " + ", ".join(repr(n) for n in names)

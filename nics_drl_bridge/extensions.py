@@ -2,7 +2,7 @@
 
 Two ways lead to code. `load` takes a name, and finds it among installed entry points, and among
 classes that this process was told to import: a name may come from a file of data. `import_class`
-and `module_at` take `path/to/file.py:ClassName` and run that file: only for what a user typed on
+and `load_module` take `path/to/file.py:ClassName` and run that file: only for what a user typed on
 the command line or passed to a Python function, never for what a file says.
 """
 
@@ -25,7 +25,7 @@ from pathlib import Path
 from traceback import extract_tb, walk_tb
 from typing import Any
 
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
+from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
 
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
@@ -50,7 +50,7 @@ TRAINING = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 
 
 @cache
-def known(group: str) -> dict[str, EntryPoint]:
+def find_extensions(group: str) -> dict[str, EntryPoint]:
     """The extensions of a group by name, sorted; one of another package goes before one of ours."""
     found = entry_points(group=f"{PACKAGE}.{group}")
     ours_first = sorted(
@@ -71,13 +71,13 @@ def load(group: str, name: str) -> Any:
     imported = _imported.get(group, {})
     if name in imported:
         return imported[name]
-    extensions = known(group)
+    extensions = find_extensions(group)
     if name not in extensions:
         names = (*extensions, *imported)
         raise ConfigError(
-            f"unknown {group.rstrip('s')} {name!r}; {nearest(name, names)}"
+            f"unknown {group.rstrip('s')} {name!r}; {suggest(name, names)}"
         )
-    with needed_by(f"{group.rstrip('s')} {name!r}"):
+    with require_modules(f"{group.rstrip('s')} {name!r}"):
         return extensions[name].load()
 
 
@@ -88,11 +88,11 @@ def import_class(group: str, place: str, base: type) -> type:
     """
     what = group.rstrip("s")
     path, _, name = place.rpartition(":")
-    found = getattr(module_at(path, what), name, None)
+    found = getattr(load_module(path, what), name, None)
     if not (isinstance(found, type) and issubclass(found, base)):
         needed = f"{base.__module__.removeprefix(f'{PACKAGE}.')}.{base.__name__}"
         raise ConfigError(f"{what} kind {place!r}: is no subclass of {needed}.")
-    if name in known(group):
+    if name in find_extensions(group):
         fix = "is installed under this name already; rename the class"
         raise ConfigError(f"{what} {place!r}: another {what} {fix}.")
     _imported.setdefault(group, {})[name] = found
@@ -100,15 +100,15 @@ def import_class(group: str, place: str, base: type) -> type:
 
 
 @contextmanager
-def needed_by(what: str) -> Iterator[None]:
+def require_modules(what: str) -> Iterator[None]:
     """Raises ConfigError, with the command to mend it, for a module that a block can't import."""
     try:
         yield
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{what} {missing(error.name or '')}") from None
+        raise ConfigError(f"{what} {explain_missing(error.name or '')}") from None
 
 
-def missing(module: str) -> str:
+def explain_missing(module: str) -> str:
     """A clause about a library that is not installed, to follow the name of what needs it."""
     library = module.partition(".")[0]
     if library.endswith(ROS):
@@ -120,7 +120,7 @@ def missing(module: str) -> str:
     return f"needs the module {module!r}; install it."
 
 
-def lacking(modules: Iterable[str]) -> str | None:
+def find_lacking(modules: Iterable[str]) -> str | None:
     """The first of some modules that is not installed."""
     return next((module for module in modules if find_spec(module) is None), None)
 
@@ -130,11 +130,11 @@ def require(what: str, *modules: str) -> None:
 
     To be asked before long work, and before an import that would fail.
     """
-    if (module := lacking(modules)) is not None:
-        raise ConfigError(f"{what} {missing(module)}")
+    if (module := find_lacking(modules)) is not None:
+        raise ConfigError(f"{what} {explain_missing(module)}")
 
 
-def unmet(error: ImportError) -> str | None:
+def explain_unmet(error: ImportError) -> str | None:
     """A clause about the libraries for whose lack or age an import failed; None if not for these.
 
     A system's own packages are often older than what this one needs, and pip was not asked.
@@ -143,15 +143,19 @@ def unmet(error: ImportError) -> str | None:
         error, ModuleNotFoundError
     ):
         return None
-    if wrong := dict(_wrong()):
+    if wrong := dict(_find_wrong()):
         told = ", ".join(
             f"{needed} ({found or 'missing'})" for needed, found in wrong.items()
         )
         return f"needs {told}; pip install {' '.join(map(repr, wrong))}."
-    return missing(error.name or "") if isinstance(error, ModuleNotFoundError) else None
+    return (
+        explain_missing(error.name or "")
+        if isinstance(error, ModuleNotFoundError)
+        else None
+    )
 
 
-def _wrong() -> Iterator[tuple[str, str]]:
+def _find_wrong() -> Iterator[tuple[str, str]]:
     """Yields each required library that is not there in a fitting version, and the version."""
     try:
         required = requires(PACKAGE) or []
@@ -163,24 +167,24 @@ def _wrong() -> Iterator[tuple[str, str]]:
             found = version(name)
         except PackageNotFoundError:
             found = ""
-        numbers = _numbers(found)
+        numbers = _parse_version(found)
         for sign, bound in re.findall(r"(>=|<)([\d.]+)", bounds):
             if sign == ">=":
-                fits = numbers >= _numbers(bound)
+                fits = numbers >= _parse_version(bound)
             else:
-                fits = numbers < _numbers(bound)
+                fits = numbers < _parse_version(bound)
             if not (found and fits):
                 yield needed, found
                 break
 
 
-def _numbers(release: str) -> tuple[int, ...]:
+def _parse_version(release: str) -> tuple[int, ...]:
     return tuple(
         int(part) for part in re.findall(r"\d+", release.partition("+")[0])[:3]
     )
 
 
-def own_fault(error: BaseException) -> str | None:
+def explain_own_fault(error: BaseException) -> str | None:
     """A clause about an error that a user's own task raised, with its place; else None."""
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
         task = type(frame.f_locals.get("self"))
@@ -193,7 +197,7 @@ def own_fault(error: BaseException) -> str | None:
     return None
 
 
-def module_at(place: str, what: str) -> Any:
+def load_module(place: str, what: str) -> Any:
     """A module by name, or file, anew if it has changed; ConfigError if it is missing or fails."""
     if place.endswith(".py"):
         return _load(Path(place), what)
@@ -227,11 +231,11 @@ def _load(path: Path, what: str) -> Any:
         del sys.modules[name]
         if not isinstance(error, Exception):
             raise
-        raise ConfigError(_unfit(path, what, error)) from error
+        raise ConfigError(_explain_unfit(path, what, error)) from error
     return module
 
 
-def _unfit(path: Path, what: str, error: Exception) -> str:
+def _explain_unfit(path: Path, what: str, error: Exception) -> str:
     frames = extract_tb(error.__traceback__)
     lines = [
         frame.lineno for frame in frames if Path(frame.filename) == path.absolute()

@@ -46,7 +46,7 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
     """Writes a file as `write_bytes` does, but in parts: it is never entirely in memory."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _named(path):
+    with _name_path_in_errors(path):
         remove_leftovers(path.parent)
         temporary, descriptor = _begin_file(path)
         try:
@@ -73,7 +73,7 @@ REPLACED = "replaced"
 _HIDDEN = re.compile(rf"\.(.+)\.[0-9a-f]{{8}}\.({UNFINISHED}|{REPLACED})", re.DOTALL)
 
 
-def hidden_name(path: Path, ending: str = "") -> Path:
+def make_hidden_name(path: Path, ending: str = "") -> Path:
     """A new hidden name beside a path; `ending` tells what is not needed after a crash."""
     return path.parent / f".{path.name}.{secrets.token_hex(4)}{ending and f'.{ending}'}"
 
@@ -81,7 +81,7 @@ def hidden_name(path: Path, ending: str = "") -> Path:
 def _begin_file(path: Path) -> tuple[Path, int]:
     """Makes a hidden file beside a path; returns it with its descriptor, which holds the lock."""
     while True:
-        temporary = hidden_name(path, UNFINISHED)
+        temporary = make_hidden_name(path, UNFINISHED)
         descriptor = os.open(
             temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666
         )
@@ -93,7 +93,7 @@ def _begin_file(path: Path) -> tuple[Path, int]:
 def begin_folder(path: Path) -> tuple[Path, int | None]:
     """Makes a hidden folder beside a path; see `_begin_file`. Windows opens no folders: None."""
     while True:
-        temporary = hidden_name(path, UNFINISHED)
+        temporary = make_hidden_name(path, UNFINISHED)
         temporary.mkdir()
         if not _POSIX:
             return temporary, None
@@ -149,14 +149,14 @@ def _remove_if_left(path: Path) -> None:
 
 
 @contextmanager
-def whole_file(path: str | Path) -> Iterator[Path]:
+def write_whole_file(path: str | Path) -> Iterator[Path]:
     """Yields a path for a library that writes files itself; it becomes `path` if the block ends.
 
     It has the same ending. Nothing is left if the block raises.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _named(path):
+    with _name_path_in_errors(path):
         remove_leftovers(path.parent)
         room, descriptor = begin_folder(path)
     try:
@@ -170,7 +170,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def _name_path_in_errors(path: Path) -> Iterator[None]:
     """Lets errors of the system name the path that was asked for, and no temporary one."""
     try:
         yield
@@ -186,14 +186,14 @@ def write_text(path: str | Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def json_of(data: Any, indent: int | None = None) -> str:
+def format_json(data: Any, indent: int | None = None) -> str:
     """JSON of plain data: null for numbers that are not finite, text for the unknown."""
     known = json.loads(json.dumps(data, default=str), parse_constant=lambda _: None)
     return json.dumps(known, allow_nan=False, indent=indent)
 
 
 def check_folder(path: str | Path, marker: str) -> Path:
-    """Resolves a path, creating nothing; ConfigError if `whole_folder` could not create it."""
+    """Resolves a path, creating nothing. Raises ConfigError if no folder can be written there."""
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
         raise ConfigError(
@@ -218,7 +218,7 @@ def check_above(path: Path) -> None:
 
 
 @contextmanager
-def whole_folder(
+def write_whole_folder(
     path: str | Path, marker: str, is_own: Callable[[str], bool] = lambda _: True
 ) -> Iterator[Path]:
     """Yields a temporary folder that replaces `path` if the block succeeds, else is removed.
@@ -230,7 +230,7 @@ def whole_folder(
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _named(path):
+    with _name_path_in_errors(path):
         remove_leftovers(path.parent)
         temporary, descriptor = begin_folder(path)
     try:
@@ -269,7 +269,7 @@ def _swap(new: Path, path: Path) -> None:
     if path.exists() and _exchange(new, path):
         _fsync(path.parent)
         return
-    old = hidden_name(path, REPLACED)
+    old = make_hidden_name(path, REPLACED)
     try:
         if path.exists():
             os.replace(path, old)
@@ -317,12 +317,12 @@ _SEAL = b"sha256 "
 _PART = 2**20
 
 
-def sha256(data: bytes) -> str:
+def hash_bytes(data: bytes) -> str:
     """The SHA-256 of some bytes, in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
 
 
-def _sha256_of(file: BinaryIO, size: int) -> str:
+def _hash_next(file: BinaryIO, size: int) -> str:
     """The SHA-256 of the next `size` bytes of a file, which are never all in memory."""
     digest = hashlib.sha256()
     while size > 0 and (part := file.read(min(size, _PART))):
@@ -331,16 +331,16 @@ def _sha256_of(file: BinaryIO, size: int) -> str:
     return digest.hexdigest()
 
 
-def sealed(data: bytes) -> bytes:
+def seal(data: bytes) -> bytes:
     """Appends a checksum to data, for `check_sealed`."""
-    return data + _SEAL + sha256(data).encode()
+    return data + _SEAL + hash_bytes(data).encode()
 
 
 def check_sealed(file: BinaryIO) -> None:
-    """Verifies in parts the checksum that `sealed` appended, and rewinds; ValueError if wrong."""
+    """Verifies in parts the checksum that `seal` appended, and rewinds; ValueError if wrong."""
     size = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
     file.seek(0)
-    digest = _sha256_of(file, size)
+    digest = _hash_next(file, size)
     if file.read() != _SEAL + digest.encode():
         raise ValueError("its checksum is missing or does not fit the rest")
     file.seek(0)
@@ -369,7 +369,7 @@ def write_sums(folder: Path) -> None:
         path for path in folder.rglob("*") if path.is_file() and path != folder / SUMS
     )
     names = [path.relative_to(folder).as_posix() for path in files]
-    write_parts(folder / SUMS, [_line_of(folder, name) for name in names])
+    write_parts(folder / SUMS, [_format_line(folder, name) for name in names])
 
 
 def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
@@ -378,9 +378,9 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
     All names must be listed, but `editable`, whose line a user may have removed to edit it. Raises
     ModelError if a file is missing, too large or different, or another is listed.
     """
-    with _opened(folder / SUMS) as file:
+    with _open_file(folder / SUMS) as file:
         listed = file.readlines(_PART)
-    expected = {name: _line_of(folder, name) for name in names}
+    expected = {name: _format_line(folder, name) for name in names}
     for name, line in expected.items():
         free = name == editable
         if line in listed or (
@@ -399,12 +399,12 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
             raise ModelError(f"{folder / SUMS}: the {reason}")
 
 
-def _line_of(folder: Path, name: str) -> bytes:
-    with _opened(folder / name) as file:
-        return f"{_sha256_of(file, MOST_BYTES)}  {name}\n".encode()
+def _format_line(folder: Path, name: str) -> bytes:
+    with _open_file(folder / name) as file:
+        return f"{_hash_next(file, MOST_BYTES)}  {name}\n".encode()
 
 
-def _opened(path: Path) -> BinaryIO:
+def _open_file(path: Path) -> BinaryIO:
     """Opens a file of a model. Raises ModelError for what is missing, no file, or too large."""
     reason = "missing, or no file"
     try:

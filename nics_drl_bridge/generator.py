@@ -10,16 +10,16 @@ import numpy as np
 from pydantic import Field
 
 from nics_drl_bridge import files
-from nics_drl_bridge.arguments import check_path, checked_arguments, shown
+from nics_drl_bridge.arguments import check_arguments, check_path, format_value
 from nics_drl_bridge.config import (
     Schema,
     dump_yaml,
+    list_shipped,
     parse_yaml,
     read_text,
-    shipped_names,
     validate,
 )
-from nics_drl_bridge.errors import ConfigError, FitError, ModelError, nearest
+from nics_drl_bridge.errors import ConfigError, FitError, ModelError, suggest
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
@@ -145,7 +145,7 @@ class SimulatorModel:
     @property
     def fingerprint(self) -> str:
         """Identifies the model: 16 digits of the SHA-256 of `text` and of the table's."""
-        return files.sha256(f"{self.text}{self.table.fingerprint}".encode())[:16]
+        return files.hash_bytes(f"{self.text}{self.table.fingerprint}".encode())[:16]
 
 
 class _File(Schema):
@@ -161,7 +161,7 @@ class _File(Schema):
     gyro: bool = False
 
 
-@checked_arguments("generate")
+@check_arguments("generate")
 def generate(
     recording: Recording | Sequence[Recording],
     robot: RobotSpec | SimulatorModel | str | Path,
@@ -188,9 +188,9 @@ def generate(
     _check_given(recording, shapes, sensors)
     alpha = fit.parse_alpha(str(alpha))
     order = fit.parse_order(str(order))
-    robot = _spec_of(robot)
+    robot = _get_spec(robot)
     if not isinstance(lidar, LidarSpec):
-        lidar = lidar_of(robot, None if lidar is None else str(lidar))
+        lidar = mount_lidar(robot, None if lidar is None else str(lidar))
     if not isinstance(recording, Recording):
         recording = join_recordings(recording, robot)
     identified = identify(
@@ -225,17 +225,21 @@ def _check_given(recording: object, shapes: object, sensors: object) -> None:
     every = list(recording) if isinstance(recording, list | tuple) else [recording]
     if not every or not all(isinstance(one, Recording) for one in every):
         needed = "a Recording, as read_recording(path) gives, or a list of them"
-        raise ConfigError(f"generate: recording={shown(recording)}: must be {needed}.")
+        raise ConfigError(
+            f"generate: recording={format_value(recording)}: must be {needed}."
+        )
     for name, given in (("shapes", shapes), ("sensors", sensors)):
         fits = isinstance(given, list | tuple) and all(
             isinstance(one, Schema) for one in given
         )
         if not fits:
             needed = f"a list of {name} of this package"
-            raise ConfigError(f"generate: {name}={shown(given)}: must be {needed}.")
+            raise ConfigError(
+                f"generate: {name}={format_value(given)}: must be {needed}."
+            )
 
 
-def _spec_of(robot: object) -> RobotSpec:
+def _get_spec(robot: object) -> RobotSpec:
     if isinstance(robot, RobotSpec):
         return robot
     if isinstance(robot, SimulatorModel):
@@ -243,7 +247,7 @@ def _spec_of(robot: object) -> RobotSpec:
     if isinstance(robot, str | Path):
         return open_model(robot).robot if Path(robot).is_dir() else load_robot(robot)
     needed = "a RobotSpec, a robot's name or YAML file, or a model"
-    raise ConfigError(f"generate: robot={shown(robot)}: must be {needed}.")
+    raise ConfigError(f"generate: robot={format_value(robot)}: must be {needed}.")
 
 
 def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
@@ -253,7 +257,7 @@ def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
     return Polygon(points=robot.footprint)
 
 
-def lidar_of(robot: RobotSpec, name: str | None = None) -> LidarSpec:
+def mount_lidar(robot: RobotSpec, name: str | None = None) -> LidarSpec:
     """A lidar by name or file where the robot has it mounted; by default the robot's usual one.
 
     That is the one that its file names, else that of the paper. Raises ConfigError.
@@ -275,7 +279,7 @@ def builtin_model(robot: str, content: str = "") -> SimulatorModel:
             f"nics_drl_bridge: {robot!r} is shipped; the folder is ./{robot}\n"
         )
     drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
-    return generate(drive, spec, lidar_of(spec), ())[0]
+    return generate(drive, spec, mount_lidar(spec), ())[0]
 
 
 def open_model(
@@ -288,21 +292,21 @@ def open_model(
     """
     if not isinstance(name, str | Path | SimulatorModel) or name == "":
         needed = "a shipped robot's name, a model's folder, a robot's YAML, or a SimulatorModel"
-        raise ModelError(f"model={shown(name)}: must be {needed}.")
+        raise ModelError(f"model={format_value(name)}: must be {needed}.")
     if lidar is not None:
         model = open_model(name)
-        spec = lidar_of(model.robot, lidar)
+        spec = mount_lidar(model.robot, lidar)
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     if isinstance(name, SimulatorModel):
         return name
-    if Path(name).is_dir() and name not in shipped_names(
+    if Path(name).is_dir() and name not in list_shipped(
         "robots"
     ):  # never so for a Path
         return load_model(name)
     if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
-    if not name.endswith((".yaml", ".yml")) and name not in shipped_names("robots"):
-        hint = nearest(name, shipped_names("robots"))
+    if not name.endswith((".yaml", ".yml")) and name not in list_shipped("robots"):
+        hint = suggest(name, list_shipped("robots"))
         fix = "or give a model's folder, or a robot's YAML file"
         raise ModelError(f"unknown robot {name!r}; {hint} ({fix}).")
     try:
@@ -313,7 +317,7 @@ def open_model(
 
 def check_place(folder: str | Path) -> None:
     """Raises ConfigError, before the work of a fit, if `save_model` can't write to a folder."""
-    if str(folder) in shipped_names("robots"):
+    if str(folder) in list_shipped("robots"):
         raise ConfigError(
             f"{folder}: a shipped robot has this name; name another folder."
         )
@@ -327,7 +331,7 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
     into the folder stays there.
     """
     own = {*MODEL_FILES, files.SUMS, *DRAWN_FILES, *files.names_in_sums(Path(folder))}
-    with files.whole_folder(folder, MODEL_FILE, own.__contains__) as temporary:
+    with files.write_whole_folder(folder, MODEL_FILE, own.__contains__) as temporary:
         files.write_text(temporary / MODEL_FILE, model.text)
         files.write_text(temporary / REPORT_FILE, model.report)
         model.table.save(temporary / TABLE_FOLDER)

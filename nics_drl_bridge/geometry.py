@@ -88,7 +88,7 @@ def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
     return east, along * (latitude - latitude[0])
 
 
-def edges_cross(corners: Array) -> bool:
+def has_crossing_edges(corners: Array) -> bool:
     """True if edges of a closed outline (K, 2) cross or touch others than their neighbours."""
     start, stop = corners, np.roll(corners, -1, axis=0)
     if (start == stop).all(axis=1).any():
@@ -115,7 +115,7 @@ def edges_cross(corners: Array) -> bool:
     return bool(crossing.any() or (folded & ~ahead).any())
 
 
-def depths(points: Array, corners: Array) -> Array:
+def compute_depths(points: Array, corners: Array) -> Array:
     """Distances (n,) of points (n, 2) to the border of an outline (V, 2), below 0 outside [m]."""
     side = np.roll(corners, -1, axis=0) - corners
     apart = points[:, None] - corners

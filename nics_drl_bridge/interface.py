@@ -33,7 +33,7 @@ class RobotView:
     sensed_age_s: float = 0.0
 
 
-def stacked(views: Sequence[RobotView]) -> RobotView:
+def stack_views(views: Sequence[RobotView]) -> RobotView:
     """Stacks the views of M robots into one with a leading (M,); stamp and ages are the maxima."""
     sensed = {
         name: np.stack([view.sensed[name] for view in views])

@@ -243,7 +243,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         super().__init__(function)
         # Without the line of the function: it may move, and leaves nothing behind.
         name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
-        stamp = digest_of(Path(function.__code__.co_filename))
+        stamp = compute_digest(Path(function.__code__.co_filename))
         self._cache_file = _Index(self._cache_path, name, stamp)
         # It is compared before the types are unpickled, whose classes may have other names now.
         self._cache_file._version += stamp
@@ -258,7 +258,7 @@ class _InnerCache(_Cache):
 
 
 @cache
-def digest_of(module: Path) -> str:
+def compute_digest(module: Path) -> str:
     """SHA-256 of a module and of all modules that it imports, directly or not; no library."""
     files = set[Path]()
     left = [module]
@@ -303,7 +303,7 @@ def imports_of(file: Path) -> tuple[Path, ...]:
     return tuple(file for file in files if file.is_file())
 
 
-def pace_s(compiled: int, spent_s: float) -> float:
+def measure_pace_s(compiled: int, spent_s: float) -> float:
     """Returns the time that a kernel takes [s], by those that were compiled so far."""
     return (TRUSTED_AFTER * SECONDS_EACH + spent_s) / (TRUSTED_AFTER + compiled)
 
@@ -313,7 +313,7 @@ def estimate(left: int, compiled: int, spent_s: float) -> str:
     what = "compiling, once on this machine"
     if left < 1:  # further types of arguments of kernels that were compiled for others
         return f"{what}: the last kernels"
-    seconds = max(1, round(left * pace_s(compiled, spent_s)))
+    seconds = max(1, round(left * measure_pace_s(compiled, spent_s)))
     kernels = "1 kernel" if left == 1 else f"{left} kernels"
     return f"{what}, up to {kernels}: about {seconds} s"
 

@@ -13,7 +13,7 @@ _SHORT = reprlib.Repr()
 _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
 
 
-def checked_seeds(
+def check_seeds(
     seeds: ArrayLike | Any, greatest: int = GREATEST_SEED
 ) -> NDArray[np.int64]:
     """Returns seeds as (n,); ConfigError if one is negative, too large or not an integer."""

@@ -76,19 +76,19 @@ class Panel(NamedTuple):
 
 
 @contextmanager
-def styled() -> Iterator[None]:
+def apply_style() -> Iterator[None]:
     """Gives what is drawn inside the style; of a function as a decorator, too."""
     with mpl.rc_context(RC):
         yield
 
 
-@styled()
-def panels(
+@apply_style()
+def make_panels(
     rows: int, columns: int, size: tuple[float, float] | None = None, **options: Any
 ) -> tuple[Figure, list[Axes]]:
     """Returns a figure of a size [inch], and its axes in rows.
 
-    Without a size, `png` gives it that of its panels.
+    Without a size, `render_png` gives it that of its panels.
     """
     figure = Figure(figsize=size, layout="constrained")
     return figure, list(
@@ -96,25 +96,25 @@ def panels(
     )
 
 
-def legend_columns(labels: Sequence[str], width: float) -> int:
+def count_legend_columns(labels: Sequence[str], width: float) -> int:
     """Returns the number of columns of a legend that fits into a width [inch]."""
     room = LETTERS_PER_IN * width
     each = [len(label) + 5 for label in labels]
     return len(labels) if sum(each) <= room else max(1, int(room / max(each)))
 
 
-def legend_rows(labels: Sequence[str], width: float) -> int:
+def count_legend_rows(labels: Sequence[str], width: float) -> int:
     """Returns the number of rows of a legend that fits into a width [inch]."""
-    return -(-len(labels) // legend_columns(labels, width)) if labels else 0
+    return -(-len(labels) // count_legend_columns(labels, width)) if labels else 0
 
 
-def width_of(panel: Panel, columns: int = 1) -> float:
+def compute_width(panel: Panel, columns: int = 1) -> float:
     """Returns the width of a figure of panels of a fixed size [inch]."""
     return columns * (panel.left + panel.width + RIGHT_IN)
 
 
-@styled()
-def png(
+@apply_style()
+def render_png(
     figure: Figure,
     legend: Axes | None = None,
     panel: Panel | None = None,
@@ -133,9 +133,9 @@ def png(
             the figure has fewer: it keeps figures side by side alike.
     """
     if panel is not None:
-        _, columns = _grid_of(figure)
+        _, columns = _count_grid(figure)
         figure.set_layout_engine(None)
-        figure.set_figwidth(width_of(panel, columns))
+        figure.set_figwidth(compute_width(panel, columns))
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_axis_off()
@@ -153,9 +153,9 @@ def png(
         place: LegendPlace = "outside upper center" if fills else "upper center"
         if labels:
             figure.legend(
-                handles, labels, loc=place, ncols=legend_columns(labels, width)
+                handles, labels, loc=place, ncols=count_legend_columns(labels, width)
             )
-        least_rows = max(least_rows, legend_rows(labels, width))
+        least_rows = max(least_rows, count_legend_rows(labels, width))
     if panel is not None:
         _place_panels(figure, panel, least_rows)
     buffer = io.BytesIO()
@@ -163,7 +163,7 @@ def png(
     return buffer.getvalue()
 
 
-def _grid_of(figure: Figure) -> tuple[int, int]:
+def _count_grid(figure: Figure) -> tuple[int, int]:
     """Returns the numbers of rows and columns of a figure's grid."""
     cells = [axes.get_subplotspec() for axes in figure.axes]
     (grid,) = {cell.get_gridspec() for cell in cells if cell is not None}
@@ -173,11 +173,11 @@ def _grid_of(figure: Figure) -> tuple[int, int]:
 
 def _place_panels(figure: Figure, panel: Panel, rows_of_legend: int) -> None:
     """Gives a figure its height, and each of its axes the size of a panel [inch]."""
-    rows, columns = _grid_of(figure)
+    rows, columns = _count_grid(figure)
     lines = [len(axes.get_title().splitlines()) for axes in figure.axes]
     above = ABOVE_IN + LINE_IN * max(TITLE_LINES, *lines)
     legend = LINE_IN * (rows_of_legend + 0.5)
-    width = width_of(panel, columns)
+    width = compute_width(panel, columns)
     height = legend + rows * (above + panel.height + BELOW_IN)
     figure.set_size_inches(width, height)
     figure.subplots_adjust(

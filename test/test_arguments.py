@@ -6,11 +6,16 @@ from typing import Any
 import pytest
 
 import nics_drl_bridge
-from nics_drl_bridge.arguments import check_count, check_path, checked_arguments, shown
+from nics_drl_bridge.arguments import (
+    check_arguments,
+    check_count,
+    check_path,
+    format_value,
+)
 from nics_drl_bridge.errors import BridgeError, ConfigError
 
 
-@checked_arguments("drive")
+@check_arguments("drive")
 def drive(
     model: str = "ackermann", metres: float = 1.0, turns: int | None = None
 ) -> Any:
@@ -71,7 +76,7 @@ def test_a_path_is_text_or_a_path(value: Any) -> None:
 
 
 def test_a_large_object_is_quoted_by_its_type() -> None:
-    assert shown([1.0] * 1000) == "of type list"
+    assert format_value([1.0] * 1000) == "of type list"
 
 
 @pytest.mark.parametrize("value", [3, None, [], 1.5, True, {}, object(), "a\0b"])

@@ -253,12 +253,15 @@ def test_a_recording_of_another_robot_is_refused(drive, tmp_path):
 
 
 def test_ctrl_c_in_a_compiled_function_is_an_interruption_and_another_fault_is_not():
-    with pytest.raises(typer.Exit) as caught, console.one_sentence():
+    with pytest.raises(typer.Exit) as caught, console.report_in_one_sentence():
         raise SystemError(
             "returned a result with an exception set"
         ) from KeyboardInterrupt()
     assert caught.value.exit_code == 130
-    with pytest.raises(SystemError, match="of another kind"), console.one_sentence():
+    with (
+        pytest.raises(SystemError, match="of another kind"),
+        console.report_in_one_sentence(),
+    ):
         raise SystemError("of another kind")
 
 

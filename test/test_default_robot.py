@@ -9,7 +9,7 @@ from pathlib import Path
 import nics_drl_bridge
 from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.commands.episodes import model_name
-from nics_drl_bridge.config import parse_yaml, share_folder, shipped_names
+from nics_drl_bridge.config import list_shipped, parse_yaml, share_folder
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -49,7 +49,7 @@ def node_rows():
 
 def named_literally(tree):
     """Defaults, alternatives and values of rows that are a shipped robot's name in the code."""
-    robots = set(shipped_names("robots"))
+    robots = set(list_shipped("robots"))
     for node in ast.walk(tree):
         held = []
         if isinstance(node, ast.arguments):
@@ -101,8 +101,8 @@ def test_every_command_env_and_node_that_has_a_default_robot_has_the_same():
 
 def test_the_default_robot_is_shipped_with_all_that_a_first_run_needs():
     for kind in ("robots", "limits"):
-        assert DEFAULT_ROBOT in shipped_names(kind)
-    assert f"navigation_{DEFAULT_ROBOT}" in shipped_names("training")
+        assert DEFAULT_ROBOT in list_shipped(kind)
+    assert f"navigation_{DEFAULT_ROBOT}" in list_shipped("training")
     assert (share_folder() / "urdf" / f"{DEFAULT_ROBOT}.urdf").is_file()
 
 

@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 from nics_drl_bridge import errors
-from nics_drl_bridge.errors import BackendError, BridgeError, StaleDataError, nearest
+from nics_drl_bridge.errors import BackendError, BridgeError, StaleDataError, suggest
 
 
 def test_every_error_of_the_package_can_be_caught_as_a_bridge_error():
@@ -16,11 +16,11 @@ def test_every_error_of_the_package_can_be_caught_as_a_bridge_error():
 
 
 def test_a_name_close_to_a_known_one_is_suggested():
-    assert nearest("ackerman", ["mecanum", "ackermann"]) == "did you mean 'ackermann'?"
+    assert suggest("ackerman", ["mecanum", "ackermann"]) == "did you mean 'ackermann'?"
 
 
 def test_without_a_close_name_all_known_ones_are_listed_in_order():
-    assert nearest("zzz", ["b", "a"]) == "valid are: 'a', 'b'"
+    assert suggest("zzz", ["b", "a"]) == "valid are: 'a', 'b'"
 
 
 def test_stale_data_name_topic_age_and_limit():

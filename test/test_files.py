@@ -18,12 +18,12 @@ from nics_drl_bridge.files import (
     check_folder,
     check_sealed,
     check_sums,
-    sealed,
-    sha256,
-    whole_folder,
+    hash_bytes,
+    seal,
     write_bytes,
     write_sums,
     write_text,
+    write_whole_folder,
 )
 
 MARKER = "model.yaml"
@@ -88,7 +88,7 @@ def test_a_crash_while_writing_leaves_the_old_file_and_no_other(
 
 
 def in_folder(path):
-    with whole_folder(path, MARKER):
+    with write_whole_folder(path, MARKER):
         pass
 
 
@@ -167,14 +167,14 @@ def test_where_folders_can_not_be_opened_as_on_windows_a_folder_is_written_all_t
     monkeypatch.setattr(files.os, "open", open_file)
     monkeypatch.setattr(files.os, "replace", replace_file)
     monkeypatch.setattr(files.ctypes, "CDLL", load)
-    with whole_folder(old, MARKER) as temporary:
+    with write_whole_folder(old, MARKER) as temporary:
         files.write_text(temporary / MARKER, "new")
     assert (old / MARKER).read_text() == "new"
     assert [each.name for each in old.parent.iterdir()] == [old.name]
 
 
 def test_a_finished_folder_takes_the_place_of_the_old_one(old):
-    with whole_folder(old, MARKER) as temporary:
+    with write_whole_folder(old, MARKER) as temporary:
         fill(temporary)
         assert tree(old)[MARKER] == b"old"
     assert tree(old.parent) == {f"out/{MARKER}": b"new", "out/sub/deep": b"deep"}
@@ -182,7 +182,7 @@ def test_a_finished_folder_takes_the_place_of_the_old_one(old):
 
 
 def test_a_new_folder_is_made_with_those_above_it(tmp_path):
-    with whole_folder(tmp_path / "a" / "b", MARKER) as temporary:
+    with write_whole_folder(tmp_path / "a" / "b", MARKER) as temporary:
         fill(temporary)
     assert set(tree(tmp_path)) == {f"a/b/{MARKER}", "a/b/sub/deep"}
 
@@ -192,7 +192,7 @@ def test_an_error_inside_leaves_the_old_folder_and_no_other(old, error):
     before = tree(old.parent)
 
     def write_half():
-        with whole_folder(old, MARKER) as temporary:
+        with write_whole_folder(old, MARKER) as temporary:
             fill(temporary)
             raise error
 
@@ -220,7 +220,7 @@ def test_where_folders_can_not_change_places_a_rename_that_fails_leaves_the_old_
     monkeypatch.setattr(files.os, "replace", failing)
 
     def write():
-        with whole_folder(old, MARKER) as temporary:
+        with write_whole_folder(old, MARKER) as temporary:
             fill(temporary)
 
     with pytest.raises(OSError, match="no space"):
@@ -272,7 +272,7 @@ def test_a_folder_of_somebody_else_is_never_replaced(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with (
         pytest.raises(ConfigError, match=r"holds other files and no 'model\.yaml'"),
-        whole_folder(tmp_path, MARKER),
+        write_whole_folder(tmp_path, MARKER),
     ):
         pass
     assert tree(tmp_path) == {"thesis.tex": b"years of work"}
@@ -282,7 +282,7 @@ def test_a_file_is_not_taken_for_a_folder(tmp_path):
     (tmp_path / "out").write_text("a file")
     with (
         pytest.raises(ConfigError, match="is a file, not a folder"),
-        whole_folder(tmp_path / "out", MARKER),
+        write_whole_folder(tmp_path / "out", MARKER),
     ):
         pass
     assert tree(tmp_path) == {"out": b"a file"}
@@ -310,7 +310,7 @@ def umask(request):
 
 def test_the_umask_decides_who_may_read_what_is_written(tmp_path, umask):
     write_text(tmp_path / "a" / "file", "text")
-    with whole_folder(tmp_path / "folder", MARKER) as temporary:
+    with write_whole_folder(tmp_path / "folder", MARKER) as temporary:
         fill(temporary)
         write_text(temporary / "more", "text")
     for path in (tmp_path / "a", tmp_path / "folder", tmp_path / "folder" / "sub"):
@@ -366,7 +366,7 @@ def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_no
         killed.wait()
         write_text(tmp_path / "third", "text")
         assert [name.split(".")[1] for name in hidden()] == ["two"]
-        with whole_folder(tmp_path / "fourth", MARKER) as temporary:
+        with write_whole_folder(tmp_path / "fourth", MARKER) as temporary:
             fill(temporary)
             assert len(hidden()) == 2
         assert living.communicate(b"", timeout=60) == (b"", None)
@@ -403,7 +403,7 @@ def test_what_the_user_put_into_a_folder_stays_there(old):
     (old / "empty").mkdir()
     (old / "script.sh").write_text("echo")
     (old / "script.sh").chmod(0o750)
-    with whole_folder(
+    with write_whole_folder(
         old, MARKER, {MARKER, "extra", "sub/deep"}.__contains__
     ) as temporary:
         fill(temporary)
@@ -421,7 +421,7 @@ def test_what_the_user_put_into_a_folder_stays_there(old):
 
 def test_an_empty_folder_is_filled(tmp_path):
     (tmp_path / "out").mkdir()
-    with whole_folder(tmp_path / "out", MARKER) as temporary:
+    with write_whole_folder(tmp_path / "out", MARKER) as temporary:
         fill(temporary)
     assert f"out/{MARKER}" in tree(tmp_path)
 
@@ -429,7 +429,7 @@ def test_an_empty_folder_is_filled(tmp_path):
 def test_a_link_stays_a_link_and_its_folder_is_replaced(old):
     link = old.parent / "latest"
     link.symlink_to("out")
-    with whole_folder(link, MARKER) as temporary:
+    with write_whole_folder(link, MARKER) as temporary:
         fill(temporary)
     assert link.is_symlink()
     assert (old / MARKER).read_text() == "new"
@@ -437,7 +437,7 @@ def test_a_link_stays_a_link_and_its_folder_is_replaced(old):
 
 def test_the_checksum_is_sha_256():
     empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
-    assert sha256(b"") == empty
+    assert hash_bytes(b"") == empty
 
 
 FULL = """
@@ -464,8 +464,8 @@ def test_a_disk_that_takes_no_more_leaves_the_old_file_and_no_other(tmp_path):
 
 
 def test_any_flipped_bit_of_what_was_sealed_is_noticed():
-    whole = sealed(b"content")
-    for good in (whole, sealed(b""), sealed(bytes(3_000_000))):
+    whole = seal(b"content")
+    for good in (whole, seal(b""), seal(bytes(3_000_000))):
         file = io.BytesIO(good)
         check_sealed(file)
         assert file.tell() == 0
@@ -544,7 +544,7 @@ def test_a_manifest_that_lists_other_files_is_refused_without_reading_them(
     listed, name
 ):
     with (listed / SUMS).open("a") as manifest:
-        manifest.write(f"{sha256(b'')}  {name}\n")
+        manifest.write(f"{hash_bytes(b'')}  {name}\n")
     with pytest.raises(ModelError, match="is of no file of a model; remove it"):
         check_sums(listed, NAMES)
 
@@ -566,7 +566,7 @@ def test_what_is_no_file_to_read_is_one_sentence(listed, name, what):
 
 
 def test_json_has_null_for_numbers_that_are_not_finite():
-    text = files.json_of(
+    text = files.format_json(
         {"nan": float("nan"), "ends": (-float("inf"), 1.5), "at": Path("a")}
     )
     assert text == '{"nan": null, "ends": [null, 1.5], "at": "a"}'

@@ -56,12 +56,15 @@ def pretend(monkeypatch, **versions):
 
 
 def test_libraries_of_a_fitting_version_are_not_complained_of():
-    assert extensions.unmet(ImportError("cannot import name", name="pydantic")) is None
+    assert (
+        extensions.explain_unmet(ImportError("cannot import name", name="pydantic"))
+        is None
+    )
 
 
 def test_all_that_is_missing_or_old_is_told_at_once(monkeypatch):
     pretend(monkeypatch, pydantic="1.10.4", typer="0.7.0+dfsg", filterpy="")
-    told = extensions.unmet(ImportError("cannot import name", name="pydantic"))
+    told = extensions.explain_unmet(ImportError("cannot import name", name="pydantic"))
     assert told == (
         "needs filterpy>=2.0 (missing), pydantic>=2.6 (1.10.4), typer>=0.12 (0.7.0+dfsg); "
         "pip install 'filterpy>=2.0' 'pydantic>=2.6' 'typer>=0.12'."
@@ -70,20 +73,20 @@ def test_all_that_is_missing_or_old_is_told_at_once(monkeypatch):
 
 def test_a_version_is_told_that_is_too_new(monkeypatch):
     pretend(monkeypatch, gymnasium="1.10.0")
-    assert "(1.10.0)" in extensions.unmet(
+    assert "(1.10.0)" in extensions.explain_unmet(
         ModuleNotFoundError("no module", name="gymnasium.x")
     )
 
 
 def test_what_is_only_needed_for_some_things_is_told_by_its_name():
-    told = extensions.unmet(ModuleNotFoundError("no module", name="mujoco"))
+    told = extensions.explain_unmet(ModuleNotFoundError("no module", name="mujoco"))
     assert told == "needs the module 'mujoco'; pip install 'nics_drl_bridge[mujoco]'."
 
 
 def test_a_module_of_this_package_is_no_library(monkeypatch):
     pretend(monkeypatch, pydantic="1.10.4")
     missing = ModuleNotFoundError("no module", name="nics_drl_bridge.env.nothing")
-    assert extensions.unmet(missing) is None
+    assert extensions.explain_unmet(missing) is None
 
 
 def test_a_name_that_needs_more_says_what(monkeypatch):

@@ -81,14 +81,14 @@ def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
 @KINDS
 def test_a_bag_is_written_told_and_looked_through_at_either(tmp_path, kind):
     pytest.importorskip("rosbags")
-    from nics_drl_bridge.extras.bags.info import bag_info
+    from nics_drl_bridge.extras.bags.info import read_bag_info
     from nics_drl_bridge.recording.bag_file import is_bag
     from nics_drl_bridge.recording.write import write_bag
 
     place = kind(tmp_path / "drive")
     write_bag(record(CAR, np.random.default_rng(0), duration=5.0), place, CAR)
     assert is_bag(place)
-    assert bag_info(place).messages > 0
+    assert read_bag_info(place).messages > 0
     assert "/cmd_vel" in collect_facts_of_bag(place).topics
 
 

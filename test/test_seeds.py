@@ -8,7 +8,7 @@ from nics_drl_bridge.commands.episodes import EvaluationOrder
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.robot.spec import load_robot
-from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
+from nics_drl_bridge.seeds import GREATEST_SEED, check_seeds
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
@@ -34,8 +34,8 @@ def simulator():
 
 
 TAKERS = {
-    "alone": lambda seed, _: checked_seeds(seed),
-    "in a list": lambda seed, _: checked_seeds([0, seed]),
+    "alone": lambda seed, _: check_seeds(seed),
+    "in a list": lambda seed, _: check_seeds([0, seed]),
     "scene": lambda seed, _: sample_scene(load_world("arena"), 0.2, seed),
     "simulator": lambda seed, simulator: simulator.reset([seed]),
     "drive": lambda seed, _: DrivePlan(load_robot("differential"), seed=seed),
@@ -55,7 +55,7 @@ def test_what_is_no_seed_is_one_sentence(simulator, taker, seed):
 
 @pytest.mark.parametrize("seed", [0, GREATEST_SEED, np.int64(3), np.uint64(7)])
 def test_every_seed_of_63_bits_is_taken(simulator, seed):
-    assert checked_seeds(seed).tolist() == [int(seed)]
+    assert check_seeds(seed).tolist() == [int(seed)]
     simulator.reset([seed])
 
 
@@ -66,5 +66,5 @@ def test_the_last_seed_of_an_evaluation_counts_too():
 
 def test_a_seed_is_told_shortly():
     with pytest.raises(ConfigError) as told:
-        checked_seeds("x" * 10_000)
+        check_seeds("x" * 10_000)
     assert len(str(told.value)) < 150

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.extras.bags.info import bag_info
+from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.readers import read_recording
@@ -180,7 +180,7 @@ def _same(bag: Path, sample: Sample) -> str:
 
 
 def _informed(bag: Path, sample: Sample) -> str:
-    told = {topic.topic: topic.count for topic in bag_info(bag).topics}
+    told = {topic.topic: topic.count for topic in read_bag_info(bag).topics}
     return (
         ""
         if told == {t: len(v[1]) for t, v in sample.held.items()}

@@ -18,8 +18,8 @@ from measuring.attempt import Attempt, nics
 from measuring.damaged_bags import samples
 from measuring.gates import Gate, gate_config
 from nics_drl_bridge.config import dump_yaml, parse_yaml
-from nics_drl_bridge.extras.bags.info import bag_info
-from nics_drl_bridge.files import SUMS, sealed, sha256, write_sums
+from nics_drl_bridge.extras.bags.info import read_bag_info
+from nics_drl_bridge.files import SUMS, hash_bytes, seal, write_sums
 from nics_drl_bridge.gate import black_box
 from nics_drl_bridge.gate.inputs import Tick
 from nics_drl_bridge.generator import (
@@ -100,7 +100,7 @@ def _good(rng: Rng, whole: Whole) -> Attempt:
     bag = whole.bags[int(rng.integers(len(whole.bags)))]
     acts: tuple[tuple[str, Callable[[], object]], ...] = (
         ("recording", lambda: read_recording(whole.recording)),
-        ("bag", lambda: bag_info(bag)),
+        ("bag", lambda: read_bag_info(bag)),
         ("bag", lambda: read_recording(bag, load_robot(ROBOT))),
         ("black box", lambda: black_box.replay(whole.box)),
         ("model", lambda: load_model(whole.model)),
@@ -122,7 +122,7 @@ def _zip(parts: dict[str, bytes]) -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in parts.items():
             archive.writestr(f"{name}.npy", data)
-    return sealed(buffer.getvalue())
+    return seal(buffer.getvalue())
 
 
 def _recording(rng: Rng, folder: Path, whole: Whole) -> Attempt:
@@ -262,7 +262,7 @@ def _bag(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     else:
         text = "tagged: !!python/object/apply:os.system ['true']\n"
     file.write_text(dump_yaml(data) + text, encoding="utf-8")
-    acts = (lambda: bag_info(bag), _read(bag), nics("bag", "info", bag))
+    acts = (lambda: read_bag_info(bag), _read(bag), nics("bag", "info", bag))
     return Attempt("bag", f"{source.name}, {way} of {k}", acts[int(rng.integers(3))])
 
 
@@ -289,7 +289,7 @@ def _box(rng: Rng, folder: Path, whole: Whole) -> Attempt:
         lines += [record] * (100_000 + size % 300_000)
     text = "".join(_line(line) for line in lines)
     path = folder / "stop.jsonl"
-    path.write_text(text + json.dumps({"sha256": sha256(text.encode())}) + "\n")
+    path.write_text(text + json.dumps({"sha256": hash_bytes(text.encode())}) + "\n")
     verdict = "any" if way in (2, 3, 5) else "bad"
     act = (
         nics("explain", path) if rng.random() < 0.3 else lambda: black_box.replay(path)
@@ -374,5 +374,5 @@ def _checkpoint(rng: Rng, folder: Path) -> Attempt:
             archive.writestr("archive/version", b"3\n")
     else:
         torch.save(torch.zeros(1).expand(2**40), buffer)
-    path.write_bytes(sealed(buffer.getvalue()))
+    path.write_bytes(seal(buffer.getvalue()))
     return Attempt("checkpoint", f"way {way}", lambda: read_checkpoint(path))

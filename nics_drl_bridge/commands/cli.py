@@ -10,7 +10,11 @@ from typer import Option
 from typer.core import TyperGroup
 
 from nics_drl_bridge import __version__, extensions
-from nics_drl_bridge.commands.console import EXIT_BAD_INPUT, ROBOT_OPTIONS, one_sentence
+from nics_drl_bridge.commands.console import (
+    EXIT_BAD_INPUT,
+    ROBOT_OPTIONS,
+    report_in_one_sentence,
+)
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
@@ -33,7 +37,7 @@ from nics_drl_bridge.commands.up import up
 from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.commands.watch import watch
 from nics_drl_bridge.commands.world import world
-from nics_drl_bridge.errors import LONGEST, shortened
+from nics_drl_bridge.errors import LONGEST, shorten
 
 
 class OneWordForARobot(TyperGroup):
@@ -41,7 +45,7 @@ class OneWordForARobot(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses the words of a command line; UsageError for two robots by two words."""
-        robots = [value for word in ROBOT_OPTIONS for value in values_of(word, args)]
+        robots = [value for word in ROBOT_OPTIONS for value in read_option(word, args)]
         if len(set(robots)) > 1:
             told = " and ".join(map(repr, robots))
             ctx.fail(
@@ -50,7 +54,7 @@ class OneWordForARobot(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-def values_of(option: str, args: Sequence[str]) -> list[str]:
+def read_option(option: str, args: Sequence[str]) -> list[str]:
     """Returns the values of an option in a command line: `--robot X` or `--robot=X`."""
     joined = [word.partition("=")[2] for word in args if word.startswith(f"{option}=")]
     return joined + [args[k + 1] for k, word in enumerate(args[:-1]) if word == option]
@@ -72,7 +76,7 @@ def _print_version(wanted: bool) -> None:
 
 
 @app.callback()
-def _options(
+def _declare_options(
     version: Annotated[
         bool,
         Option(
@@ -94,7 +98,7 @@ def _options(
     if sensor_kind:
         from nics_drl_bridge.lidar.sensor import add_sensor_kind
 
-        with one_sentence():
+        with report_in_one_sentence():
             for place in sensor_kind:
                 add_sensor_kind(place)
 
@@ -124,7 +128,7 @@ app.command(context_settings={"ignore_unknown_options": True})(up)
 app.command(context_settings={"ignore_unknown_options": True})(goal)
 app.add_typer(policy, name="policy")
 app.add_typer(world, name="world")
-for name, extension in extensions.known("commands").items():
+for name, extension in extensions.find_extensions("commands").items():
     app.add_typer(extension.load(), name=name)
 complete(app)
 
@@ -150,7 +154,7 @@ def main() -> None:
         if (
             message := error.format_message().strip()
         ):  # otherwise its help has been shown
-            message = shortened(
+            message = shorten(
                 message.rstrip(".?").replace("Value error, ", ""), LONGEST
             )
             typer.echo(f"nics: {message}; see `nics --help`.", err=True)

@@ -16,8 +16,8 @@ from typer import Option
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.start import was_interrupted
-from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
-from nics_drl_bridge.files import json_of
+from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, suggest
+from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.status import STATUS
 
@@ -32,16 +32,16 @@ Tell = Callable[
 ]  # what is done, how much of it, of how much (0: unknown)
 
 
-def say(as_json: bool, line: str, **facts: Any) -> None:
+def print_line(as_json: bool, line: str, **facts: Any) -> None:
     """Prints a line, or the facts that it tells as one JSON object."""
-    typer.echo(json_of(facts) if as_json else line)
+    typer.echo(format_json(facts) if as_json else line)
 
 
-def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[str]]:
+def complete_names(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[str]]:
     """Completion of a shell for an option that takes a name in `config/KIND`, or a path."""
 
     def complete(incomplete: str) -> list[str]:
-        from nics_drl_bridge.config import shipped_names
+        from nics_drl_bridge.config import list_shipped
 
         places = (Path(one) for one in sorted(glob(f"{incomplete}*")))
         paths = [
@@ -49,15 +49,17 @@ def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[st
             for one in places
             if one.is_dir() or one.suffix in (".yaml", ".onnx")
         ]
-        names = (*(name for kind in kinds for name in shipped_names(kind)), *also)
+        names = (*(name for kind in kinds for name in list_shipped(kind)), *also)
         return [name for name in names if name.startswith(incomplete)] + paths
 
     return complete
 
 
-ROBOTS = completing("robots")
-WORLDS = completing("worlds", "world_sets", also=("barn",))
-POLICIES = completing("policies", also=("dynamic_window", "mppi", "random", "straight"))
+ROBOTS = complete_names("robots")
+WORLDS = complete_names("worlds", "world_sets", also=("barn",))
+POLICIES = complete_names(
+    "policies", also=("dynamic_window", "mppi", "random", "straight")
+)
 ROBOT_OPTIONS = ("--robot", "--model")  # two words for one option, of every command
 RobotOption = Annotated[
     str,
@@ -80,7 +82,7 @@ DrivenRobotOption = Annotated[
 LidarOption = Annotated[
     str | None,
     Option(
-        autocompletion=completing("lidars"),
+        autocompletion=complete_names("lidars"),
         help="A shipped lidar or a YAML file; else the robot's own, or paper.",
     ),
 ]
@@ -100,14 +102,14 @@ TopicsOption = Annotated[
 OtherLidarOption = Annotated[
     str | None,
     Option(
-        autocompletion=completing("lidars"),
+        autocompletion=complete_names("lidars"),
         help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.",
     ),
 ]
 RandomisationOption = Annotated[
     str | None,
     Option(
-        autocompletion=completing("randomisation"),
+        autocompletion=complete_names("randomisation"),
         help="Drawn in each episode: a shipped one (mild) or a YAML file.",
     ),
 ]
@@ -121,7 +123,7 @@ GateOption = Annotated[
         metavar="LIMITS",
         help="Drive through the gate and its shield, with these limits: shipped ones "
         "(differential) or a YAML file.",
-        autocompletion=completing("limits"),
+        autocompletion=complete_names("limits"),
     ),
 ]
 TopicOption = Annotated[
@@ -163,10 +165,10 @@ APART: dict[
 }
 
 
-def checked(command: Callable[..., Any]) -> Callable[..., Any]:
+def check_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """A command that refuses numbers that are not finite, and options that would do nothing.
 
-    All user errors in it end as `one_sentence`.
+    All user errors in it end as `report_in_one_sentence`.
     """
     usual, needed = signature(command).parameters, NEEDED.get(command.__name__, {})
 
@@ -177,35 +179,37 @@ def checked(command: Callable[..., Any]) -> Callable[..., Any]:
             for one, value in given.items()
             if value and value != usual[one].default
         }
-        with one_sentence():
+        with report_in_one_sentence():
             for name, value in told.items():
                 for each in value if isinstance(value, tuple | list) else (value,):
                     if isinstance(each, float) and not math.isfinite(each):
                         raise ConfigError(
-                            f"{_option(name)} {each}: must be a finite number."
+                            f"{_format_option(name)} {each}: must be a finite number."
                         )
                 others = needed.get(name, ())
                 if others and not told.keys() & others:
-                    fix = f"{' or '.join(map(_option, others))}; add that, or leave it out."
-                    raise ConfigError(f"{_option(name)}: belongs to {fix}")
+                    fix = f"{' or '.join(map(_format_option, others))}; add that, or leave it out."
+                    raise ConfigError(f"{_format_option(name)}: belongs to {fix}")
                 for other in APART.get(command.__name__, {}).get(name, ()):
                     if other in told:
-                        fix = f"does not go with {_option(name)}; leave out {_option(other)}"
+                        refused = _format_option(other)
+                        partner = _format_option(name)
+                        fix = f"leave out {refused}, or {partner}."
                         raise ConfigError(
-                            f"{_option(other)} {fix}, or {_option(name)}."
+                            f"{refused} does not go with {partner}; {fix}"
                         )
             return command(**given)
 
     return run
 
 
-def _option(name: str) -> str:
+def _format_option(name: str) -> str:
     return {"places": "--in", "policy": "a policy"}.get(
         name, f"--{name.replace('_', '-')}"
     )
 
 
-def roles_of(options: Sequence[str]) -> dict[str, str]:
+def parse_roles(options: Sequence[str]) -> dict[str, str]:
     """Parses options ROLE=TOPIC for playing a bag into role -> topic. Raises ConfigError."""
     from nics_drl_bridge.middleware.playback import TYPES
 
@@ -214,14 +218,14 @@ def roles_of(options: Sequence[str]) -> dict[str, str]:
         role, _, name = option.partition("=")
         if role not in TYPES or not name:
             raise ConfigError(
-                f"--topic {option!r}: must be ROLE=TOPIC; {nearest(role, TYPES)}"
+                f"--topic {option!r}: must be ROLE=TOPIC; {suggest(role, TYPES)}"
             )
         roles[role] = name if name.startswith("/") else f"/{name}"
     return roles
 
 
 @contextmanager
-def one_sentence() -> Iterator[None]:
+def report_in_one_sentence() -> Iterator[None]:
     """Turns user errors into one sentence and exit code 2, never a traceback."""
     try:
         yield
@@ -235,11 +239,11 @@ def one_sentence() -> Iterator[None]:
             raise typer.Exit(EXIT_INTERRUPTED) from None
         if not isinstance(error, Exception):
             raise
-        clause = extensions.own_fault(error)
+        clause = extensions.explain_own_fault(error)
         if isinstance(error, BridgeError):
             clause = str(error)
         if clause is None and isinstance(error, ImportError):
-            clause = extensions.unmet(error)
+            clause = extensions.explain_unmet(error)
         elif (
             not clause
             and isinstance(error, OSError)
@@ -272,7 +276,7 @@ def needs_ros(what: str) -> Iterator[None]:
         raise ConfigError(f"{what} {MISSING_ROS.format(module=error.name)}") from None
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Formats a table; without a terminal no cell is cut or wrapped."""
     from rich.box import SIMPLE
     from rich.console import Console
@@ -294,14 +298,14 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 @contextmanager
-def progress_bar(begin: str = "starting") -> Iterator[Tell]:
+def show_progress(begin: str = "starting") -> Iterator[Tell]:
     """Yields an updater of a bar on a terminal, of a line now and then on standard error else."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        with _lines(begin) as tell:
+        with _print_progress_lines(begin) as tell:
             yield tell
         return
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
@@ -318,7 +322,7 @@ def progress_bar(begin: str = "starting") -> Iterator[Tell]:
 
 
 @contextmanager
-def _lines(begin: str) -> Iterator[Tell]:
+def _print_progress_lines(begin: str) -> Iterator[Tell]:
     now, over, since = [begin], threading.Event(), time.monotonic()
 
     def tell(what: str, done: int, total: int) -> None:

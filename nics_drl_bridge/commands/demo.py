@@ -40,4 +40,4 @@ def demo(
     console.tell_replaced(out / "report.html")
     plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
     line = run(plan, partial(typer.echo, err=as_json))
-    console.say(as_json, line, told=line, report=str(out / "report.html"))
+    console.print_line(as_json, line, told=line, report=str(out / "report.html"))

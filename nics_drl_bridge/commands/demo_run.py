@@ -18,7 +18,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, PolicyError
 from nics_drl_bridge.files import write_bytes, write_text
-from nics_drl_bridge.generator import SimulatorModel, generate, lidar_of, save_model
+from nics_drl_bridge.generator import SimulatorModel, generate, mount_lidar, save_model
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.report import opening
@@ -153,7 +153,7 @@ def run(plan: DemoPlan, say: Say) -> str:
         (part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()
     ]
     episodes = DemoEpisodes(summaries, here, there, live)
-    sections = sections_of(plan, model, identified, learned, episodes)
+    sections = make_sections(plan, model, identified, learned, episodes)
     folded = html.make_details(
         "Wall time", [html.make_table(("part", "wall time [s]"), times)]
     )
@@ -170,7 +170,7 @@ def run(plan: DemoPlan, say: Say) -> str:
     return f"demo: in process {successes(here)}/{plan.episodes}, {over}report {file}"
 
 
-def _recorded(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
+def _record_or_read(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
     """Reads the plan's drive with its robot, or records one of a textbook robot."""
     if plan.recording is not None:
         return robot_and_drive(plan.recording, plan.robot, TopicRoles(), None)
@@ -182,11 +182,11 @@ def _recorded(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
 
 
 def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
-    world, (robot, recording) = load_world(plan.world), _recorded(plan, say)
+    world, (robot, recording) = load_world(plan.world), _record_or_read(plan, say)
     say(f"generating a simulator of the robot {robot.name!r} from {recording.source}")
     # The demo has to steer even if the drive never did; the report names the assumptions.
     model, identified = generate(
-        recording, robot, lidar_of(robot), world.shapes, assume=True
+        recording, robot, mount_lidar(robot), world.shapes, assume=True
     )
     save_model(model, plan.model)
     say(opening(model.report))
@@ -200,9 +200,9 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         return Learned(
             plan.policy, f"The policy {plan.policy!r} was given; none was trained."
         )
-    missing = extensions.lacking(extensions.TRAINING)
+    missing = extensions.find_lacking(extensions.TRAINING)
     if missing is None:
-        return _trained(plan, model, say)
+        return _train_policy(plan, model, say)
     policy = BASELINE
     if (
         model.robot.name in shipped_policies()
@@ -221,7 +221,7 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     )
 
 
-def settings_of(plan: DemoPlan, model: SimulatorModel) -> Fitted:
+def derive_settings(plan: DemoPlan, model: SimulatorModel) -> Fitted:
     """Settings of the demo's training, in the plan's simulator and world."""
     chosen = load_training("demo")
     worlds = {plan.world: chosen.num_envs}
@@ -230,10 +230,10 @@ def settings_of(plan: DemoPlan, model: SimulatorModel) -> Fitted:
     return fitted(chosen.model_copy(update=changes), model, inherited=True)
 
 
-def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
+def _train_policy(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
 
-    (settings, told), curve = settings_of(plan, model), list[pictures.Point]()
+    (settings, told), curve = derive_settings(plan, model), list[pictures.Point]()
     for line in told:
         say(line)
     say(
@@ -325,7 +325,9 @@ def _deploy(
     say(f"deploying {', '.join(nodes)} in real time")
     # The policy stops where it believes the goal is; its odometry drifts.
     near = Navigation(model.robot, model.lidar).goal_radius + 0.1
-    arrived, path = _watched(nodes, plan.out / "logs" / "realtime", goal, near, say)
+    arrived, path = _watch_episode(
+        nodes, plan.out / "logs" / "realtime", goal, near, say
+    )
     say(
         f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed {seed}"
     )
@@ -333,7 +335,7 @@ def _deploy(
     return Episode(seed, result, path, path, scene.goals[0], scene.bodies, 0.0)
 
 
-def _watched(
+def _watch_episode(
     nodes: dict[str, dict[str, Any]],
     logs: Path,
     goal: list[float],
@@ -380,7 +382,7 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
     return path
 
 
-def sections_of(
+def make_sections(
     plan: DemoPlan,
     model: SimulatorModel,
     identified: Identified,
@@ -389,15 +391,15 @@ def sections_of(
 ) -> list[tuple[str, Sequence[str]]]:
     """Sections of the report, the verdict first, each a heading and HTML blocks."""
     return [
-        ("Verdict", _verdict(plan, learned, identified, of)),
-        ("Paths in the world", _episodes(plan, model, of)),
-        ("The policy", _policy(plan, learned, of)),
+        ("Verdict", _make_verdict(plan, learned, identified, of)),
+        ("Paths in the world", _format_episodes(plan, model, of)),
+        ("The policy", _make_policy_lines(plan, learned, of)),
         ("Paths of the model", make_path_blocks(identified)),
         ("The model", model_blocks(model.robot, identified, model.report)),
     ]
 
 
-def _verdict(
+def _make_verdict(
     plan: DemoPlan, learned: Learned, identified: Identified, of: DemoEpisodes
 ) -> Sequence[str]:
     summary = of.summary
@@ -436,7 +438,7 @@ def _verdict(
     )
 
 
-def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
+def _make_policy_lines(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
     summary = of.summary
     drawn = list[tuple[bytes, str]]()
     if learned.curve:
@@ -465,7 +467,7 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
     ]
 
 
-def _paths_gallery(
+def _draw_paths(
     shown: Sequence[Mapping[str, Episode]], world: AnyWorld, radius: float
 ) -> str:
     """Draws the paths of each seed, with panels of the same size."""
@@ -474,7 +476,9 @@ def _paths_gallery(
     )
 
 
-def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[str]:
+def _format_episodes(
+    plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes
+) -> list[str]:
     here = of.here
     there = of.there
     live = of.live
@@ -485,7 +489,7 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
         alone = [{both[0]: episode} for episode in here[:PANELS]]
-        return [html.make_paragraph(text), _paths_gallery(alone, world, radius)]
+        return [html.make_paragraph(text), _draw_paths(alone, world, radius)]
     rows = [
         (
             f"{a.seed}",
@@ -518,6 +522,6 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     )
     return [
         html.make_paragraph(text),
-        _paths_gallery(shown, world, radius),
+        _draw_paths(shown, world, radius),
         html.make_details("Episode by episode", [html.make_paragraph(about), table]),
     ]

@@ -72,15 +72,15 @@ def doctor(
     else:
         with console.needs_ros("nics doctor"):
             from nics_drl_bridge.nodes.listen import listen
-        with console.progress_bar(f"listening for {duration:g} s"):
+        with console.show_progress(f"listening for {duration:g} s"):
             facts = listen(duration, namespace, imu=imu)
     findings = examine(facts, expected)
     told = f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}."
     if findings:
         heads = ("", "check", "where", "what does not fit", "what to do")
         rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
-        told = console.table(heads, rows)
-    console.say(
+        told = console.format_table(heads, rows)
+    console.print_line(
         as_json, told, source=facts.source, findings=list(map(asdict, findings))
     )
     if findings:
@@ -96,8 +96,10 @@ def _tell_installation(as_json: bool) -> None:
         ("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix)
         for c in found
     ]
-    console.say(
-        as_json, console.table(heads, rows), checks=[each._asdict() for each in found]
+    console.print_line(
+        as_json,
+        console.format_table(heads, rows),
+        checks=[each._asdict() for each in found],
     )
 
 
@@ -110,6 +112,8 @@ def explain(
 
     again = black_box.replay(file)
     story = list(again.story)
-    console.say(as_json, "\n".join(story), story=story, differing=again.differing)
+    console.print_line(
+        as_json, "\n".join(story), story=story, differing=again.differing
+    )
     if again.differing:
         raise typer.Exit(EXIT_FINDINGS)

@@ -16,11 +16,11 @@ import gymnasium
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.commands.vehicle_goals import FAR_M, NEAR_M, WAIT, GoalOrder
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
-from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
-from nics_drl_bridge.files import json_of, write_bytes, write_text
+from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, suggest
+from nics_drl_bridge.files import format_json, write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend
@@ -36,7 +36,7 @@ from nics_drl_bridge.report.doctor_facts import derive_expected
 from nics_drl_bridge.report.pictures import draw_trajectories
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
@@ -95,7 +95,7 @@ def drive_in(
     check_place(place, model.robot)
     if place == FAST:
         given = {"estimator": True, "randomisation": drawn}
-        env, opened = env_of(policy, model, world, "sim", conditions, **given)
+        env, opened = open_env(policy, model, world, "sim", conditions, **given)
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
@@ -117,7 +117,7 @@ def drive_in(
     ):
         say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
         try:
-            env, opened = env_of(policy, model, world, "dds", conditions, **options)
+            env, opened = open_env(policy, model, world, "dds", conditions, **options)
             with closing(env):
                 touched = partial(witness.touched, node, START_S)
                 return drive_all(env, opened, seeds, on_episode, touched)
@@ -126,7 +126,7 @@ def drive_in(
             raise
 
 
-def env_of(
+def open_env(
     policy: str,
     model: SimulatorModel,
     world: str | AnyWorld,
@@ -140,10 +140,10 @@ def env_of(
     made = make_backend(backend, model, field, **given)
     if conditions.gate is not None:
         made = GatedBackend(made, model, conditions.gate)
-    return env_with(made, policy, model, field, conditions)
+    return make_env(made, policy, model, field, conditions)
 
 
-def env_with(
+def make_env(
     backend: Backend,
     policy: str,
     model: SimulatorModel,
@@ -168,7 +168,7 @@ def check_place(place: str, robot: RobotSpec) -> None:
     """Raises ConfigError if there is no such place, or it lacks a module or can't have a robot."""
     if place not in PLACES:
         raise ConfigError(
-            f"--in {place!r}: there is no such simulator; {nearest(place, PLACES)}"
+            f"--in {place!r}: there is no such simulator; {suggest(place, PLACES)}"
         )
     if place == FAST:
         return
@@ -177,16 +177,18 @@ def check_place(place: str, robot: RobotSpec) -> None:
         raise ConfigError(f"the world {place!r} {MISSING_ROS.format(module='rclpy')}")
     if place == MUJOCO:
         extensions.load("nodes", NODES[MUJOCO])
-        import_module(extensions.known("nodes")[NODES[MUJOCO]].module).check(robot)
+        import_module(extensions.find_extensions("nodes")[NODES[MUJOCO]].module).check(
+            robot
+        )
 
 
-def robot_of(policy: str, contract: Contract) -> str:
+def find_robot(policy: str, contract: Contract) -> str:
     """The robot that a policy was trained for: its model's folder or file, or a shipped one."""
     place = str(contract.provenance.get("model", ""))
     name = contract.robot.name
     if place and Path(place).exists():
         return place
-    if name in shipped_names("robots"):
+    if name in list_shipped("robots"):
         return name
     where = f"; its model was {place}, which is gone" if place else ""
     fix = "say where its model is with --model"
@@ -195,7 +197,7 @@ def robot_of(policy: str, contract: Contract) -> str:
     )
 
 
-def contracts_of(
+def read_contracts(
     policies: Sequence[str], model: str | None = None
 ) -> dict[str, Contract]:
     """The contracts of those policies that are files, by policy; baselines have none."""
@@ -228,7 +230,7 @@ class EvaluationOrder:
     def seeds(self) -> range:
         """Seeds of the episodes. Raises ConfigError if one is not a valid seed."""
         seeds = range(self.seed, self.seed + self.episodes)
-        checked_seeds([seeds.start, seeds.stop - 1])
+        check_seeds([seeds.start, seeds.stop - 1])
         return seeds
 
 
@@ -245,10 +247,10 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives all policies through the same episodes everywhere; writes results, pictures."""
     seeds = order.seeds
     logs = order.out / "logs"
-    contracts = contracts_of(order.policies, order.model)
+    contracts = read_contracts(order.policies, order.model)
     model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
-    under = limited(order.conditions, contracts, model, world, say)
+    under = limit_time(order.conditions, contracts, model, world, say)
     places = _places(order, model.robot, say)
     evaluated = []
     for policy in order.policies:
@@ -264,13 +266,13 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
             given = place, policy, name, order.world, seeds, logs
             runs[place] = drive_in(*given, on_episode, say, under)
         evaluated.append(
-            judged(policy, runs, model, world, order.out, PANELS, order.policies)
+            judge_runs(policy, runs, model, world, order.out, PANELS, order.policies)
         )
         write_evaluation(replace(order, conditions=under), name, model, evaluated)
     return evaluated
 
 
-def limited(
+def limit_time(
     conditions: Conditions,
     contracts: Mapping[str, Contract],
     model: SimulatorModel,
@@ -305,7 +307,7 @@ def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]
     return found
 
 
-def judged(
+def judge_runs(
     policy: str,
     runs: Mapping[str, Sequence[Episode]],
     model: SimulatorModel,
@@ -317,14 +319,14 @@ def judged(
     """Judges the runs of a policy by place, and draws their first episodes into a folder."""
     shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
     picture = draw_trajectories(shown, world, model.robot.footprint_radius)
-    write_bytes(out / f"trajectories_{short_name(policy, among)}.png", picture)
+    write_bytes(out / f"trajectories_{shorten_name(policy, among)}.png", picture)
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
 
 
 ENDS = r"\.(onnx|ya?ml)$"  # of a policy, or a mapping of one
 
 
-def short_name(policy: str, among: Sequence[str]) -> str:
+def shorten_name(policy: str, among: Sequence[str]) -> str:
     """Returns the stem of a policy's path; where others have the same, folders before it, too."""
     own, *others = (
         [part.strip("/") for part in Path(re.sub(ENDS, "", one)).absolute().parts]
@@ -341,7 +343,7 @@ def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
     if model is not None:
         return model
     robots = {
-        policy: robot_of(policy, contract) for policy, contract in contracts.items()
+        policy: find_robot(policy, contract) for policy, contract in contracts.items()
     }
     if not robots:
         return DEFAULT_ROBOT
@@ -378,26 +380,26 @@ def write_evaluation(
         "conditions": asdict(order.conditions),
         "policies": policies,
     }
-    write_text(order.out / EVALUATION, json_of(data) + "\n")
+    write_text(order.out / EVALUATION, format_json(data) + "\n")
 
 
-def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
+def format_rows(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     """Rows of the table with the columns `HEADS`, as text."""
     return [
         (
             one.policy,
             LABELS[place],
-            _percent(tally.success.value),
+            _format_percent(tally.success.value),
             f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
             *(
-                _percent(rate.value)
+                _format_percent(rate.value)
                 for rate in (tally.believed, tally.collision, tally.time_out)
             ),
             *(
                 "-" if isnan(of.value) else f"{of.value:.2f}"
                 for of in (tally.length, tally.time)
             ),
-            _percent(tally.same),
+            _format_percent(tally.same),
             f"{tally.deviation.value:.2g}",
             f"{tally.greatest_deviation:.2g}",
         )
@@ -406,15 +408,16 @@ def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     ]
 
 
-def _percent(share: float) -> str:
+def _format_percent(share: float) -> str:
     return f"{100 * share:.4g} %"
 
 
-def line_of(one: Evaluated) -> str:
+def summarize(one: Evaluated) -> str:
     """Summarises a policy in one line."""
     each = ", ".join(
-        f"{LABELS[place]}{', as believed,' if place == VEHICLE else ''} {_percent(t.success.value)}"
-        for place, t in one.tallies.items()
+        f"{LABELS[place]}{', as believed,' if place == VEHICLE else ''}"
+        f" {_format_percent(tally.success.value)}"
+        for place, tally in one.tallies.items()
     )
     return f"{one.policy}: success {each}"
 
@@ -439,7 +442,7 @@ def drive_vehicle(
     model or answer, ConfigError if a goal is refused.
     """
     policy = order.policies[0]
-    contracts = contracts_of(order.policies, order.model)
+    contracts = read_contracts(order.policies, order.model)
     name = model_name(order.model, contracts)
     namespace = options.get("namespace", "")
     model = open_model(name)
@@ -453,7 +456,7 @@ def drive_vehicle(
             wanted.episode(sample_scene(world, radius, seed)) for seed in order.seeds
         ]
         max(planned, key=lambda one: one.distance).confirm(confirm)
-    under = limited(order.conditions, contracts, model, world, say)
+    under = limit_time(order.conditions, contracts, model, world, say)
     # A misfit is an error before anything moves.
     open_policy(policy, model, order.conditions.kind)
     from nics_drl_bridge.nodes.listen import listen
@@ -479,7 +482,7 @@ def drive_vehicle(
     given["lays_map"] = wanted.lays_map
     ground = wanted.ground(world)
     backend = make_backend("dds", model, ground, **given)
-    env, driver = env_with(backend, policy, model, ground, under)
+    env, driver = make_env(backend, policy, model, ground, under)
     episodes = list[Episode]()
     with closing(env):
         for count, seed in enumerate(order.seeds, 1):
@@ -501,8 +504,8 @@ def drive_vehicle(
             )
             # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
-            say(f"  {told_end(episodes[-1])}")
-    env, driver = env_of(policy, model, order.world, "sim", under, estimator=True)
+            say(f"  {report_end(episodes[-1])}")
+    env, driver = open_env(policy, model, order.world, "sim", under, estimator=True)
     runs: dict[str, list[Episode]] = {VEHICLE: episodes}
     starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
     with closing(env):
@@ -510,7 +513,7 @@ def drive_vehicle(
             runs[FAST] = [drive(env, driver, *each) for each in starts]
         except ConfigError as error:  # by its map the vehicle may have stood in a wall
             say(f"  not driven again in process: {error}")
-    made = judged(policy, runs, model, world, order.out)
+    made = judge_runs(policy, runs, model, world, order.out)
     write_evaluation(replace(order, conditions=under), name, model, [made])
     return made
 
@@ -518,7 +521,7 @@ def drive_vehicle(
 ENDS_BELIEVED = {"success": "reached", "collision": "touched"}
 
 
-def told_end(episode: Episode) -> str:
+def report_end(episode: Episode) -> str:
     """Tells the end of an episode on a vehicle: as it believes, for nothing else is known."""
     end = ENDS_BELIEVED.get(episode.result, episode.result)
     end = f"{end}, as believed"

@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import check_above, json_of, write_bytes, write_text
+from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
 
 
 def evaluate(
@@ -128,7 +128,7 @@ def evaluate(
     as_json: console.JsonOption = False,
 ) -> None:
     """Drives policies through the same episodes, and compares them."""
-    place = _point(goal)
+    place = _parse_point(goal)
     if backend not in (None, "dds"):
         raise ConfigError(
             f"--backend {backend!r}: must be dds; simulators are chosen by --in."
@@ -142,9 +142,9 @@ def evaluate(
             f"--hardware drives one policy at a time, not {', '.join(policies)}."
         )
     if shadow is not None:
-        _shadow(shadow, policies, model, topic or [], place, ahead, out, as_json)
+        _replay_shadow(shadow, policies, model, topic or [], place, ahead, out, as_json)
         return
-    with console.progress_bar():
+    with console.show_progress():
         from nics_drl_bridge.commands import episodes as driving
         from nics_drl_bridge.commands.conditions import Conditions
 
@@ -178,14 +178,14 @@ def evaluate(
         with console.needs_ros("nics evaluate --hardware"):
             evaluated = [driven(**options)]
     else:
-        with console.progress_bar("opening robot and policies") as advance:
+        with console.show_progress("opening robot and policies") as advance:
             evaluated = driving.evaluate(order, tell, advance)
     if as_json:
         typer.echo((out / driving.EVALUATION).read_text().rstrip())
         return
-    typer.echo(console.table(driving.HEADS, driving.rows_of(evaluated)))
+    typer.echo(console.format_table(driving.HEADS, driving.format_rows(evaluated)))
     for one in evaluated:
-        typer.echo(driving.line_of(one))
+        typer.echo(driving.summarize(one))
     typer.echo(f"pictures and evaluation.json: {out}")
 
 
@@ -204,7 +204,7 @@ def _confirm(yes: bool, question: str) -> None:
         confirm_at_terminal(question)
 
 
-def _point(text: str | None) -> tuple[float, float] | None:
+def _parse_point(text: str | None) -> tuple[float, float] | None:
     if text is None:
         return None
     try:
@@ -216,7 +216,7 @@ def _point(text: str | None) -> tuple[float, float] | None:
     raise ConfigError(f"--goal {text!r}: must be X,Y in metres, as 2.5,-1.")
 
 
-def _shadow(
+def _replay_shadow(
     bag: Path,
     policies: list[str],
     model: str | None,
@@ -226,7 +226,11 @@ def _shadow(
     out: Path,
     as_json: bool,
 ) -> None:
-    from nics_drl_bridge.commands.episodes import contracts_of, model_name, short_name
+    from nics_drl_bridge.commands.episodes import (
+        model_name,
+        read_contracts,
+        shorten_name,
+    )
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
     from nics_drl_bridge.report.pictures import draw_shadow
@@ -235,11 +239,11 @@ def _shadow(
     lines = list[str]()
     told = list[dict[str, Any]]()
     for policy in policies:
-        name = model_name(model, contracts_of([policy], model))
+        name = model_name(model, read_contracts([policy], model))
         made = shadow(
-            bag, open_model(name), policy, console.roles_of(topics), goal, ahead
+            bag, open_model(name), policy, console.parse_roles(topics), goal, ahead
         )
-        place = out / f"shadow_{short_name(policy, policies)}"
+        place = out / f"shadow_{shorten_name(policy, policies)}"
         differences = made.differences()
         write_bytes(place.with_suffix(".png"), draw_shadow(made))
         data = {
@@ -253,7 +257,7 @@ def _shadow(
             "resets": made.resets,
             "commands": differences,
         }
-        write_text(place.with_suffix(".json"), json_of(data) + "\n")
+        write_text(place.with_suffix(".json"), format_json(data) + "\n")
         told.append(data)
         for (command, figures), unit in zip(
             differences.items(), made.units, strict=True
@@ -277,5 +281,9 @@ def _shadow(
         "greatest",
         "opposite sign",
     )
-    lines = [console.table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"]
-    console.say(as_json, "\n".join(lines), policies=told)
+    lines = [
+        console.format_table(heads, rows),
+        *lines,
+        f"pictures and shadow_*.json: {out}",
+    ]
+    console.print_line(as_json, "\n".join(lines), policies=told)

@@ -2,7 +2,7 @@
 
 import typer
 
-from nics_drl_bridge.commands.console import checked
+from nics_drl_bridge.commands.console import check_options
 
 EXAMPLES = {
     "list": ("nics list robots", "nics list worlds --json"),
@@ -64,7 +64,7 @@ EXAMPLES = {
 def complete(app: typer.Typer, group: str = "") -> None:
     """Ends the help of each command of an app and its groups with examples; see also `checked`."""
     for command in app.registered_commands:
-        command.callback = checked(command.callback) if command.callback else None
+        command.callback = check_options(command.callback) if command.callback else None
         name = command.name or str(getattr(command.callback, "__name__", ""))
         if found := EXAMPLES.get(f"{group}{name}"):
             # A line with this character alone keeps the lines below as they are.

@@ -5,7 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-from nics_drl_bridge.errors import ConfigError, ModelError, nearest
+from nics_drl_bridge.errors import ConfigError, ModelError, suggest
 
 # Of numpy's global generator, from which Stable-Baselines3 draws.
 GREATEST_TRAINING_SEED = 2**32 - 1
@@ -29,10 +29,10 @@ def check_writable(path: Path) -> None:
 
 def check_robot(name: str) -> None:
     """Raises ConfigError or ModelError unless a robot, or the folder of a model, can be opened."""
-    from nics_drl_bridge.config import shipped_names
+    from nics_drl_bridge.config import list_shipped
     from nics_drl_bridge.robot.spec import load_robot
 
-    shipped = shipped_names("robots")
+    shipped = list_shipped("robots")
     if name in shipped or name.endswith((".yaml", ".yml")):
         load_robot(name)
         return
@@ -41,7 +41,7 @@ def check_robot(name: str) -> None:
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
     if not folder.is_dir():
         fix = "or give a model's folder, or a robot's YAML file"
-        raise ModelError(f"unknown robot {name!r}; {nearest(name, shipped)} ({fix}).")
+        raise ModelError(f"unknown robot {name!r}; {suggest(name, shipped)} ({fix}).")
     if not (folder / "model.yaml").is_file():
         raise ModelError(
             f"{folder}: holds no model.yaml; make a model with `nics generate`."
@@ -68,9 +68,9 @@ def check_training(
     out: Path | None,
 ) -> None:
     """Raises ConfigError or ModelError for the first name, seed or place that can't be used."""
-    from nics_drl_bridge.seeds import checked_seeds
+    from nics_drl_bridge.seeds import check_seeds
 
-    checked_seeds(seeds, GREATEST_TRAINING_SEED)
+    check_seeds(seeds, GREATEST_TRAINING_SEED)
     if len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
     if out is not None:

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import JsonOption, say
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
+from nics_drl_bridge.commands.console import JsonOption, print_line
+from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
 from nics_drl_bridge.nodes.message_packages import shipped_packages, wheels_here
 
 
@@ -42,13 +42,15 @@ def install(
         write_setup,
     )
 
-    sources = [source_of(name) for name in packages]
+    sources = [find_source(name) for name in packages]
     if prefix is None:
         present = [
             source.name for source in sources if find_spec(source.name) is not None
         ]
         for name in present:
-            say(as_json, f"{name} is installed already", package=name, prefix=None)
+            print_line(
+                as_json, f"{name} is installed already", package=name, prefix=None
+            )
         sources = [source for source in sources if source.name not in present]
     if not sources:
         return
@@ -79,12 +81,12 @@ def install(
             if prefix is None:
                 check_import(source.name)
             line = f"{source.name} is installed in {place}"
-            say(as_json, line, package=source.name, prefix=str(place))
+            print_line(as_json, line, package=source.name, prefix=str(place))
     if prefix is not None:
         _tell(f"to use what is there: source {write_setup(place)}")
 
 
-def source_of(name: str) -> Path:
+def find_source(name: str) -> Path:
     """Returns the folder with the files of a message package. Raises ConfigError."""
     shipped = shipped_packages()
     if name in shipped:
@@ -94,7 +96,7 @@ def source_of(name: str) -> Path:
         return folder.resolve()
     fix = "or give the folder of a package with its msg, srv and action"
     raise ConfigError(
-        f"unknown message package {name!r}; {nearest(name, shipped)} ({fix})."
+        f"unknown message package {name!r}; {suggest(name, shipped)} ({fix})."
     )
 
 

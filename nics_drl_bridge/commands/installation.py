@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from typing import NamedTuple
 
 from nics_drl_bridge.errors import MISSING_ROS
-from nics_drl_bridge.extensions import PACKAGE, TRAINING, lacking
+from nics_drl_bridge.extensions import PACKAGE, TRAINING, find_lacking
 from nics_drl_bridge.nodes.message_packages import how_to_install
 
 EXTRAS = {  # what each brings, by the modules that it needs
@@ -53,10 +53,10 @@ def checks() -> list[Check]:
     cores = Check(
         "cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", ""
     )
-    return [_python(), *_extras(), *_ros(), cores, _kernels()]
+    return [_check_python(), *_check_extras(), *_check_ros(), cores, _check_kernels()]
 
 
-def _python() -> Check:
+def _check_python() -> Check:
     needed = ">=3.10,<3.15"
     with suppress(PackageNotFoundError):  # a source tree that was never installed
         needed = metadata(PACKAGE)["Requires-Python"] or needed
@@ -73,17 +73,17 @@ def _python() -> Check:
     )
 
 
-def _extras() -> list[Check]:
+def _check_extras() -> list[Check]:
     found = []
     for extra, (what, modules) in EXTRAS.items():
-        missing = lacking(modules)
+        missing = find_lacking(modules)
         told = what if missing is None else f"{what}: the module {missing!r} is missing"
         fix = f"pip install '{PACKAGE}[{extra}]'"
         found.append(Check(f"extra {extra}", missing is None, told, fix))
     return found
 
 
-def _ros() -> list[Check]:
+def _check_ros() -> list[Check]:
     if find_spec("rclpy") is None:
         reason = MISSING_ROS.format(module="rclpy").partition("; ")[2].rstrip(".")
         return [
@@ -109,7 +109,7 @@ def _ros() -> list[Check]:
     return [Check("ROS 2", True, told), *messages]
 
 
-def _kernels() -> Check:
+def _check_kernels() -> Check:
     for name in COMPILED:
         import_module(f"{PACKAGE}.{name}")
     from nics_drl_bridge.kernels import KERNELS, SECONDS_EACH

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from typer import Argument
 
-from nics_drl_bridge.commands.console import JsonOption, say, table
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.commands.console import JsonOption, format_table, print_line
+from nics_drl_bridge.config import list_shipped
 
 Row = dict[str, Any]
 
@@ -27,12 +27,12 @@ def list_(
     """Lists the shipped robots, worlds, lidars or policies."""
     rows = ROWS[what]()
     cells = [tuple(map(str, row.values())) for row in rows]
-    say(as_json, table(tuple(rows[0]), cells), **{what.value: rows})
+    print_line(as_json, format_table(tuple(rows[0]), cells), **{what.value: rows})
 
 
 def robots() -> list[Row]:
     """The shipped robots: name, commands with their ranges, lidar, and what they are."""
-    from nics_drl_bridge.generator import lidar_of
+    from nics_drl_bridge.generator import mount_lidar
     from nics_drl_bridge.robot.spec import load_robot
 
     return [
@@ -41,10 +41,10 @@ def robots() -> list[Row]:
             "commands": ", ".join(
                 f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in one.command
             ),
-            "lidar": lidar_of(one).name,
+            "lidar": mount_lidar(one).name,
             "description": one.description,
         }
-        for name, one in ((name, load_robot(name)) for name in shipped_names("robots"))
+        for name, one in ((name, load_robot(name)) for name in list_shipped("robots"))
     ]
 
 
@@ -55,7 +55,7 @@ def worlds() -> list[Row]:
     from nics_drl_bridge.sim.world_set import BARN
 
     rows = []
-    for name in shipped_names("worlds"):
+    for name in list_shipped("worlds"):
         world = load_world(name)
         x1, y1, x2, y2 = world.extent
         counts = [group.counts for group in world.obstacles]
@@ -63,17 +63,24 @@ def worlds() -> list[Row]:
         high = sum(most for _, most in counts)
         obstacles = f"{low}" if low == high else f"{low} to {high}"
         rows.append(
-            _world(name, f"{x2 - x1:g} x {y2 - y1:g}", world.goal_distance, obstacles)
+            _describe_world(
+                name, f"{x2 - x1:g} x {y2 - y1:g}", world.goal_distance, obstacles
+            )
         )
     rows.append(
-        _world(BARN, f"a set of {len(barn_numbers())} worlds, as barn/7", (), "")
+        _describe_world(
+            BARN, f"a set of {len(barn_numbers())} worlds, as barn/7", (), ""
+        )
     )
     return rows + [
-        _world(name, "a set of worlds", (), "") for name in shipped_names("world_sets")
+        _describe_world(name, "a set of worlds", (), "")
+        for name in list_shipped("world_sets")
     ]
 
 
-def _world(name: str, size: str, distance: tuple[float, ...], obstacles: str) -> Row:
+def _describe_world(
+    name: str, size: str, distance: tuple[float, ...], obstacles: str
+) -> Row:
     far = " to ".join(f"{value:g}" for value in distance)
     return {
         "name": name,
@@ -97,7 +104,7 @@ def lidars() -> list[Row]:
             "range [m]": f"{spec.range_min:g} to {spec.range_max:g}",
             "scans [Hz]": spec.rate,
         }
-        for name, spec in ((name, load_lidar(name)) for name in shipped_names("lidars"))
+        for name, spec in ((name, load_lidar(name)) for name in list_shipped("lidars"))
     ]
 
 

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from nics_drl_bridge.errors import ConfigError, shortened
+from nics_drl_bridge.errors import ConfigError, shorten
 from nics_drl_bridge.nodes.message_packages import Wheels
 
 # Newer ones have another interface than the generators call.
@@ -111,7 +111,7 @@ def check_programs() -> None:
         raise ConfigError(f"{needed}; install {' and '.join(missing)} {fix}.")
 
 
-def modules_of(prefix: Path) -> Path:
+def find_modules_folder(prefix: Path) -> Path:
     """Returns the folder of Python's modules below a prefix."""
     return (
         prefix
@@ -155,7 +155,7 @@ class Generators(AbstractContextManager["Generators", None]):
         pip = [python, "-m", "pip", "install", "-qq", "--disable-pip-version-check"]
         self._run([*pip, "-c", str(pins), *tools], "the generators can't be installed")
         self._name_own_folders()
-        modules = modules_of(self._prefix)
+        modules = find_modules_folder(self._prefix)
         self._environment["AMENT_PREFIX_PATH"] = str(self._prefix)
         self._environment["CMAKE_PREFIX_PATH"] = f"{self._prefix}{os.pathsep}{modules}"
         path = os.environ.get("PATH", os.defpath)
@@ -169,7 +169,7 @@ class Generators(AbstractContextManager["Generators", None]):
             return (
                 include
                 if match[1].startswith("include")
-                else str(modules_of(self._prefix))
+                else str(find_modules_folder(self._prefix))
             )
 
         for file in (self._prefix / "share").rglob("*.cmake"):
@@ -248,7 +248,7 @@ class Generators(AbstractContextManager["Generators", None]):
                 for line in (done.stdout + done.stderr).splitlines()
                 if line.strip()
             ]
-            reason = shortened(" | ".join(lines[-REASON_LINES:]), 500)
+            reason = shorten(" | ".join(lines[-REASON_LINES:]), 500)
             raise ConfigError(
                 f"{failed}: `{command[0]}` ended with {done.returncode}: {reason}"
             )
@@ -260,6 +260,6 @@ class Generators(AbstractContextManager["Generators", None]):
 def write_setup(prefix: Path) -> Path:
     """Writes a file to be sourced, for a prefix that is not that of this environment."""
     file = prefix / "setup.bash"
-    text = SETUP.format(modules=modules_of(prefix), libraries=prefix / "lib")
+    text = SETUP.format(modules=find_modules_folder(prefix), libraries=prefix / "lib")
     file.write_text(text, encoding="utf-8")
     return file

@@ -10,9 +10,9 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_drive
-from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.files import json_of
+from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def record(
     as_json: console.JsonOption = False,
 ) -> None:
     """Drives a robot through its full range of motion and records it."""
-    arguments = node_arguments(namespace, remap or ())
+    arguments = make_node_arguments(namespace, remap or ())
     given = {
         "robot": robot,
         "out": str(out),
@@ -77,14 +77,16 @@ def record(
         # First: with ROS 2 from wheels it restarts Python.
         with console.needs_ros("nics record"):
             from nics_drl_bridge.nodes.record_node import record as drive
-    lines = preview_lines(given)
+    lines = draw_preview(given)
     told: dict[str, Any] = {"out": str(out), "robot": robot}
     if preview:
-        console.say(as_json, "\n".join(lines), **told, told=lines)
+        console.print_line(as_json, "\n".join(lines), **told, told=lines)
         return
     typer.echo("\n".join(lines), err=as_json)
     if not yes and not typer.confirm("Drive the robot now?", err=as_json):
-        console.say(as_json, "nothing was driven or recorded.", **told, recorded=False)
+        console.print_line(
+            as_json, "nothing was driven or recorded.", **told, recorded=False
+        )
         return
     driven = drive(given, arguments)
     if driven.failure is not None:
@@ -94,14 +96,14 @@ def record(
     if recording is not None:
         lines += drive_summary(recording, given)
     told |= {"recorded": recording is not None, "complete": driven.complete}
-    console.say(as_json, "\n".join(lines), **told, told=lines)
+    console.print_line(as_json, "\n".join(lines), **told, told=lines)
     if not driven.complete:
         raise typer.Exit(console.EXIT_INTERRUPTED)
 
 
-def node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
+def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     """Returns the command line for `record_node`; ConfigError for a malformed remapping rule."""
-    rules = [f"__ns:={space}"] if (space := namespace_of(namespace)) else []
+    rules = [f"__ns:={space}"] if (space := parse_namespace(namespace)) else []
     for rule in remap:
         if not all(rule.partition(":=")):
             raise ConfigError(
@@ -112,7 +114,7 @@ def node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     return ["nics", "--ros-args", *flags] if flags else ["nics"]
 
 
-def preview_lines(given: dict[str, Any]) -> tuple[str, ...]:
+def draw_preview(given: dict[str, Any]) -> tuple[str, ...]:
     """Draws the drive that `record_node` would make of its parameters; returns lines."""
     from nics_drl_bridge.files import write_bytes
     from nics_drl_bridge.recording.excite import DrivePlan
@@ -168,7 +170,7 @@ def inspect(
 
     if mapping is not None and mapping.exists():
         raise ConfigError(f"--map {mapping}: is there already; give another name.")
-    with open_source(source) as opened, console.progress_bar(f"reading {source}"):
+    with open_source(source) as opened, console.show_progress(f"reading {source}"):
         tables = survey(opened)
     why = why_no_mapping(source)
     is_own = is_recording(source)  # its arrays are no columns that a mapping could name
@@ -189,7 +191,7 @@ def inspect(
     if as_json:
         facts = {"tables": [asdict(table) for table in tables], "doubts": doubts}
         facts |= {"mapping": written and str(written), "needs_mapping": not why}
-        typer.echo(json_of(facts))
+        typer.echo(format_json(facts))
         return
     for line in (*([needless] if needless else ()), *doubts):
         typer.echo(line)
@@ -200,7 +202,7 @@ def inspect(
         typer.echo(f"{table.name}: {table.rows} rows{found}")
         rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
         if rows:
-            typer.echo(console.table(("column", "least", "greatest"), rows))
+            typer.echo(console.format_table(("column", "least", "greatest"), rows))
     if is_own:
         typer.echo(
             f"no mapping was written: {needless}" if mapping is not None else needless
@@ -231,7 +233,7 @@ def import_(
     if out.suffix != ".npz":
         raise ConfigError(f"--out {out}: must end in .npz.")
     check_out(out)
-    with console.progress_bar(f"reading {source}"):
+    with console.show_progress(f"reading {source}"):
         drive = read_recording(source, mapping=mapping)
         save_recording(drive, out)
     streams = stream_facts(drive)
@@ -245,10 +247,10 @@ def import_(
         )
         for s in streams
     ]
-    table = console.table(("stream", "rows", "rate", "time", "clock"), rows)
+    table = console.format_table(("stream", "rows", "rate", "time", "clock"), rows)
     text = "\n".join((table, *drive.repairs, f"recording written to {out}"))
     facts = {"streams": streams, "repairs": drive.repairs, "robot": drive.robot}
-    console.say(as_json, text, recording=str(out), **facts)
+    console.print_line(as_json, text, recording=str(out), **facts)
 
 
 def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
@@ -316,7 +318,7 @@ def generate(
     as_json: console.JsonOption = False,
 ) -> None:
     """Generates a simulator from recordings and writes its folder."""
-    from nics_drl_bridge.generator import check_place, lidar_of, save_model
+    from nics_drl_bridge.generator import check_place, mount_lidar, save_model
     from nics_drl_bridge.generator import generate as generate_model
     from nics_drl_bridge.identify.fit import parse_alpha, parse_order
     from nics_drl_bridge.lidar.sensor import load_sensor
@@ -334,15 +336,15 @@ def generate(
     shapes = load_world(world).shapes
     named = ", ".join(map(str, recording))
     roles = topic_roles(topics, topic or ())
-    with console.progress_bar(f"reading {named}"):
+    with console.show_progress(f"reading {named}"):
         spec, drives = robot_and_drives(recording, robot, roles, mapping)
     pairs = zip(drives, names_of_sources(recording), strict=True)
     drives = [replace(drive, source=name) for drive, name in pairs]
-    with console.progress_bar("generating"):
+    with console.show_progress("generating"):
         model, identified = generate_model(
             drives if len(drives) > 1 else drives[0],
             spec,
-            lidar_of(spec, lidar),
+            mount_lidar(spec, lidar),
             shapes,
             terms,
             threshold,
@@ -356,7 +358,7 @@ def generate(
     from nics_drl_bridge.report.fit_page import write_fit_page
     from nics_drl_bridge.report.fit_pictures import write_pictures
 
-    with console.progress_bar("drawing the report"):
+    with console.show_progress("drawing the report"):
         write_fit_page(out / "report.html", named, spec, identified, model.report)
         if pictures:
             write_pictures(spec, identified, out / "pictures")
@@ -367,7 +369,9 @@ def generate(
         f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
         f"model written to {out}",
     )
-    console.say(as_json, "\n".join(lines), **fit_facts(out, spec.name, identified))
+    console.print_line(
+        as_json, "\n".join(lines), **fit_facts(out, spec.name, identified)
+    )
 
 
 def names_of_sources(recordings: Sequence[Path]) -> list[str]:
@@ -418,17 +422,17 @@ def drive(
     """
     import numpy as np
 
-    from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
+    from nics_drl_bridge.generator import check_place, generate, mount_lidar, save_model
     from nics_drl_bridge.recording.textbook import record as record_textbook
     from nics_drl_bridge.recording.write import check_out, write_drive
     from nics_drl_bridge.robot.spec import load_robot
 
     spec = load_robot(robot)
     check_place(out := out or Path(f"{Path(robot).stem}_model"))
-    seen = lidar_of(spec, lidar)
+    seen = mount_lidar(spec, lidar)
     if recording is not None and recording.suffix != ".npz":
         raise ConfigError(f"--recording {recording}: must end in .npz.")
-    with console.progress_bar(f"driving and generating {spec.name!r}"):
+    with console.show_progress(f"driving and generating {spec.name!r}"):
         driven = record_textbook(spec, np.random.default_rng(seed), duration)
         if recording is not None:
             write_drive(driven, check_out(recording), spec)
@@ -438,7 +442,7 @@ def drive(
     made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
     lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
     facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
-    console.say(
+    console.print_line(
         as_json, "\n".join(lines), **facts, recording=recording and str(recording)
     )
 
@@ -467,4 +471,6 @@ def urdf(
     further = {each.frame: each.mount for each in opened.sensors}
     write_text(file, make_urdf(opened.robot, lidar.mount, lidar.frame, further=further))
     name = opened.robot.name
-    console.say(as_json, f"{file}: the URDF of {name}", file=str(file), robot=name)
+    console.print_line(
+        as_json, f"{file}: the URDF of {name}", file=str(file), robot=name
+    )

@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.config import parse_namespace
 
 EXIT_REFUSED = 1
 
@@ -29,7 +29,7 @@ def arm(
     as_json: console.JsonOption = False,
 ) -> None:
     """Arms command_gate; tells why it refuses."""
-    namespace_of(namespace)
+    parse_namespace(namespace)
     with console.needs_ros("nics arm"):
         from nics_drl_bridge.nodes.operator import Operator
     with Operator() as operator:
@@ -38,7 +38,7 @@ def arm(
         typer.echo(f"nics: {answer.gate} refuses to arm: {answer.told}", err=True)
         raise typer.Exit(EXIT_REFUSED)
     line = f"{answer.gate} is armed: the robot moves when its policy has a goal"
-    console.say(as_json, line, gate=answer.gate, armed=True)
+    console.print_line(as_json, line, gate=answer.gate, armed=True)
 
 
 def stop(
@@ -49,7 +49,7 @@ def stop(
     as_json: console.JsonOption = False,
 ) -> None:
     """Stops one robot, or all, by the e-stop of its gate."""
-    namespace_of(namespace or "")
+    parse_namespace(namespace or "")
     with console.needs_ros("nics stop"):
         from nics_drl_bridge.nodes.operator import Operator
     with Operator() as operator:
@@ -66,7 +66,7 @@ def stop(
             typer.echo(f"nics: {answer.gate} was NOT stopped: {answer.told}", err=True)
     if lines or as_json:
         stopped = {answer.gate: answer.granted for answer in answers}
-        console.say(as_json, "\n".join(lines), stopped=stopped)
+        console.print_line(as_json, "\n".join(lines), stopped=stopped)
     if not all(answer.granted for answer in answers):
         raise typer.Exit(EXIT_REFUSED)
 
@@ -88,7 +88,7 @@ def goal(
     as_json: console.JsonOption = False,
 ) -> None:
     """Sends a goal; tells whether policy_node takes it."""
-    namespace_of(namespace)
+    parse_namespace(namespace)
     with console.needs_ros("nics goal"):
         from nics_drl_bridge.nodes.operator import GoalRequest, Operator
     with Operator() as operator:
@@ -99,4 +99,4 @@ def goal(
         typer.echo(f"nics: policy_node does not take the goal: {answer.told}", err=True)
         raise typer.Exit(EXIT_REFUSED)
     line = f"policy_node drives to {answer.told}, while command_gate is armed"
-    console.say(as_json, line, taken=True, goal=answer.told)
+    console.print_line(as_json, line, taken=True, goal=answer.told)

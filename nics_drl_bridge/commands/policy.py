@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, say
+from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, print_line
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_bytes
 
@@ -32,9 +32,9 @@ def info(
     from nics_drl_bridge.policy.policy_file import summary
 
     facts = summary(load_any(file))
-    say(
+    print_line(
         as_json,
-        "\n".join(f"{name:<18} {value}" for name, value in _lines(facts)),
+        "\n".join(f"{name:<18} {value}" for name, value in _format_lines(facts)),
         **facts,
     )
 
@@ -57,7 +57,7 @@ def export(
     from nics_drl_bridge.policy.leapp import export_bundle
 
     written = str(export_bundle(load_any(file), leapp))
-    say(as_json, f"wrote {written}", file=written)
+    print_line(as_json, f"wrote {written}", file=written)
 
 
 @policy.command(name="import")
@@ -95,10 +95,10 @@ def import_(
     write_bytes(out, data)
     name = contract.robot.name
     line = f"wrote {out}, a policy of {name!r}; see nics policy info {out}"
-    say(as_json, line, file=str(out), robot=name)
+    print_line(as_json, line, file=str(out), robot=name)
 
 
-def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
+def _format_lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lidar = facts["lidar"]
     scan = facts["scan"]
     seen = facts["observation"]

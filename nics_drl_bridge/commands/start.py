@@ -117,7 +117,7 @@ def _explain(error: BaseException) -> NoReturn:
     if isinstance(error, ImportError):
         from nics_drl_bridge import extensions
 
-        if (clause := extensions.unmet(error)) is None:
+        if (clause := extensions.explain_unmet(error)) is None:
             raise error
         sys.stderr.write(f"nics: {clause}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None

@@ -17,8 +17,8 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_settings, check_training
 from nics_drl_bridge.commands.start import was_interrupted
-from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.files import json_of
+from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 DEFAULT_EPISODES = 500
@@ -47,7 +47,7 @@ def train(
         Option(
             help="Shipped settings (navigation_differential), or a YAML file; else those of the "
             "robot, or of the shipped robot that moves like it.",
-            autocompletion=console.completing("training"),
+            autocompletion=console.complete_names("training"),
         ),
     ] = None,
     world: Annotated[
@@ -114,7 +114,7 @@ def train(
     if (settings or algorithm) and not resume:
         check_settings(task, settings, named)
     extensions.require("training", *extensions.TRAINING)
-    with console.progress_bar("loading PyTorch"):
+    with console.show_progress("loading PyTorch"):
         from nics_drl_bridge.policy import train as train_run
 
     own_task = task if ":" in task else None
@@ -122,7 +122,7 @@ def train(
         resumed = train_run.settings_of(out, own_task)
     else:
         resumed = None
-    chosen = resumed or _told(task, settings, named)
+    chosen = resumed or _load_settings(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])
     if begun := train_run.seeds_of(folder) if resume and not seeds else []:
@@ -133,8 +133,8 @@ def train(
         folder, every, episodes, own_task, engine, address, env_runners
     )
     with (
-        told_if_interrupted(again, train_run.seeds_of),
-        _learner(engine, address, env_runners, chosen.num_envs) as learn,
+        report_interruption(again, train_run.seeds_of),
+        _open_learner(engine, address, env_runners, chosen.num_envs) as learn,
     ):
         (_run_watched if watch else _run)(train_run, order, learn, as_json)
 
@@ -170,7 +170,7 @@ class ResumeCommand:
 
 
 @contextmanager
-def told_if_interrupted(
+def report_interruption(
     again: ResumeCommand, seeds_of: Callable[[Path], list[int]]
 ) -> Iterator[None]:
     """Tells the command that resumes a training, where Ctrl-C or SIGTERM ends the block."""
@@ -196,7 +196,7 @@ def seeds_of_words(words: Sequence[str], after_seeds: bool) -> list[int]:
     return [int(word) for word in words]
 
 
-def _plain(result: Any) -> dict[str, Any]:
+def _to_plain(result: Any) -> dict[str, Any]:
     worlds = {world: asdict(summary) for world, summary in result.summaries.items()}
     run = result.trained
     return {
@@ -207,7 +207,7 @@ def _plain(result: Any) -> dict[str, Any]:
     }
 
 
-def _told(task: str, settings: str | None, named: dict[str, Any]) -> Any:
+def _load_settings(task: str, settings: str | None, named: dict[str, Any]) -> Any:
     """The settings of a training, after telling what was adapted to the robot."""
     from nics_drl_bridge.policy.pace import settings_for
 
@@ -219,9 +219,9 @@ def _told(task: str, settings: str | None, named: dict[str, Any]) -> Any:
 
 def check_engine(engine: str | None, of_clusters: dict[str, Any]) -> None:
     """Raises ConfigError for an unknown engine, or an option that this one does not have."""
-    engines = (*OWN, *extensions.known("engines"))
+    engines = (*OWN, *extensions.find_extensions("engines"))
     if engine is not None and engine not in engines:
-        raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")
+        raise ConfigError(f"unknown engine {engine!r}; {suggest(engine, engines)}")
     if engine is None or engine in OWN:
         for name, value in of_clusters.items():
             if value is not None:
@@ -231,7 +231,7 @@ def check_engine(engine: str | None, of_clusters: dict[str, Any]) -> None:
 
 
 @contextmanager
-def _learner(
+def _open_learner(
     engine: str | None, address: str | None, runners: int | None, worlds: int
 ) -> Iterator[Any]:
     if engine is None or engine in OWN:
@@ -288,7 +288,7 @@ def _run(
         for world, summary in result.summaries.items():
             typer.echo(f"  {world}: {train_run.line_of(summary)}")
 
-    with console.progress_bar("starting the worlds") as tell:
+    with console.show_progress("starting the worlds") as tell:
 
         def evaluating(world: str) -> None:
             tell(f"evaluating in {world}", 0, 0)
@@ -296,7 +296,9 @@ def _run(
         results = train_run.run(order, told, done, learn, evaluating)
     folder = order.out
     if as_json:
-        typer.echo(json_of({"out": str(folder), "seeds": list(map(_plain, results))}))
+        typer.echo(
+            format_json({"out": str(folder), "seeds": list(map(_to_plain, results))})
+        )
         return
     typer.echo(
         f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}"

@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
+from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
 from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
 
@@ -49,13 +49,13 @@ def up(
     """Starts the nodes of a simulation, vehicle or fleet."""
     if what not in LAUNCHES:
         raise ConfigError(
-            f"there is nothing called {what!r} to start; {nearest(what, LAUNCHES)}"
+            f"there is nothing called {what!r} to start; {suggest(what, LAUNCHES)}"
         )
     launch = LAUNCHES[what]()
     if show_args:
-        typer.echo(table_of(launch))
+        typer.echo(format_arguments(launch))
         return
-    given = values_of(arguments or ())
+    given = parse_values(arguments or ())
     complete(launch.arguments, given)
     if find_spec("rclpy") is None:
         raise ConfigError(f"nics up {MISSING_ROS.format(module='rclpy')}")
@@ -65,7 +65,7 @@ def up(
     run(nodes)
 
 
-def values_of(words: Sequence[str]) -> dict[str, str]:
+def parse_values(words: Sequence[str]) -> dict[str, str]:
     """Returns the values of arguments `name:=value` by name. Raises ConfigError."""
     values: dict[str, str] = {}
     for word in words:
@@ -80,7 +80,7 @@ def values_of(words: Sequence[str]) -> dict[str, str]:
     return values
 
 
-def table_of(launch: Launch) -> str:
+def format_arguments(launch: Launch) -> str:
     """Returns the arguments of a launch as a table."""
     rows = []
     for argument in launch.arguments:
@@ -91,20 +91,18 @@ def table_of(launch: Launch) -> str:
         if argument.choices:
             about = f"{about} ({' or '.join(argument.choices)})"
         rows.append((f"{argument.name}:=", default, about))
-    return (
-        f"{launch.about}\n\n{console.table(('argument', 'default', 'meaning'), rows)}"
-    )
+    return f"{launch.about}\n\n{console.format_table(('argument', 'default', 'meaning'), rows)}"
 
 
 def run(nodes: Sequence[NodeStart]) -> None:
     """Runs nodes until a signal comes or one of them ends; then all of them have ended."""
     processes: list[ChildProcess] = []
-    with TemporaryDirectory(prefix="nics_up_") as folder, ending_by_signals():
+    with TemporaryDirectory(prefix="nics_up_") as folder, end_nodes_by_signals():
         commands = [command_of(node, Path(folder)) for node in nodes]
         typer.echo(
             f"starting {', '.join(map(name_of, nodes))}; Ctrl-C ends all of them"
         )
-        typer.echo(next_step(nodes))
+        typer.echo(describe_next_step(nodes))
         try:
             for node, command in zip(nodes, commands, strict=True):
                 processes.append(ChildProcess(name_of(node), command))
@@ -124,7 +122,7 @@ def name_of(node: NodeStart) -> str:
     return f"{node.namespace}/{node.executable}".lstrip("/")
 
 
-def next_step(nodes: Sequence[NodeStart]) -> str:
+def describe_next_step(nodes: Sequence[NodeStart]) -> str:
     """Returns what to do once the nodes run."""
     gates = [node for node in nodes if node.executable == "command_gate"]
     if not gates:
@@ -162,7 +160,7 @@ def end_all(processes: Sequence[ChildProcess]) -> None:
 
 
 @contextmanager
-def ending_by_signals() -> Iterator[None]:
+def end_nodes_by_signals() -> Iterator[None]:
     """Lets a lost terminal end the nodes in order, too; afterwards signals act as before."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number, handler in before.items():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import World
@@ -46,11 +46,11 @@ class GoalOrder:
     def __post_init__(self) -> None:
         if self.frame not in (None, *GOAL_FRAMES):
             raise ConfigError(
-                f"--goal-frame {self.frame!r}: {nearest(str(self.frame), GOAL_FRAMES)}"
+                f"--goal-frame {self.frame!r}: {suggest(str(self.frame), GOAL_FRAMES)}"
             )
         if self.start not in (WAIT, PRESENT):
             raise ConfigError(
-                f"--start {self.start!r}: {nearest(self.start, (WAIT, PRESENT))}"
+                f"--start {self.start!r}: {suggest(self.start, (WAIT, PRESENT))}"
             )
         if not self.confirm_beyond_m >= 0.0:
             told = f"--confirm-beyond {self.confirm_beyond_m:g}"

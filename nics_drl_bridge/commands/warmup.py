@@ -8,8 +8,8 @@ from typing import Any
 
 import typer
 
-from nics_drl_bridge.commands.console import JsonOption, progress_bar
-from nics_drl_bridge.files import json_of
+from nics_drl_bridge.commands.console import JsonOption, show_progress
+from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 WORLD = "arena"
@@ -21,29 +21,28 @@ def warmup(as_json: JsonOption = False) -> None:
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
     # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
     with (
-        progress_bar("compiling"),
+        show_progress("compiling"),
         get_context("spawn").Pool(
             2, signal.signal, (signal.SIGINT, signal.SIG_IGN)
         ) as pool,
     ):
-        *first, model = pool.apply(_compiled_by, (_model,))
+        *first, model = pool.apply(_compile_by, (_model,))
         others = [
-            pool.apply_async(_compiled_by, (part, model))
-            for part in (_simulate, _drive)
+            pool.apply_async(_compile_by, (part, model)) for part in (_simulate, _drive)
         ]
         done = [first, *(each.get()[:2] for each in others)]
     count = sum(each[0] for each in done)
     cpu_s = sum(each[1] for each in done)
     took = time.monotonic() - begin
     if as_json:
-        typer.echo(json_of({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
+        typer.echo(format_json({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
     else:
         typer.echo(
             f"compiled {count} kernels in {took:.0f} s ({cpu_s:.0f} s of CPU)", err=True
         )
 
 
-def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any]:
+def _compile_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any]:
     from nics_drl_bridge.kernels import COMPILING
 
     COMPILING.quiet = True

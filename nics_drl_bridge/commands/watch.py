@@ -80,11 +80,11 @@ def watch(
 
         check_file(record)
     if bag is not None:
-        source: Any = _bag(bag, model, world, console.roles_of(topic or []))
+        source: Any = _watch_bag(bag, model, world, console.parse_roles(topic or []))
     elif ros:
-        source = _ros(model, world, namespace)
+        source = _watch_ros(model, world, namespace)
     else:
-        source = _episodes(
+        source = _watch_episodes(
             policy or DEFAULT_ROBOT, model, world or ["circles"], seed, given
         )
     with closing(source):
@@ -94,7 +94,7 @@ def watch(
             _serve(source, port, browser)
 
 
-def _episodes(
+def _watch_episodes(
     policy: str,
     name: str | None,
     worlds: list[str],
@@ -110,42 +110,48 @@ def _episodes(
     under = Conditions(
         given["lidar"], given["randomisation"], given["gate"], kind=given["task"]
     )
-    own = [driving.robot_of(*each) for each in driving.contracts_of([policy]).items()]
+    own = [
+        driving.find_robot(*each) for each in driving.read_contracts([policy]).items()
+    ]
     model = open_model(name or (own or [DEFAULT_ROBOT])[0], under.lidar)
 
     def make(policy: str, world: Any) -> Any:
         options = {"estimator": True, "randomisation": under.ranges}
-        within = driving.limited(
-            under, driving.contracts_of([policy]), model, world, typer.echo
+        within = driving.limit_time(
+            under, driving.read_contracts([policy]), model, world, typer.echo
         )
-        return driving.env_of(policy, model, world, "sim", within, **options)
+        return driving.open_env(policy, model, world, "sim", within, **options)
 
     return EpisodeSource(
         make, policy, [load_worlds(each) for each in worlds], seed, name or ""
     )
 
 
-def _bag(
+def _watch_bag(
     bag: Path, name: str | None, worlds: list[str] | None, topics: dict[str, str]
 ) -> Any:
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.watch.bag import BagSource
 
     return BagSource(
-        bag, open_model(name or DEFAULT_ROBOT), topics, _only(worlds), name or ""
+        bag,
+        open_model(name or DEFAULT_ROBOT),
+        topics,
+        _make_only_world(worlds),
+        name or "",
     )
 
 
-def _ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
+def _watch_ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
     from nics_drl_bridge.generator import open_model
 
     with console.needs_ros("nics watch --ros"):
         from nics_drl_bridge.nodes.watching import RosSource
     model = open_model(name or DEFAULT_ROBOT)
-    return RosSource(model, _only(worlds), namespace, model_name=name or "")
+    return RosSource(model, _make_only_world(worlds), namespace, model_name=name or "")
 
 
-def _only(worlds: list[str] | None) -> Any:
+def _make_only_world(worlds: list[str] | None) -> Any:
     """The world of a robot that others drive, if it is given."""
     if worlds is None:
         return None

@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import json_of, write_text
+from nics_drl_bridge.files import format_json, write_text
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
@@ -138,9 +138,9 @@ def import_(
     for file, place in _places(files, out, name).items():
         if file.suffix.lower() in SDF:
             standing = read_sdf(file, height, tuple(without or ()), skip_unknown)
-            made.append(_standing(file, place, standing, keys, height))
+            made.append(_read_standing(file, place, standing, keys, height))
         else:
-            made += _mapped(file, place, keys, resolution)
+            made += _read_mapped(file, place, keys, resolution)
     for each in made:
         if each.path.exists():
             fix = "remove it, or give another place as --out"
@@ -151,7 +151,7 @@ def import_(
             typer.echo(f"{each.path}: {each.line}")
     if as_json:
         told = [{"file": str(each.path), "holds": each.line} for each in made]
-        typer.echo(json_of({"worlds": told}))
+        typer.echo(format_json({"worlds": told}))
 
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
@@ -175,7 +175,7 @@ def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path,
     return dict(zip(files, places, strict=True))
 
 
-def _standing(
+def _read_standing(
     file: Path, place: Path, standing: "Standing", keys: Keys, height: float
 ) -> Written:
     """The world of what stands in an SDF file."""
@@ -188,14 +188,14 @@ def _standing(
     head = [f"What stands in {file.name} at a height of {height:g} m."]
     head += [f"Left out: {each}." for each in standing.left_out]
     known = {"name": file.stem, "bounds": field, "obstacles": groups}
-    text = _text(file, head, known | keys, (x2 - x1, y2 - y1))
+    text = _format_world(file, head, known | keys, (x2 - x1, y2 - y1))
     line = (
         f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
     )
     return Written(place, text, "\n  left out: ".join([line, *standing.left_out]))
 
 
-def _mapped(
+def _read_mapped(
     file: Path, place: Path, keys: Keys, resolution: float | None
 ) -> list[Written]:
     """The world of a map; and of a picture without one, the map's own file before it."""
@@ -209,7 +209,7 @@ def _mapped(
     made = []
     if file.suffix.lower() in PICTURES and resolution is not None:
         map_file = place.with_name(f"{place.stem}_map.yaml")
-        about = {"image": _seen_from(place, file), "resolution": resolution, **NAV2}
+        about = {"image": _locate_from(place, file), "resolution": resolution, **NAV2}
         validate(about, MapFile, f"--resolution {resolution:g}")
         rows, columns = read_image(file, str(file))[0].shape
         made = [Written(map_file, dump_yaml(about), f"the map of {file.name}")]
@@ -223,16 +223,18 @@ def _mapped(
         )
     x = columns * resolution
     y = rows * resolution
-    known = {"name": file.stem, "map": _seen_from(place, map_file)}
-    text = _text(file, [f"The map {map_file.name}."], known | keys, (x, y))
+    known = {"name": file.stem, "map": _locate_from(place, map_file)}
+    text = _format_world(file, [f"The map {map_file.name}."], known | keys, (x, y))
     return [*made, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
 
 
-def _seen_from(place: Path, file: Path) -> str:
+def _locate_from(place: Path, file: Path) -> str:
     return os.path.relpath(file.resolve(), place.parent.resolve())
 
 
-def _text(file: Path, head: list[str], known: Keys, size: tuple[float, float]) -> str:
+def _format_world(
+    file: Path, head: list[str], known: Keys, size: tuple[float, float]
+) -> str:
     """Returns the text of a world file, which is read back to see that it is one.
 
     Raises ConfigError, with the file that was imported: the one to be written does not exist.
@@ -249,13 +251,15 @@ def _text(file: Path, head: list[str], known: Keys, size: tuple[float, float]) -
     lines = [f"# {' '.join(line.split())}" for line in head]
     for key in ("name", "map"):
         lines += [dump_yaml({key: known[key]}).rstrip()] if key in known else []
-    lines += [f"{key}: {_flow(known[key])}" for key in ("bounds",) if key in known]
+    lines += [
+        f"{key}: {_format_flow(known[key])}" for key in ("bounds",) if key in known
+    ]
     for g, group in enumerate(known.get("obstacles", ())):
         lines += [] if g else ["obstacles:"]
-        lines += [f"  - shapes: {_flow(group['shapes'])}", "    at:"]
-        lines += [f"      - {_flow(pose)}" for pose in group["at"]]
+        lines += [f"  - shapes: {_format_flow(group['shapes'])}", "    at:"]
+        lines += [f"      - {_format_flow(pose)}" for pose in group["at"]]
     for key in ("clearance", "goal_distance", "starts", "goals"):
-        lines += [f"{key}: {_flow(known[key])}"] if key in known else []
+        lines += [f"{key}: {_format_flow(known[key])}"] if key in known else []
     text = "\n".join(lines) + "\n"
     made = f"{file}: the world made of it"
     obstacles = sum(len(group["at"]) for group in known.get("obstacles", ()))
@@ -274,16 +278,16 @@ def _text(file: Path, head: list[str], known: Keys, size: tuple[float, float]) -
     return text
 
 
-def _flow(value: Any) -> str:
+def _format_flow(value: Any) -> str:
     """Numbers, words, lists and mappings as YAML on one line."""
     if isinstance(value, dict):
         return (
             "{"
-            + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items())
+            + ", ".join(f"{key}: {_format_flow(each)}" for key, each in value.items())
             + "}"
         )
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_flow, value)) + "]"
+        return "[" + ", ".join(map(_format_flow, value)) + "]"
     return str(value)
 
 
@@ -304,7 +308,7 @@ def draw(
 
     For a set, such as barn or a folder of files, it draws the world of the episode.
     """
-    with console.progress_bar():
+    with console.show_progress():
         from nics_drl_bridge.files import write_bytes
         from nics_drl_bridge.report.pictures import draw_seeded_world
         from nics_drl_bridge.robot.spec import load_robot
@@ -320,13 +324,15 @@ def draw(
     file = out or Path(Path(f"{opened.name}_drawn.png").name)
     if file.suffix != ".png":
         raise ConfigError(f"--out {file}: must end in .png.")
-    _spare(worlds, Path(name), file)
+    _check_overwrite(worlds, Path(name), file)
     write_bytes(file, draw_seeded_world(opened, radius, seed, outline))
     facts = {"file": str(file), "world": opened.name, "seed": seed}
-    console.say(as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts)
+    console.print_line(
+        as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts
+    )
 
 
-def _spare(worlds: Any, given: Path, *written: Path) -> None:
+def _check_overwrite(worlds: Any, given: Path, *written: Path) -> None:
     """Raises ConfigError for a file that would replace one of which a world is made."""
     from nics_drl_bridge.lidar.maps import files_of
 
@@ -356,7 +362,7 @@ def map_(
     Moving obstacles are left out. `nics world map room`, then
     `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.
     """
-    with console.progress_bar():
+    with console.show_progress():
         from nics_drl_bridge.lidar.maps import map_files
         from nics_drl_bridge.robot.spec import load_robot
         from nics_drl_bridge.sim.occupancy import occupancy, standing
@@ -374,7 +380,7 @@ def map_(
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
     if file.suffix not in MAPS:
         raise ConfigError(f"--out {file}: must end in .yaml.")
-    _spare(worlds, Path(name), file, file.with_suffix(".pgm"))
+    _check_overwrite(worlds, Path(name), file, file.with_suffix(".pgm"))
     grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
     map_files(grid, file)
     rows, columns = grid.cells.shape
@@ -386,4 +392,4 @@ def map_(
         "cells": [columns, rows],
     }
     line = f"{file}: the map of {opened.name!r}, seed {seed}, {size}"
-    console.say(as_json, line, **facts, resolution_m=grid.resolution)
+    console.print_line(as_json, line, **facts, resolution_m=grid.resolution)

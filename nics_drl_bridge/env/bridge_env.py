@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.arguments import check_options, checked_arguments, shown
+from nics_drl_bridge.arguments import check_arguments, check_options, format_value
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.guard import give, halts_on_error, refused_after_close
 from nics_drl_bridge.env.registry import make_task
@@ -24,7 +24,7 @@ from nics_drl_bridge.env.task import (
     still,
     team_space,
 )
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array, Backend, RobotView, Start
 from nics_drl_bridge.lidar.sensor import unread
@@ -108,7 +108,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         "render_fps": RENDER_FPS,
     }
 
-    @checked_arguments("BridgeEnv")
+    @check_arguments("BridgeEnv")
     def __init__(
         self,
         backend: str | Backend = "sim",
@@ -372,4 +372,6 @@ def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
     known = metadata["render_modes"]
     if mode is not None and mode not in known:
         name = mode if isinstance(mode, str) else ""
-        raise ConfigError(f"unknown render_mode {shown(mode)}; {nearest(name, known)}")
+        raise ConfigError(
+            f"unknown render_mode {format_value(mode)}; {suggest(name, known)}"
+        )

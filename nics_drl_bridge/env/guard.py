@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN
 from nics_drl_bridge.lidar.shapes import Shape
-from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
+from nics_drl_bridge.seeds import GREATEST_SEED, check_seeds
 from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import check_place
@@ -82,7 +82,7 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
     """Raises ConfigError for a wrong seed, of all worlds or one each, or wrong options."""
     several = isinstance(seed, list | tuple | np.ndarray)
     given = [one for one in (seed if several else [seed]) if one is not None]
-    checked_seeds(given, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
+    check_seeds(given, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
     if options is not None and not isinstance(options, Mapping):
         needed = "must be a dict, as {'start': (x, y, heading)}, or None."
         raise ConfigError(f"reset options of type {type(options).__name__}: {needed}")
@@ -101,7 +101,7 @@ def override(
         if name not in memory:
             valid = {*memory, *of_env}
             raise ConfigError(
-                f"unknown reset option {name!r}; {nearest(str(name), valid)}"
+                f"unknown reset option {name!r}; {suggest(str(name), valid)}"
             )
         give(memory[name], name, value)
 

@@ -6,10 +6,10 @@ import gymnasium
 
 from nics_drl_bridge.arguments import (
     check_count,
-    in_own_word,
-    keywords_of,
+    format_value,
+    list_keywords,
     refuse_unknown,
-    shown,
+    rename_robot_argument,
 )
 from nics_drl_bridge.env.bridge_env import BridgeEnv, check_render_mode
 from nics_drl_bridge.env.registry import TASK
@@ -27,8 +27,8 @@ def make(
     task: str | type[Task] | Task = "navigation", **arguments: Any
 ) -> gymnasium.Env[Any, Any]:
     """Makes an env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
-    in_own_word("make", "model", arguments)
-    known = {*keywords_of(BridgeEnv), "robot", *GYMNASIUM_ARGUMENTS}
+    rename_robot_argument("make", "model", arguments)
+    known = {*list_keywords(BridgeEnv), "robot", *GYMNASIUM_ARGUMENTS}
     refuse_unknown("make", arguments, known)
     check_render_mode(arguments.get("render_mode"), BridgeEnv.metadata)
     most_steps = arguments.get("max_episode_steps")
@@ -47,7 +47,7 @@ def make_vec(
             f"make_vec: task={first}: the task comes first; give num_envs={first}."
         )
     if "vectorization_mode" in arguments:
-        mode = shown(arguments["vectorization_mode"])
+        mode = format_value(arguments["vectorization_mode"])
         reason = "one process steps all worlds together; leave it out, threads=2 uses two cores"
         raise ConfigError(f"make_vec: vectorization_mode={mode}: {reason}.")
     return BridgeVectorEnv(num_envs, task=task, **arguments)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.arguments import check_count, checked_arguments
+from nics_drl_bridge.arguments import check_arguments, check_count
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
@@ -18,7 +18,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-with extensions.needed_by("BridgeParallelEnv"):
+with extensions.require_modules("BridgeParallelEnv"):
     from pettingzoo import ParallelEnv
 
 Observations = dict[str, NDArray[np.float32]]
@@ -51,7 +51,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         "is_parallelizable": True,
     }
 
-    @checked_arguments("BridgeParallelEnv")
+    @check_arguments("BridgeParallelEnv")
     def __init__(
         self,
         model: str | SimulatorModel | None = None,

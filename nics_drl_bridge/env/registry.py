@@ -8,9 +8,9 @@ from typing import Any
 import gymnasium
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.arguments import check_kind, check_options, shown
+from nics_drl_bridge.arguments import check_kind, check_options, format_value
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.lidar.sensor import Sensor
@@ -43,7 +43,7 @@ def make_task(
         names = options["sensors"]
         if isinstance(names, str) or not isinstance(names, Iterable):
             fix = "must be a list of names of the model's sensors"
-            raise ConfigError(f"task option sensors={shown(names)}: {fix}.")
+            raise ConfigError(f"task option sensors={format_value(names)}: {fix}.")
         options["sensors"] = tuple(_sensor(name, model) for name in names)
     try:
         return found(model.robot, model.lidar, **options)
@@ -58,7 +58,7 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
     known = {sensor.name: sensor for sensor in model.sensors}
     given = name.name if isinstance(name, Sensor) else str(name)
     if given not in known:
-        hint = nearest(given, known)
+        hint = suggest(given, known)
         raise ConfigError(
             f"task option sensors: the model has no sensor {given!r}; {hint}"
         )
@@ -76,7 +76,7 @@ def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
     for name, value in options.items():
         if name not in known and not free:
-            hint = nearest(name, set(known) - {"robot", "lidar"})
+            hint = suggest(name, set(known) - {"robot", "lidar"})
             raise ConfigError(
                 f"task {found.__name__}: unknown task option {name!r}; {hint}"
             )
@@ -103,25 +103,25 @@ def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) 
 def _class_of(name: Any) -> type[Task]:
     if not isinstance(name, str):
         fix = "a name, path/to/file.py:ClassName, a subclass of Task, or a Task"
-        raise ConfigError(f"task={shown(name)}: must be {fix}.")
+        raise ConfigError(f"task={format_value(name)}: must be {fix}.")
     path, colon, attribute = name.rpartition(":")
     if not colon and name.endswith(".py"):
         raise ConfigError(f"task {name!r}: {_missing_class(Path(name))}")
     if not colon:
         if name not in TASKS:
-            hint = nearest(name, TASKS)
+            hint = suggest(name, TASKS)
             raise ConfigError(
                 f"unknown task {name!r}; {hint} (or give path/to/file.py:ClassName)."
             )
         return _class_of(TASKS[name])
-    module = extensions.module_at(path, "task")
+    module = extensions.load_module(path, "task")
     found = getattr(module, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Task)):
         tasks = _tasks_in(module)
         if not tasks:
             raise ConfigError(f"task {name!r}: {path} {NO_TASK}")
         raise ConfigError(
-            f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}"
+            f"task {name!r}: {path} has no such Task; {suggest(attribute, tasks)}"
         )
     return found
 
@@ -140,7 +140,7 @@ def _missing_class(file: Path) -> str:
     """Says what to give instead of a file without the name of a class in it."""
     if not file.is_file():
         return "no such file; give path/to/file.py:ClassName."
-    tasks = _tasks_in(extensions.module_at(str(file), "task"))
+    tasks = _tasks_in(extensions.load_module(str(file), "task"))
     if not tasks:
         return NO_TASK
     return f"name the class in it, as {file}:{tasks[0]}."

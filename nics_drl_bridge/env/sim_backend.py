@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.arguments import check_count, checked_arguments
+from nics_drl_bridge.arguments import check_arguments, check_count
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
@@ -18,7 +18,7 @@ from nics_drl_bridge.interface import (
     BackendFacts,
     RobotView,
     Start,
-    stacked,
+    stack_views,
 )
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.middleware import Middleware
@@ -42,7 +42,7 @@ class SimBackend:
     commands have a leading (M,) if M > 1 `robots`; `simulation` are arguments of the FastSimulator.
     """
 
-    @checked_arguments("backend 'sim'", FastSimulator, without=("worlds",))
+    @check_arguments("backend 'sim'", FastSimulator, without=("worlds",))
     def __init__(
         self,
         model: SimulatorModel,
@@ -147,7 +147,7 @@ class SimBackend:
             for name, readings in self.simulator.readings.items():
                 middleware.sense(name, now, now, readings[0, m].copy())
             views.append(middleware.view(now))
-        return views[0] if len(views) == 1 else stacked(views)
+        return views[0] if len(views) == 1 else stack_views(views)
 
     def halt(self) -> None:
         """Does nothing: robots only move in `step`."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
@@ -114,7 +114,7 @@ class Task(ABC):
 
     def __post_init__(self) -> None:
         if self.actions not in ("continuous", "discrete"):
-            known = nearest(str(self.actions), ("continuous", "discrete"))
+            known = suggest(str(self.actions), ("continuous", "discrete"))
             raise ConfigError(
                 f"task option actions={self.actions!r}: no such actions; {known}"
             )

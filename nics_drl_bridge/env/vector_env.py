@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from nics_drl_bridge.arguments import check_count, checked_arguments, shown
+from nics_drl_bridge.arguments import check_arguments, check_count, format_value
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import episode_seeds
@@ -85,7 +85,7 @@ class BridgeVectorEnv(
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
-    @checked_arguments("BridgeVectorEnv", FastSimulator, without=("worlds", "robots"))
+    @check_arguments("BridgeVectorEnv", FastSimulator, without=("worlds", "robots"))
     def __init__(
         self,
         num_envs: int = 1,
@@ -116,7 +116,7 @@ class BridgeVectorEnv(
             mode = autoreset_mode
         if not isinstance(mode, str) or mode not in MODES:
             raise ConfigError(
-                f"autoreset_mode {shown(mode)}: must be one of {', '.join(MODES)}."
+                f"autoreset_mode {format_value(mode)}: must be one of {', '.join(MODES)}."
             )
         self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}

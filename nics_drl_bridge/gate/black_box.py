@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 
 from nics_drl_bridge.config import read_text
-from nics_drl_bridge.errors import ConfigError, shortened
-from nics_drl_bridge.files import sha256, write_parts
+from nics_drl_bridge.errors import ConfigError, shorten
+from nics_drl_bridge.files import hash_bytes, write_parts
 from nics_drl_bridge.gate import inputs, limits, state
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Input
@@ -150,7 +150,7 @@ def replay(path: str | Path) -> Replay:
 
 def _explain_damage(path: str | Path, error: Exception) -> ConfigError:
     return ConfigError(
-        f"{path}: is damaged ({shortened(str(error), 120)}); it can't be replayed."
+        f"{path}: is damaged ({shorten(str(error), 120)}); it can't be replayed."
     )
 
 
@@ -193,8 +193,8 @@ def _read_records(path: str | Path) -> list[dict[str, Any]]:
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
     content = text.encode()
-    rest = content[: -len(SEAL % sha256(b"").encode())]
-    if content != rest + SEAL % sha256(rest).encode():
+    rest = content[: -len(SEAL % hash_bytes(b"").encode())]
+    if content != rest + SEAL % hash_bytes(rest).encode():
         raise ConfigError(
             f"{path}: is damaged (its checksum does not fit); it can't be replayed."
         )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
@@ -95,7 +95,7 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     for given in file.commands:
         if given not in names:
             raise ConfigError(
-                f"{path}: unknown key 'commands.{given}'; {nearest(given, names)}"
+                f"{path}: unknown key 'commands.{given}'; {suggest(given, names)}"
             )
     for variable in robot.command:
         if variable.name not in file.commands:

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from scipy import ndimage
 
 from nics_drl_bridge.config import Heading, Schema, dump_yaml, find_config, load_yaml
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
@@ -236,7 +236,7 @@ def read_image(
             if file.name.lower().endswith(endings)
         ]
         if known:
-            hint = nearest(path.name, known)
+            hint = suggest(path.name, known)
         else:
             hint = f"there are no images in {str(folder)!r}."
         raise ConfigError(

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.errors import ConfigError, ModelError, nearest
+from nics_drl_bridge.errors import ConfigError, ModelError, suggest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
@@ -56,7 +56,7 @@ class Scanner:
         table = self.table
         spec = self.spec
         if self.renderer not in RENDERERS:
-            known = nearest(str(self.renderer), RENDERERS)
+            known = suggest(str(self.renderer), RENDERERS)
             raise ConfigError(f"unknown renderer {self.renderer!r}; {known}")
         if self.renderer == "exact" or not table.shapes:
             return

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, validate
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.geometry import Array, wrap_angle
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.shapes import LARGEST, Place
@@ -78,7 +78,7 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
     option = f"task option scan={given!r}"
     if isinstance(given, str):
         if given not in LAYOUTS:
-            raise ConfigError(f"{option}: no such layout; {nearest(given, LAYOUTS)}")
+            raise ConfigError(f"{option}: no such layout; {suggest(given, LAYOUTS)}")
         return LAYOUTS[given]
     if isinstance(given, int | np.integer) and not isinstance(given, bool):
         x, y, heading = lidar.mount

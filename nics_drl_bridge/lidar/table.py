@@ -19,9 +19,9 @@ from nics_drl_bridge.files import (
     MOST_BYTES,
     SUMS,
     check_sums,
-    whole_folder,
     write_sums,
     write_text,
+    write_whole_folder,
 )
 from nics_drl_bridge.lidar.baked_kernels import TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
@@ -188,7 +188,7 @@ class LidarTable:
     def save(self, folder: str | Path) -> None:
         """Writes the table as a folder, whole or not at all; ConfigError if not of its kind."""
         own = {*TABLE_FILES, SUMS}
-        with whole_folder(folder, ABOUT_FILE, own.__contains__) as temporary:
+        with write_whole_folder(folder, ABOUT_FILE, own.__contains__) as temporary:
             write_text(temporary / ABOUT_FILE, self._about)
             for name, array in self._arrays.items():
                 np.save(temporary / f"{name}.npy", array, allow_pickle=False)

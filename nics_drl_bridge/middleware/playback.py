@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.errors import RecordingError, nearest
-from nics_drl_bridge.files import sha256, write_bytes, write_text
+from nics_drl_bridge.errors import RecordingError, suggest
+from nics_drl_bridge.files import hash_bytes, write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
@@ -61,7 +61,7 @@ class EstimatedDrive:
     def digest(self) -> str:
         """SHA-256 of all numbers, to compare two runs bit for bit."""
         arrays = (self.stamp_ns, self.pose, self.twist, self.covariance)
-        return sha256(
+        return hash_bytes(
             b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
         )
 
@@ -137,7 +137,7 @@ def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
         ):
             continue
         if topic not in bag.types:
-            hint = nearest(topic, bag.types)
+            hint = suggest(topic, bag.types)
             raise RecordingError(
                 f"{bag.place}: has no topic {topic!r} ({role}); {hint}"
             )

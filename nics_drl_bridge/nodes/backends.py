@@ -21,7 +21,7 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge import interface
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.guard import halts_on_error
-from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
+from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import (
     NS_PER_S,
@@ -401,7 +401,9 @@ class FleetBackend:
         """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         stamp_ns = self._robots[0].begin(start)
         both = zip(self._robots, start.pose, strict=True)
-        return interface.stacked([robot.first(stamp_ns, pose) for robot, pose in both])
+        return interface.stack_views(
+            [robot.first(stamp_ns, pose) for robot, pose in both]
+        )
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -409,7 +411,7 @@ class FleetBackend:
         for robot, robot_command in zip(self._robots, command, strict=True):
             robot.send(robot_command)
         views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
-        return interface.stacked(views), together(facts)
+        return interface.stack_views(views), together(facts)
 
     def facts(self) -> BackendFacts:
         """Returns what is known of all robots, stacked."""
@@ -472,7 +474,7 @@ def dds_backend(
         )
     if mode not in MODES:
         raise ConfigError(
-            f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}"
+            f"backend_options: there is no mode {mode!r}; {suggest(mode, MODES)}"
         )
     if robots > 1:
         names = options.pop("namespaces", default_namespaces(robots))

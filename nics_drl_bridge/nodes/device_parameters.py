@@ -12,7 +12,7 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device, frame_fault
@@ -138,7 +138,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     value = str(node.get_parameter(name).value)
     if value not in valid:
         raise ConfigError(
-            f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}"
+            f"parameter {name!r}: unknown value {value!r}; {suggest(value, valid)}"
         )
     return value
 

@@ -27,7 +27,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
@@ -69,7 +69,7 @@ class Link:
         command_timeout_s: float = math.inf,
         patience_s: float = 0.0,
     ) -> None:
-        namespace = namespace_of(namespace)
+        namespace = parse_namespace(namespace)
         if threading.current_thread() is threading.main_thread():
             _exit_at_signals()
         self._context = open_context(domain_id=domain_id)

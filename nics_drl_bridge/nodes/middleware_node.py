@@ -7,7 +7,7 @@ from functools import partial
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 
-from nics_drl_bridge.errors import LONGEST, shortened
+from nics_drl_bridge.errors import LONGEST, shorten
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
@@ -89,7 +89,7 @@ class MiddlewareNode(ManagedNode):
             return runner.Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
         if new := sorted(health.rejected.keys() - self._rejected.keys()):
-            told = shortened("; ".join(new), LONGEST)
+            told = shorten("; ".join(new), LONGEST)
             self.get_logger().warning(f"not used, but counted in /diagnostics: {told}")
         awaited = self._topics.expected
         missing = ""

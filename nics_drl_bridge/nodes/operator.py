@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
@@ -149,7 +149,7 @@ class Operator(AbstractContextManager["Operator", None]):
         self, namespace: str, goal: GoalRequest, seconds: float, tell: Tell
     ) -> GoalAnswer:
         """Sends a goal, again while it is refused; returns the last answer of the policy node."""
-        space = namespace_of(namespace)
+        space = parse_namespace(namespace)
         deadline = time.monotonic() + seconds
         topic = self._node.create_publisher(
             PoseStamped, f"{space}/goal_pose", qos.COMMAND
@@ -205,7 +205,7 @@ class Operator(AbstractContextManager["Operator", None]):
 
     def _wait_for_gate(self, namespace: str, seconds: float) -> str:
         """Waits for the gate of a namespace, and returns its name."""
-        space = namespace_of(namespace)
+        space = parse_namespace(namespace)
         gate = f"{space}/{GATE}"
         if not holds(lambda: gate in self._gates(), seconds, POLL_S):
             spaces = {each.rpartition("/")[0] for each in self._gates()}

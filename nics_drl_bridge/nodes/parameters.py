@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
-from nics_drl_bridge.errors import shortened
+from nics_drl_bridge.errors import shorten
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 MODES = ("realtime", "lockstep", "as_fast_as_possible")
@@ -85,7 +85,7 @@ def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
             needed = (
                 "must be 1 to 255 characters, without blanks, the first of them no /"
             )
-            return f"parameter {name!r}: {needed}, not {shortened(frame, 80)!r}."
+            return f"parameter {name!r}: {needed}, not {shorten(frame, 80)!r}."
     base = frames.get("base_frame", "")
     taken = [
         name

@@ -9,7 +9,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.context import Context
 
-from nics_drl_bridge.errors import BridgeError, ConfigError, shortened
+from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -222,7 +222,7 @@ class PolicyNode(ManagedNode):
         except Exception as error:
             self.get_logger().debug(traceback.format_exc())
             place = traceback.extract_tb(error.__traceback__)[-1]
-            words = shortened(f"{type(error).__name__}: {error}", LONGEST_REASON)
+            words = shorten(f"{type(error).__name__}: {error}", LONGEST_REASON)
             name = self.get_parameter("policy").value
             where = f"{place.filename}, line {place.lineno}"
             fix = "the robot is stopped, mend the policy."

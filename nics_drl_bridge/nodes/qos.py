@@ -17,7 +17,7 @@ from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.recording.messages import Offer
 
 try:
@@ -137,7 +137,7 @@ def _check_override(name: str, policy: str, value: Any) -> None:
     if policy not in known:
         raise ConfigError(
             f"parameter {name!r}: there is no policy {policy!r}; "
-            f"{nearest(policy, known)}"
+            f"{suggest(policy, known)}"
         )
     if policy in CHOICES:
         values = [
@@ -147,7 +147,7 @@ def _check_override(name: str, policy: str, value: Any) -> None:
         ]
         if str(value).lower() not in values:
             raise ConfigError(
-                f"parameter {name!r}: is {value!r}; {nearest(str(value), values)}"
+                f"parameter {name!r}: is {value!r}; {suggest(str(value), values)}"
             )
         return
     is_flag = isinstance(value, bool)

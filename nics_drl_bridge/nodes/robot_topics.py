@@ -17,7 +17,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
+from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader
@@ -105,7 +105,7 @@ class RobotTopics:
         self._posed = pose_type != NO_POSE
         if self._posed:
             if pose_type not in POSE_TYPES:
-                fix = nearest(pose_type, (NO_POSE, *POSE_TYPES))
+                fix = suggest(pose_type, (NO_POSE, *POSE_TYPES))
                 raise ConfigError(
                     f"parameter 'pose_type': there is no {pose_type!r}; {fix}"
                 )

@@ -26,7 +26,7 @@ from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.errors import BackendError, BridgeError, nearest
+from nics_drl_bridge.errors import BackendError, BridgeError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.ending import at_once, ending_signals
@@ -297,7 +297,7 @@ def unknown(node: Node) -> list[str]:
     known = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
     ignores = getattr(node, "ignores", lambda _: False)
     sentences = [
-        f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
+        f"there is no parameter {name!r}, its value is ignored; {suggest(name, known)}"
         for name in sorted(given_values(node))
         if name not in (*known, SHARED)
         and not name.startswith(qos.OVERRIDES)
@@ -319,7 +319,7 @@ def unused_overrides(node: Node) -> list[str]:
     ]
     return [
         f"parameter {name!r} is ignored: the node has no such publisher or subscription; "
-        f"{nearest(name.rpartition('.')[0], ends)}"
+        f"{suggest(name.rpartition('.')[0], ends)}"
         for name in sorted(given_values(node))
         if name.startswith(qos.OVERRIDES) and not node.has_parameter(name)
     ]

@@ -63,7 +63,7 @@ def _main_of(node: str) -> Any:
     except (ConfigError, ImportError) as error:
         sentence = str(error)
         if isinstance(error, ImportError):
-            if (clause := extensions.unmet(error)) is None:
+            if (clause := extensions.explain_unmet(error)) is None:
                 raise
             sentence = f"{node}: {clause}"
         sys.stderr.write(f"{sentence}\n")

@@ -20,7 +20,7 @@ from nics_drl_bridge.config import (
     read_text,
     share_folder,
 )
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, MODEL, STAMPED
 
 STATE_PUBLISHER = "robot_state_publisher"
@@ -216,13 +216,13 @@ def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
     known = {argument.name for argument in arguments}
     for name in given:
         if name not in known:
-            raise ConfigError(f"unknown argument {name!r}; {nearest(name, known)}")
+            raise ConfigError(f"unknown argument {name!r}; {suggest(name, known)}")
     values: dict[str, str] = {}
     for argument in arguments:  # one that is the default of another stands before it
         default = values[argument.same_as] if argument.same_as else argument.default
         value = given.get(argument.name, default)
         if argument.choices and value not in argument.choices:
-            hint = nearest(value, argument.choices)
+            hint = suggest(value, argument.choices)
             raise ConfigError(f"launch argument {argument.name!r} is {value!r}; {hint}")
         values[argument.name] = value
     return values

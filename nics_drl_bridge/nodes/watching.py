@@ -9,7 +9,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 
-from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
@@ -66,7 +66,7 @@ class RosSource:
         self._drawn_ns = 0
         self._context = open_context([], domain_id)
         self._node = Node(
-            NAME, context=self._context, namespace=namespace_of(namespace)
+            NAME, context=self._context, namespace=parse_namespace(namespace)
         )
         declare_sensors(self._node)
         self._topics = RobotTopics(self._node, model, on_lidar=self._take_lidar)

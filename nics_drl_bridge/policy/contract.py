@@ -16,7 +16,7 @@ from nics_drl_bridge.config import Schema, share_folder, validate
 from nics_drl_bridge.env.registry import TASKS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import ScanLayout
 from nics_drl_bridge.lidar.sensor import AnySensor
@@ -212,7 +212,7 @@ def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
         "options": entry["options"],
         "observation": observation,
     }
-    return sha256(json.dumps(known, sort_keys=True).encode())
+    return hash_bytes(json.dumps(known, sort_keys=True).encode())
 
 
 def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -228,7 +228,7 @@ def checksums(data: Mapping[str, Any]) -> dict[str, str]:
     """Checksum of each entry except `checksums`, by path."""
     known = {name: value for name, value in data.items() if name != "checksums"}
     return {
-        path: sha256(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)
+        path: hash_bytes(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)
     }
 
 

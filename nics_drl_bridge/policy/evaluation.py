@@ -18,7 +18,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.middleware.uncertainty import Uncertainty, compute_uncertainty_gain
 from nics_drl_bridge.policy.stateful import Policy, begin
-from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.seeds import check_seeds
 
 Flags = NDArray[np.bool_]
 Act = Callable[
@@ -204,7 +204,7 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
     A policy with a state is given by its method `act`, so that its episodes can begin.
     """
     width = env.num_envs
-    given = checked_seeds(seeds)
+    given = check_seeds(seeds)
     # The last batch is padded with seeds that are driven but not counted.
     batches = (
         np.resize(given[k : k + width], width) for k in range(0, len(given), width)

@@ -10,7 +10,7 @@ import onnx
 from nics_drl_bridge.config import parse_yaml, read_text, validate
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.policy import leapp_bundle, onnx_graph, policy_file, rehearsal
@@ -99,7 +99,7 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
     rehearsal.rehearse_network(content, str(file))
     network = onnx_graph.parsed(content, str(file))
     onnx_graph.check_graph(network, str(file))
-    return Order(mapping, Network(network), path, sha256(content))
+    return Order(mapping, Network(network), path, hash_bytes(content))
 
 
 def _content(order: Order, model: SimulatorModel | None) -> bytes:

@@ -10,7 +10,7 @@ import onnx
 from onnx import TensorProto
 
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.errors import PolicyError, nearest
+from nics_drl_bridge.errors import PolicyError, suggest
 from nics_drl_bridge.policy import foreign_mapping, graph_folding, onnx_graph, rehearsal
 from nics_drl_bridge.policy.graph_builder import Builder
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -101,7 +101,7 @@ class Composer:
         for name in (*mapping.inputs, *self._states):
             if name not in taken:
                 where = "inputs" if name in mapping.inputs else "states"
-                fix = nearest(name, taken)
+                fix = suggest(name, taken)
                 raise self._fault(
                     f"{where}.{name}", f"the network has no such input; {fix}"
                 )
@@ -129,7 +129,7 @@ class Composer:
         ]
         for place, name in named:
             if name not in given:
-                fix = nearest(name, given)
+                fix = suggest(name, given)
                 raise self._fault(place, f"the network has no output {name!r}; {fix}")
 
     # Shapes. One observation at once: what was left open in the first place is 1.
@@ -368,7 +368,7 @@ class Composer:
             return foreign_mapping.TWIST
         for name in given:
             if name not in own:
-                fix = nearest(name, (*foreign_mapping.TWIST, *own))
+                fix = suggest(name, (*foreign_mapping.TWIST, *own))
                 raise self._fault(
                     f"{place}.{name}", f"the robot has no such command; {fix}"
                 )

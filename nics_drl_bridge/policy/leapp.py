@@ -20,7 +20,12 @@ from onnx import TensorProto
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.files import sha256, whole_folder, write_bytes, write_text
+from nics_drl_bridge.files import (
+    hash_bytes,
+    write_bytes,
+    write_text,
+    write_whole_folder,
+)
 from nics_drl_bridge.policy import onnx_graph
 from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.policy.graph_builder import Builder
@@ -60,7 +65,7 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
     network = f"{NODE}.onnx"
     start_values = f"{place.resolve().name}_initial_values.safetensors"
     own = {marker, network, start_values}
-    with whole_folder(place, marker, own.__contains__) as temporary:
+    with write_whole_folder(place, marker, own.__contains__) as temporary:
         write_bytes(temporary / network, made)
         state = policy.contract.state
         if state is not None:
@@ -210,7 +215,7 @@ def _described(
     parameters = {
         "model_path": f"{NODE}.onnx",
         "md5sum": md5,
-        "sha256sum": sha256(made),
+        "sha256sum": hash_bytes(made),
         "backend": "onnx",
     }
     node = {"inputs": inputs, "outputs": outputs, "parameters": parameters}

@@ -13,8 +13,8 @@ import onnx
 from pydantic import BaseModel, ConfigDict, Field
 
 from nics_drl_bridge.config import parse_yaml, read_text, validate
-from nics_drl_bridge.errors import PolicyError, nearest
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.errors import PolicyError, suggest
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import onnx_graph, rehearsal
 from nics_drl_bridge.policy.foreign_graph import Network
@@ -154,14 +154,14 @@ class Bundle:
         found = {}
         for node, names in ends.items():
             if node not in self.description.models:
-                fix = nearest(node, self.description.models)
+                fix = suggest(node, self.description.models)
                 raise self.fault(f"pipeline.{side}", f"names no node {node!r}; {fix}")
             known = {
                 one.name: one for one in getattr(self.description.models[node], side)
             }
             for name in names:
                 if name not in known:
-                    fix = nearest(name, known)
+                    fix = suggest(name, known)
                     raise self.fault(
                         f"pipeline.{side}.{node}", f"has no {name!r}; {fix}"
                     )
@@ -242,7 +242,7 @@ def read_bundle(path: Path) -> Bundle:
             reason = f"is {given.backend!r}, which is never opened here; export it with 'onnx'."
             raise bundle.fault(f"{place}.backend", reason)
         data = _read(bundle, given.model_path, f"{place}.model_path")
-        digests.append(sha256(data))
+        digests.append(hash_bytes(data))
         if digests[-1] != given.sha256sum:
             reason = f"does not fit {given.model_path!r}, which was changed or damaged."
             raise bundle.fault(f"{place}.sha256sum", reason)
@@ -250,7 +250,7 @@ def read_bundle(path: Path) -> Bundle:
         rehearsal.rehearse_network(data, file)
         models[name] = onnx_graph.parsed(data, file)
         onnx_graph.check_graph(models[name], file)
-    return Bundle(path, description, models, sha256("".join(digests).encode()))
+    return Bundle(path, description, models, hash_bytes("".join(digests).encode()))
 
 
 def _read(bundle: Bundle, name: str, place: str) -> bytes:

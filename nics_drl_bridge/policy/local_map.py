@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.geometry import Array, depths
+from nics_drl_bridge.geometry import Array, compute_depths
 from nics_drl_bridge.policy import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -38,7 +38,7 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
         np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True)
     )
     lattice = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    depth = depths(lattice, corners)
+    depth = compute_depths(lattice, corners)
     lattice = lattice[depth > 0.0]
     depth = depth[depth > 0.0]
     chosen = _cover(lattice, depth)

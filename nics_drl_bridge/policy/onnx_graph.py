@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from onnx import TensorProto
 
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import hash_bytes
 
 KEY = "nics_drl_bridge"  # key of the metadata entry with the contract
 SEAL = "sha256"  # key of the metadata entry at the file's end: the checksum of everything before it
@@ -216,14 +216,14 @@ def graph_hash(model: Any) -> str:
     bare = onnx.ModelProto()
     bare.CopyFrom(model)
     del bare.metadata_props[:]
-    return sha256(bare.SerializeToString(deterministic=True))
+    return hash_bytes(bare.SerializeToString(deterministic=True))
 
 
 def sealed(data: bytes) -> bytes:
     """Appends a model's checksum as another metadata entry, as messages may be concatenated."""
     end = onnx.ModelProto()
     entry = end.metadata_props.add()
-    entry.key, entry.value = SEAL, sha256(data)
+    entry.key, entry.value = SEAL, hash_bytes(data)
     return data + bytes(end.SerializeToString(deterministic=True))
 
 

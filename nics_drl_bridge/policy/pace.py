@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, class_for
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -102,7 +102,7 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     """
     robot = changes.get("robot")
     told = list[str]()
-    shipped = shipped_names("training")
+    shipped = list_shipped("training")
     own = f"{task}_{robot}" in shipped
     if name is None and robot is not None and not own and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"

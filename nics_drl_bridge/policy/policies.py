@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
+from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
@@ -299,7 +299,7 @@ def is_policy_file(name: str) -> bool:
         and name not in files
     ):
         raise ConfigError(
-            f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}"
+            f"unknown policy {name!r}; {suggest(name, (*POLICIES, *files))}"
         )
     return name not in POLICIES
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
+from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -192,7 +192,7 @@ def load_policy(path: str | Path) -> PolicyFile:
     if not (str(path).endswith(suffix) or file.is_file()):
         file = contracts.shipped() / f"{path}{suffix}"
         if not file.is_file():
-            hint = nearest(
+            hint = suggest(
                 str(path), (each.stem for each in file.parent.glob(f"*{suffix}"))
             )
             raise PolicyError(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.policy import onnx_graph
 from nics_drl_bridge.policy.onnx_session import (
     GraphNeeds,
@@ -67,7 +67,7 @@ def remember(data: bytes) -> None:
 
 
 def _digest_of(step: str, data: bytes) -> str:
-    return sha256(step.encode() + b"\0" + data)
+    return hash_bytes(step.encode() + b"\0" + data)
 
 
 def _rehearse(step: str, data: bytes, source: str, **told: Any) -> None:

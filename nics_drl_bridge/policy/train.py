@@ -15,11 +15,11 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
 
-from nics_drl_bridge.config import dump_yaml, shipped_names
+from nics_drl_bridge.config import dump_yaml, list_shipped
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.errors import ConfigError, shortened
-from nics_drl_bridge.files import json_of, write_text
+from nics_drl_bridge.errors import ConfigError, shorten
+from nics_drl_bridge.files import format_json, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import train_algorithms as algorithms
 from nics_drl_bridge.policy import train_checkpoint as checkpoints
@@ -40,7 +40,7 @@ from nics_drl_bridge.policy.training_settings import (
     is_code,
     read_settings,
 )
-from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 CHECKPOINT = "checkpoint.pt"
@@ -173,7 +173,7 @@ def _restore(
         TypeError,
         ValueError,
     ) as error:
-        reason = f"does not hold what a training needs ({shortened(str(error), 120)})"
+        reason = f"does not hold what a training needs ({shorten(str(error), 120)})"
         raise ConfigError(f"{path}: {reason}; train anew.") from None
 
 
@@ -306,7 +306,7 @@ def run(
             plain |= {
                 world: dataclasses.asdict(one) for world, one in summaries.items()
             }
-            write_text(folder / EVALUATION, json_of(plain, 2) + "\n")
+            write_text(folder / EVALUATION, format_json(plain, 2) + "\n")
             export(settings, result, order.command, folder / POLICY)
             done(result)
             results.append(result)
@@ -349,7 +349,7 @@ def export(
         "steps": result.trained.steps,
         **rates,
     }
-    if settings.robot not in shipped_names(
+    if settings.robot not in list_shipped(
         "robots"
     ):  # where an evaluation finds the robot
         provenance["model"] = str(Path(settings.robot).resolve())
@@ -360,7 +360,7 @@ def export(
 def _check(
     settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed: bool
 ) -> None:
-    checked_seeds(seeds, GREATEST_SEED)
+    check_seeds(seeds, GREATEST_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)

@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import check_sealed, sealed, write_bytes
+from nics_drl_bridge.files import check_sealed, seal, write_bytes
 from nics_drl_bridge.policy.evaluation import Act
 from nics_drl_bridge.policy.train_stop import Stop
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
@@ -42,7 +42,7 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
     """Writes a checkpoint of tensors, numbers and text, completely or not at all."""
     buffer = io.BytesIO()
     torch.save(content, buffer)
-    write_bytes(path, sealed(buffer.getvalue()))
+    write_bytes(path, seal(buffer.getvalue()))
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from nics_drl_bridge.policy.contract import (
     golden_observations,
 )
 
-with extensions.needed_by("the export of a policy"):
+with extensions.require_modules("the export of a policy"):
     import onnx
     import torch
 

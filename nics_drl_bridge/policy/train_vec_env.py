@@ -14,7 +14,7 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 
-with extensions.needed_by("TrainVecEnv"):
+with extensions.require_modules("TrainVecEnv"):
     from stable_baselines3.common.vec_env import VecEnv
 
 Observation = NDArray[np.float32]

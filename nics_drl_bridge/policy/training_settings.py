@@ -10,8 +10,8 @@ from pydantic import Field, field_validator, model_validator
 from nics_drl_bridge.config import (
     Schema,
     find_config,
+    list_shipped,
     load_yaml,
-    shipped_names,
     validate,
 )
 from nics_drl_bridge.env.teaching import Teaching
@@ -176,7 +176,7 @@ def chosen_settings(
 ) -> TrainingSettings:
     """Settings by name or file, else those shipped for task and robot, with changes by the user."""
     robot = str(changes.get("robot", DEFAULT_ROBOT))
-    if name is None and f"{task}_{robot}" not in shipped_names("training"):
+    if name is None and f"{task}_{robot}" not in list_shipped("training"):
         base = TrainingSettings(task=task, robot=robot)
     else:
         base = load_training(name or f"{task}_{robot}", task if is_code(task) else None)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nics_drl_bridge.config import no_device, parse_yaml, read_text
-from nics_drl_bridge.errors import BridgeError, RecordingError, shortened
+from nics_drl_bridge.config import check_no_device, parse_yaml, read_text
+from nics_drl_bridge.errors import BridgeError, RecordingError, shorten
 from nics_drl_bridge.recording.messages import (
     Offer,
     check_libraries,
@@ -83,7 +83,7 @@ def opened(path: str | Path) -> "Iterator[BagFile]":
             fault = f"SQLite can't open what has {sign!r} in its path"
             raise RecordingError(f"{place}: {fault}; rename the folder.")
         for file in files:
-            no_device(file)
+            check_no_device(file)
         with (
             TemporaryDirectory() as room
         ):  # before rosbags, which unpacks chunks of any size
@@ -96,7 +96,7 @@ def opened(path: str | Path) -> "Iterator[BagFile]":
         raise
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        fault = f"can't be read as a bag ({shortened(why, LONGEST_REASON)})"
+        fault = f"can't be read as a bag ({shorten(why, LONGEST_REASON)})"
         advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record anew"
         if path.suffix == ROS_1:
             advice = "mend it with `rosbag reindex`, or record anew"
@@ -108,7 +108,7 @@ def opened(path: str | Path) -> "Iterator[BagFile]":
 def _opened_ros_1(path: Path) -> "Iterator[BagFile]":
     from rosbags.rosbag1 import Reader
 
-    if not no_device(path).is_file():
+    if not check_no_device(path).is_file():
         raise RecordingError(f"{path}: no such bag; check the path.")
     with Reader(path) as reader:
         yield BagFile(reader, str(path), is_ros_1=True)
@@ -197,7 +197,7 @@ def _check_summary(reader: "Reader") -> None:
         raise ValueError("its summary has lost the name of a topic")
     for topic, kind in sorted(set(summary + held), key=str):
         if (promised := summary[topic, kind]) != (found := held[topic, kind]):
-            names = (repr(shortened(str(name), LONGEST_NAME)) for name in (topic, kind))
+            names = (repr(shorten(str(name), LONGEST_NAME)) for name in (topic, kind))
             fault = f"topic {' of type '.join(names)} has {found} messages in its files"
             raise ValueError(f"{fault}, {promised} by its summary")
     if reader.compression_mode == "message":

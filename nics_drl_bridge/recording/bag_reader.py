@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.errors import RecordingError, nearest
+from nics_drl_bridge.errors import RecordingError, suggest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import messages as msgs
@@ -216,7 +216,7 @@ def state_of(
     known = [v.name for v in spec.state]
     for name in sorted(mapping.state.keys() - set(known)):
         fault = f"robot {spec.name!r} has no state {name!r}"
-        raise RecordingError(f"{place}: topics: {fault}; {nearest(name, known)}")
+        raise RecordingError(f"{place}: topics: {fault}; {suggest(name, known)}")
     sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
     found = [source for source in sources.values() if source is not None]
     if spec.state and len(found) == len(sources):
@@ -269,7 +269,7 @@ def _source(
 def _index(joints: Joints, name: str, place: str) -> int:
     if name not in joints.names:
         fault = f"topic {joints.topic!r} has no joint {name!r}"
-        raise RecordingError(f"{place}: {fault}; {nearest(name, joints.names)}")
+        raise RecordingError(f"{place}: {fault}; {suggest(name, joints.names)}")
     return joints.names.index(name)
 
 

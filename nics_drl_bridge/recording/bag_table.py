@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nics_drl_bridge.errors import RecordingError, nearest
+from nics_drl_bridge.errors import RecordingError, suggest
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import mapping as mapped
 from nics_drl_bridge.recording import topic_roles as roles
@@ -91,7 +91,7 @@ def column_of(
     """Returns a field of all messages (T,); RecordingError if they have none of that name."""
     path = names[which] if isinstance(which, int) else which
     inner = [name for name in names if name.startswith(path)]
-    hint = f"say which, as {inner[0]!r}." if inner else nearest(path, names)
+    hint = f"say which, as {inner[0]!r}." if inner else suggest(path, names)
     read = reader_of_field(path)
     try:
         values = [read(message.content) for message in messages]

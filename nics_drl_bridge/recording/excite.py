@@ -16,7 +16,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.kinds import has_textbook, reach, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.seeds import check_seeds
 
 PERIOD_S = 0.05
 STILL_S = 1.0  # standstill at both ends of a drive [s]
@@ -365,7 +365,7 @@ class DrivePlan:
     seed: int = 0  # of the pattern
 
     def __post_init__(self) -> None:
-        checked_seeds(self.seed)
+        check_seeds(self.seed)
         for name, value, low, high, unit in (
             ("bound", self.bound, self.robot.footprint_radius, 1000.0, " m"),
             ("duration", self.duration, SHORTEST_S, LONGEST_S, " s"),

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
-from nics_drl_bridge.errors import nearest
+from nics_drl_bridge.errors import suggest
 from nics_drl_bridge.recording.names import words_of
 
 TURN = 2.0 * math.pi
@@ -74,7 +74,7 @@ RATES = {
 def known_unit(name: str) -> str:
     """Returns the name of a unit; ValueError tells the nearest known one."""
     if str(name) not in UNITS:
-        raise ValueError(f"is no known unit ({nearest(str(name), UNITS)})")
+        raise ValueError(f"is no known unit ({suggest(str(name), UNITS)})")
     return str(name)
 
 

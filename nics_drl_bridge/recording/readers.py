@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge.arguments import check_path
-from nics_drl_bridge.config import find_config, no_device
+from nics_drl_bridge.config import check_no_device, find_config
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag, opened
 from nics_drl_bridge.recording.bag_reader import load_bag
@@ -288,7 +288,7 @@ def arranged(recording: Recording, spec: RobotSpec) -> Recording:
 @contextmanager
 def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
     """Opens a recording of any format; RecordingError if there is nothing to read."""
-    if not no_device(path).exists():
+    if not check_no_device(path).exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     if not is_bag(path):
         yield Files(path)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import files, geometry
-from nics_drl_bridge.config import no_device
+from nics_drl_bridge.config import check_no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.heading import Turning
@@ -290,13 +290,13 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         meta["latency"] = recording.latency.model_dump(mode="json")
     buffer = io.BytesIO()
     np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
-    files.write_bytes(path, files.sealed(buffer.getvalue()))
+    files.write_bytes(path, files.seal(buffer.getvalue()))
 
 
 def load_recording(path: str | Path) -> Recording:
     """Reads a recording of `save_recording`; RecordingError if it is missing or not a whole one."""
     try:
-        data = files.read_file(no_device(Path(path)))
+        data = files.read_file(check_no_device(Path(path)))
         arrays = _arrays(data)
         meta = json.loads(str(arrays["meta"]))
         version = meta["format"]

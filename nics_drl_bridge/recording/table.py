@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.errors import RecordingError, nearest
+from nics_drl_bridge.errors import RecordingError, suggest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot.noise import Latency
@@ -91,7 +91,7 @@ def _number(place: str, names: Sequence[str], which: str | int) -> int:
         raise RecordingError(f"{place}: has no column {which}; {columns}.")
     named = [name for name in names if name]
     if named:
-        hint = nearest(which, named)
+        hint = suggest(which, named)
     else:
         hint = "they have no names: give its number, from 0."
     raise RecordingError(f"{place}: has no column {which!r}; {hint}")

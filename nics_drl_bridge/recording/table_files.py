@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.config import no_device
+from nics_drl_bridge.config import check_no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.table import Column, Source, Table, flattened, table_of
 
@@ -66,7 +66,7 @@ def read_text_table(path: Path) -> Table:
 
 def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     """Returns the lines with their numbers, from 1, without empty ones, and those of comments."""
-    no_device(path)
+    check_no_device(path)
     try:
         if path.stat().st_size > MOST_BYTES:
             fault = f"is larger than {MOST_BYTES // 2**20} MB"
@@ -248,7 +248,7 @@ def _typed(column: Sequence[str]) -> Column:
 def read_arrays(path: Path) -> Table:
     """Reads an .npz or .npy file, of records too; RecordingError if it holds objects or damage."""
     try:
-        with no_device(path).open("rb") as file:
+        with check_no_device(path).open("rb") as file:
             loaded = np.load(file, allow_pickle=False)
             arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
     except Exception as error:  # noqa: BLE001 - damage breaks numpy in any way
@@ -273,7 +273,7 @@ def read_parquet(path: Path) -> Table:
         )
     parquet = import_module("pyarrow.parquet")
     try:
-        table = parquet.read_table(no_device(path))
+        table = parquet.read_table(check_no_device(path))
         columns = [table.column(k).to_numpy() for k in range(table.num_columns)]
     except Exception as error:  # noqa: BLE001 - damage breaks the reader in any way
         why = " ".join(str(error).split())[:200]

@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import Field
 
 from nics_drl_bridge.config import Schema, load_yaml, validate
-from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
+from nics_drl_bridge.errors import ConfigError, RecordingError, suggest
 
 Stamps = Literal["auto", "header", "receive"]
 NONE = "none"
@@ -105,7 +105,7 @@ def topic_roles(
             )
         if role not in ROLES:
             raise ConfigError(
-                f"--topic {option!r}: unknown role {role!r}; {nearest(role, ROLES)}"
+                f"--topic {option!r}: unknown role {role!r}; {suggest(role, ROLES)}"
             )
         if role in given:
             raise ConfigError(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
+from nics_drl_bridge.errors import ConfigError, RecordingError, suggest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import mapping as schema
@@ -83,7 +83,7 @@ class MappedReader:
         if isinstance(reference, str) and ":" in reference:
             wanted = reference.rpartition(":")[0]
         if wanted is not None:
-            hint = nearest(wanted, names)
+            hint = suggest(wanted, names)
             raise RecordingError(f"{self.source.place}: has no {wanted!r}; {hint}")
         advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
         listed = ", ".join(names[:20])

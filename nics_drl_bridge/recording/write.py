@@ -15,7 +15,7 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.files import (
     begin_folder,
     check_above,
-    hidden_name,
+    make_hidden_name,
     remove_leftovers,
     sync_folder,
 )
@@ -353,7 +353,7 @@ def bag_sink(
 
 def _set_apart(unfinished: Path, path: Path) -> Path:
     """Gives an unfinished folder a name under which no later writer removes it."""
-    apart = hidden_name(path)
+    apart = make_hidden_name(path)
     os.rename(unfinished, apart)
     return apart
 

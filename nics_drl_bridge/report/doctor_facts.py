@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
@@ -143,7 +143,7 @@ class Facts:
 
 def names_in(namespace: str, imu: str = "auto") -> dict[str, str]:
     """Role -> topic of a robot in a namespace; none of a gyro if `imu` is none."""
-    space = namespace_of(namespace)
+    space = parse_namespace(namespace)
     names = {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
     if gyros := imu_topics(imu, by_default=True):
         names[GYRO] = gyros[0] if gyros[0].startswith("/") else f"{space}/{gyros[0]}"

@@ -34,8 +34,8 @@ from nics_drl_bridge.style import (
     MODEL,
     OTHER,
     Panel,
-    panels,
-    png,
+    make_panels,
+    render_png,
 )
 
 SHOWN_S = 8.0
@@ -99,7 +99,7 @@ def fit_pictures(
 
 def draw_accuracy(identified: Identified) -> bytes:
     """Draws the cross-validated error over the number of terms, a line per degree of freedom."""
-    figure, (axes,) = panels(1, 1, (7.5, 4.5))
+    figure, (axes,) = make_panels(1, 1, (7.5, 4.5))
     circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
     for n, curve in enumerate(identified.fit.curves):
         share = np.maximum(curve.share, LEAST_SHARE)
@@ -117,7 +117,7 @@ def draw_accuracy(identified: Identified) -> bytes:
     )
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
-    return png(figure)
+    return render_png(figure)
 
 
 def draw_held_out_paths(identified: Identified) -> bytes:
@@ -125,19 +125,19 @@ def draw_held_out_paths(identified: Identified) -> bytes:
     paths = _collect_unseen_paths(identified)
     rows = -(-len(paths) // 3)
     columns = min(len(paths), 3)
-    figure, grid = panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
+    figure, grid = make_panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
     for axes, path in zip(grid, paths, strict=False):
         _draw_unseen_path(axes, path)
-    return png(figure, grid[0])
+    return render_png(figure, grid[0])
 
 
 def draw_unseen_paths(identified: Identified, most: int) -> list[bytes]:
     """Draws some of the panels of `draw_held_out_paths`, each as a PNG of its own."""
     drawn = []
     for path in _collect_unseen_paths(identified)[:most]:
-        figure, (axes,) = panels(1, 1)
+        figure, (axes,) = make_panels(1, 1)
         _draw_unseen_path(axes, path)
-        drawn.append(png(figure, axes, UNSEEN_PANEL))
+        drawn.append(render_png(figure, axes, UNSEEN_PANEL))
     return drawn
 
 
@@ -176,7 +176,7 @@ def _draw_unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
 
 def draw_yardsticks(identified: Identified) -> bytes:
     """Draws mean errors on unseen data over the horizon, beside those of the yardsticks."""
-    figure, (axes,) = panels(1, 1, (5.0, 3.6))
+    figure, (axes,) = make_panels(1, 1, (5.0, 3.6))
     judgement = identified.judgement
     for name, label, colour, line in (
         ("model", "model", MODEL, "o-"),
@@ -212,7 +212,7 @@ def draw_yardsticks(identified: Identified) -> bytes:
     axes.set_xticks(ticks, [f"{s:g}" for s in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter("{x:g}")
-    return png(figure, axes)
+    return render_png(figure, axes)
 
 
 def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
@@ -222,7 +222,9 @@ def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
     t = unseen.t - unseen.t[0]
     shown = t < SHOWN_S
     moving = np.flatnonzero(np.abs(unseen.dq).max(axis=0) > LEAST_RATE)
-    figure, grid = panels(len(moving), 1, (9.0, 1.7 * len(moving) + 0.6), sharex=True)
+    figure, grid = make_panels(
+        len(moving), 1, (9.0, 1.7 * len(moving) + 0.6), sharex=True
+    )
     for d, axes in zip(map(int, moving), grid, strict=True):
         rest = unseen.dq[:, d] - predicted[:, d]
         axes.plot(
@@ -236,7 +238,7 @@ def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
     grid[-1].set_xlabel("time since the end of the training part [s]")
     for color, label in ((MEASURED, "measured"), (MODEL, "model"), (OTHER, "residual")):
         grid[0].plot([], [], color=color, label=label)
-    return png(figure, grid[0])
+    return render_png(figure, grid[0])
 
 
 def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
@@ -245,7 +247,9 @@ def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
     calibration = identified.calibration
     command = identified.recording.command
     moved = np.flatnonzero(np.ptp(command.values, axis=0) > 0.0)
-    figure, grid = panels(len(moved), 1, (9.0, 2.5 * len(moved) + 0.6), sharex=True)
+    figure, grid = make_panels(
+        len(moved), 1, (9.0, 2.5 * len(moved) + 0.6), sharex=True
+    )
     begin = samples.t[0] + SETTLED_S
     shown = (samples.t >= begin) & (samples.t < begin + SHOWN_S)
     t = samples.t[shown]
@@ -266,7 +270,7 @@ def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
     grid[0].plot([], [], color=MEASURED, linewidth=2.5, alpha=0.55, label="response")
     title = f"clock offset {calibration.clock_offset_s:.4g} s, command latency {latency:.4g} s"
     grid[0].set_title(title)
-    return png(figure, grid[0])
+    return render_png(figure, grid[0])
 
 
 def _draw_response(
@@ -335,7 +339,7 @@ def draw_mounting(
     x, y = calibration.lever_arm_m
     base = turned + tracked[:, 2:] * np.array([y, -x])
     count = 1 if lever_x.value is None else 2
-    figure, grid = panels(1, count, (5.2 * count, 4.4))
+    figure, grid = make_panels(1, count, (5.2 * count, 4.4))
     _draw_points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
     grid[0].set_aspect("equal", adjustable="datalim")
     grid[0].set(
@@ -347,7 +351,7 @@ def draw_mounting(
         _draw_points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
         axes.set(xlabel="yaw rate [rad/s]", ylabel="lateral velocity [m/s]")
         _finish(axes, f"{lever_x.text}\n{lever_y.text}")
-    return png(figure)
+    return render_png(figure)
 
 
 def _draw_points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
@@ -362,7 +366,7 @@ def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     restrained = [dof for dof in model.dofs if model.restraint(dof)]
     if not (count := len(curves) + len(restrained)):
         return None
-    figure, grid = panels(1, count, (4.2 * count, 3.8))
+    figure, grid = make_panels(1, count, (4.2 * count, 3.8))
     for axes, dof in zip(grid[len(curves) :], restrained, strict=True):
         _draw_restraint(axes, identified, dof)
     names = [command.name for command in spec.command]
@@ -386,7 +390,7 @@ def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
             xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]"
         )
         _finish(axes, curve.equation.replace("-+", "∓"))
-    return png(figure)
+    return render_png(figure)
 
 
 def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
@@ -449,7 +453,7 @@ def draw_noise(identified: Identified) -> bytes | None:
     count = len(histograms) + 2 * drifts
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
-    figure, grid = panels(rows, columns, (4.3 * columns, 3.4 * rows))
+    figure, grid = make_panels(rows, columns, (4.3 * columns, 3.4 * rows))
     for axes, (name, level, rest) in zip(grid, histograms, strict=False):
         edges = np.linspace(-REACH * level.std, REACH * level.std, BINS + 1)
         axes.hist(
@@ -473,7 +477,7 @@ def draw_noise(identified: Identified) -> bytes | None:
             after[0], horizon, "position", levels.position_drift, position, "m"
         )
         _draw_growth(after[1], horizon, "heading", levels.heading_drift, heading, "rad")
-    return png(figure)
+    return render_png(figure)
 
 
 def _draw_growth(

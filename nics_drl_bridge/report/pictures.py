@@ -30,11 +30,11 @@ from nics_drl_bridge.style import (
     MODEL,
     OTHER,
     Panel,
-    legend_rows,
-    panels,
-    png,
-    styled,
-    width_of,
+    apply_style,
+    compute_width,
+    count_legend_rows,
+    make_panels,
+    render_png,
 )
 
 LINES: tuple[dict[str, Any], ...] = (
@@ -108,10 +108,10 @@ def draw_trajectories(
         for some in zip_longest(*runs.values())
     ]
     columns = min(len(by_seed), max(1, int(GREATEST_WIDTH / view.panel.width)))
-    figure, grid = panels(-(-len(by_seed) // columns), columns)
+    figure, grid = make_panels(-(-len(by_seed) // columns), columns)
     for axes, episodes in zip(grid, by_seed, strict=False):
         _draw_panel(axes, episodes, world, footprint, view)
-    return png(figure, grid[0], view.panel)
+    return render_png(figure, grid[0], view.panel)
 
 
 def draw_trajectory_gallery(
@@ -122,12 +122,12 @@ def draw_trajectory_gallery(
         world, [each for episodes in shown for each in episodes.values()]
     )
     runs = dict.fromkeys(name for episodes in shown for name in episodes)
-    rows = legend_rows(["goal", "start", *runs], width_of(view.panel))
+    rows = count_legend_rows(["goal", "start", *runs], compute_width(view.panel))
     drawn = []
     for episodes in shown:
-        figure, (axes,) = panels(1, 1)
+        figure, (axes,) = make_panels(1, 1)
         _draw_panel(axes, episodes, world, footprint, view)
-        drawn.append(png(figure, axes, view.panel, rows))
+        drawn.append(render_png(figure, axes, view.panel, rows))
     return drawn
 
 
@@ -152,7 +152,7 @@ def _draw_panel(
     view.show(axes)
 
 
-@styled()
+@apply_style()
 def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
     """Draws the expected path within its bounding circle, and each command over time."""
     rows = len(spec.command)
@@ -184,7 +184,7 @@ def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
             axes.axhline(limit, color=MODEL, linewidth=0.8, linestyle="--")
         axes.set_ylabel(f"{command.name}\n[{command.unit}]")
     axes.set_xlabel("time [s]")
-    return png(figure)
+    return render_png(figure)
 
 
 class Point(NamedTuple):
@@ -197,7 +197,7 @@ class Point(NamedTuple):
 
 def draw_training_curve(points: Sequence[Point]) -> bytes:
     """Draws success and collisions [%] over the environment steps."""
-    figure, (axes,) = panels(1, 1)
+    figure, (axes,) = make_panels(1, 1)
     steps, *shares = np.array(points, np.float64).T
     for name, share, line in zip(
         ("success", "collision"), shares, ("-", "--"), strict=True
@@ -209,25 +209,27 @@ def draw_training_curve(points: Sequence[Point]) -> bytes:
     axes.set_ylim(0.0, 100.0)
     axes.set_xlim(left=0.0)
     axes.legend()
-    return png(figure, panel=CURVE_PANEL)
+    return render_png(figure, panel=CURVE_PANEL)
 
 
 def draw_robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
     """Draws success [%] with its interval, by what was perturbed."""
-    figure, (axes,) = panels(1, 1)
+    figure, (axes,) = make_panels(1, 1)
     value, low, high = 100.0 * np.array([astuple(share) for share in shares.values()]).T
     names = [fill(name.replace("_", " "), NAME_LETTERS) for name in shares]
     ends = value - low, high - value
     axes.errorbar(value, names, xerr=ends, fmt="o", color=MODEL, capsize=3.0)
     axes.invert_yaxis()
     axes.set(xlabel="success [%]", xlim=(min(90.0, low.min() - 2.0), 100.5))
-    return png(figure, panel=CURVE_PANEL)
+    return render_png(figure, panel=CURVE_PANEL)
 
 
 def draw_shadow(shadow: Shadow) -> bytes:
     """Draws each command over time, as driven and as chosen by the policy."""
     count = len(shadow.names)
-    figure, grid = panels(count, 2, (11.0, 2.4 * count + 0.6), width_ratios=(4.0, 1.0))
+    figure, grid = make_panels(
+        count, 2, (11.0, 2.4 * count + 0.6), width_ratios=(4.0, 1.0)
+    )
     for c, (wide, narrow) in enumerate(zip(grid[::2], grid[1::2], strict=True)):
         driven = shadow.driven[:, c]
         wanted = shadow.policy[:, c]
@@ -251,7 +253,7 @@ def draw_shadow(shadow: Shadow) -> bytes:
         narrow.hist(wanted - driven, bins=31, color=OTHER)
         narrow.set_xlabel(f"policy less driven [{shadow.units[c]}]")
     grid[-2].set_xlabel("time [s]")
-    return png(figure, grid[0])
+    return render_png(figure, grid[0])
 
 
 def draw_seeded_world(
@@ -276,7 +278,7 @@ def draw_seeded_world(
     low, high = np.array(world.extent).reshape(2, 2)
     size = high - low
     view = make_view(low, high, WORLD_SIDE)
-    figure, (axes,) = panels(1, 1)
+    figure, (axes,) = make_panels(1, 1)
     draw_world(axes, world, scene.bodies)
     for kind, places, colour in (
         ("starts", world.starts, GREEN),
@@ -308,7 +310,7 @@ def draw_seeded_world(
     count = np.count_nonzero(scene.bodies[:, RADIUS])
     about = f"{size[0]:.3g} m x {size[1]:.3g} m, {count} obstacles, seed {seed}"
     axes.set_title(f"{world.name}: {about}")
-    return png(figure, axes, view.panel)
+    return render_png(figure, axes, view.panel)
 
 
 def _draw_movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:

@@ -29,7 +29,7 @@ from nics_drl_bridge.config import (
     read_text,
     validate,
 )
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.template import Ranges
 
@@ -67,12 +67,12 @@ def kind_names() -> list[str]:
     """Names of all kinds of robots."""
     modules = (module.name for module in iter_modules([str(Path(__file__).parent)]))
     own = (name for module in modules for name in _own_kinds(module))
-    return sorted({*own, *extensions.known("kinds")})
+    return sorted({*own, *extensions.find_extensions("kinds")})
 
 
 def find_kind(name: str) -> Any | None:
     """Returns a `kinds.RobotKind`; None if there is none of that name."""
-    if name in extensions.known("kinds"):
+    if name in extensions.find_extensions("kinds"):
         return extensions.load("kinds", name)
     return (_own_kinds(name) or _own_kinds(name.rpartition("_")[0])).get(name)
 
@@ -206,7 +206,7 @@ class RobotSpec(Schema):
                 f"{told}, at most {LARGEST:g} m can be; lengths are in metres"
             )
         if self.footprint is not None:
-            if geometry.edges_cross(np.array(self.footprint)):
+            if geometry.has_crossing_edges(np.array(self.footprint)):
                 raise ValueError(
                     "edges of footprint cross or touch; list its corners in order"
                 )
@@ -477,7 +477,7 @@ def read_definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:
 def _of_kind(data: dict[str, Any], ranges: Ranges, source: str) -> dict[str, Any]:
     kind = find_kind(str(data["kind"]))
     if kind is None:
-        hint = nearest(str(data["kind"]), kind_names())
+        hint = suggest(str(data["kind"]), kind_names())
         raise ConfigError(f"{source}: key 'kind': there is no {data['kind']!r}; {hint}")
     if "textbook" in data:
         raise ConfigError(

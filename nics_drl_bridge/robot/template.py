@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
 
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 
 Given = Mapping[str, Any]  # a part of a robot's file
 Ranges = Mapping[str, tuple[float, float]]
@@ -87,7 +87,7 @@ class Template:
             usual = {**sizes, **self.parameters}
             for name in own:  # one of the user's own may have any other name
                 if get_close_matches(str(name), usual.keys() - own.keys(), 1, MISSPELT):
-                    fault = f"unknown parameter {name!r}; {nearest(name, usual)}"
+                    fault = f"unknown parameter {name!r}; {suggest(name, usual)}"
                     raise ConfigError(f"robot {data['name']!r}: {fault}")
             data["parameters"], data["assumed"] = (
                 {**usual, **own},

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.cell_kernels import BodyCells, body_cells
@@ -133,7 +133,7 @@ def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
                 grid.cells.shape,
                 grid.resolution,
                 grid.origin,
-                sha256(grid.cells.tobytes()),
+                hash_bytes(grid.cells.tobytes()),
             )
             found.append(once.setdefault(about, grid))
     return found

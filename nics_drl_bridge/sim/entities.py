@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
+from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.shapes import Shape, convex_hull, place
@@ -132,7 +132,7 @@ class Entities:
         known = {entity.name: entity for entity in self}
         if name not in known:
             raise UnknownEntityError(
-                f"there is no entity {name!r}; {nearest(name, known)}"
+                f"there is no entity {name!r}; {suggest(name, known)}"
             )
         return known[name]
 

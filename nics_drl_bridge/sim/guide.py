@@ -6,7 +6,7 @@ Only a simulator knows it: it is for the reward of a training.
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array, depths
+from nics_drl_bridge.geometry import Array, compute_depths
 from nics_drl_bridge.lidar.shapes import Circle, Polygon
 from nics_drl_bridge.sim import guide_kernels as kernels
 from nics_drl_bridge.sim.guide_kernels import GuideGrid
@@ -49,7 +49,9 @@ class Guide:
         frames = np.column_stack([extents[:, :2], cells])
         inner = footprint.radius
         if isinstance(footprint, Polygon):
-            inner = abs(float(depths(np.zeros((1, 2)), np.array(footprint.outline))[0]))
+            inner = abs(
+                float(compute_depths(np.zeros((1, 2)), np.array(footprint.outline))[0])
+            )
         self._grid = GuideGrid(
             walls,
             frames,

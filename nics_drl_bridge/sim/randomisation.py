@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 from nics_drl_bridge import files
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml, validate
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import fault_kernels
@@ -22,7 +22,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
-from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.seeds import check_seeds
 
 __all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
 Integers = NDArray[np.int64]
@@ -190,7 +190,7 @@ class Randomisation(Schema):
     @property
     def fingerprint(self) -> str:
         """Identifies the ranges: 16 digits of a SHA-256."""
-        return files.sha256(self.model_dump_json().encode())[:16]
+        return files.hash_bytes(self.model_dump_json().encode())[:16]
 
 
 def load_randomisation(name: str | Path) -> Randomisation:
@@ -271,7 +271,7 @@ class Sampler:
 
     def draw(self, seeds: ArrayLike) -> Draws:
         """Draws the numbers of the episodes of some seeds (n,)."""
-        chosen = checked_seeds(seeds)
+        chosen = check_seeds(seeds)
         robots = self._robots
         timing = np.floor(_between(self._timing, chosen, robots, LATENCY_GROUP)).astype(
             np.int64
@@ -352,7 +352,7 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
         for dof in named:
             if dof not in model.dofs:
                 raise ConfigError(
-                    f"{place}: unknown rate {dof!r}; {nearest(dof, model.dofs)}"
+                    f"{place}: unknown rate {dof!r}; {suggest(dof, model.dofs)}"
                 )
     for dof, span in ranges.dofs.items():
         spans[model.dofs.index(dof)] = span
@@ -380,7 +380,7 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
                 taylor.parse_term(name, model.variables), model.variables
             )
         ]
-    hint = nearest(name, known) if known else "it has none at all: remove it."
+    hint = suggest(name, known) if known else "it has none at all: remove it."
     raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")
 
 

@@ -24,7 +24,7 @@ from nics_drl_bridge.lidar.shapes import (
     Shape,
     describe,
 )
-from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.packing_kernels import pack
@@ -153,7 +153,7 @@ class SceneSampler:
         self, seeds: ArrayLike, count: ArrayLike | None, size: ArrayLike | None
     ) -> tuple[Integers, Integers, Integers]:
         """Returns seeds, numbers of obstacles (-1 for the world's own) and sizes; see `draw`."""
-        numbers = checked_seeds(seeds)
+        numbers = check_seeds(seeds)
         n = len(numbers)
         if count is None:
             wanted = np.full(n, -1)
@@ -259,7 +259,7 @@ class SetSampler:
 def member_of(world: AnyWorld, seed: int) -> int:
     """Returns the index of the world of a set in which the scene of a seed is."""
     chosen = np.zeros(1, np.int64)
-    kernels.choose_members(checked_seeds(seed), len(world.members), chosen)
+    kernels.choose_members(check_seeds(seed), len(world.members), chosen)
     return int(chosen[0])
 
 

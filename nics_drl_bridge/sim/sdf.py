@@ -20,8 +20,8 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from nics_drl_bridge.arguments import check_path
-from nics_drl_bridge.config import no_device
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.config import check_no_device
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import FARTHEST, LARGEST, MOST_CORNERS, SMALLEST
 from nics_drl_bridge.sim import sections
@@ -231,7 +231,7 @@ class _Scope:
         ):
             return self.frame(first) @ inner.frame(rest)
         if found is None:
-            near = nearest(name, self._named) if self._named else "there are none here."
+            near = suggest(name, self._named) if self._named else "there are none here."
             raise ConfigError(f"{self.where}: there is no frame {name!r}; {near}")
         if name in self._open:
             reason = (
@@ -364,7 +364,7 @@ def _matrix(pose: Element | None, where: str) -> Array:
         return matrix
     unknown = [name for name in pose.attrib if name not in POSE and ":" not in name]
     if unknown:
-        hint = nearest(unknown[0], POSE)
+        hint = suggest(unknown[0], POSE)
         raise ConfigError(
             f"{where}: unknown attribute {unknown[0]!r} of a <pose>; {hint}"
         )
@@ -375,7 +375,7 @@ def _matrix(pose: Element | None, where: str) -> Array:
         ("degrees", degrees, ["true", "false", "1", "0"]),
     ):
         if given not in known:
-            hint = nearest(given, known)
+            hint = suggest(given, known)
             raise ConfigError(
                 f"{where}: attribute {name}={given!r} of a <pose>; {hint}"
             )
@@ -466,7 +466,7 @@ def root_of(path: Path) -> Element:
 def _tree(path: Path) -> Element:
     """Reads XML. Raises ConfigError with line and column, and for declared entities, which grow."""
     try:
-        if no_device(path).stat().st_size > MOST_BYTES:
+        if check_no_device(path).stat().st_size > MOST_BYTES:
             reason = f"is larger than {MOST_BYTES // 2**20} MB, which no such file is"
             raise ConfigError(f"{path}: {reason}; give another.")
         data = path.read_bytes()

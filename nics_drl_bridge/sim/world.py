@@ -11,7 +11,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from nics_drl_bridge.config import Heading, Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Shape
@@ -184,7 +184,7 @@ class World(Schema):
                 (self.grid.cells.shape, self.grid.resolution, self.grid.origin)
             )
             content += about.encode() + self.grid.cells.tobytes()
-        return f"{self.name}-{sha256(content)[:8]}"
+        return f"{self.name}-{hash_bytes(content)[:8]}"
 
     @property
     def shapes(self) -> tuple[Shape, ...]:

@@ -12,10 +12,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from nics_drl_bridge.arguments import shown
+from nics_drl_bridge.arguments import format_value
 from nics_drl_bridge.config import Schema, parse_yaml, read_text, share_folder, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.lidar.shapes import Shape
 from nics_drl_bridge.sim.barn import barn_numbers, barn_world
 from nics_drl_bridge.sim.cellular import Cellular, grow
@@ -62,7 +62,7 @@ class WorldSet:
     def fingerprint(self) -> str:
         """The name, and 8 digits of a SHA-256 over the content of all members."""
         content = "\n".join(world.fingerprint for world in self.members)
-        return f"{self.name}-{sha256(content.encode())[:8]}"
+        return f"{self.name}-{hash_bytes(content.encode())[:8]}"
 
     @cached_property
     def shapes(self) -> tuple[Shape, ...]:
@@ -95,7 +95,7 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
         several = isinstance(name, list | tuple)
         if not several or not all(isinstance(one, str | Path) for one in name):
             needed = "a name, the path of a YAML file or a folder, a World, or a list of names"
-            raise ConfigError(f"world={shown(name)}: must be {needed}.")
+            raise ConfigError(f"world={format_value(name)}: must be {needed}.")
         return _set_of("worlds", _members([str(one) for one in name], Path()))
     text = str(name)
     sets = share_folder() / "config" / "world_sets"

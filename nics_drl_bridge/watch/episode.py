@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Shape
 from nics_drl_bridge.policy.policies import POLICIES, actions_of, shipped_policies
 from nics_drl_bridge.policy.stateful import Policy, begin
-from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.scenes import scaled
 from nics_drl_bridge.sim.world import Obstacles, World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
@@ -115,7 +115,7 @@ class Lane:
 
     def anew(self, seed: float) -> bool:
         """Begins a seed's episode in the world as at first; True in a new env. ConfigError."""
-        self.seed = int(checked_seeds([seed])[0])
+        self.seed = int(check_seeds([seed])[0])
         if changed := self.world is not self._native:
             self.close()
             self._open(self._policy, self._native)
@@ -232,7 +232,7 @@ class EpisodeSource:
         policies = dict.fromkeys(
             [self._policy, self._given_policy, *fitting, *POLICIES]
         )
-        worlds = dict.fromkeys([first, *self._given_worlds, *shipped_names("worlds")])
+        worlds = dict.fromkeys([first, *self._given_worlds, *list_shipped("worlds")])
         return Stage(
             f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}",
             self.model,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from nics_drl_bridge.env.rendering import WorldPicture
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.extensions import require
-from nics_drl_bridge.files import check_above, whole_file, write_bytes
+from nics_drl_bridge.files import check_above, write_bytes, write_whole_file
 from nics_drl_bridge.watch.frame import Frame, Stage
 
 Pixels = NDArray[np.uint8]  # (H, W, 3)
@@ -90,7 +90,7 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     shown = iter(shown)
     first = next(shown)
     height, width = first.shape[:2]
-    with whole_file(path) as part:
+    with write_whole_file(path) as part:
         options = {
             "fps": fps,
             "macro_block_size": 2,
@@ -119,7 +119,7 @@ WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
 def check_file(path: Path) -> None:
     """Raises ConfigError for a kind that is unknown or lacks its library, or a bad folder."""
     if path.suffix not in WRITERS:
-        raise ConfigError(f"--record {str(path)!r}: {nearest(path.suffix, WRITERS)}")
+        raise ConfigError(f"--record {str(path)!r}: {suggest(path.suffix, WRITERS)}")
     require(str(path), *LIBRARIES.get(path.suffix, ()))
     check_above(path)
 

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extensions import missing
+from nics_drl_bridge.extensions import explain_missing
 from nics_drl_bridge.seeds import GREATEST_SEED
 from nics_drl_bridge.watch.frame import Frame, Stage
 from nics_drl_bridge.watch.motion import MotionMeter
@@ -90,7 +90,7 @@ class PageServer:
             from websockets.sync.server import serve
         except ImportError as error:
             raise ConfigError(
-                f"the page {missing(error.name or 'websockets')}"
+                f"the page {explain_missing(error.name or 'websockets')}"
             ) from None
         self._requests: queue.Queue[Request] = queue.Queue(MOST_REQUESTS)
         self._news = threading.Condition()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol
 
-from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
+from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.watch.frame import Frame, Stage
 from nics_drl_bridge.watch.server import PageServer, Request
 
@@ -88,7 +88,7 @@ def check_listed(request: Request, stage: Stage) -> None:
     if request.kind in stage.choices:
         offered = stage.choices[request.kind]
         if request.name not in offered:
-            hint = nearest(request.name, offered)
+            hint = suggest(request.name, offered)
             raise ConfigError(
                 f"{request.kind} {request.name!r}: is not on the page's list; {hint}"
             )

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.policy.policies import shipped_policies
 
 from .runs import BENCHMARKS, asked, fails
@@ -73,7 +73,7 @@ def test_success_has_a_floor_in_each_world_and_may_be_two_and_four_points_off(
 
 
 def test_every_world_that_comes_with_the_package_is_driven(transfer):
-    assert set(transfer.FLOORS) == set(shipped_names("worlds"))
+    assert set(transfer.FLOORS) == set(list_shipped("worlds"))
 
 
 def test_no_robot_is_no_transfer(transfer):

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("gymnasium")
 
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
-from nics_drl_bridge.commands.episodes import env_of
+from nics_drl_bridge.commands.episodes import open_env
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, load_model
 from nics_drl_bridge.policy.evaluation import drive
@@ -49,7 +49,7 @@ def test_an_episode_is_driven_through_the_gate_and_with_what_was_drawn():
             "estimator": True,
             "randomisation": Conditions(randomisation="mild").ranges,
         }
-        env, policy = env_of(
+        env, policy = open_env(
             "dynamic_window", model, "circles", "sim", Conditions(gate=gate), **given
         )
         episode = drive(env, policy, 5)

@@ -14,13 +14,13 @@ from nics_drl_bridge.commands.demo_run import (
     DemoEpisodes,
     DemoPlan,
     Learned,
+    derive_settings,
     learn,
-    sections_of,
-    settings_of,
+    make_sections,
 )
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import builtin_model, generate, lidar_of
+from nics_drl_bridge.generator import builtin_model, generate, mount_lidar
 from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode, Summary, rate
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.pictures import Point
@@ -97,7 +97,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
 ):
     robot = load_robot("differential")
     drive = record(robot, np.random.default_rng(0), 30.0)
-    model, identified = generate(drive, robot, lidar_of(robot), ())
+    model, identified = generate(drive, robot, mount_lidar(robot), ())
     arrivals = int(500 * share)
     rates = [rate(count, 500) for count in (arrivals, 500 - arrivals, 0, arrivals)]
     length = ConfidenceInterval(3.0, 2.9, 3.1)
@@ -109,7 +109,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
     of = DemoEpisodes(
         summaries, [episode(0), episode(1)], [episode(0), episode(1)], live
     )
-    sections = dict(sections_of(DemoPlan(tmp_path), model, identified, learned, of))
+    sections = dict(make_sections(DemoPlan(tmp_path), model, identified, learned, of))
     assert next(iter(sections)) == "Verdict"
     verdict = "".join(sections["Verdict"])
     for words in (
@@ -127,7 +127,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
 
 def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):
     plan = DemoPlan(tmp_path, world="circles", train_steps=7)
-    settings, told = settings_of(plan, direct_model())
+    settings, told = derive_settings(plan, direct_model())
     assert told == ()
     assert settings.robot == str(tmp_path / "model")
     assert settings.worlds == {"circles": 512}
@@ -148,7 +148,7 @@ def test_without_ros_it_drives_in_process_alone_and_says_so(tmp_path, monkeypatc
     monkeypatch.setattr(demo_run, "_evaluate", lambda *given: None)
     monkeypatch.setattr(demo_run, "_drive", drive_here)
     monkeypatch.setattr(
-        demo_run, "sections_of", lambda *given: shown.append(given[-1]) or []
+        demo_run, "make_sections", lambda *given: shown.append(given[-1]) or []
     )
     said = list[str]()
     line = demo_run.run(DemoPlan(tmp_path, episodes=1), said.append)
@@ -157,6 +157,6 @@ def test_without_ros_it_drives_in_process_alone_and_says_so(tmp_path, monkeypatc
     assert "needs the module 'rclpy'" in said[0]
     (of,) = shown
     assert (of.there, of.live) == ([], None)
-    paths = demo_run._episodes(DemoPlan(tmp_path), direct_model(), of)
+    paths = demo_run._format_episodes(DemoPlan(tmp_path), direct_model(), of)
     assert "1 of 1 episodes reached the goal in process." in "".join(paths)
     assert "DDS" not in "".join(paths)

@@ -18,10 +18,10 @@ from nics_drl_bridge.commands.episodes import (
     PLACES,
     EvaluationOrder,
     _places,
-    contracts_of,
-    limited,
+    limit_time,
     model_name,
-    short_name,
+    read_contracts,
+    shorten_name,
 )
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -47,7 +47,7 @@ KART = SimpleNamespace(
 def test_pictures_of_policies_with_the_same_name_are_told_apart_by_their_folders(
     policy, among, name
 ):
-    assert short_name(policy, [policy, *among]) == name
+    assert shorten_name(policy, [policy, *among]) == name
 
 
 def order(*places):
@@ -122,7 +122,7 @@ def contract(robot, **known):
 
 
 def test_a_baseline_drives_the_robot_of_the_policy_beside_it(tmp_path):
-    assert contracts_of(["dynamic_window", "straight"]) == {}
+    assert read_contracts(["dynamic_window", "straight"]) == {}
     assert model_name(None, {}) == DEFAULT_ROBOT
     mine = {"mine.onnx": contract("mine", model=str(tmp_path))}
     assert model_name(None, mine) == str(tmp_path)
@@ -143,8 +143,10 @@ def test_an_evaluation_uses_the_time_limit_of_the_policy_and_tells_if_it_is_shor
     world = load_worlds("doorway")
     slow = SimpleNamespace(robot=load_robot("turtlebot3_burger"), control_period=0.1)
     known = {"mine.onnx": contract("mine", max_episode_steps=400)}
-    assert limited(NO_CONDITIONS, known, slow, world, said.append).steps == 400
-    assert limited(NO_CONDITIONS, {}, slow, world, said.append).steps == 573
+    assert limit_time(NO_CONDITIONS, known, slow, world, said.append).steps == 400
+    assert limit_time(NO_CONDITIONS, {}, slow, world, said.append).steps == 573
     assert said == []
-    assert limited(Conditions(steps=300), known, slow, world, said.append).steps == 300
+    assert (
+        limit_time(Conditions(steps=300), known, slow, world, said.append).steps == 300
+    )
     assert "an episode ends after 30 s" in said[0]

@@ -88,7 +88,10 @@ def test_the_messages_that_were_built_can_be_used(tmp_path):
     done = nics("install", "tf2_msgs", "--prefix", tmp_path / "built", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     prefix = (tmp_path / "built").resolve()
-    environment = {**os.environ, "PYTHONPATH": str(message_build.modules_of(prefix))}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(message_build.find_modules_folder(prefix)),
+    }
     libraries = os.environ.get("LD_LIBRARY_PATH", "")
     environment["LD_LIBRARY_PATH"] = f"{prefix / 'lib'}{os.pathsep}{libraries}"
     used = subprocess.run(

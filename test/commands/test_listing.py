@@ -5,7 +5,7 @@ import json
 import pytest
 from command_line import nics
 
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.config import list_shipped
 
 
 @pytest.mark.parametrize("what", ["robots", "worlds", "lidars", "policies"])
@@ -18,7 +18,7 @@ def test_what_comes_with_the_package_is_listed_by_name(what, tmp_path):
     known = (
         {"dynamic_window", "differential"}
         if what == "policies"
-        else set(shipped_names(what))
+        else set(list_shipped(what))
     )
     assert listed >= known
     assert all(name in table.stdout for name in known)

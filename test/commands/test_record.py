@@ -115,11 +115,11 @@ def test_what_can_not_be_done_is_one_sentence(tmp_path, words, hint):
 
 
 def test_options_become_arguments_of_the_node():
-    assert model.node_arguments("", ()) == ["nics"]
-    named = model.node_arguments("/bot/", ("odom:=/wheels",))
+    assert model.make_node_arguments("", ()) == ["nics"]
+    named = model.make_node_arguments("/bot/", ("odom:=/wheels",))
     assert named == ["nics", "--ros-args", "-r", "__ns:=/bot", "-r", "odom:=/wheels"]
     with pytest.raises(ConfigError, match="--remap 'odom=wheels': must be NAME:=OTHER"):
-        model.node_arguments("", ("odom=wheels",))
+        model.make_node_arguments("", ("odom=wheels",))
 
 
 def test_the_summary_tells_each_command_and_the_next_step():

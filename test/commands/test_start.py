@@ -95,16 +95,16 @@ def nested(interrupt):
     "make", [nested, lambda _: SwallowedError("lost"), lambda _: typer.Abort()]
 )
 def test_an_interrupt_is_one_whatever_a_library_made_of_it(make, capsys):
-    with pytest.raises(typer.Exit) as caught, console.one_sentence():
+    with pytest.raises(typer.Exit) as caught, console.report_in_one_sentence():
         swallow(make)
     assert caught.value.exit_code == 130
     assert capsys.readouterr().err.startswith("nics: interrupted;")
 
 
 def test_an_error_without_an_interrupt_stays_an_error():
-    with pytest.raises(typer.Abort), console.one_sentence():
+    with pytest.raises(typer.Abort), console.report_in_one_sentence():
         raise typer.Abort from EOFError()
-    with pytest.raises(SystemError), console.one_sentence():
+    with pytest.raises(SystemError), console.report_in_one_sentence():
         raise SystemError("of a library")
 
 

@@ -58,10 +58,10 @@ def test_a_page_without_its_library_is_refused_before_a_robot_is_opened(
 ):
     monkeypatch.setattr(module.extensions, "lacking", lambda names: next(iter(names)))
     monkeypatch.setattr(
-        module, "_episodes", lambda *given: pytest.fail("a robot was opened")
+        module, "_watch_episodes", lambda *given: pytest.fail("a robot was opened")
     )
     with pytest.raises(typer.Exit):
-        console.checked(module.watch)(policy="straight")
+        console.check_options(module.watch)(policy="straight")
     assert "pip install 'nics_drl_bridge[view]'" in capsys.readouterr().err
 
 
@@ -70,17 +70,17 @@ def test_an_episode_has_the_time_that_its_policy_was_learnt_with(monkeypatch):
         provenance={}, robot=SimpleNamespace(name="differential"), max_episode_steps=777
     )
     driven = []
-    env_of = driving.env_of
+    env_of = driving.open_env
     monkeypatch.setattr(
-        driving, "contracts_of", lambda policies: dict.fromkeys(policies, learnt)
+        driving, "read_contracts", lambda policies: dict.fromkeys(policies, learnt)
     )
     monkeypatch.setattr(
         driving,
-        "env_of",
+        "open_env",
         lambda *given, **more: driven.append(given[4]) or env_of(*given, **more),
     )
     under = dict.fromkeys(("lidar", "randomisation", "gate", "task"))
-    with closing(module._episodes("straight", None, ["circles"], 0, under)):
+    with closing(module._watch_episodes("straight", None, ["circles"], 0, under)):
         assert [each.steps for each in driven] == [777]
 
 

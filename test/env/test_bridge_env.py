@@ -291,7 +291,7 @@ def test_a_backend_that_does_not_take_what_it_is_told_is_named():
             return lambda model, world: Recorder()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(extensions, "known", lambda group: {"mine": Point})
+        patch.setattr(extensions, "find_extensions", lambda group: {"mine": Point})
         BridgeEnv("mine", direct_model(), field()).reset(seed=0)
         with pytest.raises(
             ConfigError, match=r"'mine': got an unexpected .*'randomisation'; look"

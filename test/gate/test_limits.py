@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gate.rig import TICK_S, Rig, config, driving
-from nics_drl_bridge.config import find_config, shipped_names
+from nics_drl_bridge.config import find_config, list_shipped
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import gate
 from nics_drl_bridge.gate.inputs import Command
@@ -24,7 +24,7 @@ from nics_drl_bridge.gate.limits import (
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.spec import load_robot
 
-ROBOTS = shipped_names("limits")
+ROBOTS = list_shipped("limits")
 LIMITS = {robot: load_limits(robot, load_robot(robot)) for robot in ROBOTS}
 TOLERANCE = 1e-6
 WISH = st.floats(-3.0, 3.0)

@@ -7,7 +7,7 @@ import pytest
 
 from identify import planted
 from nics_drl_bridge import geometry
-from nics_drl_bridge.generator import generate, lidar_of, load_model, save_model
+from nics_drl_bridge.generator import generate, load_model, mount_lidar, save_model
 from nics_drl_bridge.identify.acceptance import (
     THRESHOLDS,
     Outcome,
@@ -203,7 +203,7 @@ def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(
     assert "the model that was written is the textbook" in " ".join(told.doubts)
     (at,) = [at for at in found.judgement if at.horizon_s == 5.0]
     assert at.model.position_m < 0.03
-    model, again = generate(recording, spec, lidar_of(spec), (), alpha="auto")
+    model, again = generate(recording, spec, mount_lidar(spec), (), alpha="auto")
     assert again.findings.replaced
     save_model(model, tmp_path / "model")
     opened = load_model(tmp_path / "model")

@@ -10,7 +10,7 @@ import pytest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError
-from nics_drl_bridge.generator import generate, lidar_of
+from nics_drl_bridge.generator import generate, mount_lidar
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.by_recording import Alone
 from nics_drl_bridge.identify.calibration import Calibration
@@ -75,7 +75,7 @@ def test_the_time_between_two_recordings_is_no_gap_in_the_pose():
 
 @pytest.fixture(scope="module")
 def together():
-    return generate([STRAIGHT, TURNING], ROBOT, lidar_of(ROBOT), (), strict=True)
+    return generate([STRAIGHT, TURNING], ROBOT, mount_lidar(ROBOT), (), strict=True)
 
 
 def test_no_prediction_window_crosses_from_one_drive_to_another():
@@ -121,9 +121,9 @@ def test_not_even_episodes_without_a_gap_are_crossed():
 
 def test_two_drives_teach_together_what_neither_does_alone(together):
     with pytest.raises(FitError):
-        generate(STRAIGHT, ROBOT, lidar_of(ROBOT), (), strict=True)
+        generate(STRAIGHT, ROBOT, mount_lidar(ROBOT), (), strict=True)
     with pytest.raises(FitError):
-        generate(TURNING, ROBOT, lidar_of(ROBOT), (), strict=True)
+        generate(TURNING, ROBOT, mount_lidar(ROBOT), (), strict=True)
     model, identified = together
     last = identified.judgement[-1]
     assert last.model.position_m < 0.02

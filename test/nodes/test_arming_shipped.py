@@ -13,7 +13,7 @@ import yaml
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.config import find_config, shipped_names
+from nics_drl_bridge.config import find_config, list_shipped
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.state import begin
@@ -25,7 +25,7 @@ from nics_drl_bridge.nodes.runner import open_context
 
 pytestmark = pytest.mark.ros
 
-ROBOTS = shipped_names("robots")
+ROBOTS = list_shipped("robots")
 FILE = find_config("bridge", "nodes")
 TICK_S = 0.02
 SETTLED_S = 3.0

@@ -17,7 +17,7 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.extras.bags.info import bag_info
+from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.middleware.playback import estimate
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.recording.bag_file import opened
@@ -114,7 +114,9 @@ def test_a_recorder_writes_a_whole_bag_at_ctrl_c(words, meet, domain_id, tmp_pat
     recorder.send_signal(signal.SIGINT)
     out, err, code = ended(recorder)
     assert code == 0, err
-    counts = {topic.topic: topic.count for topic in bag_info(tmp_path / "drive").topics}
+    counts = {
+        topic.topic: topic.count for topic in read_bag_info(tmp_path / "drive").topics
+    }
     if words:
         assert json.loads(out) == {"path": str(tmp_path / "drive"), "messages": counts}
     else:

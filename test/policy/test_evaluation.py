@@ -16,7 +16,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import json_of
+from nics_drl_bridge.files import format_json
 from nics_drl_bridge.policy.evaluation import (
     ELSEWHERE,
     Episode,
@@ -391,6 +391,6 @@ def test_a_summary_shows_neither_nan_nor_inf_and_is_json_that_others_read(arrive
     assert not re.search(r"\b(nan|inf)\b", line)
     assert ("path" in line) == (arrived > 0)
     assert (
-        json.loads(json_of(asdict(told)), parse_constant=pytest.fail)["length"]
+        json.loads(format_json(asdict(told)), parse_constant=pytest.fail)["length"]
         is not None
     )

@@ -10,7 +10,7 @@ import pytest
 from shapely.geometry import Point, Polygon
 from shapely.prepared import prep
 
-from nics_drl_bridge.geometry import depths
+from nics_drl_bridge.geometry import compute_depths
 from nics_drl_bridge.policy.local_map import CELL_M, outline_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import (
     Clearance,
@@ -62,7 +62,7 @@ def test_depths_are_distances_to_the_border_and_negative_outside():
     points = np.random.default_rng(0).uniform(-1.0, 3.0, (300, 2))
     exact = Polygon(shape).exterior
     inside = prep(Polygon(shape))
-    for point, depth in zip(points, depths(points, shape), strict=True):
+    for point, depth in zip(points, compute_depths(points, shape), strict=True):
         assert abs(depth) == pytest.approx(exact.distance(Point(point)))
         assert (depth > 0.0) == inside.contains(Point(point))
 

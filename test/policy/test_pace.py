@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, make_task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
@@ -41,7 +41,7 @@ def slow(model, speed=0.22):
 def test_the_shipped_robots_keep_the_time_limit_that_their_policies_were_learnt_with(
     name,
 ):
-    worlds = [load_worlds(world) for world in shipped_names("worlds")]
+    worlds = [load_worlds(world) for world in list_shipped("worlds")]
     known = SimpleNamespace(robot=load_robot(name), control_period=0.1)
     assert pace_of(known, worlds).steps == MAX_EPISODE_STEPS
 

@@ -9,7 +9,7 @@ import torch
 from robots import direct_model, field
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import sealed
+from nics_drl_bridge.files import seal
 from nics_drl_bridge.policy import train as training
 from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, evaluate, run, train
 from nics_drl_bridge.policy.train_checkpoint import FORMAT, read_checkpoint
@@ -228,7 +228,7 @@ def test_a_checkpoint_that_would_run_code_is_refused(tmp_path):
     path = tmp_path / CHECKPOINT
     content = io.BytesIO()
     torch.save({"format": FORMAT, "about": Harmful()}, content)
-    path.write_bytes(sealed(content.getvalue()))
+    path.write_bytes(seal(content.getvalue()))
     with pytest.raises(ConfigError, match="is no checkpoint"):
         read_checkpoint(path)
     assert not (tmp_path / "harm").exists()
@@ -262,7 +262,7 @@ def test_a_checkpoint_that_holds_something_else_is_refused(tmp_path, name):
     content = io.BytesIO()
     torch.save(BAD_CONTENTS[name], content)
     path = tmp_path / CHECKPOINT
-    path.write_bytes(sealed(content.getvalue()))
+    path.write_bytes(seal(content.getvalue()))
     with pytest.raises(ConfigError, match="is no checkpoint"):
         read_checkpoint(path)
 
@@ -273,7 +273,7 @@ def test_a_packed_checkpoint_is_refused_unread(tmp_path):
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("archive/data.pkl", bytes(100_000_000))
     path = tmp_path / CHECKPOINT
-    path.write_bytes(sealed(content.getvalue()))
+    path.write_bytes(seal(content.getvalue()))
     with pytest.raises(ConfigError, match="is no checkpoint"):
         read_checkpoint(path)
 

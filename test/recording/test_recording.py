@@ -9,7 +9,7 @@ import pytest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import MOST_BYTES, sealed
+from nics_drl_bridge.files import MOST_BYTES, seal
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.recording import (
     FORMAT,
@@ -168,7 +168,7 @@ def test_numpy_reads_a_recording_whose_checksum_follows_the_archive(
 @pytest.mark.parametrize(
     "version", [*(f"nics_drl_bridge/recording/{n}" for n in (1, 2, 3)), "other/1"]
 )
-@pytest.mark.parametrize("seal", [sealed, bytes])
+@pytest.mark.parametrize("seal", [seal, bytes])
 def test_another_format_is_one_sentence_that_says_what_to_do(tmp_path, version, seal):
     meta = {"format": version, "source": "", "clocks": {}}
     path = tmp_path / "a.npz"
@@ -195,7 +195,7 @@ def test_another_format_is_one_sentence_that_says_what_to_do(tmp_path, version, 
 def test_a_file_that_lacks_a_part_is_refused(tmp_path, meta):
     path = tmp_path / "a.npz"
     arrays = {"meta": np.array(json.dumps(meta)), "command": np.zeros((2, 2))}
-    path.write_bytes(sealed(packed({**arrays, "command_t": np.zeros(2)})))
+    path.write_bytes(seal(packed({**arrays, "command_t": np.zeros(2)})))
     with pytest.raises(RecordingError, match="is not a recording of this package"):
         load_recording(path)
 
@@ -239,14 +239,14 @@ def test_entries_that_zipfile_can_not_unpack_are_refused(tmp_path, field):
             iter(field.values())
         )
     path = tmp_path / "drive.npz"
-    path.write_bytes(sealed(data))
+    path.write_bytes(seal(data))
     with pytest.raises(RecordingError, match=r"compression|password|encrypted"):
         load_recording(path)
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_refused_packed(monkeypatch, tmp_path):
     path = tmp_path / "drive.npz"
-    path.write_bytes(sealed(packed({"meta": np.zeros(3_000_000, np.int8)})))
+    path.write_bytes(seal(packed({"meta": np.zeros(3_000_000, np.int8)})))
     monkeypatch.setattr(recordings.files, "MOST_BYTES", 2_000_000)
     with pytest.raises(RecordingError, match="unpacked it is larger than"):
         load_recording(path)

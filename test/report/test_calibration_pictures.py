@@ -14,7 +14,7 @@ from nics_drl_bridge.report import fit_pictures
 from nics_drl_bridge.report.fit_pictures import CAPTIONS, draw_calibration
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
-from nics_drl_bridge.style import png
+from nics_drl_bridge.style import render_png
 
 Found = tuple[RobotSpec, Identified]
 PNG = b"\x89PNG"
@@ -113,7 +113,7 @@ def test_titles_stay_within_their_pictures(exact, disturbed, monkeypatch):
 
     def drawn(figure, *rest):
         figures.append(figure)
-        return png(figure, *rest)
+        return render_png(figure, *rest)
 
     monkeypatch.setattr(fit_pictures, "png", drawn)
     for spec, identified in (disturbed, (exact[0], with_half_a_lever(exact[1])[0])):

@@ -359,7 +359,7 @@ def test_another_package_adds_a_kind_by_an_entry_point_or_takes_the_place_of_one
 ):
     points = {name: EntryPoint(name, f"nics_drl_bridge.robot.{NEW}:KIND", "")}
     monkeypatch.setattr(
-        extensions, "known", lambda group: points if group == "kinds" else {}
+        extensions, "find_extensions", lambda group: points if group == "kinds" else {}
     )
     robot = RobotSpec.model_validate(load_robot(NEW).model_dump() | {"textbook": name})
     assert textbook(robot).twist(np.array([1.0, 0.0])) == pytest.approx([1.0, 0.0, 0.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import find_kind, kind_names, textbook
 from nics_drl_bridge.robot.spec import (
@@ -178,8 +178,8 @@ def test_a_file_without_a_name_is_a_robot_of_the_files_name(tmp_path):
         build_robot({"kind": "skid_steer", "footprint_radius": 0.6}).name
         == "skid_steer"
     )
-    shipped = [load_robot(name).name for name in shipped_names("robots")]
-    assert shipped == shipped_names("robots")
+    shipped = [load_robot(name).name for name in list_shipped("robots")]
+    assert shipped == list_shipped("robots")
 
 
 def test_the_content_of_a_file_is_a_robot_too():

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from nics_drl_bridge.commands.cli import app
-from nics_drl_bridge.generator import lidar_of
+from nics_drl_bridge.generator import mount_lidar
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.urdf import make_urdf
 
@@ -51,7 +51,7 @@ def wheels(text: str) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_shipped_files_are_those_of_the_shipped_robots(name: str) -> None:
-    lidar = lidar_of(load_robot(name))
+    lidar = mount_lidar(load_robot(name))
     file = ROOT / "urdf" / f"{name}.urdf"
     assert file.read_text(encoding="utf-8") == make_urdf(
         load_robot(name), lidar.mount, lidar.frame

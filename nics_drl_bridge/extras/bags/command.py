@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import needs_ros
-from nics_drl_bridge.config import namespace_of
+from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 bag = typer.Typer(
@@ -42,18 +42,18 @@ def record(
     as_json: console.JsonOption = False,
 ) -> None:
     """Records a robot's topics without driving it."""
-    kind = _storage(storage)
+    kind = _choose_storage(storage)
     with needs_ros("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
     names = tuple(topics or ())
     say = partial(typer.echo, err=True)
     order = BagOrder(
-        out, names, everything, namespace_of(namespace), duration, kind, use_sim_time
+        out, names, everything, parse_namespace(namespace), duration, kind, use_sim_time
     )
     counts = dict(sorted(record_bag(order, say).items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")
-    console.say(as_json, "\n".join(lines), path=str(out), messages=counts)
+    console.print_line(as_json, "\n".join(lines), path=str(out), messages=counts)
 
 
 @bag.command()
@@ -62,9 +62,9 @@ def info(
     as_json: console.JsonOption = False,
 ) -> None:
     """Shows a bag's topics, rates, gaps, and the clock of its stamps."""
-    from nics_drl_bridge.extras.bags.info import bag_info
+    from nics_drl_bridge.extras.bags.info import read_bag_info
 
-    told = bag_info(path)
+    told = read_bag_info(path)
     span = f"{told.duration_s:.3f} s"
     size = f"{told.size_bytes / 1e6:.2f} MB"
     line = f"{path}: {told.messages} messages in {span}, {size}"
@@ -78,8 +78,10 @@ def info(
         "clock",
         "delay [ms]",
     )
-    table = console.table(heads, [_row(each) for each in told.topics])
-    console.say(as_json, f"{line}\n{table}", **asdict(told) | {"path": str(path)})
+    table = console.format_table(heads, [_format_row(each) for each in told.topics])
+    console.print_line(
+        as_json, f"{line}\n{table}", **asdict(told) | {"path": str(path)}
+    )
 
 
 @bag.command()
@@ -131,7 +133,9 @@ def replay(
         from nics_drl_bridge.generator import open_model
         from nics_drl_bridge.middleware import playback
 
-        made = playback.estimate(path, open_model(model), console.roles_of(topic or []))
+        made = playback.estimate(
+            path, open_model(model), console.parse_roles(topic or [])
+        )
         if out is not None:
             playback.write_estimate(made, out)
         rejected = dict(sorted(made.rejected.items()))
@@ -143,13 +147,13 @@ def replay(
         )
         told = {"estimates": number, "last": last, "not_used": rejected}
         line = "\n".join((*lines, f"sha256 {made.digest}"))
-        console.say(as_json, line, **told, sha256=made.digest)
+        console.print_line(as_json, line, **told, sha256=made.digest)
         return
     with needs_ros("nics bag replay"):
         from nics_drl_bridge.extras.bags.live import play_bag
     say = partial(typer.echo, err=True)
     sent = play_bag(path, topics or (), rate, loop, clock, namespace, lockstep, say)
-    console.say(as_json, f"{sent} messages were published", published=sent)
+    console.print_line(as_json, f"{sent} messages were published", published=sent)
 
 
 @bag.command()
@@ -175,18 +179,20 @@ def export(
 
     added = convert(path, mcap, None if model is None else open_model(model))
     also = f", with {' and '.join(added)} added" if added else ""
-    console.say(as_json, f"bag written to {mcap}{also}", mcap=str(mcap), added=added)
+    console.print_line(
+        as_json, f"bag written to {mcap}{also}", mcap=str(mcap), added=added
+    )
 
 
-def _storage(name: str) -> Any:
-    from nics_drl_bridge.errors import ConfigError, nearest
+def _choose_storage(name: str) -> Any:
+    from nics_drl_bridge.errors import ConfigError, suggest
 
     if name not in STORAGES:
-        raise ConfigError(f"--storage {name!r}: {nearest(name, STORAGES)}")
+        raise ConfigError(f"--storage {name!r}: {suggest(name, STORAGES)}")
     return name
 
 
-def _row(each: Any) -> tuple[str, ...]:
+def _format_row(each: Any) -> tuple[str, ...]:
     span = "" if each.first_s is None else f"{each.first_s:.2f}, {each.last_s:.2f}"
     if each.longest_gap_s is None:
         gaps = ""

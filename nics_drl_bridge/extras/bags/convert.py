@@ -36,7 +36,10 @@ def convert(
                 topic, kind, bag.offers(topic), definition=bag.definition(topic)
             )
             rows += ((topic, ns, data) for ns, data in bag.serialized(topic))
-        made = [*_moving(bag, sink.store), *_fixed(bag, sink.store, model)]
+        made = [
+            *_convert_moving(bag, sink.store),
+            *_convert_fixed(bag, sink.store, model),
+        ]
         added = list(dict.fromkeys(topic for topic, _, _ in made))
         for topic in added:
             sink.add_topic(topic, topic_roles.TRANSFORMS, OFFERS.get(topic, ()))
@@ -45,9 +48,11 @@ def convert(
     return added
 
 
-def _moving(bag: BagFile, store: Any) -> Iterator[Row]:
+def _convert_moving(bag: BagFile, store: Any) -> Iterator[Row]:
     for message in (
-        [] if MOVING in bag.types else _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
+        []
+        if MOVING in bag.types
+        else _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
     ):
         told = message.content
         where = told.pose.pose
@@ -58,8 +63,10 @@ def _moving(bag: BagFile, store: Any) -> Iterator[Row]:
         yield MOVING, message.receive_ns, made
 
 
-def _fixed(bag: BagFile, store: Any, model: SimulatorModel | None) -> Iterator[Row]:
-    scans = _messages(bag, f"/{SCAN}", SCAN_TYPE)
+def _convert_fixed(
+    bag: BagFile, store: Any, model: SimulatorModel | None
+) -> Iterator[Row]:
+    scans = _make_messages(bag, f"/{SCAN}", SCAN_TYPE)
     if model is None or FIXED in bag.types or not scans:
         return
     x, y, heading = model.lidar.mount
@@ -69,7 +76,7 @@ def _fixed(bag: BagFile, store: Any, model: SimulatorModel | None) -> Iterator[R
     )
     bases = [
         m.content.child_frame_id
-        for m in _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
+        for m in _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
     ]
     scan = scans[0].content.header
     header = type(scan)(scan.stamp, (*bases, FRAMES[1])[0])
@@ -80,7 +87,7 @@ def _fixed(bag: BagFile, store: Any, model: SimulatorModel | None) -> Iterator[R
     )
 
 
-def _messages(bag: BagFile, topic: str, kind: str) -> list[Message]:
+def _make_messages(bag: BagFile, topic: str, kind: str) -> list[Message]:
     return bag.messages(topic) if bag.types.get(topic) == kind else []
 
 

@@ -49,16 +49,17 @@ class BagInfo:
     topics: tuple[BagTopic, ...]
 
 
-def bag_info(path: str | Path) -> BagInfo:
+def read_bag_info(path: str | Path) -> BagInfo:
     """Reads a whole bag and describes its contents; a damaged one raises RecordingError."""
     path = Path(path)
     with opened(path) as bag:
-        received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
+        received = {topic: _read_receipt(bag, topic) for topic in sorted(bag.types)}
         times = np.concatenate([ns for ns, _ in received.values()])
         start = int(times.min())
         end = int(times.max())
         topics = tuple(
-            _topic(t, bag.types[t], ns - start, s) for t, (ns, s) in received.items()
+            _describe_topic(t, bag.types[t], ns - start, s)
+            for t, (ns, s) in received.items()
         )
     if path.is_file():
         files = [path]
@@ -68,7 +69,7 @@ def bag_info(path: str | Path) -> BagInfo:
     return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
 
 
-def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
+def _read_receipt(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
     if not bag.knows(topic):
         return np.array(
             [ns for ns, _ in bag.serialized(topic)], dtype=np.int64
@@ -79,7 +80,7 @@ def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]
     return receive, receive - stamps if stamps.any() else UNSTAMPED
 
 
-def _topic(
+def _describe_topic(
     topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str
 ) -> BagTopic:
     clock = delays if isinstance(delays, str) else ""

@@ -19,8 +19,8 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from nics_drl_bridge.config import namespace_of
-from nics_drl_bridge.errors import BackendError, RecordingError, nearest
+from nics_drl_bridge.config import parse_namespace
+from nics_drl_bridge.errors import BackendError, RecordingError, suggest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
 from nics_drl_bridge.nodes.runner import (
@@ -78,7 +78,7 @@ class BagOrder:
 
     def wants(self, topic: str) -> bool:
         """True if a topic is to be recorded."""
-        space = namespace_of(self.namespace)
+        space = parse_namespace(self.namespace)
         if self.everything:
             return not space or topic.startswith(f"{space}/") or topic in SHARED
         names = self.topics or (*ROBOT, *SHARED)
@@ -199,7 +199,7 @@ class _Player:
         self._stopping = stopping
         self._rate = rate
         self._lockstep = lockstep
-        self._space = namespace_of(namespace)
+        self._space = parse_namespace(namespace)
         self.publishers: dict[str, Publisher] = {}
         self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if clock else None
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -344,7 +344,7 @@ def _wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
     for name in names:
         if name not in bag.types:
             raise RecordingError(
-                f"{bag.place}: has no topic {name!r}; {nearest(name, bag.types)}"
+                f"{bag.place}: has no topic {name!r}; {suggest(name, bag.types)}"
             )
     left_out = {*bag.empty, *([CLOCK] if clock else [])}
     return [topic for topic in sorted(names or bag.types) if topic not in left_out]

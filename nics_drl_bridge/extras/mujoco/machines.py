@@ -70,7 +70,7 @@ class Machine:
     gyro: bool = False  # tells odometry how the robot turns, instead of the wheels
 
 
-def _motor(
+def _make_motor(
     transmission: str,
     inertia: float,
     lag: float,
@@ -92,7 +92,7 @@ def _motor(
              forcerange="{-torque:.8g} {torque:.8g}"/>"""
 
 
-def _document(
+def _make_document(
     name: str,
     physics: Physics,
     height: float,
@@ -122,7 +122,7 @@ def _document(
 """
 
 
-def _chassis(
+def _make_chassis(
     mass: float, centre: tuple[float, float, float], size: tuple[float, ...]
 ) -> str:
     half = " ".join(f"{0.5 * s:.6g}" for s in size)
@@ -131,7 +131,7 @@ def _chassis(
       <geom name="chassis" type="box" mass="{mass}" pos="{x:.6g} {y:.6g} {z:.6g}" size="{half}"/>"""
 
 
-def _wheel(
+def _make_wheel(
     name: str,
     radius: float,
     width: float,
@@ -180,7 +180,7 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
         raise ConfigError(f"robot {spec.name!r}: {reason}") from None
 
 
-def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
+def _make_ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     # One motor turns both rear wheels through a tendon that averages their speeds, which shares its
     # torque as a differential does.
     wheelbase = p["wheelbase"]
@@ -188,14 +188,18 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     total = physics.mass + 4 * physics.wheel_mass
     rotor = ROTOR * 0.5 * physics.mass * radius**2
     inertia = (total + 2 * physics.wheel_mass) * radius**2 + 2 * rotor
-    engine = _motor('tendon="axle"', inertia, p["speed_lag"], radius, step, physics)
+    engine = _make_motor(
+        'tendon="axle"', inertia, p["speed_lag"], radius, step, physics
+    )
     centre = (0.45 * wheelbase, 0.0, 0.0)
     size = (1.3 * wheelbase, 0.7 * track, 0.04)
-    wheels = _car_wheels(wheelbase, track, radius, p["steering_lag"], physics, rotor)
-    robot = _chassis(physics.mass, centre, size) + wheels
+    wheels = _make_car_wheels(
+        wheelbase, track, radius, p["steering_lag"], physics, rotor
+    )
+    robot = _make_chassis(physics.mass, centre, size) + wheels
     half_ratio = 0.5 * track / wheelbase
-    actuators = _car_actuators(engine) + _tie_rod(half_ratio, p["steepest"])
-    xml = _document("ackermann", physics, radius, robot, actuators)
+    actuators = _make_car_actuators(engine) + _make_tie_rod(half_ratio, p["steepest"])
+    xml = _make_document("ackermann", physics, radius, robot, actuators)
 
     def controls(state: Array) -> Array:
         speed, steering = state
@@ -217,7 +221,7 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     return Machine(xml, joints, controls, measured)
 
 
-def _car_wheels(
+def _make_car_wheels(
     wheelbase: float,
     track: float,
     radius: float,
@@ -227,8 +231,10 @@ def _car_wheels(
 ) -> str:
     parts = ""
     for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
-        rear = _wheel(f"rear_{side}", radius, 0.4 * radius, physics, rotor=rotor)
-        front = _wheel(f"front_{side}", radius, 0.4 * radius, physics, physics.bearing)
+        rear = _make_wheel(f"rear_{side}", radius, 0.4 * radius, physics, rotor=rotor)
+        front = _make_wheel(
+            f"front_{side}", radius, 0.4 * radius, physics, physics.bearing
+        )
         parts += f"""
       <body pos="0 {y:.6g} 0">{rear}
       </body>
@@ -242,7 +248,7 @@ def _car_wheels(
     return parts
 
 
-def _tie_rod(half_ratio: float, steepest: float) -> str:
+def _make_tie_rod(half_ratio: float, steepest: float) -> str:
     # Servos that are not joined pass through angles at which the wheels scrub.
     middle = np.tan(np.linspace(-steepest, steepest, 101))
     left, right = (
@@ -256,7 +262,7 @@ def _tie_rod(half_ratio: float, steepest: float) -> str:
   <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{given}"/></equality>"""
 
 
-def _car_actuators(engine: str) -> str:
+def _make_car_actuators(engine: str) -> str:
     servos = "".join(
         f"""
     <position joint="steer_{side}" kp="{STEERING_STIFFNESS}"
@@ -272,7 +278,7 @@ def _car_actuators(engine: str) -> str:
   </actuator>"""
 
 
-def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
+def _make_differential(p: Parameters, step: float, physics: Physics) -> Machine:
     radius = p["wheel_radius"]
     track = p["track"]
     behind = -0.5 * track
@@ -282,7 +288,7 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
     inertia = 0.5 * (total + physics.wheel_mass) * radius**2 + rotor
     wheels = "".join(
         f"""
-      <body pos="0 {y:.6g} 0">{_wheel(side, radius, 0.4 * radius, physics, rotor=rotor)}
+      <body pos="0 {y:.6g} 0">{_make_wheel(side, radius, 0.4 * radius, physics, rotor=rotor)}
       </body>"""
         for side, y in (("left", 0.5 * track), ("right", -0.5 * track))
     )
@@ -290,19 +296,19 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
     # behind would push it further into every turn.
     centre = (-0.06 * track, 0.0, -0.55 * radius)
     size = (track, 0.7 * track, 0.03)
-    robot = f"""{_chassis(physics.mass, centre, size)}
+    robot = f"""{_make_chassis(physics.mass, centre, size)}
       <body pos="{behind:.6g} 0 {ball - radius:.6g}">
         <joint type="ball" damping="{physics.bearing}"/>
         <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
       </body>{wheels}"""
-    motors = _motors(
+    motors = _make_motors(
         names := ("left", "right"), inertia, p["wheel_lag"], radius, step, physics
     )
-    xml = _document("differential", physics, radius, robot, motors)
+    xml = _make_document("differential", physics, radius, robot, motors)
     return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
 
-def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
+def _make_mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     # MuJoCo can't align a friction that differs by direction with the roller at the bottom of a
     # turning wheel; free rollers are robust, and reproduce the slight vibration of real ones.
     radius = p["wheel_radius"]
@@ -313,11 +319,11 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     y = p["half_width"]
     names = ("front_left", "front_right", "rear_left", "rear_right")
     places = ((x, y, -1), (x, -y, 1), (-x, y, 1), (-x, -y, -1))
-    body = _chassis(physics.mass, (0, 0, 0), (2.2 * x, 1.4 * y, 0.04))
+    body = _make_chassis(physics.mass, (0, 0, 0), (2.2 * x, 1.4 * y, 0.04))
     for name, (px, py, lean) in zip(names, places, strict=True):
-        body += _roller_wheel(name, (px, py), lean, radius, physics, rotor)
-    motors = _motors(names, inertia, p["wheel_lag"], radius, step, physics)
-    xml = _document("mecanum", physics, radius, body, motors)
+        body += _make_roller_wheel(name, (px, py), lean, radius, physics, rotor)
+    motors = _make_motors(names, inertia, p["wheel_lag"], radius, step, physics)
+    xml = _make_document("mecanum", physics, radius, body, motors)
     # On a diagonal two wheels stand, each on a roller that it meets anywhere along its length: they
     # turn the robot by up to 0.03 rad/s. Only a gyro can tell.
     return Machine(
@@ -325,44 +331,47 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     )
 
 
-def _skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
+def _make_skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
     # A point of contact for each wheel: how far a turn skids follows from where the wheels stand.
     radius = p["wheel_radius"]
     places = places_of_four(p)
     x, y = places["front_left"]
     rotor = ROTOR * 0.25 * physics.mass * radius**2
     inertia = (0.25 * physics.mass + 1.5 * physics.wheel_mass) * radius**2 + rotor
-    body = _chassis(physics.mass, (0.0, 0.0, 0.0), (2.0 * x + radius, 1.4 * y, 0.1))
+    body = _make_chassis(
+        physics.mass, (0.0, 0.0, 0.0), (2.0 * x + radius, 1.4 * y, 0.1)
+    )
     for name, (px, py) in places.items():
+        wheel = _make_wheel(name, radius, 0.4 * radius, physics, rotor=rotor)
         body += f"""
-      <body pos="{px:.6g} {py:.6g} 0">{_wheel(name, radius, 0.4 * radius, physics, rotor=rotor)}
+      <body pos="{px:.6g} {py:.6g} 0">{wheel}
       </body>"""
     names = tuple(places)
-    motors = _motors(
+    motors = _make_motors(
         names, inertia, p["wheel_lag"], radius, step, physics, STIFF_SERVO_LAG_S
     )
-    xml = _document("skid_steer", physics, radius, body, motors, SKIDDING)
+    xml = _make_document("skid_steer", physics, radius, body, motors, SKIDDING)
     both = lambda _, speed: 0.5 * (speed[:2] + speed[2:])  # noqa: E731
     # How far it skids differs with speed and curve; such robots' odometry turns by their gyro.
     return Machine(xml, names, lambda state: np.tile(state, 2), both, gyro=True)
 
 
-def _motors(names: tuple[str, ...], *servo: Any) -> str:
-    rows = "".join(_motor(f'joint="{name}"', *servo) for name in names)
+def _make_motors(names: tuple[str, ...], *servo: Any) -> str:
+    rows = "".join(_make_motor(f'joint="{name}"', *servo) for name in names)
     return f"""
   <actuator>{rows}
   </actuator>"""
 
 
 _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
-    "ackermann": _ackermann,
-    "differential": _differential,
-    "mecanum": _mecanum,
-    "skid_steer": _skid_steer,
+    "ackermann": _make_ackermann,
+    "differential": _make_differential,
+    "mecanum": _make_mecanum,
+    "skid_steer": _make_skid_steer,
 }
 
 
-def roller_size(radius: float, rollers: int) -> tuple[float, float]:
+def fit_roller(radius: float, rollers: int) -> tuple[float, float]:
     """Semi-axes [m], thickness and length, of ellipsoidal rollers that best outline a circle."""
     a = THICKNESS * radius
     q = np.pi / rollers
@@ -370,7 +379,7 @@ def roller_size(radius: float, rollers: int) -> tuple[float, float]:
     return float(a), float(np.sqrt(a**2 + 2.0 * (reach**2 - a**2) / np.sin(q) ** 2))
 
 
-def _roller_wheel(
+def _make_roller_wheel(
     name: str,
     place: tuple[float, float],
     lean: int,
@@ -379,7 +388,7 @@ def _roller_wheel(
     rotor: float,
 ) -> str:
     # It leans by +1 if the axle of the roller on the floor points forward and left, else by -1.
-    a, b = roller_size(radius, physics.rollers)
+    a, b = fit_roller(radius, physics.rollers)
     hub = physics.wheel_mass - physics.rollers * ROLLER_MASS
     rows = ""
     for angle in 2.0 * np.pi * np.arange(physics.rollers) / physics.rollers:

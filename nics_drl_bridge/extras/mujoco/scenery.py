@@ -23,7 +23,7 @@ OBSTACLE_NAME = "obstacle_"
 SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
 
 
-def prefix_of(robot: int) -> str:
+def make_prefix(robot: int) -> str:
     """Prefix of the names of a robot's parts."""
     return f"robot_{robot}/" if robot else ""
 
@@ -47,7 +47,7 @@ def compile_scene(
         another = mujoco.MjSpec.from_string(machine.xml)
         another.delete(another.geom("floor"))
         _Maker(mujoco, another, physics).bumper(another.body("base_link"), footprint)
-        spec.attach(another, prefix=prefix_of(m), frame=spec.worldbody.add_frame())
+        spec.attach(another, prefix=make_prefix(m), frame=spec.worldbody.add_frame())
     for wall in world.all_walls():
         maker.wall(spec.worldbody, wall[:2], wall[2:])
     if world.grid is not None:
@@ -60,10 +60,10 @@ def compile_scene(
     return spec.compile()
 
 
-def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
+def find_bumpers(model: Any, robots: int) -> NDArray[np.int64]:
     """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
-    heads = [f"{prefix_of(m)}{BUMPER_NAME}" for m in range(robots)]
+    heads = [f"{make_prefix(m)}{BUMPER_NAME}" for m in range(robots)]
     found = [
         next((m for m, head in enumerate(heads) if n.startswith(head)), -1)
         for n in names
@@ -87,7 +87,7 @@ class _Maker:
             kind = self._kinds.mjGEOM_ELLIPSOID
             self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **own)
         else:
-            for i, part in enumerate(convex_parts(footprint.outline)):
+            for i, part in enumerate(split_convex(footprint.outline)):
                 self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
@@ -99,7 +99,7 @@ class _Maker:
     def map(self, grid: GridMap) -> None:
         heading = grid.origin[2]
         side = grid.resolution
-        for first_row, first, row, column in rectangles(grid.blocked):
+        for first_row, first, row, column in merge_into_rectangles(grid.blocked):
             middle = grid.cell_to_world(
                 [0.5 * (first_row + row - 1), 0.5 * (first + column - 1)]
             )
@@ -115,7 +115,7 @@ class _Maker:
         body = self._spec.worldbody.add_body(
             name=f"{OBSTACLE_NAME}{k}",
             pos=[x, y, 0.0],
-            quat=quaternion(heading),
+            quat=make_quaternion(heading),
             mocap=moves,
         )
         if isinstance(shape, Circle):
@@ -133,14 +133,14 @@ class _Maker:
         elif isinstance(shape, Segment):
             self.wall(body, *shape.outline)
         else:
-            for part in convex_parts(shape.outline):
+            for part in split_convex(shape.outline):
                 self._prism(body, part, (0.0, HEIGHT))
 
     def _box(
         self, body: Any, middle: Array, heading: float, size: Sequence[float]
     ) -> None:
         pos = [middle[0], middle[1], 0.5 * HEIGHT]
-        turned = quaternion(heading)
+        turned = make_quaternion(heading)
         self._add(body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=turned)
 
     def _prism(
@@ -162,12 +162,12 @@ class _Maker:
         body.add_geom(**common, solref=self._solref, **values)
 
 
-def quaternion(heading: float) -> list[float]:
+def make_quaternion(heading: float) -> list[float]:
     """Quaternion w, x, y, z of a rotation about the vertical [rad]."""
     return [float(np.cos(0.5 * heading)), 0.0, 0.0, float(np.sin(0.5 * heading))]
 
 
-def convex_parts(outline: Array) -> list[Array]:
+def split_convex(outline: Array) -> list[Array]:
     """Splits an outline (V, 2) into convex ones, if need be by ear clipping (Meisters 1975)."""
     if len(convex_hull(outline)) == len(outline):
         return [outline]
@@ -179,10 +179,10 @@ def convex_parts(outline: Array) -> list[Array]:
         parts.append(outline[[rest[at - 1], rest[at], rest[(at + 1) % len(rest)]]])
         del rest[at]
     parts.append(outline[rest])
-    return [part for part in parts if _area(*part) > least]
+    return [part for part in parts if _compute_area(*part) > least]
 
 
-def _area(a: Array, b: Array, c: Array) -> float:
+def _compute_area(a: Array, b: Array, c: Array) -> float:
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
@@ -193,15 +193,17 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
     a = outline[before]
     b = outline[here]
     c = outline[after]
-    if _area(a, b, c) <= 0.0:
+    if _compute_area(a, b, c) <= 0.0:
         return False
     others = (outline[k] for k in rest if k not in (before, here, after))
     return not any(
-        min(_area(a, b, p), _area(b, c, p), _area(c, a, p)) >= 0.0 for p in others
+        min(_compute_area(a, b, p), _compute_area(b, c, p), _compute_area(c, a, p))
+        >= 0.0
+        for p in others
     )
 
 
-def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
+def merge_into_rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Rectangles (R, 4) of blocked cells: first row, first column, and those after the last."""
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}

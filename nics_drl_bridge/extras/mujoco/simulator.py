@@ -56,7 +56,7 @@ class Rig:
         self.spec = spec
         self.machine = machine
         self._target = textbook(spec).target
-        prefix = scenery.prefix_of(number)
+        prefix = scenery.make_prefix(number)
         base = model.joint(int(model.body(f"{prefix}base_link").jntadr[0]))
         joints = [model.joint(f"{prefix}{name}") for name in machine.joints]
         self._place = int(base.qposadr[0])
@@ -281,7 +281,7 @@ class MujocoSimulator(DrivenSimulator):
             int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0]) for k in there
         ]
         self._mocap = [(k, one) for k, one in zip(there, ids, strict=True) if one >= 0]
-        self._bumper_of = scenery.bumpers(compiled, robots)
+        self._bumper_of = scenery.find_bumpers(compiled, robots)
 
     def step(self, commands: ArrayLike) -> None:
         """Moves one control period by commands (1, M, C), clipped. ConfigError, BackendError."""
@@ -319,7 +319,7 @@ class MujocoSimulator(DrivenSimulator):
             bodies = self.move_obstacles((part + 1) * part_s)
             for k, mocap in self._mocap:
                 data.mocap_pos[mocap, :2] = bodies[k, :2]
-                data.mocap_quat[mocap] = scenery.quaternion(bodies[k, 2])
+                data.mocap_quat[mocap] = scenery.make_quaternion(bodies[k, 2])
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             bumped = self._bumper_of[data.contact.geom.ravel()]
             touched[bumped[bumped >= 0]] = True

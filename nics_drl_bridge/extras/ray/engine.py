@@ -101,7 +101,7 @@ class Rollout:
 
 
 class WorldsRunner(SingleAgentEnvRunner):
-    """Steps its share of the worlds of a training; `env_config` is made by `_algorithm`."""
+    """Steps its share of the worlds of a training; `env_config` is made by `_build_algorithm`."""
 
     def make_env(self) -> None:
         """Makes the worlds of this runner; each runner draws different episodes."""
@@ -198,13 +198,13 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 def learner(
     address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Callable[..., train.Trained]]:
-    """Connects with a cluster, see `connected`; gives the function that trains one policy on it."""
-    with connected(address, env_runners, worlds) as runners:
+    """Connects with a cluster, see `connect`; gives the function that trains one policy on it."""
+    with connect(address, env_runners, worlds) as runners:
         yield functools.partial(train_on_ray, runners=runners)
 
 
 @contextmanager
-def connected(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
+def connect(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
     """Connects with `auto`, `HOST:PORT` or an own cluster, and yields its runners. ConfigError."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
@@ -225,12 +225,14 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
             f"--address {address}: no Ray cluster answers ({first}); {fix}"
         ) from None
     try:
-        yield _runners(runners, int(ray.cluster_resources().get("CPU", 0)), worlds)
+        yield _count_runners(
+            runners, int(ray.cluster_resources().get("CPU", 0)), worlds
+        )
     finally:
         ray.shutdown()
 
 
-def _runners(runners: int | None, cpus: int, worlds: int) -> int:
+def _count_runners(runners: int | None, cpus: int, worlds: int) -> int:
     if runners is None:
         return max(1, min(cpus, worlds))
     if runners > cpus:
@@ -268,7 +270,7 @@ def train_on_ray(
     content = read_checkpoint(path, FORMAT) if resumed else None
     if content is not None:
         train.check_same(content["about"], about, path)
-    algorithm = _algorithm(
+    algorithm = _build_algorithm(
         settings, seed, 0 if content is None else content["steps"], runners
     )
     try:
@@ -378,7 +380,9 @@ class Learning:
         )
 
 
-def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -> PPO:
+def _build_algorithm(
+    settings: TrainingSettings, seed: int, done: int, runners: int
+) -> PPO:
     torch.set_num_threads(settings.threads)
     model = open_model(settings.robot, settings.lidar)
     scenes = {name: load_worlds(name) for name in settings.worlds}
@@ -389,10 +393,10 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     normaliser = train_algorithms.observed(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()
-    make = ray.put(functools.partial(share_of_worlds, settings, model, scenes))
+    make = ray.put(functools.partial(select_worlds, settings, model, scenes))
     env_config = {"make": make, "seed": (seed, done), "threads": settings.threads}
     env_config["rollout"] = settings.ppo.rollout
-    config = _config(settings, seed, done, normaliser, spaces).env_runners(
+    config = _make_config(settings, seed, done, normaliser, spaces).env_runners(
         env_runner_cls=WorldsRunner,
         num_env_runners=runners,
         rollout_fragment_length="auto",
@@ -403,7 +407,7 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     return algorithm
 
 
-def share_of_worlds(
+def select_worlds(
     settings: TrainingSettings,
     model: SimulatorModel,
     scenes: Mapping[str, AnyWorld],
@@ -418,7 +422,7 @@ def share_of_worlds(
     )
 
 
-def _config(
+def _make_config(
     settings: TrainingSettings,
     seed: int,
     done: int,

@@ -142,6 +142,6 @@ class Region:
         x, y, z = self._points[0]
         room = self._points[1, 0] ** 2 - max(-z, z - HEIGHT, 0.0) ** 2
         apart = -float(
-            geometry.depths(np.array([[x, y]]), outline)[0]
+            geometry.compute_depths(np.array([[x, y]]), outline)[0]
         )  # below 0 inside
         return bool(room >= 0.0 and apart <= math.sqrt(room))

@@ -11,7 +11,7 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.extras.bags.info import bag_info
+from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.write import write_bag
 from nics_drl_bridge.robot.spec import load_robot
@@ -48,13 +48,13 @@ def test_any_flipped_bit_of_a_sealed_file_is_found(sealed, seed):
     data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
     file.write_bytes(data)
     with pytest.raises(RecordingError):
-        bag_info(sealed)
+        read_bag_info(sealed)
 
 
 def test_info_tells_rates_gaps_and_clocks(tmp_path):
     poses = [row for row in bags.poses(offset=100.0) if not 2.0 < row[0] < 4.0]
     bag = bags.write(tmp_path / "bag", {"/cmd_vel": bags.commands(), "/pose": poses})
-    told = {topic.topic: topic for topic in bag_info(bag).topics}
+    told = {topic.topic: topic for topic in read_bag_info(bag).topics}
     command = told["/cmd_vel"]
     pose = told["/pose"]
     assert command.rate_hz == pytest.approx(10.0)
@@ -63,7 +63,7 @@ def test_info_tells_rates_gaps_and_clocks(tmp_path):
     assert (pose.clock, pose.gaps) == ("another", 1)
     assert pose.longest_gap_s == pytest.approx(2.0, abs=0.05)
     assert pose.delay_s == pytest.approx(-99.998)
-    assert bag_info(bag).messages == len(bags.commands()) + len(poses)
+    assert read_bag_info(bag).messages == len(bags.commands()) + len(poses)
 
 
 def test_stamps_of_several_clocks_are_told(tmp_path):
@@ -72,7 +72,7 @@ def test_stamps_of_several_clocks_are_told(tmp_path):
         for t in bags.times()
     ]
     bag = bags.write(tmp_path / "bag", {"/pose": poses})
-    (pose,) = bag_info(bag).topics
+    (pose,) = read_bag_info(bag).topics
     assert pose.clock == "several"
 
 
@@ -82,5 +82,5 @@ def test_sentences_of_damage_name_the_place(sealed):
     data[100] ^= 1
     file.write_bytes(data)
     with pytest.raises(RecordingError) as caught:
-        bag_info(sealed)
+        read_bag_info(sealed)
     assert re.search(r"sealed\.mcap is damaged at byte \d+", str(caught.value))

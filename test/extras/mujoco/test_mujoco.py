@@ -11,8 +11,8 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco.machines import (
     Physics,
     build_machine,
+    fit_roller,
     load_mujoco,
-    roller_size,
 )
 from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, Reading, record
 from nics_drl_bridge.recording.recording import check
@@ -236,7 +236,7 @@ def test_a_model_is_identified_from_a_drive(robots):
 def test_rollers_make_a_wheel_round():
     radius = 0.05
     count = 12
-    a, b = roller_size(radius, count)
+    a, b = fit_roller(radius, count)
     q = np.linspace(0.0, np.pi / count, 50)
     reach = (radius - a) * np.cos(q) + np.sqrt(
         a**2 + (b**2 - a**2) * np.sin(q) ** 2 / 2.0

@@ -24,8 +24,8 @@ from ray.cluster_utils import Cluster
 
 from nics_drl_bridge.extras.ray.engine import (
     FORMAT,
-    connected,
-    share_of_worlds,
+    connect,
+    select_worlds,
     train_on_ray,
 )
 from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, run
@@ -116,7 +116,7 @@ def test_a_training_on_two_nodes_outlives_a_killed_worker_and_writes_its_policy_
             os.kill(killed[0], signal.SIGKILL)
 
     order = TrainOrder(settings(), [3], tmp_path, episodes=10)
-    with connected(cluster.address, RUNNERS, worlds=9) as runners:
+    with connect(cluster.address, RUNNERS, worlds=9) as runners:
         (result,) = run(order, tell, learn=partial(train_on_ray, runners=runners))
     assert killed
     assert told[-1].steps == result.trained.steps >= 2000
@@ -159,7 +159,7 @@ def test_a_killed_worker_is_begun_anew_and_an_interrupted_run_goes_on_where_it_w
         first["resumed"] = progress.steps
         raise BrokenOffError
 
-    with connected(cluster.address, RUNNERS, worlds=9) as runners:
+    with connect(cluster.address, RUNNERS, worlds=9) as runners:
         learn = partial(train_on_ray, endless, 0, tmp_path, runners=runners)
         with pytest.raises(BrokenOffError):
             learn(until_it_is_back)
@@ -229,7 +229,7 @@ def test_env_runners_share_all_worlds_among_them():
     from nics_drl_bridge.generator import open_model
 
     shares = [
-        share_of_worlds(settings(), open_model("differential"), {}, k, 4).num_envs
+        select_worlds(settings(), open_model("differential"), {}, k, 4).num_envs
         for k in range(4)
     ]
     assert shares == [3, 2, 2, 2]
