@@ -15,7 +15,7 @@ def main() -> None:
     pattern = DrivePlan(
         robot, bound=2.0, duration=60.0
     ).preview()  # as `nics record --preview`
-    print("\n".join(pattern.lines()))
+    print("\n".join(pattern.describe()))
     Path("record_drive.png").write_bytes(drive_picture(pattern, robot))
 
     recording = textbook.record(

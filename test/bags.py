@@ -17,9 +17,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import topic_roles as kinds
-from nics_drl_bridge.recording.messages import typestore
+from nics_drl_bridge.recording.messages import make_typestore
 
-STORE = typestore()
+STORE = make_typestore()
 START_S = 1_700_000_000.0
 STEP_S = 0.02
 DURATION_S = 6.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.textbook import INTEGRATION_STEP_S, _arc
+from nics_drl_bridge.recording.textbook import INTEGRATION_STEP_S, _integrate_substep
 from nics_drl_bridge.robot.kinds import Textbook
 
 
@@ -23,5 +23,7 @@ def integrate(
     h = dt / steps
     goal = book.target(command)
     for k in range(steps):
-        pose = geometry.compose(pose, geometry.exp(_arc(book, state, goal, k * h, h)))
+        pose = geometry.compose(
+            pose, geometry.exp(_integrate_substep(book, state, goal, k * h, h))
+        )
     return pose, book.respond(state, goal, dt)

@@ -18,7 +18,7 @@ from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording.recording import load_recording
-from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.recording.topic_roles import load_topic_roles
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.world import load_world
@@ -37,7 +37,7 @@ CONFIGS = {
 OTHERS = {
     "policy.onnx": load_policy,
     "stop.jsonl": replay,
-    "topics.yaml": topic_roles,
+    "topics.yaml": load_topic_roles,
     "drive.npz": load_recording,
     "lidar_table": LidarTable.load,
 }

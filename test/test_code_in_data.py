@@ -32,7 +32,7 @@ from nics_drl_bridge.policy.train import settings_of
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording.mapping import load_mapping
-from nics_drl_bridge.recording.messages import with_types
+from nics_drl_bridge.recording.messages import collect_types
 from nics_drl_bridge.recording.recording import load_recording
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.world import load_world
@@ -310,13 +310,13 @@ def test_the_name_of_a_type_in_a_bag_is_no_program(tmp_path, name):
     canary = tmp_path / "canary"
     given = SimpleNamespace(msgdef=(definition_format(), "int32 a\n"))
     given.msgtype = name.format(canary=str(canary))
-    with_types([given])
+    collect_types([given])
     given.msgdef = (
         definition_format(),
         f"string A=x'+open('{canary}','w')+'\nint32 b\n",
     )
     given.msgtype = "pkg/msg/Fine"
-    with_types([given])
+    collect_types([given])
     assert not canary.exists()
 
 

@@ -27,7 +27,7 @@ from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.recording.topic_roles import load_topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.report.doctor_facts import collect_facts_of_bag
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -127,7 +127,9 @@ def test_a_policy_is_loaded_from_either(kind):
 
 
 @KINDS
-@pytest.mark.parametrize("load", [read_recording, load_recording, replay, topic_roles])
+@pytest.mark.parametrize(
+    "load", [read_recording, load_recording, replay, load_topic_roles]
+)
 def test_what_is_not_there_is_one_sentence_for_either(tmp_path, kind, load):
     with pytest.raises(BridgeError, match=r"gone: no such f"):
         load(kind(tmp_path / "gone"))

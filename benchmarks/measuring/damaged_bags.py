@@ -14,7 +14,7 @@ import numpy as np
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.bag_file import open_bag
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.write import write_bag
 from nics_drl_bridge.robot.spec import load_robot
@@ -102,10 +102,10 @@ def _foreign(source: Path, path: Path, compression: str) -> None:
 
 
 def _held(path: Path) -> Held:
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         told: Held = {}
         for topic, kind in bag.types.items():
-            rows = bag.serialized(topic)
+            rows = bag.read_serialized(topic)
             digests = [sha256(data).hexdigest() for _, data in rows]
             told[topic] = kind, [ns for ns, _ in rows], digests
         return told

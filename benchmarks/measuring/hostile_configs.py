@@ -18,7 +18,7 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.training_settings import load_training
-from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.recording.topic_roles import load_topic_roles
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
@@ -54,7 +54,7 @@ USES: dict[str, Callable[[str], object]] = {
     "randomisation/strong": load_randomisation,
     "training/navigation_differential": load_training,
     "maps/room": _map,
-    "topics": topic_roles,
+    "topics": load_topic_roles,
 }
 """What is done with the file of each kind."""
 OWN = {

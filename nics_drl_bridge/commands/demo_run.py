@@ -34,7 +34,7 @@ from nics_drl_bridge.policy.pace import Fitted, fitted, pace_of
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.readers import read_recording, robot_and_drive
+from nics_drl_bridge.recording.readers import read_recording, read_robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.report import html, pictures
@@ -173,7 +173,7 @@ def run(plan: DemoPlan, say: Say) -> str:
 def _record_or_read(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
     """Reads the plan's drive with its robot, or records one of a textbook robot."""
     if plan.recording is not None:
-        return robot_and_drive(plan.recording, plan.robot, TopicRoles(), None)
+        return read_robot_and_drive(plan.recording, plan.robot, TopicRoles(), None)
     robot = load_robot(plan.robot or DEFAULT_ROBOT)
     file = plan.out / "recording.npz"
     say(f"recording a drive of the textbook {robot.name!r} robot")

@@ -107,11 +107,11 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
 def check_drive(given: dict[str, Any]) -> None:
     """Raises BridgeError for a name, place or number with which `nics record` could not drive."""
     from nics_drl_bridge.recording.excite import DrivePlan
-    from nics_drl_bridge.recording.topic_roles import topic_roles
+    from nics_drl_bridge.recording.topic_roles import load_topic_roles
     from nics_drl_bridge.recording.write import check_out
     from nics_drl_bridge.robot.spec import load_robot
 
     robot = load_robot(given["robot"])
     check_writable(check_out(Path(given["out"])))
-    topic_roles(given["topics"] or None)
+    load_topic_roles(given["topics"] or None)
     DrivePlan(robot, given["bound"], given["duration"], given["speed"], given["seed"])

@@ -118,21 +118,23 @@ def draw_preview(given: dict[str, Any]) -> tuple[str, ...]:
     """Draws the drive that `record_node` would make of its parameters; returns lines."""
     from nics_drl_bridge.files import write_bytes
     from nics_drl_bridge.recording.excite import DrivePlan
-    from nics_drl_bridge.recording.topic_roles import topic_roles
+    from nics_drl_bridge.recording.topic_roles import load_topic_roles
     from nics_drl_bridge.recording.write import check_out
     from nics_drl_bridge.report.pictures import drive_picture
     from nics_drl_bridge.robot.spec import load_robot
 
     robot = load_robot(given["robot"])
     out = check_out(Path(given["out"]))
-    topic_roles(given["topics"] or None)  # reports a wrong file before the robot moves
+    load_topic_roles(
+        given["topics"] or None
+    )  # reports a wrong file before the robot moves
     plan = DrivePlan(
         robot, *(given[name] for name in ("bound", "duration", "speed", "seed"))
     )
     pattern = plan.preview()
     picture = out.parent / f"{out.stem}_preview.png"
     write_bytes(picture, drive_picture(pattern, robot))
-    return (*pattern.lines(), f"its path is drawn in {picture}")
+    return (*pattern.describe(), f"its path is drawn in {picture}")
 
 
 def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
@@ -163,18 +165,18 @@ def inspect(
 ) -> None:
     """Lists the contents of any recording and drafts its mapping."""
     from nics_drl_bridge.files import write_text
-    from nics_drl_bridge.recording.guess import DOUBT, NOT_USED, first_mapping
-    from nics_drl_bridge.recording.readers import open_source, why_no_mapping
+    from nics_drl_bridge.recording.guess import DOUBT, NOT_USED, propose_mapping
+    from nics_drl_bridge.recording.readers import explain_no_mapping, open_source
     from nics_drl_bridge.recording.recording import is_recording
-    from nics_drl_bridge.recording.survey import survey
+    from nics_drl_bridge.recording.survey import inspect_tables
 
     if mapping is not None and mapping.exists():
         raise ConfigError(f"--map {mapping}: is there already; give another name.")
     with open_source(source) as opened, console.show_progress(f"reading {source}"):
-        tables = survey(opened)
-    why = why_no_mapping(source)
+        tables = inspect_tables(opened)
+    why = explain_no_mapping(source)
     is_own = is_recording(source)  # its arrays are no columns that a mapping could name
-    text = "" if is_own else first_mapping(tables)
+    text = "" if is_own else propose_mapping(tables)
     written = None if is_own else mapping
     if written is not None:
         write_text(written, text)
@@ -323,8 +325,8 @@ def generate(
     from nics_drl_bridge.identify.fit import parse_alpha, parse_order
     from nics_drl_bridge.lidar.sensor import load_sensor
     from nics_drl_bridge.lidar.spec import load_lidar
-    from nics_drl_bridge.recording.readers import robot_and_drives
-    from nics_drl_bridge.recording.topic_roles import topic_roles
+    from nics_drl_bridge.recording.readers import read_robot_and_drives
+    from nics_drl_bridge.recording.topic_roles import load_topic_roles
     from nics_drl_bridge.sim.world import load_world
 
     check_place(out)
@@ -335,9 +337,9 @@ def generate(
     further = tuple(load_sensor(file) for file in sensor or ())
     shapes = load_world(world).shapes
     named = ", ".join(map(str, recording))
-    roles = topic_roles(topics, topic or ())
+    roles = load_topic_roles(topics, topic or ())
     with console.show_progress(f"reading {named}"):
-        spec, drives = robot_and_drives(recording, robot, roles, mapping)
+        spec, drives = read_robot_and_drives(recording, robot, roles, mapping)
     pairs = zip(drives, names_of_sources(recording), strict=True)
     drives = [replace(drive, source=name) for drive, name in pairs]
     with console.show_progress("generating"):

@@ -21,7 +21,7 @@ from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.stamping import not_repeated
+from nics_drl_bridge.recording.stamping import select_new_rows
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
 from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
 
@@ -107,7 +107,7 @@ def _with_rows(
 def _without_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording:
     recording = drive.recording
     for name, stream in recording.streams.items():
-        keep, note = not_repeated(stream.t, stream.values, name)
+        keep, note = select_new_rows(stream.t, stream.values, name)
         if note:
             recording = _with_rows(recording, name, keep)
             notes.append(note)
@@ -563,14 +563,16 @@ def check_axes(drive: Drive) -> None:
     values = drive.dated.values
     noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
-    some = drive.dated.rows(recordings.along_path(values, apart))
-    line = "" if drive.spec.moves_sideways else recordings.clockwise_line(some.values)
+    some = drive.dated.rows(recordings.select_along_path(values, apart))
+    line = (
+        "" if drive.spec.moves_sideways else recordings.find_clockwise_keys(some.values)
+    )
     state = recording.state
     if (
         drive.spec.moves_sideways
         and state is not None
         and state.clock == recording.pose.clock
-        and recordings.shows_axes(some.values)
+        and recordings.has_visible_axes(some.values)
     ):
         other = some.values * np.array([1.0, 1.0, -1.0])
         as_given, mirrored = (

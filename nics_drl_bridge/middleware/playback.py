@@ -20,14 +20,14 @@ from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
-from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.bag_file import BagFile, Message, open_bag
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import (
-    commanded,
-    stamp,
-    turn_variance,
-    twist_row,
-    whole_pose,
+    get_stamp,
+    read_robot_command,
+    read_turn_variance,
+    read_twist,
+    read_whole_pose,
 )
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
@@ -80,7 +80,7 @@ def estimate(
     middleware = playback.middleware
     for role, message in merge_messages(messages):
         if playback.take(role, message) and role == ODOM:
-            stamp_ns = max(stamp(message.content), middleware.estimator.time_ns)
+            stamp_ns = max(get_stamp(message.content), middleware.estimator.time_ns)
             view = middleware.view(stamp_ns)
             covariance = middleware.estimator.covariance
             rows.append((stamp_ns, view.pose, view.twist, covariance[:3, :3]))
@@ -105,7 +105,7 @@ def with_gyro(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
         if named:
             return topics
         return {role: t for role, t in topics.items() if role != IMU}
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         for name in (f"/{name}" for name in topic_roles.IMU_NAMES):
             if bag.types.get(name) == topic_roles.IMU and name not in bag.empty:
                 return {**topics, IMU: name}
@@ -117,9 +117,9 @@ def read_messages(
 ) -> dict[str, list[Message]]:
     """Returns the messages of each role that is played. Raises as `estimate` does."""
     topics = with_gyro(path, topics) if use_gyro else topics
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         roles = chosen(bag, topics)
-        messages = {role: bag.messages(topic) for role, topic in roles.items()}
+        messages = {role: bag.read_messages(topic) for role, topic in roles.items()}
     _check_clocks(str(path), roles, messages)
     return messages
 
@@ -161,7 +161,9 @@ def _check_clocks(
     place: str, roles: Mapping[str, str], messages: Mapping[str, list[Message]]
 ) -> None:
     stamps = {
-        role: np.array([(m.receive_ns, stamp(m.content)) for m in some], dtype=np.int64)
+        role: np.array(
+            [(m.receive_ns, get_stamp(m.content)) for m in some], dtype=np.int64
+        )
         for role, some in messages.items()
         if hasattr(some[0].content, "header")
     }
@@ -216,7 +218,7 @@ class Playback:
         if not takes[role](message.receive_ns, message.content):
             return False
         newest = self.middleware.cache.newest.get(role)
-        return newest is not None and newest.stamp_ns == stamp(message.content)
+        return newest is not None and newest.stamp_ns == get_stamp(message.content)
 
     def _scan(self, arrival_ns: int, message: Any) -> bool:
         values = np.asarray(message.ranges, np.float32)
@@ -232,23 +234,23 @@ class Playback:
             if len(values) != self.lidar.beams:
                 return self.middleware.cache.reject(f"{SCAN}: another lidar")
         ranges = from_device(np.ascontiguousarray(values), self.lidar)
-        return self.middleware.scan(stamp(message), arrival_ns, ranges)
+        return self.middleware.scan(get_stamp(message), arrival_ns, ranges)
 
     def _odometry(self, arrival_ns: int, message: Any) -> bool:
-        stamp_ns = stamp(message)
-        pose = np.array(whole_pose(message))
+        stamp_ns = get_stamp(message)
+        pose = np.array(read_whole_pose(message))
         if not self._started and np.isfinite(pose).all():
             self.middleware.reset(
                 stamp_ns, pose, ANYWHERE if self._posed else START_STD
             )
             self._started = True
-        twist = np.array(twist_row(message))
-        variance = turn_variance(message)
+        twist = np.array(read_twist(message))
+        variance = read_turn_variance(message)
         return self.middleware.odometry(stamp_ns, arrival_ns, pose, twist, variance)
 
     def _command(self, _: int, message: Any) -> bool:
-        command = commanded(message, self._model.robot)
-        stamp_ns = stamp(message) if hasattr(message, "header") else 0
+        command = read_robot_command(message, self._model.robot)
+        stamp_ns = get_stamp(message) if hasattr(message, "header") else 0
         self.middleware.command(stamp_ns or None, command)
         return True
 
@@ -257,13 +259,13 @@ class Playback:
         if covariance is not None:
             covariance = np.reshape(covariance, (6, 6))[np.ix_([0, 1, 5], [0, 1, 5])]
         return self.middleware.pose(
-            stamp(message), arrival_ns, whole_pose(message), covariance
+            get_stamp(message), arrival_ns, read_whole_pose(message), covariance
         )
 
     def _imu(self, arrival_ns: int, message: Any) -> bool:
         if (measured := self._gyro.read(message)) is None:
             return self.middleware.cache.reject(f"{IMU}: no angular velocity")
-        return self.middleware.imu(stamp(message), arrival_ns, *measured)
+        return self.middleware.imu(get_stamp(message), arrival_ns, *measured)
 
 
 def merge_messages(

@@ -93,7 +93,7 @@ def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> geometry.Twist
 
 def twist_from_ros(message: geometry.Twist | geometry.TwistStamped) -> Array:
     """Returns linear.x, linear.y, angular.z (3,) of a Twist, stamped or not."""
-    return np.array(messages.command_row(message))
+    return np.array(messages.read_command(message))
 
 
 def scan_to_ros(
@@ -142,7 +142,9 @@ def odometry_to_ros(
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     """Returns pose (3,) and body twist (3,) of an Odometry message."""
-    return np.array(messages.whole_pose(message)), np.array(messages.twist_row(message))
+    return np.array(messages.read_whole_pose(message)), np.array(
+        messages.read_twist(message)
+    )
 
 
 def covariance_to_ros(planar: Array) -> Array:
@@ -158,7 +160,7 @@ def pose_from_ros(
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
     known = isinstance(message, geometry.PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
-    return np.array(messages.whole_pose(message)), covariance
+    return np.array(messages.read_whole_pose(message)), covariance
 
 
 def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) -> Array:

@@ -31,7 +31,7 @@ from nics_drl_bridge.policy.follow import (
     ProgressChecker,
 )
 from nics_drl_bridge.policy.route import route
-from nics_drl_bridge.recording.messages import pose_row
+from nics_drl_bridge.recording.messages import read_pose
 
 FOLLOW = "follow_path"
 NAVIGATE = "navigate_to_pose"
@@ -282,7 +282,7 @@ class PathActions:
                 code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
                 raise Refusal(code, f"{FOLLOW}: {wrong}")
             names.append(name)
-        poses = np.array([pose_row(each) for each in asked.path.poses]).reshape(-1, 3)
+        poses = np.array([read_pose(each) for each in asked.path.poses]).reshape(-1, 3)
         headers = [asked.path.header, *(each.header for each in asked.path.poses[:1])]
         frame = next((each.frame_id for each in headers if each.frame_id), "")
         return self._begin(goal, frame, poses, names[1:3])
@@ -295,7 +295,7 @@ class PathActions:
                 f"there are no behaviour trees here, as {asked.behavior_tree!r}; {fix}."
             )
             raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
-        end = np.array([pose_row(asked.pose)])
+        end = np.array([read_pose(asked.pose)])
         frame, end = self._placed(goal, asked.pose.header.frame_id, end)
         self._planned(goal, end)
         try:

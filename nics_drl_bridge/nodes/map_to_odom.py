@@ -34,7 +34,7 @@ def transform_to_ros(
 
 def transform_from_ros(message: TransformStamped) -> tuple[str, str, Array]:
     """Returns parent and child of a transform, without slashes, and the child's pose (3,) there."""
-    return *messages.frames(message), np.array(messages.pose_row(message))
+    return *messages.get_frames(message), np.array(messages.read_pose(message))
 
 
 def odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
@@ -86,7 +86,7 @@ class MapToOdom:
 
     def _take(self, message: Any) -> None:
         for each in message.transforms:
-            if messages.frames(each) != self._frames or each in self._own:
+            if messages.get_frames(each) != self._frames or each in self._own:
                 continue
             if time.monotonic() - self._heard_s > QUIET_S:
                 told = f"another node publishes {' -> '.join(self._frames)}, so this one does not"

@@ -26,13 +26,22 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.parameters import IMU, drive
 from nics_drl_bridge.recording.bag_file import Message
-from nics_drl_bridge.recording.bag_reader import joint_streams
+from nics_drl_bridge.recording.bag_reader import read_joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.imu_axis import GyroReader
-from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
+from nics_drl_bridge.recording.messages import (
+    get_stamp,
+    read_imu,
+    read_pose,
+    read_twist,
+)
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, streams
-from nics_drl_bridge.recording.topic_roles import TopicRoles, imu_topics, topic_roles
+from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, stamp_streams
+from nics_drl_bridge.recording.topic_roles import (
+    TopicRoles,
+    list_imu_topics,
+    load_topic_roles,
+)
 from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
@@ -73,7 +82,7 @@ def declare_drive(node: Node) -> DriveParameters:
     topics, silence, stamped = (
         get[name]() for name in ("topics", "odom_timeout", "stamped")
     )
-    roles = topic_roles(topics or None)
+    roles = load_topic_roles(topics or None)
     return DriveParameters(plan, out, silence, stamped, roles, get[IMU]())
 
 
@@ -106,11 +115,11 @@ class DriveLog:
 
     def odometry(self, message: Odometry) -> Array | None:
         """Records an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
-        header = stamp(message)
-        pose = np.array(pose_row(message))
+        header = get_stamp(message)
+        pose = np.array(read_pose(message))
         if not self.add("odom", header, pose):
             return None
-        self.add("odom twist", header, twist_row(message))
+        self.add("odom twist", header, read_twist(message))
         return pose
 
     def joints(self, message: JointState) -> None:
@@ -121,7 +130,9 @@ class DriveLog:
         """Raises BridgeError if a state is not measured, or stamps run at another rate."""
         measured = [v.name for v in self._spec.state if v.must_be_measured]
         if self._joints:
-            joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
+            read_joint_streams(
+                "joint_states", self._joints, self._spec, self._roles, PLACE
+            )
         elif measured or self._roles.state:
             what = f"{(measured or ['the state'])[0]} of robot {self._spec.name!r}"
             fix = "has to be measured; start the joints' publisher, or remap the topic."
@@ -152,14 +163,14 @@ class DriveLog:
         if not data.keys() >= {"command", "pose"}:
             raise RecordingError("recording: nothing was received that could be saved.")
         if len(self._joints) >= FEWEST:
-            data |= joint_streams(
+            data |= read_joint_streams(
                 "joint_states", self._joints, self._spec, self._roles, PLACE
             )
         try:
-            kept: Any = streams(data, self._roles.stamps, PLACE)
+            kept: Any = stamp_streams(data, self._roles.stamps, PLACE)
         except RecordingError:
             # Poorer stamps are better than no recording of a drive that is over.
-            kept = streams(data, "receive", PLACE)
+            kept = stamp_streams(data, "receive", PLACE)
         tracked = len(self.rows["pose"]) >= FEWEST
         return Recording(
             **kept,
@@ -215,11 +226,11 @@ class RecordNode(qos.QosWatch):
         self.create_subscription(
             JointState, "joint_states", self._log.joints, qos.SENSOR
         )
-        take_pose = partial(self._take, "pose", pose_row)
+        take_pose = partial(self._take, "pose", read_pose)
         self.create_subscription(PoseStamped, "pose", take_pose, qos.SENSOR)
         self._imu_topic = ""  # the first that speaks
         self._gyro = GyroReader()
-        for topic in imu_topics(self._order.imu, by_default=True):
+        for topic in list_imu_topics(self._order.imu, by_default=True):
             self.create_subscription(
                 Imu, topic, partial(self._take_imu, topic), qos.SENSOR
             )
@@ -244,14 +255,14 @@ class RecordNode(qos.QosWatch):
         return self._steady_origin_ns + time.monotonic_ns()
 
     def _take(self, topic: str, row: Callable[[Any], ArrayLike], message: Any) -> None:
-        self._log.add(topic, stamp(message), row(message))
+        self._log.add(topic, get_stamp(message), row(message))
 
     def _take_imu(self, topic: str, message: Imu) -> None:
         self._imu_topic = self._imu_topic or topic
         measured = self._gyro.read(message) if topic == self._imu_topic else None
         if measured is not None:
-            ax, ay, _ = imu_row(message)
-            self._log.add("imu", stamp(message), (ax, ay, measured[0]))
+            ax, ay, _ = read_imu(message)
+            self._log.add("imu", get_stamp(message), (ax, ay, measured[0]))
 
     def _on_odometry(self, message: Odometry) -> None:
         self._stamp_ns = max(
@@ -263,7 +274,7 @@ class RecordNode(qos.QosWatch):
         self._pose, self._heard = pose, time.monotonic()
         self._frame = message.child_frame_id
         if self._ticks:
-            self._drive.see(geometry.between(self._start, pose))
+            self._drive.observe(geometry.between(self._start, pose))
             self._on_time()  # at once: with a fast simulated time a poll may be a tick late
 
     def _on_time(self) -> None:
@@ -320,7 +331,7 @@ class RecordNode(qos.QosWatch):
         if self._ticks < STILL_S / PERIOD_S <= self._ticks + due:
             self._log.check()
         for _ in range(due):  # several if time advances in larger steps
-            command = self._drive.next()
+            command = self._drive.choose_command()
             self._ticks += 1
         self._send(command)
 

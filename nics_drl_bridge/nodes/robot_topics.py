@@ -40,7 +40,7 @@ from nics_drl_bridge.nodes.parameters import (
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
-from nics_drl_bridge.recording.topic_roles import IMU_NAMES, imu_topics
+from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
 
 KINDS_OF_POSE = {
     each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)
@@ -142,7 +142,7 @@ class RobotTopics:
     def _hear_imu(self) -> None:
         """Subscribes to the gyro, if one is named or the model was made with one."""
         wanted = str(self._node.get_parameter(IMU).value)
-        topics = imu_topics(wanted, self._model.gyro)
+        topics = list_imu_topics(wanted, self._model.gyro)
         self._imu_topic = ""  # the first that speaks
         self._gyro = GyroReader()
         for topic in topics:
@@ -233,7 +233,7 @@ class RobotTopics:
         return self.middleware.view(self.newest_ns)
 
     def _take_scan(self, message: LaserScan) -> None:
-        stamp = messages.stamp(message)
+        stamp = messages.get_stamp(message)
         if stamp < self._since_ns:
             return
         reader = self._reader_for(message)
@@ -279,7 +279,7 @@ class RobotTopics:
         return self._reader
 
     def _take_odometry(self, message: Odometry) -> None:
-        stamp = messages.stamp(message)
+        stamp = messages.get_stamp(message)
         pose, twist = conversions.odometry_from_ros(message)
         self.frames = message.header.frame_id, message.child_frame_id
         if not self._started and np.isfinite(pose).all():
@@ -287,7 +287,7 @@ class RobotTopics:
             self._started = True
             if self._placed is not None:
                 self.middleware.place(*self._placed)
-        variance = messages.turn_variance(message)
+        variance = messages.read_turn_variance(message)
         used = self.middleware.odometry(stamp, self.now_ns(), pose, twist, variance)
         newest = self.middleware.cache.newest
         if (
@@ -299,7 +299,7 @@ class RobotTopics:
 
     def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         measured = conversions.pose_from_ros(message)
-        self.middleware.pose(messages.stamp(message), self.now_ns(), *measured)
+        self.middleware.pose(messages.get_stamp(message), self.now_ns(), *measured)
 
     def _take_imu(self, topic: str, message: Imu) -> None:
         self._imu_topic = self._imu_topic or topic
@@ -308,7 +308,7 @@ class RobotTopics:
         if (measured := self._gyro.read(message)) is None:
             self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
         else:
-            self.middleware.imu(messages.stamp(message), self.now_ns(), *measured)
+            self.middleware.imu(messages.get_stamp(message), self.now_ns(), *measured)
 
     def _take_reading(self, sensor: Sensor, message: Any) -> None:
         try:
@@ -317,7 +317,7 @@ class RobotTopics:
             self.middleware.cache.reject(f"{sensor.name}: {error}")
         else:
             self.middleware.sense(
-                sensor.name, messages.stamp(message), self.now_ns(), reading
+                sensor.name, messages.get_stamp(message), self.now_ns(), reading
             )
 
     def _take_command(self, message: Twist | TwistStamped) -> None:

@@ -17,7 +17,7 @@ from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.stateful import resume
 from nics_drl_bridge.recording.bag_file import Message
-from nics_drl_bridge.recording.messages import commanded
+from nics_drl_bridge.recording.messages import read_robot_command
 
 JITTER = 0.25  # permitted earliness of a scan, in control periods
 HELD_S = 1.0  # age from which a command no longer applies to the robot
@@ -114,7 +114,7 @@ def _moments(
     for role, message in merge_messages(messages):
         playback.take(role, message)
         if role == CMD_VEL:
-            row = commanded(message.content, model.robot)
+            row = read_robot_command(message.content, model.robot)
             held = message.receive_ns, row
             if moments and moments[-1].driven is None:
                 moments[-1].driven = row

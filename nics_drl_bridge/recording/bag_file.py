@@ -16,9 +16,9 @@ from nics_drl_bridge.errors import BridgeError, RecordingError, shorten
 from nics_drl_bridge.recording.messages import (
     Offer,
     check_libraries,
-    offers_of,
-    stamp,
-    with_types,
+    collect_types,
+    convert_offers,
+    get_stamp,
 )
 from nics_drl_bridge.recording.stamping import Nanoseconds
 
@@ -64,18 +64,18 @@ def is_storage(path: Path) -> bool:
 
 
 @contextmanager
-def opened(path: str | Path) -> "Iterator[BagFile]":
+def open_bag(path: str | Path) -> "Iterator[BagFile]":
     """Opens a bag (folder or only file); RecordingError: missing, damaged, empty, no library."""
     path = Path(path)
     check_libraries(path, "reading")
     try:
         if path.suffix == ROS_1:
-            with _opened_ros_1(path) as found:
+            with _open_ros_1(path) as found:
                 yield found
             return
         from rosbags.rosbag2 import Reader
 
-        place = _place(path)
+        place = _find_place(path)
         files = [place, *(place.iterdir() if place.is_dir() else ())]
         # rosbags opens databases by URI, which these characters cut.
         sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
@@ -87,7 +87,7 @@ def opened(path: str | Path) -> "Iterator[BagFile]":
         with (
             TemporaryDirectory() as room
         ):  # before rosbags, which unpacks chunks of any size
-            for file in _listed(place, Path(room)) if place.is_dir() else [place]:
+            for file in _list_files(place, Path(room)) if place.is_dir() else [place]:
                 _check_storage(file)
         with Reader(place) as reader:
             _check_summary(reader)
@@ -105,7 +105,7 @@ def opened(path: str | Path) -> "Iterator[BagFile]":
 
 
 @contextmanager
-def _opened_ros_1(path: Path) -> "Iterator[BagFile]":
+def _open_ros_1(path: Path) -> "Iterator[BagFile]":
     from rosbags.rosbag1 import Reader
 
     if not check_no_device(path).is_file():
@@ -114,7 +114,7 @@ def _opened_ros_1(path: Path) -> "Iterator[BagFile]":
         yield BagFile(reader, str(path), is_ros_1=True)
 
 
-def _place(path: Path) -> Path:
+def _find_place(path: Path) -> Path:
     """Returns what to open: the folder if it has metadata, which give the expected counts."""
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
@@ -132,7 +132,7 @@ def _place(path: Path) -> Path:
     return file
 
 
-def metadata_of(folder: Path) -> dict[str, Any]:
+def read_metadata(folder: Path) -> dict[str, Any]:
     """Returns a bag's metadata within `parse_yaml`'s limits; ValueError if they are not whole."""
     try:
         about = parse_yaml(read_text(folder / METADATA), METADATA).get(ABOUT)
@@ -143,9 +143,9 @@ def metadata_of(folder: Path) -> dict[str, Any]:
     return about
 
 
-def _listed(folder: Path, room: Path) -> list[Path]:
+def _list_files(folder: Path, room: Path) -> list[Path]:
     """Returns the files of a bag; those compressed as a whole are unpacked to another folder."""
-    about = metadata_of(folder)
+    about = read_metadata(folder)
     listed = [
         folder / Path(str(name)).name for name in about.get("relative_file_paths") or ()
     ]
@@ -181,8 +181,8 @@ def _check_summary(reader: "Reader") -> None:
     from nics_drl_bridge.recording.mcap import check_message
 
     storages: list[Any] = list(getattr(reader.storage, "storages", [reader.storage]))
-    summary = _counts(reader)
-    held = sum(map(_counts, storages), Counter())
+    summary = _count_messages(reader)
+    held = sum(map(_count_messages, storages), Counter())
     told = summary.total()
     there = sum(each.metadata.message_count for each in storages)
     if there != told:
@@ -206,23 +206,23 @@ def _check_summary(reader: "Reader") -> None:
                 check_message(data)
 
 
-def _counts(reader: Any) -> Counter[tuple[str, str]]:
+def _count_messages(reader: Any) -> Counter[tuple[str, str]]:
     counts: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
         counts[connection.topic, connection.msgtype] += connection.msgcount
     return counts
 
 
-def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | None]:
+def read_times(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | None]:
     """Returns times of receipt and header stamps (T,) [ns]; None if there are no headers."""
     receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
     if not messages or not hasattr(messages[0].content, "header"):
         return receive, None
-    return receive, np.array([stamp(m.content) for m in messages], dtype=np.int64)
+    return receive, np.array([get_stamp(m.content) for m in messages], dtype=np.int64)
 
 
 class BagFile:
-    """A bag in `opened`; ValueError if a topic's messages are not all there and whole."""
+    """A bag in `open_bag`; ValueError if a topic's messages are not all there and whole."""
 
     def __init__(self, reader: "AnyBag", place: str, is_ros_1: bool = False) -> None:
         if not reader.message_count:
@@ -231,7 +231,7 @@ class BagFile:
             )
         self._reader = reader
         self._is_ros_1 = is_ros_1
-        self._store = with_types(reader.connections)
+        self._store = collect_types(reader.connections)
         self.place = place  # its name, for errors
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
@@ -255,26 +255,26 @@ class BagFile:
         some = (
             getattr(c.ext, "offered_qos_profiles", ()) for c in self._connections[topic]
         )
-        return tuple(offer for profiles in some for offer in offers_of(profiles))
+        return tuple(offer for profiles in some for offer in convert_offers(profiles))
 
-    def knows(self, topic: str) -> bool:
+    def can_decode(self, topic: str) -> bool:
         """True if messages of the topic can be decoded."""
         return self.types[topic] in self._store.fielddefs
 
-    def definition(self, topic: str) -> str:
+    def get_definition(self, topic: str) -> str:
         """Returns the definition of a topic's type as ROS 2 has it, with all that it contains."""
-        if self.knows(topic):
+        if self.can_decode(topic):
             return str(self._store.generate_msgdef(self.types[topic], ros_version=2)[0])
         return str(self._connections[topic][0].msgdef.data)
 
-    def messages(self, topic: str) -> list[Message]:
+    def read_messages(self, topic: str) -> list[Message]:
         """Returns all messages of a topic."""
         found = []
         if self._is_ros_1:
             decode = self._store.deserialize_ros1
         else:
             decode = self._store.deserialize_cdr
-        for k, (kind, ns, data) in enumerate(self._raw(topic)):
+        for k, (kind, ns, data) in enumerate(self._read_raw(topic)):
             try:
                 found.append(Message(ns, decode(data, kind)))
             except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
@@ -284,15 +284,15 @@ class BagFile:
                 raise ValueError(what) from None
         return found
 
-    def serialized(self, topic: str) -> list[tuple[int, bytes]]:
+    def read_serialized(self, topic: str) -> list[tuple[int, bytes]]:
         """Returns the same messages undecoded, as ROS 2 sends them: receipt [ns] and bytes."""
-        raw = self._raw(topic)
+        raw = self._read_raw(topic)
         if self._is_ros_1:
-            convert = with_types(self._connections[topic], header=False).ros1_to_cdr
+            convert = collect_types(self._connections[topic], header=False).ros1_to_cdr
             return [(ns, bytes(convert(data, kind))) for kind, ns, data in raw]
         return [(ns, bytes(data)) for _, ns, data in raw]
 
-    def _raw(self, topic: str) -> list[tuple[str, int, bytes]]:
+    def _read_raw(self, topic: str) -> list[tuple[str, int, bytes]]:
         connections = self._connections[topic]
         raw = [
             (c.msgtype, ns, data) for c, ns, data in self._reader.messages(connections)

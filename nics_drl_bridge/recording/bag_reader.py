@@ -13,15 +13,15 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles as roles
-from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
-from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, up_axis_of, vector_of
-from nics_drl_bridge.recording.pose_source import source_of_pose
-from nics_drl_bridge.recording.recording import W_FIRST, Recording, check, w_first
+from nics_drl_bridge.recording.bag_file import BagFile, Message, open_bag, read_times
+from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_up_axis, to_array
+from nics_drl_bridge.recording.pose_source import guess_pose_source
+from nics_drl_bridge.recording.recording import W_FIRST, Recording, check, is_w_first
 from nics_drl_bridge.recording.stamping import (
     SAME_CLOCK_S,
     Nanoseconds,
     TopicData,
-    streams,
+    stamp_streams,
 )
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
 from nics_drl_bridge.robot.noise import Delay, Latency
@@ -40,26 +40,28 @@ def load_bag(
     """Reads a robot's drive from a bag, guessing missing roles of topics; RecordingError if bad."""
     if spec is None:
         raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         topics = roles.assign(mapping, bag.types, bag.empty, bag.place)
         data = {
-            "command": _command(bag, topics["cmd_vel"], spec),
-            "pose": _pose(bag, topics.get("pose") or topics["odom"], mapping),
+            "command": _read_command(bag, topics["cmd_vel"], spec),
+            "pose": _read_pose(bag, topics.get("pose") or topics["odom"], mapping),
         }
         if "pose" in topics and "odom" in topics:
-            data["odometry"] = _table(bag, topics["odom"], msgs.twist_row)
+            data["odometry"] = _read_rows(bag, topics["odom"], msgs.read_twist)
         if topic := topics.get("joint_states"):
-            data |= joint_streams(topic, bag.messages(topic), spec, mapping, bag.place)
+            data |= read_joint_streams(
+                topic, bag.read_messages(topic), spec, mapping, bag.place
+            )
         repairs: tuple[str, ...] = ()
         if "imu" in topics:
-            data["imu"], axis = _imu(bag, topics["imu"])
+            data["imu"], axis = _read_imu(bag, topics["imu"])
             if not axis.is_usual:
                 told = f"imu: by gravity its axis {axis.name} points up, so that is its yaw axis."
                 repairs = (told,)
-        latency = latency_of(bag, topics.get("odom"))
+        latency = measure_latency(bag, topics.get("odom"))
         pose = topics.get("pose") or topics["odom"]
-        measured_by = source_of_pose(pose, bag.types[pose])
-    made: Any = streams(data, mapping.stamps, str(path))
+        measured_by = guess_pose_source(pose, bag.types[pose])
+    made: Any = stamp_streams(data, mapping.stamps, str(path))
     recording = Recording(
         **made,
         source=str(path),
@@ -71,14 +73,14 @@ def load_bag(
     return check(recording, spec)
 
 
-def _table(
+def _read_rows(
     bag: BagFile,
     topic: str,
     row: Callable[[Any], msgs.Row],
     some: Sequence[Message] | None = None,
 ) -> TopicData:
-    messages = bag.messages(topic) if some is None else some
-    receive, header = times_of(messages)
+    messages = bag.read_messages(topic) if some is None else some
+    receive, header = read_times(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
         fault = f"topic {topic!r}: message {k} holds NaN or inf"
@@ -87,14 +89,14 @@ def _table(
     return TopicData(topic, receive, header, values)
 
 
-def _imu(bag: BagFile, topic: str) -> tuple[TopicData, UpAxis]:
+def _read_imu(bag: BagFile, topic: str) -> tuple[TopicData, UpAxis]:
     """Reads accelerations and yaw rates about the axis that points up."""
-    messages = bag.messages(topic)
+    messages = bag.read_messages(topic)
     accelerations = np.array(
-        [vector_of(m.content.linear_acceleration) for m in messages]
+        [to_array(m.content.linear_acceleration) for m in messages]
     )
-    axis = up_axis_of(np.median(accelerations, axis=0))
-    data = _table(bag, topic, msgs.imu_row, messages)
+    axis = find_up_axis(np.median(accelerations, axis=0))
+    data = _read_rows(bag, topic, msgs.read_imu, messages)
     if axis.is_usual:
         return data, axis
     rates = [getattr(m.content.angular_velocity, AXES[axis.place]) for m in messages]
@@ -103,7 +105,7 @@ def _imu(bag: BagFile, topic: str) -> tuple[TopicData, UpAxis]:
     return replace(data, values=values), axis
 
 
-def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
+def _read_command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
     steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
     for variable in spec.command:
         if steered and variable.turns and not variable.steers:
@@ -111,7 +113,7 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
             other = f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}"
             advice = "choose the robot that drove, or another topic"
             raise RecordingError(f"{fault}, but {other}; {advice}.")
-    data = _table(bag, topic, msgs.command_row)
+    data = _read_rows(bag, topic, msgs.read_command)
     if steered:
         commands = spec.from_fields(data.values)
     else:
@@ -119,23 +121,25 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
     return replace(data, values=commands)
 
 
-def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
-    messages = bag.messages(topic)
+def _read_pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
+    messages = bag.read_messages(topic)
     if bag.types[topic] in (roles.TRANSFORM, roles.TRANSFORMS):
-        messages = of_one_body(bag, topic, messages, mapping.frame, mapping.child_frame)
-    quaternions = np.array([msgs.quaternion(m.content) for m in messages])
+        messages = select_transforms(
+            bag, topic, messages, mapping.frame, mapping.child_frame
+        )
+    quaternions = np.array([msgs.read_quaternion(m.content) for m in messages])
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
     for k in np.flatnonzero(~(np.abs(length - 1.0) < QUATERNION_TOLERANCE))[:1]:
         fault = f"message {k}: the quaternion has the length {length[k]:.3f} and not 1"
         advice = "check its publisher, or choose another topic"
         raise RecordingError(f"{bag.place}: topic {topic!r}: {fault}; {advice}.")
-    if w_first(quaternions):
+    if is_w_first(quaternions):
         raise RecordingError(f"{bag.place}: topic {topic!r}: {W_FIRST}.")
-    return _table(bag, topic, msgs.pose_row, messages)
+    return _read_rows(bag, topic, msgs.read_pose, messages)
 
 
-def of_one_body(
+def select_transforms(
     bag: BagFile,
     topic: str,
     messages: Sequence[Message],
@@ -144,7 +148,7 @@ def of_one_body(
 ) -> list[Message]:
     """Returns the transforms between two frames, or the only two frames; else RecordingError."""
     single = [
-        (msgs.frames(transform), Message(message.receive_ns, transform))
+        (msgs.get_frames(transform), Message(message.receive_ns, transform))
         for message in messages
         for transform in getattr(message.content, "transforms", (message.content,))
     ]
@@ -168,17 +172,17 @@ def of_one_body(
     raise RecordingError(f"{fault}; {advice}; it holds {listed}.")
 
 
-def joint_streams(
+def read_joint_streams(
     topic: str,
     messages: Sequence[Message],
     spec: RobotSpec,
     mapping: TopicRoles,
     place: str,
 ) -> dict[str, TopicData]:
-    """Returns state and wheels, each if the joints show it; for errors see `state_of`."""
-    joints = gather(topic, messages)
-    state = state_of(joints, spec, mapping, place)
-    wheels = wheels_of(joints, mapping, place)
+    """Returns state and wheels, each if the joints show it; for errors see `extract_state`."""
+    joints = gather_joints(topic, messages)
+    state = extract_state(joints, spec, mapping, place)
+    wheels = extract_wheels(joints, mapping, place)
     found = {"state": state, "wheels": wheels}
     return {name: data for name, data in found.items() if data is not None}
 
@@ -194,7 +198,7 @@ class Joints(NamedTuple):
     velocity: Array  # (T, J) [rad/s or m/s]
 
 
-def gather(topic: str, messages: Sequence[Message]) -> Joints:
+def gather_joints(topic: str, messages: Sequence[Message]) -> Joints:
     """Collects messages, which may contain different joints, in one table."""
     names = tuple(
         dict.fromkeys(name for message in messages for name in message.content.name)
@@ -206,10 +210,10 @@ def gather(topic: str, messages: Sequence[Message]) -> Joints:
         for table, values in ((position, told.position), (velocity, told.velocity)):
             if len(values) == len(columns):
                 table[row, columns] = values
-    return Joints(topic, *times_of(messages), names, position, velocity)
+    return Joints(topic, *read_times(messages), names, position, velocity)
 
 
-def state_of(
+def extract_state(
     joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str
 ) -> TopicData | None:
     """Returns the measured state (T, S), or None without joints; RecordingError if it is needed."""
@@ -217,7 +221,7 @@ def state_of(
     for name in sorted(mapping.state.keys() - set(known)):
         fault = f"robot {spec.name!r} has no state {name!r}"
         raise RecordingError(f"{place}: topics: {fault}; {suggest(name, known)}")
-    sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
+    sources = {v.name: _find_joint(joints, v, mapping, place) for v in spec.state}
     found = [source for source in sources.values() if source is not None]
     if spec.state and len(found) == len(sources):
         columns = []
@@ -228,7 +232,7 @@ def state_of(
             else:
                 table = joints.velocity
             columns.append(source.scale * table[:, joints.names.index(source.joint)])
-        return _complete(
+        return _select_complete(
             joints, np.stack(columns, axis=1), [s.joint for s in found], place
         )
     if mapping.state or any(v.must_be_measured for v in spec.state):
@@ -242,38 +246,40 @@ def state_of(
     return None
 
 
-def wheels_of(joints: Joints, mapping: TopicRoles, place: str) -> TopicData | None:
+def extract_wheels(joints: Joints, mapping: TopicRoles, place: str) -> TopicData | None:
     """Returns the speeds (T, 2) of the left and right wheel; None without such joints."""
-    guesses = (_alike(joints.names, wheel) for wheel in msgs.WHEELS)
+    guesses = (_match_joint(joints.names, wheel) for wheel in msgs.WHEELS)
     chosen = list(mapping.wheels or (name for name in guesses if name is not None))
     if len(chosen) < len(msgs.WHEELS):
         return None
-    values = joints.velocity[:, [_index(joints, name, place) for name in chosen]]
+    values = joints.velocity[
+        :, [_get_joint_index(joints, name, place) for name in chosen]
+    ]
     if mapping.wheels is None and not np.isfinite(values).all(axis=1).any():
         return None
-    return _complete(joints, values, chosen, place)
+    return _select_complete(joints, values, chosen, place)
 
 
-def _source(
+def _find_joint(
     joints: Joints, variable: StateVariable, mapping: TopicRoles, place: str
 ) -> JointSource | None:
     named = mapping.state.get(variable.name)
     if named is None:
-        guess = _alike(joints.names, variable.name)
+        guess = _match_joint(joints.names, variable.name)
         return None if guess is None else JointSource(joint=guess)
     source = JointSource(joint=named) if isinstance(named, str) else named
-    _index(joints, source.joint, place)
+    _get_joint_index(joints, source.joint, place)
     return source
 
 
-def _index(joints: Joints, name: str, place: str) -> int:
+def _get_joint_index(joints: Joints, name: str, place: str) -> int:
     if name not in joints.names:
         fault = f"topic {joints.topic!r} has no joint {name!r}"
         raise RecordingError(f"{place}: {fault}; {suggest(name, joints.names)}")
     return joints.names.index(name)
 
 
-def _alike(names: Iterable[str], wanted: str) -> str | None:
+def _match_joint(names: Iterable[str], wanted: str) -> str | None:
     """Returns the only joint whose name has all words of the wanted name, in any order."""
     words = set(wanted.split("_"))
     found = [name for name in names if words <= set(re.split(r"[^a-z]+", name.lower()))]
@@ -284,7 +290,7 @@ def _alike(names: Iterable[str], wanted: str) -> str | None:
     return None
 
 
-def _complete(
+def _select_complete(
     joints: Joints, values: Array, names: Sequence[str], place: str
 ) -> TopicData:
     keep = np.asarray(np.isfinite(values).all(axis=1))
@@ -297,13 +303,16 @@ def _complete(
     )
 
 
-def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
+def measure_latency(bag: BagFile, odom: str | None = None) -> Latency:
     """Measures delays of scan and odometry by the recorder's own clock, as far as a bag shows."""
-    odom = odom or _topic(bag, roles.ODOMETRY, "odom")
-    return Latency(scan=_delay(bag, _topic(bag, SCAN, "scan")), odom=_delay(bag, odom))
+    odom = odom or _find_topic(bag, roles.ODOMETRY, "odom")
+    return Latency(
+        scan=_measure_delay(bag, _find_topic(bag, SCAN, "scan")),
+        odom=_measure_delay(bag, odom),
+    )
 
 
-def _topic(bag: BagFile, kind: str, name: str) -> str | None:
+def _find_topic(bag: BagFile, kind: str, name: str) -> str | None:
     """Returns the only topic of a type, or the only one of several with the usual name."""
     of_kind = [
         topic
@@ -315,9 +324,9 @@ def _topic(bag: BagFile, kind: str, name: str) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _delay(bag: BagFile, topic: str | None) -> Delay | None:
-    messages = bag.messages(topic) if topic else []
-    receive, stamps = times_of(messages)
+def _measure_delay(bag: BagFile, topic: str | None) -> Delay | None:
+    messages = bag.read_messages(topic) if topic else []
+    receive, stamps = read_times(messages)
     if len(messages) < LEAST_MESSAGES or stamps is None or not stamps.all():
         return None
     late = (receive - stamps) * S_PER_NS

@@ -11,14 +11,14 @@ from nics_drl_bridge.errors import RecordingError, suggest
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import mapping as mapped
 from nics_drl_bridge.recording import topic_roles as roles
-from nics_drl_bridge.recording.bag_file import BagFile, Message, times_of
-from nics_drl_bridge.recording.bag_reader import latency_of, of_one_body
+from nics_drl_bridge.recording.bag_file import BagFile, Message, read_times
+from nics_drl_bridge.recording.bag_reader import measure_latency, select_transforms
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.stamping import (
     ROBOT_STREAMS,
     TopicData,
-    go_on_together,
-    streams,
+    has_continuous_headers,
+    stamp_streams,
 )
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.robot.noise import Latency
@@ -36,7 +36,7 @@ STAMPS: dict[str, roles.Stamps] = {
 NAMES = "name"  # field of JointState with a name for each element of the other arrays
 
 
-def fields_of(message: Any, path: str = "") -> Iterator[str]:
+def list_fields(message: Any, path: str = "") -> Iterator[str]:
     """Yields the paths of all numbers and texts in a message, as `pose.position.x`, `data[0]`."""
     if isinstance(message, (bool, int, float, str, np.generic)) or hasattr(
         message, "nanosec"
@@ -44,7 +44,7 @@ def fields_of(message: Any, path: str = "") -> Iterator[str]:
         yield path
     elif isinstance(message, (list, tuple, np.ndarray)):
         for k in range(len(message) if len(message) <= LONGEST_ARRAY else 0):
-            yield from fields_of(message[k], f"{path}[{k}]")
+            yield from list_fields(message[k], f"{path}[{k}]")
     else:
         labels: Any = getattr(message, NAMES, None)
         for name in (each for each in vars(message) if not each.startswith("__")):
@@ -54,10 +54,10 @@ def fields_of(message: Any, path: str = "") -> Iterator[str]:
             if listed and name != NAMES and len(inner) == len(labels) > 0:
                 yield from (f"{where}[{label}]" for label in labels)
             else:
-                yield from fields_of(inner, where)
+                yield from list_fields(inner, where)
 
 
-def reader_of_field(path: str) -> Callable[[Any], Any]:
+def make_field_reader(path: str) -> Callable[[Any], Any]:
     """Returns a function that reads a field of messages; NaN where a message lacks it."""
     parts = PART.findall(path)
 
@@ -85,14 +85,14 @@ def reader_of_field(path: str) -> Callable[[Any], Any]:
     return read
 
 
-def column_of(
+def read_column(
     place: str, names: Sequence[str], messages: Sequence[Message], which: str | int
 ) -> Column:
     """Returns a field of all messages (T,); RecordingError if they have none of that name."""
     path = names[which] if isinstance(which, int) else which
     inner = [name for name in names if name.startswith(path)]
     hint = f"say which, as {inner[0]!r}." if inner else suggest(path, names)
-    read = reader_of_field(path)
+    read = make_field_reader(path)
     try:
         values = [read(message.content) for message in messages]
     except AttributeError:
@@ -114,11 +114,13 @@ class Bag(Source):
     def __init__(self, bag: BagFile, mapping: mapped.Mapping | None = None) -> None:
         known = bag.types.keys() - bag.empty
         scenes = {topic for topic in known if SCENES.search(bag.types[topic])}
-        super().__init__(bag.place, sorted(t for t in known - scenes if bag.knows(t)))
+        super().__init__(
+            bag.place, sorted(t for t in known - scenes if bag.can_decode(t))
+        )
         self._bag = bag
         self._frames = (None, None) if mapping is None else mapping.pose.frames
         # topics that are read, and whether they come from the robot's computer, for common stamps
-        self._used = {} if mapping is None else topics_used(mapping, self.names)
+        self._used = {} if mapping is None else list_topics_used(mapping, self.names)
         self._messages: dict[str, Sequence[Message]] = {}
         self._notes: dict[str, list[str]] = {}  # by topic
         self._stamps: dict[tuple[str, ...], dict[str, Stream]] = {}
@@ -126,31 +128,35 @@ class Bag(Source):
     @property
     def latency(self) -> Latency:
         """Delays of scan and odometry, as far as the bag shows them."""
-        return latency_of(self._bag)
+        return measure_latency(self._bag)
 
     def read(self, name: str) -> Table:
         """Reads a topic."""
-        messages = self._of(name)
+        messages = self._read_messages(name)
         place = f"{self.place}: topic {name!r}"
-        names = tuple(dict.fromkeys(fields_of(messages[0].content)))
-        column = partial(column_of, place, names, messages)
-        stamps = partial(self._stamps_of, name)
+        names = tuple(dict.fromkeys(list_fields(messages[0].content)))
+        column = partial(read_column, place, names, messages)
+        stamps = partial(self._stamp_rows, name)
         notes = self._notes.setdefault(name, [])
         kind = self._bag.types[name]
         return Table(place, names, column, "message {}".format, notes, stamps, kind)
 
-    def _of(self, topic: str) -> Sequence[Message]:
+    def _read_messages(self, topic: str) -> Sequence[Message]:
         if topic not in self._messages:
-            messages: Sequence[Message] = self._bag.messages(topic)
+            messages: Sequence[Message] = self._bag.read_messages(topic)
             if self._bag.types[topic] == roles.TRANSFORMS:
-                messages = of_one_body(self._bag, topic, messages, *self._frames)
+                messages = select_transforms(self._bag, topic, messages, *self._frames)
             self._messages[topic] = messages
         return self._messages[topic]
 
-    def _stamps_of(self, topic: str, which: str) -> Stream:
+    def _stamp_rows(self, topic: str, which: str) -> Stream:
         """Stamps a topic with all that are used: only together do they show their clocks."""
         topics = tuple(self._used) or (topic,)
-        bare = [each for each in topics if not np.any(times_of(self._of(each))[1])]
+        bare = [
+            each
+            for each in topics
+            if not np.any(read_times(self._read_messages(each))[1])
+        ]
         # Beside topics without headers these are compared with the arrival, as if nobody asked.
         stamps = STAMPS[which]
         if which == mapped.HEADER and bare and topic not in bare:
@@ -158,28 +164,30 @@ class Bag(Source):
         if (key := (which, stamps, *topics)) not in self._stamps:
             data = {}
             for each in topics:
-                messages = self._of(each)
+                messages = self._read_messages(each)
                 rows = np.arange(len(messages), dtype=np.float64)[:, None]
-                data[each] = TopicData(each, *times_of(messages), rows)
+                data[each] = TopicData(each, *read_times(messages), rows)
             robot = [each for each, own in self._used.items() if own]
             try:
-                self._stamps[key] = streams(data, stamps, self.place, robot)
+                self._stamps[key] = stamp_streams(data, stamps, self.place, robot)
             except RecordingError as error:
                 if which:
                     raise
                 fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
-                stamps = "header" if go_on_together(data.values()) else "receive"
+                stamps = (
+                    "header" if has_continuous_headers(data.values()) else "receive"
+                )
                 if stamps == "header":
                     by = "headers, which go on together"
                 else:
                     by = "arrival"
                 note = f"{fault}; all messages were stamped by their {by}."
                 self._notes.setdefault(topic, []).append(note)
-                self._stamps[key] = streams(data, stamps, self.place, robot)
+                self._stamps[key] = stamp_streams(data, stamps, self.place, robot)
         return self._stamps[key][topic]
 
 
-def topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
+def list_topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
     """Returns the topics that a mapping names, and whether commands or the robot's sensors do."""
     found: dict[str, bool] = {}
 

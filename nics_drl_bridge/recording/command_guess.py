@@ -13,9 +13,9 @@ import numpy as np
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.mapped import NEAR_DEG, SHORT_OF_EARTH
 from nics_drl_bridge.recording.mapping import NO_COMMANDS
-from nics_drl_bridge.recording.names import words_of
+from nics_drl_bridge.recording.names import split_words
 from nics_drl_bridge.recording.pose_guess import PoseGuess
-from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
+from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.robot.spec import find_kind, kind_names
 from nics_drl_bridge.robot.template import list_names
 
@@ -304,25 +304,27 @@ def guess_command(
     tables: Sequence[TableSurvey], pose: PoseGuess | None
 ) -> CommandGuess:
     """Finds the columns that drive a robot of a known kind; else what may be its commands."""
-    found = [each for table in tables for each in _candidates_of(table, tables, pose)]
-    found = _with_partner(found)
+    found = [each for table in tables for each in _find_candidates(table, tables, pose)]
+    found = _accept_steering(found)
     certain = [each for each in found if each.strength >= LIKELY]
-    kind, commands = _fitting_kind(certain)
+    kind, commands = _choose_kind(certain)
     if kind is not None:
         return CommandGuess(kind, commands, {})
     if not certain:
-        kind, commands = _fitting_kind(list(_wheels_of(tables)))
+        kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
             return CommandGuess(kind, commands, {}, of_wheels=True)
-    found = found or [each for table in tables for each in _unexplained_in(table, pose)]
-    kind, candidates = _fitting_kind(found)
+    found = found or [
+        each for table in tables for each in _find_unexplained(table, pose)
+    ]
+    kind, candidates = _choose_kind(found)
     if kind is None:
         some = sorted(found, key=lambda each: -each.strength)[:MOST_CANDIDATES]
         candidates = {f"command_{k}": each for k, each in enumerate(some)}
     return CommandGuess(kind, {}, candidates)
 
 
-def _candidates_of(
+def _find_candidates(
     table: TableSurvey, tables: Sequence[TableSurvey], pose: PoseGuess | None
 ) -> Iterator[Candidate]:
     """Yields the columns of a table that were or may have been sent to the robot."""
@@ -331,7 +333,7 @@ def _candidates_of(
     of_pose = pose is not None and pose.table is table
     # The name of a file tells what it holds only beside other files, and if the pose is elsewhere.
     if table.kind or (len(tables) > 1 and not of_pose):
-        context = {*words_of(table.name)}
+        context = {*split_words(table.name)}
     else:
         context = set()
     if context & (NEVER_WORDS | MEASURING) and not context & COMMANDING:
@@ -340,27 +342,31 @@ def _candidates_of(
     for column in table.numbers:
         if column.name in taken or column.name in table.stamp_columns:
             continue
-        words = {*unit_in(column.name)[0]}
+        words = {*split_unit(column.name)[0]}
         if words == {"data"}:
-            words = {*words_of(table.name)}
+            words = {*split_words(table.name)}
         if words & (NEVER_WORDS | MEASURING) or _is_place_on_earth(column):
             continue
-        meaning = meaning_of(
+        meaning = guess_meaning(
             words | (context & {"cmd", "vel"} if table.kind else set())
         )
-        strength = _strength_of(table, words, context, meaning)
+        strength = _estimate_strength(table, words, context, meaning)
         known = meaning is not None or strength >= LIKELY
         if known and not (table.kind in TWIST_KINDS and meaning is None):
-            yield Candidate(table, column, meaning, strength, _rank_of(table, context))
+            yield Candidate(
+                table, column, meaning, strength, _rank_topic(table, context)
+            )
 
 
-def _unexplained_in(table: TableSurvey, pose: PoseGuess | None) -> Iterator[Candidate]:
+def _find_unexplained(
+    table: TableSurvey, pose: PoseGuess | None
+) -> Iterator[Candidate]:
     """Yields the columns of a table of no message whose names tell nothing, as in other languages.
 
     None of them was certainly sent to the robot, but none was certainly measured either.
     """
     beside = (
-        {*words_of(table.name)}
+        {*split_words(table.name)}
         if pose is not None and pose.table is not table
         else set()
     )
@@ -370,7 +376,7 @@ def _unexplained_in(table: TableSurvey, pose: PoseGuess | None) -> Iterator[Cand
         {*pose.columns} if pose and pose.table is table else set()
     )
     for column in table.numbers:
-        words = {*words_of(column.name)}
+        words = {*split_words(column.name)}
         told = bool(words & (NEVER_WORDS | MEASURING | WHEEL_WORDS | {"x", "y", "z"}))
         told = (
             told
@@ -382,7 +388,7 @@ def _unexplained_in(table: TableSurvey, pose: PoseGuess | None) -> Iterator[Cand
             yield Candidate(table, column, None, POSSIBLE)
 
 
-def _strength_of(
+def _estimate_strength(
     table: TableSurvey, words: set[str], context: set[str], meaning: str | None
 ) -> int:
     if table.kind in ACKERMANN_KINDS:
@@ -394,7 +400,7 @@ def _strength_of(
     return LIKELY if meaning == "throttle" else POSSIBLE
 
 
-def _rank_of(table: TableSurvey, context: set[str]) -> int:
+def _rank_topic(table: TableSurvey, context: set[str]) -> int:
     """Returns how near to the robot a topic is: `cmd_vel` itself before what a mux gets."""
     if not table.kind:
         return 0
@@ -403,7 +409,7 @@ def _rank_of(table: TableSurvey, context: set[str]) -> int:
     return int(context <= BARE_TWIST)
 
 
-def meaning_of(words: set[str]) -> str | None:
+def guess_meaning(words: set[str]) -> str | None:
     """Returns what a command with these words in its name means; None if they do not tell."""
     moves = words & {"velocity", "vel", "rate", "speed"}
     left = bool(words & LEFT)
@@ -436,22 +442,22 @@ def meaning_of(words: set[str]) -> str | None:
     return None
 
 
-def _with_partner(found: Sequence[Candidate]) -> list[Candidate]:
+def _accept_steering(found: Sequence[Candidate]) -> list[Candidate]:
     """Takes a plain `steering` for a command where a throttle is recorded beside it."""
     throttle = any(
         each.meaning == "throttle" and each.strength >= LIKELY for each in found
     )
     made = []
     for each in found:
-        words = unit_in(each.column.name)[0]
-        words = words_of(each.table.name) if words == ["data"] else words
+        words = split_unit(each.column.name)[0]
+        words = split_words(each.table.name) if words == ["data"] else words
         if throttle and words in (["steering"], ["steer"]):
             each = each._replace(strength=max(each.strength, LIKELY))
         made.append(each)
     return made
 
 
-def _fitting_kind(
+def _choose_kind(
     found: Sequence[Candidate],
 ) -> tuple[str | None, dict[str, Candidate]]:
     """Returns the kind of robot that these columns drive best, and its commands by its names."""
@@ -462,7 +468,7 @@ def _fitting_kind(
     ]
     best: tuple[tuple[int, int, int], str, dict[str, Candidate]] | None = None
     for order, (kind, names) in enumerate((*own, *KINDS)):
-        commands = _by_meaning(names, found) if names else {}
+        commands = _match_commands(names, found) if names else {}
         if not commands:
             continue
         still = sum(each.is_still for each in commands.values())
@@ -474,7 +480,7 @@ def _fitting_kind(
     return (None, {}) if best is None else best[1:]
 
 
-def _by_meaning(
+def _match_commands(
     names: Mapping[str, str], found: Sequence[Candidate]
 ) -> dict[str, Candidate]:
     """Finds a column for each of a kind's commands; none if one is missing or can't be told."""
@@ -485,32 +491,32 @@ def _by_meaning(
             return {}
         most = max((not each.is_still, each.strength, each.rank) for each in fitting)
         best = [e for e in fitting if (not e.is_still, e.strength, e.rank) == most]
-        if any(not _same_values(best[0], other) for other in best[1:]):
+        if any(not _has_same_values(best[0], other) for other in best[1:]):
             return {}
         commands[name] = best[0]
     return commands
 
 
-def _same_values(one: Candidate, other: Candidate) -> bool:
+def _has_same_values(one: Candidate, other: Candidate) -> bool:
     values = [each.table.data[each.column.name] for each in (one, other)]
     return np.array_equal(values[0], values[1])
 
 
-def _wheels_of(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
+def _find_wheels(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
     """Yields the measured ticks or speeds of wheels, which stand in where no command was sent."""
     for table in tables:
         if STANDARD_PACKAGES.match(table.kind):
             continue
         for column in table.numbers:
-            words, _ = unit_in(column.name)
-            spoken = {*words_of(column.name)}
+            words, _ = split_unit(column.name)
+            spoken = {*split_words(column.name)}
             if (
                 not spoken & WHEEL_WORDS
                 or spoken & NO_SPEED
                 or column.low == column.high
             ):
                 continue
-            meaning = meaning_of({*words} - TICKS - {"speed", "velocity", "vel"})
+            meaning = guess_meaning({*words} - TICKS - {"speed", "velocity", "vel"})
             if meaning in ("left", "right", *WHEELS):
                 yield Candidate(
                     table, column, meaning, LIKELY, int(bool(spoken & TICKS))
@@ -519,12 +525,12 @@ def _wheels_of(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
 
 def _is_place_on_earth(column: Survey) -> bool:
     """True for `lat` or `lon` whose values stay within a degree, as those of a drive do."""
-    if not {*words_of(column.name)} & SHORT_OF_EARTH:
+    if not {*split_words(column.name)} & SHORT_OF_EARTH:
         return False
     return column.high - column.low < NEAR_DEG <= max(abs(column.low), abs(column.high))
 
 
-def look_alikes(kind: str) -> list[str]:
+def find_look_alikes(kind: str) -> list[str]:
     """Returns the other kinds of robots that have the same commands."""
     found = []
     own = find_kind(kind)

@@ -38,40 +38,42 @@ class EpisodeOfTable(Source):
         table = self._table
         rows = self._rows
 
-        def column(which: str | int) -> Column:
+        def read_column(which: str | int) -> Column:
             return table.column(which)[rows]
 
-        def row(k: int) -> str:
+        def name_row(k: int) -> str:
             return table.row(int(rows[k]))
 
-        return replace(table, place=self.place, column=column, row=row)
+        return replace(table, place=self.place, column=read_column, row=name_row)
 
 
-def episodes_of_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
+def split_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
     """Returns the episodes of a table with rows of its own stamps; none of several tables."""
     reader = MappedReader(source, mapping)
-    table, which = reader.place(mapping.episode or 0)
+    table, which = reader.locate(mapping.episode or 0)
     if len(source.names) > 1 and any(
-        name != _name_of(source, table) for name in _tables_used(source, mapping)
+        name != _find_name(source, table) for name in _list_tables_used(source, mapping)
     ):
         return []
     if table.stamps("") is not None:
         return []  # stamps that come with the rows go on from one episode to the next
     column = table.column(which)
     values, first, of = np.unique(column, return_index=True, return_inverse=True)
-    name = _name_of(source, table)
+    name = _find_name(source, table)
     found = []
     for k in np.argsort(first):
         rows = np.flatnonzero(of == k)
         if len(rows) >= FEWEST_ROWS:
-            found.append(EpisodeOfTable(source, table, name, rows, _label(values[k])))
+            found.append(
+                EpisodeOfTable(source, table, name, rows, _format_label(values[k]))
+            )
     if not found:
         fault = f"{table.place}: no value of the column {which!r} lasts for {FEWEST_ROWS} rows"
         raise ConfigError(f"{fault}; name the column that numbers the episodes.")
     return found
 
 
-def episodes_by_time(
+def split_by_time(
     source: Source, mapping: Mapping, recording: Recording, since: float
 ) -> Recording:
     """Splits a recording, whose stamps began at `since` [s], where the column changes its value."""
@@ -79,26 +81,26 @@ def episodes_by_time(
         fault = f"{source.place}: episode: pose and commands have clocks of their own"
         raise ConfigError(f"{fault}; give each episode as a recording of its own.")
     reader = MappedReader(source, mapping)
-    table, which = reader.place(mapping.episode or 0)
+    table, which = reader.locate(mapping.episode or 0)
     column = table.column(which)
-    at = reader.stamped(table, column, None)
+    at = reader.stamp_rows(table, column, None)
     values = column[at.rows]
     changes = np.flatnonzero(values[1:] != values[:-1]) + 1
     starts = [-np.inf, *(float(t) - since for t in at.t[changes])]
-    labels = [_label(values[k]) for k in (0, *changes)]
+    labels = [_format_label(values[k]) for k in (0, *changes)]
     names = [f"{source.place} (episode {label})" for label in labels]
     return split_at(recording, starts, names)
 
 
-def _label(value: Any) -> str:
+def _format_label(value: Any) -> str:
     return str(value) if isinstance(value, str) else f"{float(value):g}"
 
 
-def _name_of(source: Source, table: Table) -> str:
-    return next(name for name in source.names if source.table(name) is table)
+def _find_name(source: Source, table: Table) -> str:
+    return next(name for name in source.names if source.get_table(name) is table)
 
 
-def _tables_used(source: Source, mapping: Mapping) -> Iterator[str]:
+def _list_tables_used(source: Source, mapping: Mapping) -> Iterator[str]:
     """Yields the tables that the values of a mapping are of."""
     reader = MappedReader(source, mapping)
     references: list[tuple[Any, str | None]] = [
@@ -107,4 +109,4 @@ def _tables_used(source: Source, mapping: Mapping) -> Iterator[str]:
     references += [(value.from_, None) for value in mapping.state.values()]
     references.append((mapping.pose.x.from_ if mapping.pose.x else 0, mapping.pose.in_))
     for reference, within in references:
-        yield _name_of(source, reader.place(reference, within)[0])
+        yield _find_name(source, reader.locate(reference, within)[0])

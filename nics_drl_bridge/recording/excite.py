@@ -55,7 +55,7 @@ class Exploration:
     def __init__(self, plan: "DrivePlan", rng: np.random.Generator) -> None:
         spec = plan.robot
         self._plan = plan
-        self._motion = expected_motion(spec)
+        self._motion = predict_motion(spec)
         self._rng = rng
         share = np.array(
             [1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command]
@@ -79,43 +79,43 @@ class Exploration:
         self._outermost = plan.bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
         turning = np.array([c.turns for c in spec.command])
-        self._ways = self._ways_back(np.where(turning, TURNING, TURNING_SPEED))
-        self._emergency = self._ways_back(np.where(turning, 1.0, TURNING_SPEED))
+        self._ways = self._list_ways_back(np.where(turning, TURNING, TURNING_SPEED))
+        self._emergency = self._list_ways_back(np.where(turning, 1.0, TURNING_SPEED))
 
     @property
     def done(self) -> bool:
         """True if the drive is over."""
         return self._tick >= self._ticks
 
-    def see(self, pose: Array) -> None:
+    def observe(self, pose: Array) -> None:
         """Observes the pose (3,) at the start of the current period, in the start frame."""
         self.pose = geometry.compose(pose, geometry.between(self._before, self.pose))
         self._before = np.asarray(pose, dtype=np.float64)
         self._seen = True
 
-    def next(self) -> Array:
+    def choose_command(self) -> Array:
         """Returns the command (C,) for the period that begins now."""
         command = self.rest
         if self._still <= self._tick < self._ticks:
-            if len(self._queue) == 0 or self._goes_astray():
-                self._queue = self._segment()
+            if len(self._queue) == 0 or self._is_astray():
+                self._queue = self._plan_segment()
             command = np.asarray(self._queue[0])
             self._queue = self._queue[1:]
-        poses, states = self._roll(command[None, None])
+        poses, states = self._predict(command[None, None])
         self._before = self.pose
         self.pose = poses[0, -1]
         self._state = states[0, -1]
         self._command = command
-        self._visits[self._cells(command)] += 1.0
+        self._visits[self._find_cells(command)] += 1.0
         self._tick += 1
         return command
 
-    def expected(self) -> "Pattern | None":
+    def simulate(self) -> "Pattern | None":
         """Drives to the end; None if it finds no way back, or shows too little of a command."""
         poses = [self.pose]
         commands = []
         while not self.done:
-            commands.append(self.next())
+            commands.append(self.choose_command())
             poses.append(self.pose)
             if self._lost >= LOST:
                 return None
@@ -129,46 +129,51 @@ class Exploration:
         varied = (np.abs(alike - np.eye(len(alike))) < ALIKE).all()
         return pattern if varied and pattern.reach <= plan.bound else None
 
-    def _goes_astray(self) -> bool:
+    def _is_astray(self) -> bool:
         """True if, from the observed pose, the rest of the segment leads too far out."""
         if not self._seen or self._tick >= self._ticks - self._still:
             return False
         self._seen = False
         return bool(
-            _distance(self._roll(self._queue[None])[0]).max() > self._limit() + MARGIN_M
+            _compute_distance(self._predict(self._queue[None])[0]).max()
+            > self._limit() + MARGIN_M
         )
 
     def _limit(self) -> float:
         """Returns the greatest allowed distance from the start, at least the present one [m]."""
-        return max(self.keep_within, float(_distance(self.pose))) + TOLERANCE_M
+        return max(self.keep_within, float(_compute_distance(self.pose))) + TOLERANCE_M
 
-    def _roll(self, commands: Array, period: float = PERIOD_S) -> tuple[Array, Array]:
+    def _predict(
+        self, commands: Array, period: float = PERIOD_S
+    ) -> tuple[Array, Array]:
         many = len(commands)
         pose = np.repeat(self.pose[None], many, 0)
         state = np.repeat(self._state[None], many, 0)
-        return self._motion.roll(pose, state, commands, period)
+        return self._motion.predict(pose, state, commands, period)
 
-    def _cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
+    def _find_cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
         share = (command - self.low) / (self.high - self.low)
         return tuple(
             np.moveaxis(np.clip((share * BINS).astype(np.intp), 0, BINS - 1), -1, 0)
         )
 
-    def _segment(self) -> Array:
+    def _plan_segment(self) -> Array:
         left = self._ticks - self._still - self._tick
         if left <= self._ramp:
-            return np.asarray(self._towards(self.rest[None], left + self._still)[0])
+            return np.asarray(
+                self._interpolate_commands(self.rest[None], left + self._still)[0]
+            )
         length = round(self._rng.uniform(*SEGMENT_S) / PERIOD_S)
         length = max(1, min(length, left - self._ramp))
         for alone in (True, False) if self._rng.random() < ALONE else (False,):
-            segment = self._best(self._candidates(alone), length)
+            segment = self._choose_best(self._draw_levels(alone), length)
             if segment is not None:
                 self._lost = 0
                 return segment
         self._lost += 1
-        return self._least_harm(length)
+        return self._return_to_circle(length)
 
-    def _candidates(self, alone: bool) -> Array:
+    def _draw_levels(self, alone: bool) -> Array:
         size = (CANDIDATES, len(self.low))
         fresh = self._rng.uniform(self.low, self.high, size)
         changed = self._rng.random(size) < (0.0 if alone else REDRAWN)
@@ -176,21 +181,23 @@ class Exploration:
         self._turn += 1
         return np.where(changed, fresh, self._command)
 
-    def _best(self, levels: Array, length: int) -> Array | None:
+    def _choose_best(self, levels: Array, length: int) -> Array | None:
         """Returns commands (T, C) to the best of levels (K, C); None if all lead too far out."""
-        commands = self._towards(levels, length)
-        poses, states = self._roll(commands)
+        commands = self._interpolate_commands(levels, length)
+        poses, states = self._predict(commands)
         limit = self._limit()
-        allowed = np.flatnonzero(_distance(poses).max(axis=1) <= limit)
+        allowed = np.flatnonzero(_compute_distance(poses).max(axis=1) <= limit)
         if len(allowed) == 0:
             return None
-        familiar = self._visits[self._cells(levels[allowed])] / self._visits.mean()
-        nearest = self._way_to_centre(poses[allowed, -1], states[allowed, -1], limit)
+        familiar = self._visits[self._find_cells(levels[allowed])] / self._visits.mean()
+        nearest = self._measure_way_to_centre(
+            poses[allowed, -1], states[allowed, -1], limit
+        )
         score = familiar + CENTRED * nearest
         best = int(np.argmin(score))
         return np.asarray(commands[allowed[best]]) if np.isfinite(score[best]) else None
 
-    def _towards(self, levels: Array, length: int) -> Array:
+    def _interpolate_commands(self, levels: Array, length: int) -> Array:
         """Returns commands (K, T, C) that go smoothly from the present one to levels (K, C)."""
         share = (
             1.0 - np.cos(np.pi * np.minimum(np.arange(1, length + 1) / self._ramp, 1.0))
@@ -199,7 +206,7 @@ class Exploration:
             self._command + share[None, :, None] * (levels - self._command)[:, None]
         )
 
-    def _ways_back(self, factor: Array) -> Array:
+    def _list_ways_back(self, factor: Array) -> Array:
         """Returns constant commands (E, T, C) for turning back: half a turn by the fastest one."""
         low = np.minimum(factor * self.low, self.rest)
         high = np.maximum(factor * self.high, self.rest)
@@ -207,20 +214,20 @@ class Exploration:
         ways = np.array(list(product(*ends)))[:, None]
         first = round(WAY_S[0] / WAY_STEP_S)
         last = round(1.0 / WAY_STEP_S)
-        poses, _ = self._roll(np.repeat(ways, first, axis=1), WAY_STEP_S)
+        poses, _ = self._predict(np.repeat(ways, first, axis=1), WAY_STEP_S)
         heading = np.unwrap(poses[..., 2], axis=1)
         turned = float(np.abs(heading[:, -1] - heading[:, -1 - last]).max())
         needed = float(np.clip(np.pi / max(turned, 1e-6) + 1.0, *WAY_S))
         return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
 
-    def _way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
+    def _measure_way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
         """Returns the least distance from the centre, over the radius, of ways back; maybe inf."""
         many = len(self._ways)
         start = np.repeat(pose, many, 0), np.repeat(state, many, 0)
-        poses, _ = self._motion.roll(
+        poses, _ = self._motion.predict(
             *start, np.tile(self._ways, (len(pose), 1, 1)), WAY_STEP_S
         )
-        away = _distance(poses)
+        away = _compute_distance(poses)
         inside = away.max(axis=1) <= limit
         turned = (
             np.abs(np.unwrap(poses[..., 2], axis=1) - poses[:, :1, 2]).max(axis=1)
@@ -237,15 +244,17 @@ class Exploration:
         )
         return np.where(useful, reached / self._outermost, np.inf)
 
-    def _least_harm(self, length: int) -> Array:
+    def _return_to_circle(self, length: int) -> Array:
         """Returns commands (T, C) towards the path back that leaves the circle least."""
-        away = _distance(self._roll(self._emergency, WAY_STEP_S)[0])
+        away = _compute_distance(self._predict(self._emergency, WAY_STEP_S)[0])
         outside = np.maximum(away.max(axis=1) - self._outermost, 0.0)
         best = np.lexsort((away.min(axis=1), np.round(outside, 2)))[0]
-        return np.asarray(self._towards(self._emergency[[best], 0], length)[0])
+        return np.asarray(
+            self._interpolate_commands(self._emergency[[best], 0], length)[0]
+        )
 
 
-def _distance(pose: Array) -> Array:
+def _compute_distance(pose: Array) -> Array:
     return np.asarray(np.hypot(pose[..., 0], pose[..., 1]))
 
 
@@ -290,7 +299,7 @@ class Pattern:
         """Speed (T,) of each period [m/s]."""
         return np.asarray(np.hypot(*self.twist[:, :2].T))
 
-    def lines(self) -> tuple[str, ...]:
+    def describe(self) -> tuple[str, ...]:
         """Returns the lines that an operator must read before the robot moves."""
         (left, low), (right, high) = self.box
         return (
@@ -314,7 +323,7 @@ class ExpectedMotion:
     ]  # state, command, time held [s] -> state
     twist: Callable[[Array, Array], Array]  # state, command -> body twist
 
-    def roll(
+    def predict(
         self, pose: Array, state: Array, command: Array, period: float
     ) -> tuple[Array, Array]:
         """Rolls commands (K, T, C) out to poses (K, T + 1, 3) and states; one arc a period [s]."""
@@ -332,7 +341,7 @@ class ExpectedMotion:
         return np.stack(poses, axis=1), np.stack(states, axis=1)
 
 
-def expected_motion(spec: RobotSpec) -> ExpectedMotion:
+def predict_motion(spec: RobotSpec) -> ExpectedMotion:
     """Returns the motion of the robot's textbook, else of `cmd_vel`; ConfigError: has neither."""
     if has_textbook(spec):
         book = textbook(spec)
@@ -378,21 +387,21 @@ class DrivePlan:
 
     def begin(self) -> Exploration:
         """Returns the previewed drive, at its start; raises ConfigError as `preview` does."""
-        return self._attempt(self._found[0])
+        return self._start_attempt(self._found[0])
 
     def preview(self) -> Pattern:
         """Returns the pattern by the expected motion; ConfigError if the circle is too small."""
         return self._found[1]
 
-    def _attempt(self, number: int) -> Exploration:
+    def _start_attempt(self, number: int) -> Exploration:
         return Exploration(self, np.random.default_rng([self.seed, number]))
 
     @cached_property
     def _found(self) -> tuple[int, Pattern]:
         """Number and pattern of the first attempt that varies all commands within the circle."""
         for number in range(ATTEMPTS):
-            drive = self._attempt(number)
-            pattern = drive.expected() if drive.keep_within > 0.0 else None
+            drive = self._start_attempt(number)
+            pattern = drive.simulate() if drive.keep_within > 0.0 else None
             if pattern is not None:
                 return number, pattern
         circle = f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small"

@@ -11,17 +11,22 @@ from nics_drl_bridge.recording.command_guess import (
     TICKS,
     Candidate,
     CommandGuess,
+    find_look_alikes,
     guess_command,
-    look_alikes,
 )
-from nics_drl_bridge.recording.imu_guess import guess_yaw_rate, imu_line
+from nics_drl_bridge.recording.imu_guess import guess_yaw_rate, write_imu_line
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.motion_check import doubts_of_commands, reversed_wheels
-from nics_drl_bridge.recording.names import quoted, words_of
-from nics_drl_bridge.recording.pose_guess import GLOBE, PoseGuess, guess_pose, thinned
-from nics_drl_bridge.recording.recording import along_path, clockwise_line
-from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
+from nics_drl_bridge.recording.motion_check import find_doubts, find_reversed_wheels
+from nics_drl_bridge.recording.names import split_words, write_reference
+from nics_drl_bridge.recording.pose_guess import (
+    GLOBE,
+    PoseGuess,
+    guess_pose,
+    select_apart,
+)
+from nics_drl_bridge.recording.recording import find_clockwise_keys, select_along_path
+from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.recording.switch_guess import Switch, guess_switch
 
 GUESSED = "# guessed"
@@ -46,7 +51,7 @@ MIRRORED = 0.6
 MIRRORED_BETTER = 0.3
 
 
-def first_mapping(tables: Sequence[TableSurvey]) -> str:
+def propose_mapping(tables: Sequence[TableSurvey]) -> str:
     """Drafts a mapping in YAML; guesses are marked, and what is not certain is left blank."""
     alone = len(tables) == 1
     pose = guess_pose(tables)
@@ -54,18 +59,18 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     times = [table.time for table in tables if table.time is not None]
     common = max(times, key=times.count) if times else None
     if pose:
-        pose_lines = _pose_lines(pose, alone, common)
+        pose_lines = _write_pose(pose, alone, common)
     else:
         pose_lines = [NO_POSE, "pose:", "  x: ", "  y: "]
-    values = _pose_values(pose, pose_lines) if pose else None
+    values = _compute_poses(pose, pose_lines) if pose else None
     if guess.commands or guess.candidates:
         switch = guess_switch(tables, values)
     else:
         switch = None
-    lines = [f"{DOUBT} {doubt}" for doubt in doubts_of_commands(guess, values)]
+    lines = [f"{DOUBT} {doubt}" for doubt in find_doubts(guess, values)]
     if not guess.commands and not guess.candidates:
         lines.append(f"{DOUBT} {NO_COMMAND}")
-    lines.append(_robot_line(guess, _radius(values)))
+    lines.append(_write_robot(guess, _guess_radius(values)))
     if common is not None:
         lines.append(f"time: {common}  {GUESSED}")
     elif any(table.t is None and table.rows for table in tables):
@@ -73,26 +78,26 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
             f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
         )
     lines += pose_lines
-    lines += _clock_lines(pose, guess.commands or guess.candidates)
-    backwards = reversed_wheels(guess, values)
-    lines += _command_lines(guess, switch, backwards, alone, common)
-    gyro = _free_yaw_rate(tables, guess)
+    lines += _write_clock(pose, guess.commands or guess.candidates)
+    backwards = find_reversed_wheels(guess, values)
+    lines += _write_commands(guess, switch, backwards, alone, common)
+    gyro = _find_free_yaw_rate(tables, guess)
     if gyro is not None:
-        lines.append(f"{imu_line(*gyro, alone, common)}  {GUESSED}")
-    lines += _unused_lines(tables, pose, guess, switch, gyro)
+        lines.append(f"{write_imu_line(*gyro, alone, common)}  {GUESSED}")
+    lines += _list_unused(tables, pose, guess, switch, gyro)
     return "\n".join(lines) + "\n"
 
 
-def _robot_line(guess: CommandGuess, radius: float) -> str:
+def _write_robot(guess: CommandGuess, radius: float) -> str:
     if guess.kind is None:
         example = f"{{kind: differential, footprint_radius: {radius}}}"
         return f"robot:  # which kind is not certain, as in {example}"
-    alike = "".join(f", or {each}" for each in look_alikes(guess.kind))
+    alike = "".join(f", or {each}" for each in find_look_alikes(guess.kind))
     robot = f"robot: {{kind: {guess.kind}, footprint_radius: {radius}}}"
     return f"{robot}  {GUESSED}{alike}; radius in m"
 
 
-def _command_lines(
+def _write_commands(
     guess: CommandGuess,
     switch: Switch | None,
     backwards: Sequence[Candidate],
@@ -100,7 +105,7 @@ def _command_lines(
     common: str | None,
 ) -> Iterator[str]:
     """Yields the commands, or a blank with the candidates as comments."""
-    when = "" if switch is None else f"when: {{{switch.reference(alone)}: {switch.on}}}"
+    when = "" if switch is None else f"when: {{{switch.refer_to(alone)}: {switch.on}}}"
     if guess.commands:
         wheels = "  # no command was recorded: what the wheels did stands in for it"
         yield "command:" + wheels * guess.of_wheels
@@ -108,25 +113,25 @@ def _command_lines(
             keys = when
             if each in backwards:
                 keys = "scale: -1"
-            value = _value_of(name, each, keys, alone, common)
+            value = _write_value(name, each, keys, alone, common)
             why = ": else it turns against the other" * (each in backwards)
             yield f"  {name}: {value}  {GUESSED}{STILL * each.is_still}{why}"
     elif guess.candidates:
         yield "command:  # none is certain: uncomment what was sent to the robot"
         for name, each in guess.candidates.items():
-            yield f"#  {name}: {_value_of(name, each, when, alone, common)}"
+            yield f"#  {name}: {_write_value(name, each, when, alone, common)}"
     else:
         yield f"command:  # {NO_COMMAND}"
 
 
-def _value_of(
+def _write_value(
     name: str, candidate: Candidate, when: str, alone: bool, common: str | None
 ) -> str:
     """Returns a command as a mapping has it: a column, or a column with more keys."""
     table = candidate.table
     column = candidate.column
-    reference = table.reference(column.name, alone)
-    keys = [*_unit_keys(name, table, column)]
+    reference = table.refer_to(column.name, alone)
+    keys = [*_write_unit_keys(name, table, column)]
     if (
         when and "steer" not in name
     ):  # a switch cuts the motor; the steering stays as it is
@@ -136,12 +141,12 @@ def _value_of(
     return f"{{from: {reference}, {', '.join(keys)}}}" if keys else reference
 
 
-def _unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
-    words = {*words_of(column.name)}
-    unit = unit_in(column.name)[1]
+def _write_unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
+    words = {*split_words(column.name)}
+    unit = split_unit(column.name)[1]
     if words & TICKS:
         counters = [
-            table.data[c.name] for c in table.numbers if {*words_of(c.name)} & TICKS
+            table.data[c.name] for c in table.numbers if {*split_words(c.name)} & TICKS
         ]
         step = np.abs(
             np.concatenate([np.diff(each.astype(np.float64)) for each in counters])
@@ -158,7 +163,7 @@ def _unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
         yield "unit: deg"
 
 
-def _clock_lines(
+def _write_clock(
     pose: PoseGuess | None, commands: Mapping[str, Candidate]
 ) -> list[str]:
     """Returns the line that gives the pose a clock of its own, if it has one by its stamps."""
@@ -177,7 +182,7 @@ def _clock_lines(
     return [f"  clock: tracker  {GUESSED}: {why}"]
 
 
-def _free_yaw_rate(
+def _find_free_yaw_rate(
     tables: Sequence[TableSurvey], guess: CommandGuess
 ) -> tuple[TableSurvey, Survey] | None:
     """Returns the yaw rate of a gyro, unless it may be a command."""
@@ -192,7 +197,7 @@ def _free_yaw_rate(
     return None if taken else found
 
 
-def _unused_lines(
+def _list_unused(
     tables: Sequence[TableSurvey],
     pose: PoseGuess | None,
     guess: CommandGuess,
@@ -213,45 +218,47 @@ def _unused_lines(
     for table in tables:
         rest = []
         for column in table.columns:
-            is_value = not {*words_of(column.name)} & NO_VALUES
+            is_value = not {*split_words(column.name)} & NO_VALUES
             is_free = (id(table), column.name) not in taken
             if is_value and is_free and column.name not in table.stamp_columns:
-                rest.append(f"{column.name}{_why_not(column)}")
+                rest.append(f"{column.name}{_explain_unused(column)}")
         place = "" if len(tables) == 1 else f"{table.name}: "
         more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
         if rest:
             yield f"{NOT_USED}: {place}{', '.join(rest[:MOST_LISTED])}{more}"
 
 
-def _why_not(column: Survey) -> str:
+def _explain_unused(column: Survey) -> str:
     if column.low < column.high:
         return ""
     return " (constant)" if column.low == column.high else " (no numbers)"
 
 
-def _pose_lines(pose: PoseGuess, alone: bool, common: str | None) -> list[str]:
+def _write_pose(pose: PoseGuess, alone: bool, common: str | None) -> list[str]:
     table = pose.table
     if table.stamps is None and pose.x in (form[0].format("x") for form in POSES[:4]):
         return [f"pose: {table.name}  {GUESSED}"]  # a message whose fields are known
     lines = [f"pose:  {GUESSED}"]
     if not alone:
-        lines.append(f"  in: {quoted(table.name)}")
-    lines.append(f"  x: {quoted(pose.x)}")
-    lines.append(f"  y: {quoted(pose.y)}")
+        lines.append(f"  in: {write_reference(table.name)}")
+    lines.append(f"  x: {write_reference(pose.x)}")
+    lines.append(f"  y: {write_reference(pose.y)}")
     if pose.heading is not None:
-        lines.append(f"  heading: {quoted(pose.heading)}")
+        lines.append(f"  heading: {write_reference(pose.heading)}")
     else:
-        lines.append(f"  quaternion: [{', '.join(map(quoted, pose.quaternion))}]")
+        lines.append(
+            f"  quaternion: [{', '.join(map(write_reference, pose.quaternion))}]"
+        )
     if table.time not in (common, None):
         lines.append(f"  time: {table.time}")
-    units = _pose_units(pose)
-    return [_turned_round(line, pose, units) for line in lines] + units
+    units = _guess_pose_units(pose)
+    return [_correct_heading(line, pose, units) for line in lines] + units
 
 
-def _pose_units(pose: PoseGuess) -> list[str]:
+def _guess_pose_units(pose: PoseGuess) -> list[str]:
     """Returns the lines on the units of a pose, by its names, else by what is plausible."""
-    place = "deg" if {*words_of(pose.x)} & {*GLOBE} else unit_in(pose.x)[1]
-    turned = unit_in(pose.heading or "")[1]
+    place = "deg" if {*split_words(pose.x)} & {*GLOBE} else split_unit(pose.x)[1]
+    turned = split_unit(pose.heading or "")[1]
     said = []
     for key, unit in (("unit", place), ("heading_unit", turned)):
         if (
@@ -263,32 +270,36 @@ def _pose_units(pose: PoseGuess) -> list[str]:
     if place is not None or turned is not None:
         return said
     for _ in range(2):
-        values = _pose_values(pose, said)
+        values = _compute_poses(pose, said)
         if values is None:
             break
-        fault = recordings.implausible_pose(*values, radius=_radius(values, 0.0))
+        fault = recordings.find_implausible_pose(
+            *values, radius=_guess_radius(values, 0.0)
+        )
         if fault is not None and not fault.line.startswith("time"):
             said.append(f"  {fault.line}  {GUESSED}: else {fault.reason}")
     return said
 
 
-def _turned_round(line: str, pose: PoseGuess, units: Sequence[str]) -> str:
+def _correct_heading(line: str, pose: PoseGuess, units: Sequence[str]) -> str:
     """Returns the heading's line as that of a compass, if the path only leads along such a one."""
     if not line.startswith("  heading: "):
         return line
-    values = _pose_values(pose, units)
+    values = _compute_poses(pose, units)
     if values is None:
         return line
-    apart = values[1][along_path(values[1], _radius(values))]
-    keys = clockwise_line(apart)
-    keys = keys or clockwise_line(thinned(values[1]), MIRRORED, MIRRORED_BETTER)
+    apart = values[1][select_along_path(values[1], _guess_radius(values))]
+    keys = find_clockwise_keys(apart)
+    keys = keys or find_clockwise_keys(
+        select_apart(values[1]), MIRRORED, MIRRORED_BETTER
+    )
     if not keys:
         return line
     why = "else heading and path turn opposite ways"
     return f"  heading: {{from: {line.partition(': ')[2]}, {keys}}}  {GUESSED}: {why}"
 
 
-def _pose_values(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array] | None:
+def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array] | None:
     """Returns stamps (T,) and poses (T, 3) of a guess in the units of its lines, if known."""
     table = pose.table
     if table.t is None:
@@ -297,7 +308,7 @@ def _pose_values(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array] |
     if any(len(each) != len(table.t) for each in columns):  # of several streams
         return None
     x, y, *turned = columns
-    heading = turned[0] if len(turned) == 1 else _heading_of(*turned)
+    heading = turned[0] if len(turned) == 1 else _compute_heading(*turned)
     values = np.stack([x, y, heading], axis=1)
     whole = np.isfinite(values).all(axis=1)
     if whole.sum() < 3:
@@ -316,11 +327,13 @@ def _pose_values(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array] |
     return table.t[whole], values[whole]
 
 
-def _heading_of(x: Array, y: Array, z: Array, w: Array) -> Array:
+def _compute_heading(x: Array, y: Array, z: Array, w: Array) -> Array:
     return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def _radius(values: tuple[Array, Array] | None, fastest: float = FAR_AWAY) -> float:
+def _guess_radius(
+    values: tuple[Array, Array] | None, fastest: float = FAR_AWAY
+) -> float:
     """Returns the radius of a robot [m]: of a car if it is as fast, or on a map of the land."""
     if values is None:
         return NO_RADIUS

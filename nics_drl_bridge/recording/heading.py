@@ -55,7 +55,7 @@ class Turning:
     apart: float  # root mean square disagreement after `window_s` [rad]; NaN if the drive is short
     apart_std: float  # what bias and scale of the gyro may contribute to that [rad]
 
-    def bias_at(self, t: Array) -> Array:
+    def compute_bias(self, t: Array) -> Array:
         """Returns the bias (T,) at times (T,) [s]."""
         return np.asarray(self.bias + self.bias_slope * (t - self.bias_time))
 
@@ -102,14 +102,14 @@ def compare_turning(
     """
     if len(t) < FEWEST_BLOCKS or len(gyro_t) < FEWEST_BLOCKS:
         return None
-    blocks = _blocks(t, pose, gyro_t, yaw_rate)
+    blocks = _split_blocks(t, pose, gyro_t, yaw_rate)
     if len(blocks.span) < FEWEST_BLOCKS:
         return None
-    bias, bias_std, slope, bias_time, rest_s = _bias_of(blocks)
+    bias, bias_std, slope, bias_time, rest_s = _estimate_bias(blocks)
     unbiased = blocks.gyro_rate - (bias + slope * (blocks.middle - bias_time))
-    scale, scale_std, alike = _scale_of(blocks.odom_rate, unbiased, blocks.span)
-    apart = _root_mean_square(blocks, blocks.odom_rate - unbiased, window_s)
-    turned = _root_mean_square(blocks, unbiased, window_s)
+    scale, scale_std, alike = _estimate_scale(blocks.odom_rate, unbiased, blocks.span)
+    apart = _compute_rms(blocks, blocks.odom_rate - unbiased, window_s)
+    turned = _compute_rms(blocks, unbiased, window_s)
     return Turning(
         bias=bias,
         bias_std=bias_std,
@@ -132,7 +132,9 @@ def turn_by_gyro(
 
     And the share of the time for which there was a gyro; for the rest, the wheels turn the robot.
     """
-    gyro_turn, covered = _turns(t, gyro_t, yaw_rate - turning.bias_at(gyro_t))
+    gyro_turn, covered = _integrate_gyro(
+        t, gyro_t, yaw_rate - turning.compute_bias(gyro_t)
+    )
     step = geometry.log(geometry.between(pose[:-1], pose[1:]))
     standing = (step == 0.0).all(axis=1)
     step[covered, 2] = gyro_turn[covered]
@@ -161,7 +163,9 @@ class _Blocks:
     speed: Array  # (n,) path of the wheels over time [m/s]
 
 
-def _turns(t: Array, gyro_t: Array, yaw_rate: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _integrate_gyro(
+    t: Array, gyro_t: Array, yaw_rate: Array
+) -> tuple[Array, NDArray[np.bool_]]:
     """Returns the gyro's turns (T - 1,) between times (T,) [s], and whether it covers them."""
     span = np.diff(gyro_t)
     total = np.concatenate(
@@ -175,13 +179,13 @@ def _turns(t: Array, gyro_t: Array, yaw_rate: Array) -> tuple[Array, NDArray[np.
     return turn, np.asarray(inside & (without < 1e-9))
 
 
-def _blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blocks:
+def _split_blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blocks:
     place = np.unique(np.searchsorted(t, np.arange(t[0], t[-1] + 1e-9, BLOCK_S)))
     place = place[place < len(t)]
     at = t[place]
     heading = np.unwrap(pose[:, 2])
     path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))])
-    gyro_turn, covered = _turns(at, gyro_t, yaw_rate)
+    gyro_turn, covered = _integrate_gyro(at, gyro_t, yaw_rate)
     span = np.diff(at)
     usable = covered & (span > 0.5 * BLOCK_S) & (span < 2.0 * BLOCK_S)
     span = span[usable]
@@ -194,11 +198,11 @@ def _blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blocks:
     )
 
 
-def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
+def _estimate_bias(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     """Returns the gyro's bias, its deviation, slope and time, and how long it was at rest."""
     rest = (blocks.speed < STANDING_MPS) & (np.abs(blocks.odom_rate) < STANDING_RADPS)
     if rest.sum() < FEWEST_AT_REST:
-        return _bias_while_driving(blocks)
+        return _estimate_bias_while_driving(blocks)
     rate = blocks.gyro_rate[rest]
     when = blocks.middle[rest]
     rest_s = float(blocks.span[rest].sum())
@@ -225,7 +229,9 @@ def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     return bias, std, slope, middle, rest_s
 
 
-def _bias_while_driving(blocks: _Blocks) -> tuple[float, float, float, float, float]:
+def _estimate_bias_while_driving(
+    blocks: _Blocks,
+) -> tuple[float, float, float, float, float]:
     """Returns the bias that is left if odometry's turns are too large or small by a factor."""
     # A robot that turns at one rate only does not show both: the usual bias and factor then count.
     chi = np.stack([np.ones_like(blocks.odom_rate), blocks.odom_rate], axis=1)
@@ -241,7 +247,7 @@ def _bias_while_driving(blocks: _Blocks) -> tuple[float, float, float, float, fl
     return float(bias), max(std, LEAST_BIAS_STD), 0.0, float(blocks.middle.mean()), 0.0
 
 
-def _scale_of(
+def _estimate_scale(
     odom_rate: Array, gyro_rate: Array, span: Array
 ) -> tuple[float, float, float]:
     """Returns odometry's turn per turn of the gyro, its deviation, and their correlation."""
@@ -257,7 +263,7 @@ def _scale_of(
     return scale, std, together / float(np.sqrt(power * odom_power))
 
 
-def _root_mean_square(blocks: _Blocks, rate: Array, window_s: float) -> float:
+def _compute_rms(blocks: _Blocks, rate: Array, window_s: float) -> float:
     """Returns the root mean square of turns at rates (n,) over windows [rad]."""
     each = rate * blocks.span
     count = max(1, round(window_s / BLOCK_S))

@@ -33,7 +33,7 @@ class UpAxis(NamedTuple):
         return self == UpAxis()
 
 
-def up_axis_of(acceleration: Array) -> UpAxis:
+def find_up_axis(acceleration: Array) -> UpAxis:
     """Returns the axis that points up by a mean acceleration (3,) [m/s^2]; z if none shows."""
     size = float(np.linalg.norm(acceleration))
     if not GRAVITY[0] < size < GRAVITY[1]:
@@ -44,7 +44,7 @@ def up_axis_of(acceleration: Array) -> UpAxis:
     return UpAxis(index, 1.0 if acceleration[index] > 0.0 else -1.0)
 
 
-def vector_of(vector: Any) -> Array:
+def to_array(vector: Any) -> Array:
     """Returns a message's vector as an array (3,)."""
     return np.array([vector.x, vector.y, vector.z], dtype=np.float64)
 
@@ -61,7 +61,7 @@ class GyroReader:
         covariance = message.angular_velocity_covariance
         if covariance[0] == -1.0:
             return None
-        acceleration = vector_of(message.linear_acceleration)
+        acceleration = to_array(message.linear_acceleration)
         if (
             np.isfinite(acceleration).all()
             and message.linear_acceleration_covariance[0] != -1.0
@@ -70,6 +70,6 @@ class GyroReader:
             self._acceleration = self._acceleration + (
                 acceleration - self._acceleration
             ) / float(self._count)
-        axis = up_axis_of(self._acceleration)
+        axis = find_up_axis(self._acceleration)
         rate = axis.sign * float(getattr(message.angular_velocity, AXES[axis.place]))
         return rate, float(covariance[4 * axis.place])

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, up_axis_of
-from nics_drl_bridge.recording.names import words_of
-from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
+from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_up_axis
+from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 
 OF_MESSAGE = "angular_velocity.z"  # of sensor_msgs/Imu
 TURNING = (
@@ -35,19 +35,22 @@ FASTEST_RADPS = 20.0  # a robot that seems to turn faster does so in degrees
 
 def guess_yaw_rate(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:
     """Finds the yaw rate of a gyro; None if no column is called one."""
-    found = [*_of_messages(tables)] or [*_of_columns(tables)]
+    found = [*_find_in_messages(tables)] or [*_find_in_columns(tables)]
     usual = [each for each in found if each[0].name in USUAL_NAMES]
     return next(iter(usual or found), None)
 
 
-def imu_line(
+def write_imu_line(
     table: TableSurvey, column: Survey, alone: bool, common: str | None
 ) -> str:
     """Returns the line of a mapping for a yaw rate, beside the stamps that are common to all."""
-    keys = [f"from: {table.reference(column.name, alone)}"]
-    if column.name.startswith("angular_velocity.") and _up_axis(table).sign < 0.0:
+    keys = [f"from: {table.refer_to(column.name, alone)}"]
+    if (
+        column.name.startswith("angular_velocity.")
+        and _find_message_axis(table).sign < 0.0
+    ):
         keys.append("scale: -1")
-    unit = unit_in(column.name)[1]
+    unit = split_unit(column.name)[1]
     if unit == "deg" or max(-column.low, column.high) > FASTEST_RADPS:
         keys.append("unit: deg/s")
     if table.time not in (common, None):
@@ -59,30 +62,34 @@ def imu_line(
     return f"imu: {{yaw_rate: {value}}}"
 
 
-def _of_messages(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, Survey]]:
+def _find_in_messages(
+    tables: Sequence[TableSurvey],
+) -> Iterator[tuple[TableSurvey, Survey]]:
     for table in tables:
         names = {column.name for column in table.columns}
         if {OF_MESSAGE, "linear_acceleration.x"} <= names:
-            wanted = f"angular_velocity.{AXES[_up_axis(table).place]}"
+            wanted = f"angular_velocity.{AXES[_find_message_axis(table).place]}"
             for column in table.numbers:
                 if column.name == wanted and column.low < column.high:
                     yield table, column
 
 
-def _up_axis(table: TableSurvey) -> UpAxis:
+def _find_message_axis(table: TableSurvey) -> UpAxis:
     """Returns the axis of an IMU's messages that points up; z if they tell no acceleration."""
     names = [f"linear_acceleration.{axis}" for axis in AXES]
     if not all(name in table.data for name in names):
         return UpAxis()
     columns = [table.data[name].astype(np.float64) for name in names]
-    return up_axis_of(np.array([float(np.nanmedian(column)) for column in columns]))
+    return find_up_axis(np.array([float(np.nanmedian(column)) for column in columns]))
 
 
-def _of_columns(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, Survey]]:
+def _find_in_columns(
+    tables: Sequence[TableSurvey],
+) -> Iterator[tuple[TableSurvey, Survey]]:
     for table in tables:
         for column in table.numbers:
-            words = {*words_of(column.name)}
-            around = words | {*words_of(table.name)}
+            words = {*split_words(column.name)}
+            around = words | {*split_words(table.name)}
             wanted = TURNING_OF_IMU if around & {"imu", "gyro"} else ()
             named = any(each <= words for each in wanted)
             if (

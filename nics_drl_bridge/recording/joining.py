@@ -43,12 +43,12 @@ def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Reco
     have clocks of their own; by default none.
     """
     offsets = offsets or [0.0] * len(recordings)
-    aligned = [_on_one_clock(*pair) for pair in zip(recordings, offsets, strict=True)]
+    aligned = [_align_clocks(*pair) for pair in zip(recordings, offsets, strict=True)]
     _check_alike(aligned)
-    parts = [part for recording in aligned for part in _parts_of(recording)]
+    parts = [part for recording in aligned for part in _split_recording(recording)]
     learnt = [part for part in parts if part.is_learnt]
     held_out = [part for part in parts if not part.is_learnt]
-    return _laid_out(aligned, learnt, held_out)
+    return _place_parts(aligned, learnt, held_out)
 
 
 def split_at(
@@ -69,7 +69,7 @@ def split_at(
     return recording
 
 
-def _on_one_clock(recording: Recording, offset: float) -> Recording:
+def _align_clocks(recording: Recording, offset: float) -> Recording:
     pose = recording.pose
     command = recording.command
     if pose.clock == command.clock:
@@ -91,7 +91,7 @@ def _check_alike(recordings: Sequence[Recording]) -> None:
             raise RecordingError(f"{fault}, {first.source} has {mine}; {advice}.")
 
 
-def _parts_of(recording: Recording) -> list[_Part]:
+def _split_recording(recording: Recording) -> list[_Part]:
     """Splits a recording into the part to learn from and the rest; episodes stay as they are."""
     if recording.episodes:
         until = recording.learn_until_s
@@ -119,7 +119,7 @@ def _parts_of(recording: Recording) -> list[_Part]:
     ]
 
 
-def _laid_out(
+def _place_parts(
     recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
 ) -> Recording:
     """Lays parts out on one time axis, each pose beginning where the one before ended."""
@@ -132,16 +132,16 @@ def _laid_out(
     place = np.zeros(3)
     for part in (*learnt, *held_out):
         shift = start - part.start_s
-        cut = _cut(part, shared)
+        cut = _cut_part(part, shared)
         first = cut["pose"].values[0]
-        cut["pose"] = _moved(cut["pose"], first, place)
+        cut["pose"] = _move_pose(cut["pose"], first, place)
         place = cut["pose"].values[-1]
         for name, stream in cut.items():
             streams[name].append(replace(stream, t=stream.t + shift))
         episodes.append(Episode(part.source, start, part.end_s + shift))
         start = part.end_s + shift + APART_S
     made: dict[str, Any] = {
-        name: _end_to_end(name, parts) for name, parts in streams.items()
+        name: _append_streams(name, parts) for name, parts in streams.items()
     }
     sources = list(dict.fromkeys(part.source for part in (*learnt, *held_out)))
     until = episodes[len(learnt) - 1].end_s
@@ -153,20 +153,23 @@ def _laid_out(
         **without,
         **made,
         source=", ".join(dict.fromkeys(each.source for each in recordings)),
-        repairs=(*_about(sources, bool(held_out)), *_repairs_of(recordings, shared)),
+        repairs=(
+            *_describe_join(sources, bool(held_out)),
+            *_collect_repairs(recordings, shared),
+        ),
         robot=next((each.robot for each in recordings if each.robot is not None), None),
         episodes=tuple(episodes),
         learn_until_s=until,
     )
 
 
-def _cut(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
+def _cut_part(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
     """Returns the streams of a part: the commands with those before and after it."""
     cut = {}
     for name in names:
         stream = part.recording.streams[name]
         if name == "command":
-            cut[name] = _commands_around(stream, part)
+            cut[name] = _cut_commands(stream, part)
             continue
         rows = (stream.t >= part.start_s) & (stream.t <= part.end_s)
         if rows.sum() < 2:
@@ -177,7 +180,7 @@ def _cut(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
     return cut
 
 
-def _commands_around(command: Stream, part: _Part) -> Stream:
+def _cut_commands(command: Stream, part: _Part) -> Stream:
     """Returns the commands of a part, and before them the one in effect, for states to settle."""
     lead = part.start_s - LEAD_S
     first = max(int(np.searchsorted(command.t, lead, side="right")) - 1, 0)
@@ -190,7 +193,7 @@ def _commands_around(command: Stream, part: _Part) -> Stream:
     return replace(rows, t=t, values=values, sigma=sigma)
 
 
-def _moved(pose: Stream, first: Array, place: Array) -> Stream:
+def _move_pose(pose: Stream, first: Array, place: Array) -> Stream:
     """Moves poses (T, 3) rigidly so that the first lies at a place: a robot moves alike anywhere.
 
     Between two episodes the pose is then at rest, whatever their frames are.
@@ -205,7 +208,7 @@ def _moved(pose: Stream, first: Array, place: Array) -> Stream:
     return replace(pose, values=values, sigma=sigma)
 
 
-def _end_to_end(name: str, parts: Sequence[Stream]) -> Stream:
+def _append_streams(name: str, parts: Sequence[Stream]) -> Stream:
     """Appends streams; a deviation counts only if all of them have one."""
     for before, after in pairwise(parts):
         if after.t[0] < before.t[-1]:
@@ -220,7 +223,7 @@ def _end_to_end(name: str, parts: Sequence[Stream]) -> Stream:
     return Stream(t, values, parts[0].clock, sigma)
 
 
-def _about(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
+def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
     if len(sources) <= 10:
         names = ", ".join(sources)
     else:
@@ -235,7 +238,7 @@ def _about(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
     )
 
 
-def _repairs_of(
+def _collect_repairs(
     recordings: Sequence[Recording], shared: Sequence[str]
 ) -> tuple[str, ...]:
     lost = {name for each in recordings for name in each.streams} - {*shared}

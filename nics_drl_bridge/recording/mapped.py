@@ -12,7 +12,7 @@ from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.episodes import episodes_by_time, episodes_of_table
+from nics_drl_bridge.recording.episodes import split_by_time, split_table
 from nics_drl_bridge.recording.joining import join
 from nics_drl_bridge.recording.mapping import (
     ImuSource,
@@ -21,19 +21,24 @@ from nics_drl_bridge.recording.mapping import (
     PoseSource,
     Reference,
     Value,
-    why_no_command,
+    explain_no_command,
 )
-from nics_drl_bridge.recording.names import words_of
-from nics_drl_bridge.recording.pose_source import source_by_names
+from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.recording import (
     MeasuredBy,
     Recording,
     Stream,
     check_streams,
-    implausible_pose,
+    find_implausible_pose,
 )
-from nics_drl_bridge.recording.table import Source, numbers_of
-from nics_drl_bridge.recording.values import MappedReader, Series, together, unit_of
+from nics_drl_bridge.recording.table import Source, read_numbers
+from nics_drl_bridge.recording.values import (
+    MappedReader,
+    Series,
+    combine_series,
+    get_unit,
+)
 
 QUATERNION_TOLERANCE = 0.05
 MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
@@ -51,10 +56,10 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     if mapping.episode is None:
         return _read_drive(source, mapping)[0]
     plain = mapping.model_copy(update={"episode": None})
-    single = episodes_of_table(source, mapping)
+    single = split_table(source, mapping)
     if not single:
         recording, since = _read_drive(source, plain)
-        return episodes_by_time(source, mapping, recording, since)
+        return split_by_time(source, mapping, recording, since)
     drives = []
     for episode in single:
         try:
@@ -77,21 +82,22 @@ def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
         if values:
             held = name == "command"
             parts = [
-                reader.series(f"{name}.{k}", v, None, held) for k, v in values.items()
+                reader.read_series(f"{name}.{k}", v, None, held)
+                for k, v in values.items()
             ]
-            found[name] = together(name, parts, held)
+            found[name] = combine_series(name, parts, held)
     if mapping.imu is not None and mapping.imu.heading is not None:
-        found["imu"] = _turn_rate_of_heading(reader, mapping.imu, mapping.imu.heading)
+        found["imu"] = _read_turn_rate(reader, mapping.imu, mapping.imu.heading)
     for name in ("wheels", "imu", "odometry"):
         if name not in found and (stream := getattr(mapping, name)) is not None:
-            found[name] = _measured(reader, name, stream)
+            found[name] = _read_measured(reader, name, stream)
     for name, stream in found.items():
-        keep, note = stamping.not_repeated(stream.t, stream.values, name)
-        reader.say(note)
+        keep, note = stamping.select_new_rows(stream.t, stream.values, name)
+        reader.add_notes(note)
         found[name] = stream.rows(keep)
     names = (*mapping.state, *mapping.command)
     streams = cast(Any, found)
-    measured_by = mapping.pose.measured_by or _source_of_pose(source, mapping)
+    measured_by = mapping.pose.measured_by or _guess_pose_source(source, mapping)
     made = Recording(
         **streams,
         source=source.place,
@@ -103,7 +109,7 @@ def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
         made,
         {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2},
     )
-    shifted: Any = _from_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
+    shifted: Any = _shift_to_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
     since = float(found["pose"].t[0] - shifted["pose"].t[0])
     return replace(made, **shifted, repairs=tuple(reader.notes)), since
 
@@ -111,53 +117,53 @@ def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
 def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
     """Refuses what was measured, by the name of its column, where a command is needed."""
     for name, value in commands.items():
-        table, which = reader.place(value.from_)
+        table, which = reader.locate(value.from_)
         is_number = isinstance(which, int) or (
             which not in table.names and which.isdecimal()
         )
         known = is_number and int(which) < len(table.names)
         column = table.names[int(which)] if known else str(which)
-        if why := why_no_command(column):
+        if why := explain_no_command(column):
             raise ConfigError(f"{table.place}: command.{name}: {why}.")
-        words = {*words_of(column)}
-        if words & SHORT_OF_EARTH and _stays_near(numbers_of(table, which)):
+        words = {*split_words(column)}
+        if words & SHORT_OF_EARTH and _is_place_on_earth(read_numbers(table, which)):
             fault = f"{column!r} looks like a latitude or longitude, and was not sent to the robot"
             raise ConfigError(
                 f"{table.place}: command.{name}: {fault}; name a column that was."
             )
 
 
-def _stays_near(values: Array) -> bool:
+def _is_place_on_earth(values: Array) -> bool:
     """True for values that stay within a degree, far from zero, as places on the earth do."""
     known = values[np.isfinite(values)]
     return len(known) > 0 and np.ptp(known) < NEAR_DEG <= np.abs(known).max()
 
 
-def _source_of_pose(source: Source, mapping: Mapping) -> MeasuredBy:
+def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
     """Returns what measured the pose, by the names of its topic or file, columns and frames."""
     pose = mapping.pose
     values = (pose.x, pose.y, pose.heading)
     references = [value.from_ for value in values if value is not None]
     tables = [pose.in_, *(str(each).partition(":")[0] for each in references)]
     topics = [name for table in tables if table for name in (table, f"/{table}")]
-    kinds = [source.table(name).kind for name in topics if name in source.names]
+    kinds = [source.get_table(name).kind for name in topics if name in source.names]
     kind = next((each for each in kinds if each), "")
     names = [pose.in_, pose.clock, *pose.frames, *references]
-    return source_by_names((str(name) for name in names if name is not None), kind)
+    return guess_source_by_names(
+        (str(name) for name in names if name is not None), kind
+    )
 
 
-def _turn_rate_of_heading(
-    reader: MappedReader, imu: ImuSource, heading: Value
-) -> Stream:
+def _read_turn_rate(reader: MappedReader, imu: ImuSource, heading: Value) -> Stream:
     """Reads a second heading as accelerations of zero and the turn rate that integrates to it."""
     heading = heading.model_copy(update={"unit": heading.unit or "rad"})
-    unit = unit_of(heading).si
+    unit = get_unit(heading).si
     if unit != "rad":
         raise ConfigError(
             f"imu.heading: is in {unit}, where rad is needed; check its unit."
         )
-    series = reader.series("imu.heading", heading, imu, held=False)
-    joined = together("imu", [series], held=False)
+    series = reader.read_series("imu.heading", heading, imu, held=False)
+    joined = combine_series("imu", [series], held=False)
     t = joined.t
     keep = np.concatenate([[True], np.diff(t) > 0.0])
     joined = joined.rows(keep)
@@ -179,14 +185,14 @@ def _check_units(reader: MappedReader, pose: Stream) -> None:
     else:
         given = None
     radius = float(given) if isinstance(given, (int, float)) else 0.0
-    if fault := implausible_pose(pose.t, pose.values, radius=radius):
+    if fault := find_implausible_pose(pose.t, pose.values, radius=radius):
         time = mapping.pose.time or mapping.time
         line = fault.line.replace("...", str(time.columns[0] if time else "t"))
         said = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"
         raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
 
 
-def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
+def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
     """Reads a stream of measurements; values that it lacks are zero."""
     parts: list[Series | None] = []
     for key, kinds in schema.SI[name].items():
@@ -194,16 +200,18 @@ def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
         if (
             value is not None
             and value.unit is not None
-            and unit_of(value).si not in kinds
+            and get_unit(value).si not in kinds
         ):
-            fault = f"{name}.{key}: is in {unit_of(value).si}"
+            fault = f"{name}.{key}: is in {get_unit(value).si}"
             raise ConfigError(
                 f"{fault}, where {' or '.join(kinds)} is needed; check its unit."
             )
         parts.append(
-            reader.series(f"{name}.{key}", value, stream, False) if value else None
+            reader.read_series(f"{name}.{key}", value, stream, False) if value else None
         )
-    joined = together(name, [part for part in parts if part is not None], held=False)
+    joined = combine_series(
+        name, [part for part in parts if part is not None], held=False
+    )
     columns = iter(joined.values.T)
     full = [
         np.zeros(len(joined.t)) if part is None else next(columns) for part in parts
@@ -214,63 +222,63 @@ def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
 def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
     """Reads poses, with their deviations where a covariance is mapped."""
     if pose.x is None:
-        pose = _of_message(reader, pose)
+        pose = _complete_pose(reader, pose)
     parts = []
     factors = []
     whole = list[Value]()
     for key, kinds in schema.SI["pose"].items():
         value: Value | None = getattr(pose, key)
         if value is None:
-            parts.append(_heading(reader, pose, pose.quaternion or ""))
+            parts.append(_read_heading(reader, pose, pose.quaternion or ""))
             factors.append(schema.UNITS[pose.heading_unit].factor)
             continue
         unit = value.unit or (pose.heading_unit if key == "heading" else pose.unit)
         value = value.model_copy(update={"unit": unit})
-        kinds = kinds if key != "y" else (unit_of(whole[0]).si,)
+        kinds = kinds if key != "y" else (get_unit(whole[0]).si,)
         whole.append(value)
-        if unit_of(value).si not in kinds:
-            fault = f"pose.{key}: is in {unit_of(value).si}, not in {kinds[0]}"
+        if get_unit(value).si not in kinds:
+            fault = f"pose.{key}: is in {get_unit(value).si}, not in {kinds[0]}"
             raise ConfigError(f"{fault}; check its unit.")
-        parts.append(reader.series(f"pose.{key}", value, pose, held=False))
-        factors.append(abs(unit_of(value).factor * value.scale))
+        parts.append(reader.read_series(f"pose.{key}", value, pose, held=False))
+        factors.append(abs(get_unit(value).factor * value.scale))
         if (
-            key == "y" and unit_of(value).si == "rad"
+            key == "y" and get_unit(value).si == "rad"
         ):  # longitude, latitude; covariances are in m
             ground = east_and_north(parts[0].values, parts[1].values)
             parts = [
                 each._replace(values=v) for each, v in zip(parts, ground, strict=True)
             ]
             factors = [1.0, 1.0]
-    _check_units(reader, together("pose", parts, held=False))
+    _check_units(reader, combine_series("pose", parts, held=False))
     heading = parts[2]
     parts[2] = heading._replace(
         values=np.unwrap(heading.values)
     )  # as it may be interpolated
-    made = together("pose", parts, held=False)
+    made = combine_series("pose", parts, held=False)
     made.values[:, 2] = wrap_angle(made.values[:, 2])
     if pose.covariance is None:
         return made
-    sigma = _deviations(reader, pose, pose.covariance, made.t)
+    sigma = _read_deviations(reader, pose, pose.covariance, made.t)
     return made if sigma is None else replace(made, sigma=sigma * np.array(factors))
 
 
-def _heading(
+def _read_heading(
     reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference]
 ) -> Series:
     """Returns the heading of quaternions; those of length 0 are left out."""
     each = [f"{given}.{axis}" for axis in "xyzw"] if isinstance(given, str) else given
     parts = [
-        reader.series(
+        reader.read_series(
             "pose.quaternion", Value.model_validate({"from": which}), pose, held=False
         )
         for which in each
     ]
-    made = together("pose.quaternion", parts, held=False)
+    made = combine_series("pose.quaternion", parts, held=False)
     norm = np.linalg.norm(made.values, axis=1)
     lost = norm < NO_LENGTH
     if lost.any() and lost.mean() <= MOST_UNTRACKED:
         some = f"{int(lost.sum())} of {len(lost)} rows without orientation"
-        reader.say(f"pose: {some} were left out.")
+        reader.add_notes(f"pose: {some} were left out.")
         made = made.rows(~lost)
         norm = norm[~lost]
     for k in np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)[:1]:
@@ -279,7 +287,7 @@ def _heading(
         )
         fault = f"{where} the quaternion has the length {norm[k]:.3f} and not 1"
         raise RecordingError(f"{fault}; list its columns in the order x, y, z, w.")
-    if recordings.w_first(made.values):
+    if recordings.is_w_first(made.values):
         raise RecordingError(f"{reader.source.place}: pose: {recordings.W_FIRST}.")
     x, y, z, w = made.values.T
     tilt = np.degrees(
@@ -303,9 +311,9 @@ POSES = (
 """Fields of messages that are poses: position, orientation, covariance."""
 
 
-def _of_message(reader: MappedReader, pose: PoseSource) -> PoseSource:
+def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
     """Completes a pose of which only the topic is given."""
-    table, _ = reader.place("", pose.in_)
+    table, _ = reader.locate("", pose.in_)
     for position, turned, covariance in POSES:
         x, y = (position.format(axis) for axis in "xy")
         quaternion = f"{turned}.w" in table.names
@@ -321,12 +329,12 @@ def _of_message(reader: MappedReader, pose: PoseSource) -> PoseSource:
     )
 
 
-def _deviations(
+def _read_deviations(
     reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference], t: Array
 ) -> Array | None:
     """Returns standard deviations (T, 3) from variances or a matrix; None if they say nothing."""
     if isinstance(given, str):
-        table, which = reader.place(given, pose.in_)
+        table, which = reader.locate(given, pose.in_)
         count = sum(name.startswith(f"{which}[") for name in table.names)
         if count not in schema.COVARIANCES:
             fault = f"{table.place}: {which!r} has {count} numbers"
@@ -335,7 +343,9 @@ def _deviations(
     columns = []
     for k in schema.COVARIANCES[len(given)]:
         value = Value.model_validate({"from": given[k]})
-        part = reader.series("pose.covariance", value, pose, held=False, infinite=True)
+        part = reader.read_series(
+            "pose.covariance", value, pose, held=False, infinite=True
+        )
         positive = part.values > 0.0
         known = np.interp(t, part.t, positive) == 1.0
         variance = np.interp(t, part.t, np.where(positive, part.values, 0.0))
@@ -346,13 +356,13 @@ def _deviations(
         return None
     if unknown.any():
         rows = int(unknown.any(axis=1).sum())
-        reader.say(
+        reader.add_notes(
             f"pose: {rows} of {len(t)} rows have a variance that is not positive: unknown."
         )
     return sigma
 
 
-def _from_zero(
+def _shift_to_zero(
     found: dict[str, Stream], main: str, reader: MappedReader
 ) -> dict[str, Stream]:
     """Shifts stamps to begin near 0: by one origin, but for clocks whose spans do not overlap."""
@@ -385,14 +395,14 @@ def _from_zero(
             )
     base = spans.get(main) or next(iter(spans.values()))
     origin = {}
-    together = [
+    combine_series = [
         span for span in spans.values() if span[0] <= base[1] and span[1] >= base[0]
     ]
-    first = min(span[0] for span in together)
+    first = min(span[0] for span in combine_series)
     for clock, span in spans.items():
-        origin[clock] = first if span in together else span[0]
-        if span not in together:
-            reader.say(
+        origin[clock] = first if span in combine_series else span[0]
+        if span not in combine_series:
+            reader.add_notes(
                 f"The clock {clock!r} was set to 0 at its first stamp, {span[0]:.3f} s."
             )
     return {

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import suggest
-from nics_drl_bridge.recording.names import words_of
+from nics_drl_bridge.recording.names import split_words
 
 TURN = 2.0 * math.pi
 
@@ -20,7 +20,7 @@ class UnitOfData(NamedTuple):
     factor: float
 
 
-def _each(si: str, **factors: float) -> dict[str, UnitOfData]:
+def _make_units(si: str, **factors: float) -> dict[str, UnitOfData]:
     return {
         name.replace("_per_", "/"): UnitOfData(si, factor)
         for name, factor in factors.items()
@@ -28,11 +28,11 @@ def _each(si: str, **factors: float) -> dict[str, UnitOfData]:
 
 
 UNITS = {
-    **_each("m", m=1.0, dm=1e-1, cm=1e-2, mm=1e-3, um=1e-6, km=1e3, ft=0.3048),
+    **_make_units("m", m=1.0, dm=1e-1, cm=1e-2, mm=1e-3, um=1e-6, km=1e3, ft=0.3048),
     "in": UnitOfData("m", 0.0254),
-    **_each("rad", rad=1.0, mrad=1e-3, deg=TURN / 360.0, rev=TURN),
-    **_each("s", s=1.0, ms=1e-3, us=1e-6, ns=1e-9, min=60.0, h=3600.0),
-    **_each(
+    **_make_units("rad", rad=1.0, mrad=1e-3, deg=TURN / 360.0, rev=TURN),
+    **_make_units("s", s=1.0, ms=1e-3, us=1e-6, ns=1e-9, min=60.0, h=3600.0),
+    **_make_units(
         "m/s",
         m_per_s=1.0,
         cm_per_s=1e-2,
@@ -40,19 +40,21 @@ UNITS = {
         mph=0.44704,
         knots=1852.0 / 3600.0,
     ),
-    **_each("m/s", km_per_h=1.0 / 3.6, kmh=1.0 / 3.6, kph=1.0 / 3.6, ft_per_s=0.3048),
-    **_each(
+    **_make_units(
+        "m/s", km_per_h=1.0 / 3.6, kmh=1.0 / 3.6, kph=1.0 / 3.6, ft_per_s=0.3048
+    ),
+    **_make_units(
         "rad/s", rad_per_s=1.0, deg_per_s=TURN / 360.0, rpm=TURN / 60.0, rev_per_s=TURN
     ),
-    **_each("rad/s", mrad_per_s=1e-3),
+    **_make_units("rad/s", mrad_per_s=1e-3),
     "m/s^2": UnitOfData("m/s^2", 1.0),
     "cm/s^2": UnitOfData("m/s^2", 1e-2),
     "mm/s^2": UnitOfData("m/s^2", 1e-3),
     "g": UnitOfData("m/s^2", 9.80665),
     "mg": UnitOfData("m/s^2", 9.80665e-3),
-    **_each("V", V=1.0, mV=1e-3),
-    **_each("A", A=1.0, mA=1e-3),
-    **_each("N", N=1.0),
+    **_make_units("V", V=1.0, mV=1e-3),
+    **_make_units("A", A=1.0, mA=1e-3),
+    **_make_units("N", N=1.0),
     "N*m": UnitOfData("N*m", 1.0),
     "1": UnitOfData("1", 1.0),
     "share": UnitOfData("1", 1.0),
@@ -71,7 +73,7 @@ RATES = {
 }
 
 
-def known_unit(name: str) -> str:
+def check_unit(name: str) -> str:
     """Returns the name of a unit; ValueError tells the nearest known one."""
     if str(name) not in UNITS:
         raise ValueError(f"is no known unit ({suggest(str(name), UNITS)})")
@@ -107,7 +109,7 @@ Reference = str | int
 Condition = float | str | bool | list[float | str]
 
 
-def _short(key: str) -> Any:
+def _expand_reference(key: str) -> Any:
     """Lets a plain reference, or a list of them, stand for the model with only that key."""
 
     def expand(given: Any) -> Any:
@@ -117,11 +119,11 @@ def _short(key: str) -> Any:
     return BeforeValidator(expand)
 
 
-def _of_kind(kinds: tuple[str, ...]) -> Any:
+def _check_kind(kinds: tuple[str, ...]) -> Any:
     """Refuses units of another kind than `kinds`, which are in SI."""
 
     def check(unit: str | None) -> str | None:
-        if unit is not None and UNITS[known_unit(unit)].si not in kinds:
+        if unit is not None and UNITS[check_unit(unit)].si not in kinds:
             fitting = (name for name, each in UNITS.items() if each.si in kinds)
             raise ValueError(f"must be one of {', '.join(fitting)}")
         return unit
@@ -129,9 +131,9 @@ def _of_kind(kinds: tuple[str, ...]) -> Any:
     return BeforeValidator(check)
 
 
-def why_no_command(column: str) -> str:
+def explain_no_command(column: str) -> str:
     """Says why a column was not sent to the robot, by the words in its name; empty if it may be."""
-    found = NO_COMMANDS & {*words_of(column)}
+    found = NO_COMMANDS & {*split_words(column)}
     if not found:
         return ""
     is_place = found & PLACES_ON_EARTH
@@ -146,11 +148,11 @@ class Time(Schema):
     from_: Reference | tuple[Reference, Reference] | None = Field(
         default=None, alias="from"
     )
-    unit: Annotated[str | None, _of_kind(("s",))] = None  # of the stamps; None: s
+    unit: Annotated[str | None, _check_kind(("s",))] = None  # of the stamps; None: s
     rate: float | None = Field(default=None, gt=0.0)  # of rows without stamps [Hz]
 
     @model_validator(mode="after")
-    def _one(self) -> "Time":
+    def _check_source(self) -> "Time":
         if (self.from_ is None) == (self.rate is None):
             raise ValueError("time needs either `from`, a column, or `rate` [Hz]")
         return self
@@ -182,16 +184,16 @@ class Value(Schema):
     when: dict[str, Condition] = Field(default_factory=dict)
     otherwise: float = 0.0  # in SI, where a flag is not as `when` needs it
     # stamps of this value; None: of its stream
-    time: Annotated[Time | None, _short("from")] = None
+    time: Annotated[Time | None, _expand_reference("from")] = None
     clock: str | None = None  # name of the clock of these stamps; None: of its stream
 
     @field_validator("unit")
     @classmethod
-    def _known(cls, unit: str | None) -> str | None:
-        return None if unit is None else known_unit(unit)
+    def _check_unit(cls, unit: str | None) -> str | None:
+        return None if unit is None else check_unit(unit)
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Value":
+    def _check_maximum(self) -> "Value":
         if self.maximum is not None and (self.unit or "share") not in SHARES:
             raise ValueError("maximum belongs to the units share and %")
         return self
@@ -205,7 +207,7 @@ class Value(Schema):
         return ticks if self.differentiate is None else self.differentiate
 
 
-AValue = Annotated[Value, _short("from")]
+AValue = Annotated[Value, _expand_reference("from")]
 
 
 class Measured(Schema):
@@ -215,7 +217,7 @@ class Measured(Schema):
         default=None, alias="in"
     )  # file or topic of columns that name none
     # stamps; None: those of the whole mapping
-    time: Annotated[Time | None, _short("from")] = None
+    time: Annotated[Time | None, _expand_reference("from")] = None
     # clock of the stamps; two clocks differ by an unknown offset
     clock: str | None = None
 
@@ -229,9 +231,9 @@ class PoseSource(Measured):
     # instead of the heading: x, y, z, w, or the field of a message
     quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
     # of x and y, and in the covariance; an angle if they are longitude and latitude
-    unit: Annotated[str, _of_kind(("m", "rad"))] = "m"
+    unit: Annotated[str, _check_kind(("m", "rad"))] = "m"
     # of the heading and its variance
-    heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"
+    heading_unit: Annotated[str, _check_kind(("rad",))] = "rad"
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
     # what measured it: `odometry`, which drifts, or a `tracker`, as motion capture or a localiser;
@@ -246,7 +248,7 @@ class PoseSource(Measured):
         return self.frame, self.child_frame
 
     @model_validator(mode="after")
-    def _whole(self) -> "PoseSource":
+    def _check_pose(self) -> "PoseSource":
         if (self.x is None) != (self.y is None):
             raise ValueError("pose needs both x and y")
         if self.x is None and self.in_ is None:
@@ -280,7 +282,7 @@ class ImuSource(Measured):
     heading: AValue | None = None
 
     @model_validator(mode="after")
-    def _turns(self) -> "ImuSource":
+    def _check_rate(self) -> "ImuSource":
         if (self.yaw_rate is None) == (self.heading is None):
             raise ValueError("imu needs either yaw_rate or heading")
         return self
@@ -303,13 +305,13 @@ class Mapping(Schema):
         default=None, alias="in"
     )  # file or topic of streams that name none
     # stamps of all streams; None: a bag's own
-    time: Annotated[Time | None, _short("from")] = None
+    time: Annotated[Time | None, _expand_reference("from")] = None
     # clock of all streams; None: `robot`, unless a bag's headers differ
     clock: str | None = None
     # column whose value changes from one episode to the next; None: one drive
     episode: Reference | None = None
     pose: Annotated[
-        PoseSource, _short("in")
+        PoseSource, _expand_reference("in")
     ]  # of the tracked body; a topic alone means its `in`
     command: dict[str, AValue]  # by the names of the robot's commands
     state: dict[str, AValue] = Field(
@@ -323,7 +325,7 @@ class Mapping(Schema):
 
     @model_validator(mode="before")
     @classmethod
-    def _names_commands(cls, given: Any) -> Any:
+    def _require_commands(cls, given: Any) -> Any:
         if (
             isinstance(given, dict)
             and "command" in given
@@ -333,9 +335,9 @@ class Mapping(Schema):
         return given
 
     @model_validator(mode="after")
-    def _of_what_was_sent(self) -> "Mapping":
+    def _check_commands(self) -> "Mapping":
         for name, value in self.command.items():
-            if why := why_no_command(str(value.from_)):
+            if why := explain_no_command(str(value.from_)):
                 raise ValueError(f"command.{name}: {why}")
         return self
 

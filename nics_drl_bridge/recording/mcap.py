@@ -63,7 +63,7 @@ class _View:
         return self._data[start : self.place]
 
 
-def records(data: memoryview, place: int = 0) -> Iterator[Record]:
+def read_records(data: memoryview, place: int = 0) -> Iterator[Record]:
     """Yields the records from an offset until a footer or the end; DamageError at a broken one."""
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
@@ -96,7 +96,7 @@ def records(data: memoryview, place: int = 0) -> Iterator[Record]:
         place = end
 
 
-def unpacked(record: Record) -> memoryview:
+def unpack_chunk(record: Record) -> memoryview:
     """Decompresses the records of a chunk and verifies size and checksum (DamageError)."""
     chunk: kinds.Chunk = record.content
     if chunk.compression not in COMPRESSIONS:
@@ -118,19 +118,21 @@ def unpacked(record: Record) -> memoryview:
     return memoryview(plain)
 
 
-def mapped(path: Path, access: int = ACCESS_READ) -> memoryview:
+def map_file(path: Path, access: int = ACCESS_READ) -> memoryview:
     """Maps a file into memory; the mapping lasts until its last view is released."""
     with path.open("rb" if access == ACCESS_READ else "r+b") as file:
         return memoryview(mmap(file.fileno(), 0, access=access))
 
 
-def seal(path: Path) -> None:
+def write_checksums(path: Path) -> None:
     """Adds the checksums of chunks, data and summary to a file that was written without them."""
-    data = mapped(path, ACCESS_WRITE)
-    for record in records(data, len(MAGIC)):
+    data = map_file(path, ACCESS_WRITE)
+    for record in read_records(data, len(MAGIC)):
         content = record.offset + PREFIX
         if isinstance(record.content, kinds.Chunk):
-            struct.pack_into("<I", data, content + CHUNK_CRC, crc32(unpacked(record)))
+            struct.pack_into(
+                "<I", data, content + CHUNK_CRC, crc32(unpack_chunk(record))
+            )
         elif isinstance(record.content, kinds.DataEnd):
             struct.pack_into("<I", data, content, crc32(data[: record.offset]))
         elif isinstance(record.content, kinds.Footer) and (
@@ -148,7 +150,7 @@ def check_mcap(path: Path) -> None:
     """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
-    data = mapped(path)
+    data = map_file(path)
     end = len(data) - len(MAGIC)
     if data[: len(MAGIC)] != MAGIC:
         raise DamageError(0, "it does not begin as an MCAP file")
@@ -156,7 +158,7 @@ def check_mcap(path: Path) -> None:
         fault = "it does not end as an MCAP file: it is cut off or was not closed"
         raise DamageError(len(data), fault)
     data_end = 0  # offset of the summary; 0 within the data
-    for record in records(data[:end], len(MAGIC)):
+    for record in read_records(data[:end], len(MAGIC)):
         content = record.content
         if record.offset == len(MAGIC) and not isinstance(content, kinds.Header):
             raise DamageError(record.offset, "the header is missing")
@@ -184,7 +186,7 @@ def _check_crc(record: Record, data: memoryview, crc: int, name: str) -> None:
 def _check_chunk(record: Record) -> None:
     """Walks through a chunk, which holds nothing but schemas, channels and messages."""
     try:
-        for inner in records(unpacked(record)):
+        for inner in read_records(unpack_chunk(record)):
             if not isinstance(inner.content, INSIDE):
                 kind = type(inner.content).__name__
                 raise DamageError(
@@ -194,7 +196,7 @@ def _check_chunk(record: Record) -> None:
         raise DamageError(record.offset, damage.what) from None
 
 
-def _zstd() -> Any:
+def _import_zstd() -> Any:
     try:
         return import_module("compression.zstd")
     except ImportError:
@@ -206,7 +208,7 @@ def _zstd() -> Any:
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
     """Unpacks `lz4` or `zstd`; ValueError: cut off, or above `most` bytes (may be terabytes)."""
     if compression == "zstd":
-        unpacker = _zstd().ZstdDecompressor()
+        unpacker = _import_zstd().ZstdDecompressor()
     else:
         unpacker = import_module("lz4.frame").LZ4FrameDecompressor()
     most = min(most, MOST_UNPACKED)
@@ -222,7 +224,7 @@ def unpack_file(path: Path, out: Path) -> Path:
     """Decompresses a file. Raises ValueError if it becomes far larger than it was."""
     most = max(MOST_UNPACKED, MOST_PACKED_SHARE * path.stat().st_size)
     length = 0
-    with _zstd().open(path, "rb") as file, out.open("wb") as plain:
+    with _import_zstd().open(path, "rb") as file, out.open("wb") as plain:
         while part := file.read(_PART):
             length += plain.write(part)
             if length > most:
@@ -234,6 +236,6 @@ def unpack_file(path: Path, out: Path) -> Path:
 
 def check_message(data: bytes) -> None:
     """Raises ValueError for a compressed message whose stated size is missing or too large."""
-    size = _zstd().get_frame_info(data).decompressed_size
+    size = _import_zstd().get_frame_info(data).decompressed_size
     if size is None or size > MOST_UNPACKED:
         raise ValueError(f"a message unpacks to {size or 'unknown'} bytes")

@@ -46,7 +46,7 @@ def check_libraries(path: Path, what: str, instead: str = "") -> None:
         )
 
 
-def typestore() -> "Typestore":
+def make_typestore() -> "Typestore":
     """Returns the message types of ROS 2, and those of Ackermann drives."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -58,8 +58,10 @@ def typestore() -> "Typestore":
     return store
 
 
-def with_types(connections: "Sequence[Connection]", header: bool = True) -> "Typestore":
-    """Returns the message types of `typestore`, and before these those that a bag defines.
+def collect_types(
+    connections: "Sequence[Connection]", header: bool = True
+) -> "Typestore":
+    """Returns the message types of `make_typestore`, and before these those that a bag defines.
 
     That of ROS 1 for headers decodes messages, that of ROS 2 (`header` is false) converts them.
     """
@@ -72,7 +74,7 @@ def with_types(connections: "Sequence[Connection]", header: bool = True) -> "Typ
     )
 
     own: dict[str, Any] = {}
-    store = typestore()
+    store = make_typestore()
     for connection in connections:
         form, text = connection.msgdef
         with suppress(
@@ -96,18 +98,18 @@ def with_types(connections: "Sequence[Connection]", header: bool = True) -> "Typ
     return store
 
 
-def frames(transform: Any) -> tuple[str, str]:
+def get_frames(transform: Any) -> tuple[str, str]:
     """Returns parent and child of a transform, without the leading slash of old publishers."""
     return transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
 
 
-def stamp(message: Any) -> int:
+def get_stamp(message: Any) -> int:
     """Returns the stamp of a message's header [ns]."""
     time = message.header.stamp
     return int(time.sec) * NS_PER_S + int(time.nanosec)
 
 
-def command_row(message: Any) -> Row:
+def read_command(message: Any) -> Row:
     """Returns linear.x, linear.y, angular.z; of an Ackermann drive speed, 0, steering angle."""
     drive = getattr(message, "drive", message)
     if hasattr(drive, "steering_angle"):
@@ -116,23 +118,23 @@ def command_row(message: Any) -> Row:
     return twist.linear.x, twist.linear.y, twist.angular.z
 
 
-def commanded(message: Any, spec: RobotSpec) -> Array:
-    """Returns the command (C,) of a message for a robot; see `command_row`."""
-    row = np.array(command_row(message))
+def read_robot_command(message: Any, spec: RobotSpec) -> Array:
+    """Returns the command (C,) of a message for a robot; see `read_command`."""
+    row = np.array(read_command(message))
     of_angles = hasattr(getattr(message, "drive", message), "steering_angle")
     return spec.from_fields(row) if of_angles else spec.from_cmd_vel(row)
 
 
-def _place(message: Any) -> tuple[Any, Any]:
+def _get_place(message: Any) -> tuple[Any, Any]:
     if hasattr(message, "transform"):
         return message.transform.translation, message.transform.rotation
     pose = getattr(message.pose, "pose", message.pose)
     return pose.position, pose.orientation
 
 
-def quaternion(message: Any) -> tuple[float, float, float, float]:
+def read_quaternion(message: Any) -> tuple[float, float, float, float]:
     """Returns x, y, z, w of a message's orientation."""
-    q = _place(message)[1]
+    q = _get_place(message)[1]
     return q.x, q.y, q.z, q.w
 
 
@@ -141,33 +143,37 @@ def is_rotation(x: float, y: float, z: float, w: float) -> bool:
     return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
 
 
-def whole_pose(message: Any) -> Row:
+def read_whole_pose(message: Any) -> Row:
     """Returns the pose of a message; NaN where its orientation was never filled in."""
-    return pose_row(message) if is_rotation(*quaternion(message)) else (math.nan,) * 3
+    return (
+        read_pose(message)
+        if is_rotation(*read_quaternion(message))
+        else (math.nan,) * 3
+    )
 
 
-def pose_row(message: Any) -> Row:
+def read_pose(message: Any) -> Row:
     """Returns position x, y [m] and heading [rad]."""
-    position, q = _place(message)
+    position, q = _get_place(message)
     heading = math.atan2(
         2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)
     )
     return position.x, position.y, heading
 
 
-def twist_row(message: Any) -> Row:
+def read_twist(message: Any) -> Row:
     """Returns body velocity x, y [m/s] and yaw rate [rad/s] of an Odometry."""
     twist = message.twist.twist
     return twist.linear.x, twist.linear.y, twist.angular.z
 
 
-def turn_variance(message: Any) -> float | None:
+def read_turn_variance(message: Any) -> float | None:
     """Returns the variance of an Odometry's yaw rate [rad^2/s^2]; None if it says nothing."""
     variance = float(message.twist.covariance[35])
     return variance if math.isfinite(variance) and variance > 0.0 else None
 
 
-def imu_row(message: Any) -> Row:
+def read_imu(message: Any) -> Row:
     """Returns acceleration along x and y [m/s^2] and yaw rate [rad/s]."""
     acceleration = message.linear_acceleration
     return acceleration.x, acceleration.y, message.angular_velocity.z
@@ -183,7 +189,7 @@ class Offer:
     transient_local: bool = False
 
 
-def offers_of(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:
+def convert_offers(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:
     """Converts profiles of rosbags to offers."""
     from rosbags.interfaces import QosDurability, QosReliability
 
@@ -197,7 +203,7 @@ def offers_of(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:
     )
 
 
-def profile_of(offer: Offer) -> "Qos":
+def make_profile(offer: Offer) -> "Qos":
     """Converts an offer to a profile of rosbags; the other policies keep their defaults."""
     from rosbags import interfaces as rosbags
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.command_guess import TICKS, Candidate, CommandGuess
-from nics_drl_bridge.recording.names import words_of
+from nics_drl_bridge.recording.names import split_words
 
 STEP_S = 0.1
 SMOOTHED = 3  # steps over which measured rates are averaged
@@ -19,16 +19,14 @@ CLEAR_CORRELATION = 0.6  # from which on a latency is told
 FEWEST = 100  # steps
 
 
-def doubts_of_commands(
-    guess: CommandGuess, pose: tuple[Array, Array] | None
-) -> Iterator[str]:
+def find_doubts(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterator[str]:
     """Yields sentences on commands that do not go with the motion, or long before or after it.
 
     `pose` are its stamps (T,) [s] and poses (T, 3).
     """
     if pose is None or guess.of_wheels:
         return
-    motion = _rates(*pose)
+    motion = _compute_rates(*pose)
     if motion is None:
         return
     t, speed, turn_rate = motion
@@ -37,21 +35,26 @@ def doubts_of_commands(
         if found is None or signal.std() < 1e-3:
             continue
         lags = np.arange(EARLIEST_S, LONGEST_LATENCY_S + STEP_S / 2.0, STEP_S)
-        likeness = _likeness(found, t, signal, lags)
+        likeness = _compute_likeness(found, t, signal, lags)
         if likeness is None:
             continue
         best = int(np.argmax(likeness))
         if likeness[best] < LEAST_CORRELATION:
-            yield f"{_place(found)} hardly goes with the motion; is it what was sent to the robot?"
+            said = f"{_name_candidate(found)} hardly goes with the motion"
+            yield f"{said}; is it what was sent to the robot?"
         elif likeness[best] > CLEAR_CORRELATION and lags[best] > IMPLAUSIBLE_LATENCY_S:
-            late = f"the motion follows {_place(found)} after {lags[best]:.1f} s"
+            late = (
+                f"the motion follows {_name_candidate(found)} after {lags[best]:.1f} s"
+            )
             yield f"{late}, which no latency explains; check `time:` and the command"
         elif likeness[best] > CLEAR_CORRELATION and lags[best] < PRECEDES_S:
-            early = f"the motion precedes {_place(found)} by {-lags[best]:.1f} s"
+            early = (
+                f"the motion precedes {_name_candidate(found)} by {-lags[best]:.1f} s"
+            )
             yield f"{early}, as a measurement's would; check `time:` and the command"
 
 
-def reversed_wheels(
+def find_reversed_wheels(
     guess: CommandGuess, pose: tuple[Array, Array] | None
 ) -> list[Candidate]:
     """Returns the measured wheel, left or right, that counts backwards, as the motion shows.
@@ -59,12 +62,12 @@ def reversed_wheels(
     Both have to turn the same way when the robot moves, and the right one faster when it turns
     counter-clockwise.
     """
-    motion = _rates(*pose) if pose is not None and guess.of_wheels else None
+    motion = _compute_rates(*pose) if pose is not None and guess.of_wheels else None
     sides = {each.meaning: each for each in guess.commands.values()}
     if motion is None or sides.keys() != {"left", "right"}:
         return []
     t, speed, turn_rate = motion
-    left, right = (_wheel_rate(sides[side], t) for side in ("left", "right"))
+    left, right = (_compute_wheel_rate(sides[side], t) for side in ("left", "right"))
     if left is None or right is None:
         return []
     likeness = [float(np.corrcoef(rate, speed)[0, 1]) for rate in (left, right)]
@@ -74,23 +77,23 @@ def reversed_wheels(
     return [sides["left"] if turned_by_left > 0.0 else sides["right"]]
 
 
-def _wheel_rate(wheel: Candidate, t: Array) -> Array | None:
+def _compute_wheel_rate(wheel: Candidate, t: Array) -> Array | None:
     """Returns the rate (K,) of a wheel at times t (K,) [s]; None if it is not known, or still."""
     values = wheel.table.data[wheel.column.name].astype(np.float64)
     if wheel.table.t is None or len(wheel.table.t) != len(values):
         return None
     at = np.interp(t, wheel.table.t, values)
-    is_counter = bool({*words_of(wheel.column.name)} & TICKS)
+    is_counter = bool({*split_words(wheel.column.name)} & TICKS)
     rate = np.gradient(at, STEP_S) if is_counter else at
     rate = np.convolve(rate, np.ones(SMOOTHED) / SMOOTHED, "same")
     return np.asarray(rate) if rate.std() > 1e-9 else None
 
 
-def _place(candidate: Candidate) -> str:
+def _name_candidate(candidate: Candidate) -> str:
     return f"{candidate.table.name}:{candidate.column.name}"
 
 
-def _rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
+def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
     """Returns times (K,) [s], speeds (K,) along the heading and turn rates (K,) of a pose."""
     order = np.argsort(t, kind="stable")
     t = t[order]
@@ -113,7 +116,7 @@ def _rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
     return grid[:-1] + STEP_S / 2.0, along, turn
 
 
-def _likeness(
+def _compute_likeness(
     candidate: Candidate, t: Array, signal: Array, lags: Array
 ) -> Array | None:
     """Returns the correlation of a signal (K,) at t (K,) with a command, by lags (L,) [s]."""

@@ -3,13 +3,13 @@
 import re
 
 
-def words_of(name: str) -> list[str]:
+def split_words(name: str) -> list[str]:
     """Splits a name into its words: `vicon x`, `q.x`, `Left_Tick`, `cmdVel`."""
     parts = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
     return [word for word in re.split(r"[^A-Za-z]+", parts.lower()) if word]
 
 
-def quoted(reference: str) -> str:
+def write_reference(reference: str) -> str:
     """Returns a reference as YAML, within a list too."""
     plain = re.fullmatch(r"[A-Za-z/][\w/. -]*(:[\w. -]+)?|\d+", reference)
     is_word = reference.lower() not in ("true", "false", "null")

@@ -9,9 +9,9 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.names import words_of
-from nics_drl_bridge.recording.recording import led_along
-from nics_drl_bridge.recording.survey import TableSurvey, unit_in
+from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.recording import measure_alignment
+from nics_drl_bridge.recording.survey import TableSurvey, split_unit
 
 # Words of the first coordinate, and of the second beside it.
 AXES = {
@@ -165,21 +165,23 @@ def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
     """Finds x, y and heading, or a quaternion: by their names, else where the motion shows them."""
     beside = len(tables) > 1  # then the names of tables tell what they hold
     mine = [
-        table for table in tables if not (beside and {*words_of(table.name)} & OTHERS)
+        table
+        for table in tables
+        if not (beside and {*split_words(table.name)} & OTHERS)
     ]
-    found = [guess for table in mine for guess in _named_poses(table)]
+    found = [guess for table in mine for guess in _find_named_poses(table)]
     if not found:
-        found = [guess for table in mine for guess in _unnamed_poses(table)]
-    return max(found, key=_trust, default=None)
+        found = [guess for table in mine for guess in _find_unnamed_poses(table)]
+    return max(found, key=_rank_pose, default=None)
 
 
-def _trust(pose: PoseGuess) -> float:
+def _rank_pose(pose: PoseGuess) -> float:
     """Returns how far a pose is to be preferred to others, by what its names say."""
-    words = {*words_of(pose.x)}
+    words = {*split_words(pose.x)}
     if (
         pose.table.kind or not words & SOURCES
     ):  # else the column itself says more than its file
-        words |= {*words_of(pose.table.name)}
+        words |= {*split_words(pose.table.name)}
     trust = 0.0
     if words & TRACKERS or {"ground", "truth"} <= words:
         trust += 3.0
@@ -192,14 +194,14 @@ def _trust(pose: PoseGuess) -> float:
     return trust + 0.5 * bool(pose.quaternion)
 
 
-def _named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
+def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
     """Yields the poses whose x, y and heading say so by their names."""
     if OTHER_PLACES.search(table.kind):
         return
     named: dict[tuple[str, ...], str] = {}
     for column in table.numbers:
         if not ELEMENT.search(column.name):
-            named.setdefault(tuple(unit_in(column.name)[0]), column.name)
+            named.setdefault(tuple(split_unit(column.name)[0]), column.name)
     moving = {column.name for column in table.numbers if column.low < column.high}
     for words, x in named.items():
         for first, second in ALL_AXES.items():
@@ -210,7 +212,7 @@ def _named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
                 x, first in GLOBE, "m", "rad"
             ):
                 continue
-            turned = _turned(table, words, named)
+            turned = _find_heading(table, words, named)
             if turned is not None:
                 heading, quaternion = turned
                 yield PoseGuess(table, x, y, heading, quaternion)
@@ -218,14 +220,14 @@ def _named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
 
 def _is_in(name: str, also_angle: bool, *kinds: str) -> bool:
     """True if a name has no unit, or one of these kinds; of angles only where they may be."""
-    unit = unit_in(name)[1]
+    unit = split_unit(name)[1]
     if unit is None:
         return True
     si = UNITS[unit].si
     return si in kinds and (also_angle or si != "rad")
 
 
-def _turned(
+def _find_heading(
     table: TableSurvey, place: tuple[str, ...], named: dict[tuple[str, ...], str]
 ) -> tuple[str | None, tuple[str, ...]] | None:
     """Returns the heading, or the quaternion, that shares most words with a place."""
@@ -262,16 +264,16 @@ def _turned(
         and _is_in(z, True, "rad")
         and -3.3 < low < high < 6.4
         and high - low > 0.5
-        and _leads(table, place, z)
+        and _is_heading(table, place, z)
     ):
         return z, ()
     return None
 
 
-def _leads(table: TableSurvey, place: tuple[str, ...], z: str) -> bool:
+def _is_heading(table: TableSurvey, place: tuple[str, ...], z: str) -> bool:
     """True if a path leads along what is called z, as it is then a heading and no height."""
     y = (*place[:-1], "y")
-    named = {tuple(unit_in(column.name)[0]): column.name for column in table.numbers}
+    named = {tuple(split_unit(column.name)[0]): column.name for column in table.numbers}
     columns = [
         table.data[name].astype(np.float64) for name in (named[place], named[y], z)
     ]
@@ -281,13 +283,14 @@ def _leads(table: TableSurvey, place: tuple[str, ...], z: str) -> bool:
     pose = pose[np.isfinite(pose).all(axis=1)]
     if (np.abs(np.diff(pose[:, 2])) > NEARLY_A_TURN).any():
         return True  # it wraps, as only an angle does
-    pose = thinned(pose)
+    pose = select_apart(pose)
     return (
-        len(pose) > 2 and max(led_along(pose, 1.0), led_along(pose, -1.0)) > CONFIRMED
+        len(pose) > 2
+        and max(measure_alignment(pose, 1.0), measure_alignment(pose, -1.0)) > CONFIRMED
     )
 
 
-def thinned(pose: Array) -> Array:
+def select_apart(pose: Array) -> Array:
     """Returns the poses (of T, 3) that are a thirtieth of the path's extent from the one before."""
     apart = np.ptp(pose[:, :2], axis=0).max() / PIECES
     kept = [0]
@@ -297,14 +300,14 @@ def thinned(pose: Array) -> Array:
     return np.asarray(pose[kept])
 
 
-def _unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
+def _find_unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
     """Yields a quaternion after a place, or x, y, heading, side by side, that the motion shows."""
     if table.kind:
         return  # the fields of messages have names
     names = [c.name for c in table.numbers if c.name not in table.stamp_columns]
     columns = [table.data[name].astype(np.float64) for name in names]
     for k in range(2, len(names) - 3):
-        guess = _with_quaternion(table, names, columns, k)
+        guess = _match_quaternion(table, names, columns, k)
         if guess is not None:
             yield guess
     for k in range(len(names) - 2):
@@ -316,19 +319,19 @@ def _unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
         pose = pose[np.isfinite(pose).all(axis=1)][:: max(1, len(pose) // 200)]
         if not len(pose) or not (np.ptp(pose, axis=0) > 0.0).all():
             continue
-        led = max(led_along(pose, 1.0), led_along(pose, np.pi / 180.0))
-        if led > ALONG > led_along(pose, 0.0):
+        led = max(measure_alignment(pose, 1.0), measure_alignment(pose, np.pi / 180.0))
+        if led > ALONG > measure_alignment(pose, 0.0):
             x, y, heading = names[k : k + 3]
             yield PoseGuess(table, x, y, heading)
 
 
-def _with_quaternion(
+def _match_quaternion(
     table: TableSurvey, names: Sequence[str], columns: Sequence[Array], k: int
 ) -> PoseGuess | None:
     """Returns the pose whose quaternion stands in four columns from k on, if they are one."""
     turn = list(names[k : k + 4])
     four = columns[k : k + 4]
-    if not all(name.isdecimal() or {*words_of(name)} & TURNS for name in turn):
+    if not all(name.isdecimal() or {*split_words(name)} & TURNS for name in turn):
         return None
     if len({len(each) for each in four}) > 1:
         return None  # of several streams
@@ -338,15 +341,15 @@ def _with_quaternion(
         or not np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH
     ):
         return None
-    if recordings.w_first(np.stack(four, axis=1)):
+    if recordings.is_w_first(np.stack(four, axis=1)):
         turn = [*turn[1:], turn[0]]
         four = [*four[1:], four[0]]
     place = [
-        name for word in ("x", "y") for name in names if unit_in(name)[0] == [word]
+        name for word in ("x", "y") for name in names if split_unit(name)[0] == [word]
     ]
     place = [name for name in place if name not in turn]
     x, y = place if len(place) == 2 else names[max(k - 3, 0) :][:2]
-    if {*words_of(f"{x} {y}")} & NOT_PLACES or {x, y} & {*turn}:
+    if {*split_words(f"{x} {y}")} & NOT_PLACES or {x, y} & {*turn}:
         return None
     where = [columns[names.index(name)] for name in (x, y)]
     if any(len(each) != len(four[0]) for each in where):
@@ -354,6 +357,6 @@ def _with_quaternion(
     heading = 2.0 * np.arctan2(four[2], four[3])
     pose = np.stack([*where, heading], axis=1)
     pose = pose[np.isfinite(pose).all(axis=1)][:: max(1, len(pose) // 200)]
-    if len(pose) < 3 or led_along(pose, 1.0) < CONFIRMED:
+    if len(pose) < 3 or measure_alignment(pose, 1.0) < CONFIRMED:
         return None
     return PoseGuess(table, x, y, None, tuple(turn))

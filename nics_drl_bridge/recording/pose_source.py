@@ -17,12 +17,12 @@ ODOMETRY = re.compile(r"odom|wheel|encoder|dead_?reckon", re.IGNORECASE)
 TRACKERS_TYPES = (roles.POSE, roles.POSE_COVARIANCE, roles.TRANSFORM)
 
 
-def source_of_pose(name: str, kind: str = "") -> MeasuredBy:
+def guess_pose_source(name: str, kind: str = "") -> MeasuredBy:
     """Returns what measured the poses of a topic or table by its name, and by its type if any."""
-    return source_by_names((name,), kind)
+    return guess_source_by_names((name,), kind)
 
 
-def source_by_names(names: Iterable[str], kind: str = "") -> MeasuredBy:
+def guess_source_by_names(names: Iterable[str], kind: str = "") -> MeasuredBy:
     """Returns what measured poses, by all names that belong to them; empty if none tells."""
     known = [*names]
     if any(TRACKED.search(name) for name in known):

@@ -11,7 +11,7 @@ import numpy as np
 from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import check_no_device, find_config
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.recording.bag_file import is_bag, opened
+from nics_drl_bridge.recording.bag_file import is_bag, open_bag
 from nics_drl_bridge.recording.bag_reader import load_bag
 from nics_drl_bridge.recording.bag_table import Bag
 from nics_drl_bridge.recording.mapped import read_mapped
@@ -25,7 +25,7 @@ from nics_drl_bridge.recording.recording import (
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles, assign
-from nics_drl_bridge.recording.values import unit_of
+from nics_drl_bridge.recording.values import get_unit
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot, read_definition
 
@@ -99,7 +99,7 @@ def read_recording(
     path = Path(path)
     topics = topics or TopicRoles()
     if mapping is not None and not is_recording(path):
-        return _by_mapping(path, spec, topics, mapping)
+        return _read_by_mapping(path, spec, topics, mapping)
     found = next((each for each in FORMATS if each.recognises(path)), None)
     if topics != TopicRoles() and not (found and found.has_topics):
         advice = "leave out --topics and --topic, which are for bags only"
@@ -114,7 +114,7 @@ def read_recording(
     raise RecordingError(f"{fault}; say what is what in it with --map; {begin}.")
 
 
-def why_no_mapping(path: Path) -> str:
+def explain_no_mapping(path: Path) -> str:
     """Says why a recording is read without a mapping; empty if it needs one."""
     if is_recording(path):
         return "was written by this package"
@@ -122,7 +122,7 @@ def why_no_mapping(path: Path) -> str:
         return f"has the files of config/recordings/{FOLDER}.yaml, by which it is read"
     if not is_bag(path):
         return ""
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         try:
             topics = assign(TopicRoles(), bag.types, bag.empty, bag.place)
         except RecordingError:
@@ -133,7 +133,7 @@ def why_no_mapping(path: Path) -> str:
     return f"has topics of known names and types ({used})"
 
 
-def _by_mapping(
+def _read_by_mapping(
     path: Path,
     spec: RobotSpec | None,
     topics: TopicRoles,
@@ -143,7 +143,7 @@ def _by_mapping(
         raise ConfigError(
             "--topics and --topic do not go with --map; name the topics in the map."
         )
-    given = _loaded(mapping)
+    given = _load_if_path(mapping)
     with open_source(path, given) as source:
         recording = read_mapped(source, given)
     if given.robot is not None:
@@ -151,7 +151,7 @@ def _by_mapping(
     if spec is None:
         return recording
     _check_units(given, spec)
-    return arranged(recording, spec)
+    return reorder_variables(recording, spec)
 
 
 def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
@@ -161,7 +161,7 @@ def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
             value = getattr(mapping, stream).get(variable.name)
             if value is None or value.scale != 1.0 or value.maximum is not None:
                 continue  # what is scaled may have become what is needed
-            si = unit_of(value).si
+            si = get_unit(value).si
             if si and si != variable.unit != "1":
                 turns = si.startswith("ticks") and variable.unit.startswith("rad")
                 if turns:
@@ -172,11 +172,11 @@ def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
                 raise ConfigError(f"{fault}; {cure}.")
 
 
-def _loaded(mapping: Mapping | str | Path) -> Mapping:
+def _load_if_path(mapping: Mapping | str | Path) -> Mapping:
     return mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
 
 
-def robot_and_drive(
+def read_robot_and_drive(
     path: Path,
     robot: str | None,
     topics: TopicRoles,
@@ -184,12 +184,12 @@ def robot_and_drive(
 ) -> tuple[RobotSpec, Recording]:
     """Reads a drive with its robot: the named one, else its mapping's or own, or the default."""
     if mapping is not None:
-        given = _loaded(mapping)
+        given = _load_if_path(mapping)
         given = given if robot is None else given.model_copy(update={"robot": robot})
         drive = read_recording(path, None, topics, given)
-        spec = robot_of(given, drive)
+        spec = build_mapped_robot(given, drive)
         _check_units(given, spec)
-        return spec, arranged(drive, spec)
+        return spec, reorder_variables(drive, spec)
     if not is_recording(path):
         own: str | dict[str, Any] | None = robot
         if (
@@ -199,18 +199,20 @@ def robot_and_drive(
         spec = build_robot(own or DEFAULT_ROBOT)
         return spec, read_recording(path, spec, topics)
     drive = read_recording(path, None, topics)
-    spec = _ranged(robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables)
-    return spec, drive if drive.robot is None else arranged(drive, spec)
+    spec = _build_with_ranges(
+        robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables
+    )
+    return spec, drive if drive.robot is None else reorder_variables(drive, spec)
 
 
-def robot_and_drives(
+def read_robot_and_drives(
     paths: Sequence[Path],
     robot: str | None,
     topics: TopicRoles,
     mapping: Mapping | str | Path | None,
 ) -> tuple[RobotSpec, list[Recording]]:
     """Reads drives of one robot; its commands reach as far as in any of them."""
-    read = [robot_and_drive(path, robot, topics, mapping) for path in paths]
+    read = [read_robot_and_drive(path, robot, topics, mapping) for path in paths]
     first, *others = [spec for spec, _ in read]
     for path, spec in zip(paths[1:], others, strict=True):
         if (
@@ -222,7 +224,7 @@ def robot_and_drives(
     if others:
         ranges = {
             stream: tuple(
-                _spanned([getattr(spec, stream)[k] for spec, _ in read])
+                _merge_ranges([getattr(spec, stream)[k] for spec, _ in read])
                 for k in range(len(getattr(first, stream)))
             )
             for stream in ("command", "state")
@@ -231,24 +233,28 @@ def robot_and_drives(
     return first, [check(drive, first) for _, drive in read]
 
 
-def _spanned(variables: Sequence[Any]) -> Any:
+def _merge_ranges(variables: Sequence[Any]) -> Any:
     """Returns a variable that reaches as far as any of these."""
     low = min(each.min for each in variables)
     high = max(each.max for each in variables)
     return variables[0].model_copy(update={"min": low, "max": high})
 
 
-def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:
+def build_mapped_robot(
+    mapping: Mapping | str | Path, recording: Recording
+) -> RobotSpec:
     """Returns the robot of a mapping, whose commands reach as far as in its recording."""
-    given = _loaded(mapping)
+    given = _load_if_path(mapping)
     if (robot := given.robot or recording.robot) is None:
         raise ConfigError(
             "the mapping names no robot; add `robot:` to it, or give --robot."
         )
-    return _ranged(robot, recording, recording.variables or tuple(given.command))
+    return _build_with_ranges(
+        robot, recording, recording.variables or tuple(given.command)
+    )
 
 
-def _ranged(
+def _build_with_ranges(
     robot: str | dict[str, Any], recording: Recording, variables: tuple[str, ...]
 ) -> RobotSpec:
     """Returns a robot; ranges of commands that it leaves out are those that were recorded."""
@@ -259,7 +265,7 @@ def _ranged(
     )
 
 
-def arranged(recording: Recording, spec: RobotSpec) -> Recording:
+def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording in the order of a robot's variables; ConfigError if they differ."""
     if not recording.variables:
         return check(recording, spec)
@@ -293,5 +299,5 @@ def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
     if not is_bag(path):
         yield Files(path)
         return
-    with opened(path) as file:
+    with open_bag(path) as file:
         yield Bag(file, mapping)

@@ -232,7 +232,7 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
     pose = recording.pose
     radius = spec.footprint_radius
-    if fault := implausible_pose(pose.t, pose.values, fastest, radius):
+    if fault := find_implausible_pose(pose.t, pose.values, fastest, radius):
         raise RecordingError(
             f"{recording.source}: pose: {fault.reason}; {fault.cause}."
         )
@@ -242,11 +242,11 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
 def check_streams(recording: Recording, width: dict[str, int]) -> None:
     """Refuses streams of other than `width` columns (3 by default), with NaN, or out of order."""
     for name, stream in recording.streams.items():
-        if fault := _fault(stream, width.get(name, 3)):
+        if fault := _find_fault(stream, width.get(name, 3)):
             raise RecordingError(f"{recording.source}: {name}: {fault}.")
 
 
-def _fault(stream: Stream, width: int) -> str:
+def _find_fault(stream: Stream, width: int) -> str:
     t = stream.t
     values = stream.values
     if values.shape != (len(t), width):
@@ -297,7 +297,7 @@ def load_recording(path: str | Path) -> Recording:
     """Reads a recording of `save_recording`; RecordingError if it is missing or not a whole one."""
     try:
         data = files.read_file(check_no_device(Path(path)))
-        arrays = _arrays(data)
+        arrays = _read_arrays(data)
         meta = json.loads(str(arrays["meta"]))
         version = meta["format"]
         if version != FORMAT:
@@ -307,7 +307,7 @@ def load_recording(path: str | Path) -> Recording:
             )
         files.check_sealed(io.BytesIO(data))
         streams: Any = {
-            n: _stream(arrays, n, clock) for n, clock in meta["clocks"].items()
+            n: _read_stream(arrays, n, clock) for n, clock in meta["clocks"].items()
         }
         latency = Latency.model_validate(meta.get("latency", {}))
         variables = tuple(meta["variables"])
@@ -347,14 +347,14 @@ def is_recording(path: Path) -> bool:
         return False
 
 
-def _stream(arrays: dict[str, NDArray[Any]], name: str, clock: str) -> Stream:
+def _read_stream(arrays: dict[str, NDArray[Any]], name: str, clock: str) -> Stream:
     sigma = arrays.get(f"{name}_sigma")
     t = arrays[f"{name}_t"].astype(float)
     values = arrays[name].astype(float)
     return Stream(t, values, clock, None if sigma is None else sigma.astype(float))
 
 
-def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
+def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` file's content. Raises ValueError if it is damaged or too large."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -379,7 +379,7 @@ class Implausible(NamedTuple):
     line: str  # for the mapping, as `heading_unit: deg`
 
 
-def implausible_pose(
+def find_implausible_pose(
     t: Array, pose: Array, fastest: float = np.inf, radius: float = 0.0
 ) -> Implausible | None:
     """Finds poses (T, 3) at t (T,) [s] that degrees, centimetres or milliseconds explain.
@@ -390,11 +390,11 @@ def implausible_pose(
     if len(t) < 3:
         return None
     hardest = HARDEST if radius < SMALL_M else HARDEST_OF_CARS
-    degrees = _degrees(t, pose) or _radians(pose[_spaced(t)])
-    return _too_slow(t) or degrees or _too_fast(t, pose, fastest, hardest)
+    degrees = _find_degrees(t, pose) or _find_radians(pose[_select_spaced(t)])
+    return _find_too_slow(t) or degrees or _find_too_fast(t, pose, fastest, hardest)
 
 
-def _degrees(t: Array, pose: Array) -> Implausible | None:
+def _find_degrees(t: Array, pose: Array) -> Implausible | None:
     heading = pose[:, 2]
     cause = "it must be in radians (degrees look like this)"
     turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(heading))), 95)
@@ -404,65 +404,67 @@ def _degrees(t: Array, pose: Array) -> Implausible | None:
     if np.abs(heading).max() <= 2.0 * np.pi + 0.1:
         return None
     around = np.abs(np.abs(np.diff(heading)) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
-    every = _spaced(t)
+    every = _select_spaced(t)
     rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(
         t[every]
     )
     turns = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
-    if not (around.any() or turns or _only_along(pose[every], np.pi / 180.0)):
+    if not (around.any() or turns or _is_only_along(pose[every], np.pi / 180.0)):
         return None
     reason = f"the heading is up to {np.abs(heading).max():.4g} rad"
     return Implausible(reason, cause, "heading_unit: deg")
 
 
-def _radians(pose: Array) -> Implausible | None:
-    if not _only_along(pose, 180.0 / np.pi):
+def _find_radians(pose: Array) -> Implausible | None:
+    if not _is_only_along(pose, 180.0 / np.pi):
         return None
     reason = f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad, and the path leads along"
     cause = "it was in radians, and is taken as degrees"
     return Implausible(f"{reason} 57 times as much", cause, "heading_unit: rad")
 
 
-def _only_along(pose: Array, scale: float) -> bool:
+def _is_only_along(pose: Array, scale: float) -> bool:
     """True if poses (T, 3) lead along headings x scale, and not along them as they are."""
-    led, as_given, none = (led_along(pose, each) for each in (scale, 1.0, 0.0))
+    led, as_given, none = (measure_alignment(pose, each) for each in (scale, 1.0, 0.0))
     return led > max(ALONG, as_given + LESS_ALONG, none + ALONG_BY_CHANCE)
 
 
-def along_path(pose: Array, apart: float) -> NDArray[np.intp]:
+def select_along_path(pose: Array, apart: float) -> NDArray[np.intp]:
     """Returns the poses (of T, 3) that are about as far `apart` [m] on their path."""
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     return np.unique(np.searchsorted(path, np.arange(0.0, path[-1], apart)))
 
 
-def shows_axes(pose: Array) -> bool:
+def has_visible_axes(pose: Array) -> bool:
     """True if poses (T, 3), apart on their path, turn far enough to show a reversed axis."""
     turned = float(np.ptp(np.unwrap(pose[:, 2]))) if len(pose) else 0.0
     return len(pose) >= MIN_DIRECTIONS and turned >= MIN_TURN
 
 
-def clockwise_line(pose: Array, least: float = MIRRORED, better: float = BETTER) -> str:
+def find_clockwise_keys(
+    pose: Array, least: float = MIRRORED, better: float = BETTER
+) -> str:
     """Returns the keys that turn the heading of poses (T, 3), apart on their path, round.
 
     As in `scale: -1`; empty unless the path leads along the mirrored headings alone: to the share
     `least`, and by so much `better` than along those given.
     """
-    if not shows_axes(pose):
+    if not has_visible_axes(pose):
         return ""
-    mirrored = _course(pose, -1.0)
-    if abs(mirrored) < max(least, better + led_along(pose, 1.0)):
+    mirrored = _compute_course(pose, -1.0)
+    if abs(mirrored) < max(least, better + measure_alignment(pose, 1.0)):
         return ""
     if mirrored.real > 0.0:
         return "scale: -1"
     return f"scale: -1, offset: {np.pi / 2.0:.5g}"
 
 
-def led_along(pose: Array, scale: float) -> float:
+def measure_alignment(pose: Array, scale: float) -> float:
     """Returns to what share poses (T, 3) lead along their headings x scale, ahead or back."""
-    return abs(_course(pose, scale))
+    return abs(_compute_course(pose, scale))
 
 
-def _course(pose: Array, scale: float) -> complex:
+def _compute_course(pose: Array, scale: float) -> complex:
     """Returns the mean of exp(2i x direction of travel), as seen from the headings x scale."""
     x, y = np.diff(pose[:, :2], axis=0).T
     ahead = np.exp(1j * scale * pose[:, 2])
@@ -473,15 +475,15 @@ def _course(pose: Array, scale: float) -> complex:
     return complex((step * (course / middle) ** 2).sum() / max(step.sum(), 1e-9))
 
 
-def _spaced(t: Array) -> NDArray[np.intp]:
+def _select_spaced(t: Array) -> NDArray[np.intp]:
     """Returns the samples that are about half a second apart."""
     return np.unique(np.floor((t - t[0]) / SPEED_OVER_S), return_index=True)[1]
 
 
-def _too_fast(
+def _find_too_fast(
     t: Array, pose: Array, fastest: float, hardest: float
 ) -> Implausible | None:
-    every = _spaced(t)
+    every = _select_spaced(t)
     step = np.diff(pose[every, :2], axis=0)
     took = np.diff(t[every])
     if not len(took):
@@ -506,7 +508,7 @@ def _too_fast(
     return Implausible(reason, cause, line)
 
 
-def likely_unit(t: Array) -> str | None:
+def guess_time_unit(t: Array) -> str | None:
     """Returns the unit of stamps (T,) that can't be seconds; None if they can."""
     step = np.diff(t)
     usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
@@ -514,15 +516,15 @@ def likely_unit(t: Array) -> str | None:
     return next(fitting, None) if usual > SLOWEST_SAMPLING_S else None
 
 
-def _too_slow(t: Array) -> Implausible | None:
-    if (unit := likely_unit(t)) is None:
+def _find_too_slow(t: Array) -> Implausible | None:
+    if (unit := guess_time_unit(t)) is None:
         return None
     reason = f"there are {np.median(np.diff(t)):.3g} s between samples"
     cause = f"stamps must be in seconds ({UNITS_OF_STEP[unit]} look like this)"
     return Implausible(reason, cause, f"time: {{from: ..., unit: {unit}}}")
 
 
-def w_first(quaternions: ArrayLike) -> bool:
+def is_w_first(quaternions: ArrayLike) -> bool:
     """True if quaternions (T, 4), read as x, y, z, w, look like w, x, y, z of a level body."""
     size = np.mean(np.square(np.asarray(quaternions).reshape(-1, 4)), axis=0)
     return bool(size[0] + size[1] > TILTED and size[1] + size[2] < LEVEL)

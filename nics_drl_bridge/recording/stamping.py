@@ -85,7 +85,7 @@ class TopicData:
         return TopicData(self.topic, self.receive_ns[keep], header, self.values[keep])
 
 
-def streams(
+def stamp_streams(
     data: Mapping[str, TopicData],
     stamps: Stamps,
     place: str,
@@ -97,28 +97,30 @@ def streams(
     # offset for calibration. Command, state, wheels and IMU share one clock, by receipt if need be.
     # Late messages are sorted; those before a simulation's first time are dropped.
     if stamps != "receive":
-        data = {name: _in_order(part, place) for name, part in data.items()}
+        data = {name: _sort_by_stamp(part, place) for name, part in data.items()}
     origin = min(int(part.receive_ns.min()) for part in data.values())
     if stamps == "receive":
-        return {name: _by_receipt(part, origin) for name, part in data.items()}
-    headers = {name: _header(part, stamps, place) for name, part in data.items()}
+        return {name: _stamp_by_receipt(part, origin) for name, part in data.items()}
+    headers = {name: _check_header(part, stamps, place) for name, part in data.items()}
     if stamps == "header":
         first = min(int(ns.min()) for ns in headers.values() if ns is not None)
         clocks = dict.fromkeys(data, (HEADER, origin - first))
     else:
-        clocks = _clocks(data, headers, place)
+        clocks = _assign_clocks(data, headers, place)
     robot = {clocks[name][0] for name in of_robot if name in data}
     made = {}
     for name, part in data.items():
         ns, (clock, shift) = headers[name], clocks[name]
         if ns is None or (len(robot) > 1 and name in of_robot):
-            made[name] = _by_receipt(part, origin)
+            made[name] = _stamp_by_receipt(part, origin)
         else:
-            made[name] = Stream(_seconds(ns + shift - origin), part.values, clock)
+            made[name] = Stream(
+                _convert_to_seconds(ns + shift - origin), part.values, clock
+            )
     return made
 
 
-def go_on_together(parts: Iterable[TopicData]) -> bool:
+def has_continuous_headers(parts: Iterable[TopicData]) -> bool:
     """True if the headers of all go on without a leap, at whatever rate beside the receipt."""
     received, stamped = zip(
         *((part.receive_ns, part.header_ns) for part in parts), strict=True
@@ -133,7 +135,7 @@ def go_on_together(parts: Iterable[TopicData]) -> bool:
     )
 
 
-def _clocks(
+def _assign_clocks(
     data: Mapping[str, TopicData], headers: Mapping[str, Nanoseconds | None], place: str
 ) -> dict[str, tuple[str, int]]:
     """Returns each stream's clock, and the shift of its stamps to the recorder's clock [ns]."""
@@ -168,7 +170,7 @@ def _clocks(
     return clocks
 
 
-def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
+def _check_header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
     ns = part.header_ns
     topic = f"{place}: topic {part.topic!r}"
     if ns is None or not ns.any():
@@ -186,7 +188,7 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
     return ns
 
 
-def _in_order(part: TopicData, place: str) -> TopicData:
+def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
     """Drops unstamped messages at the start, and sorts the few late ones by stamp."""
     ns = part.header_ns
     if ns is None or not ns.any():
@@ -209,23 +211,25 @@ def _in_order(part: TopicData, place: str) -> TopicData:
     return part.rows(np.argsort(ns, kind="stable"))
 
 
-def _by_receipt(part: TopicData, origin: int) -> Stream:
+def _stamp_by_receipt(part: TopicData, origin: int) -> Stream:
     order = np.argsort(part.receive_ns, kind="stable")
     return Stream(
-        _seconds(part.receive_ns[order] - origin), part.values[order], RECEIVE
+        _convert_to_seconds(part.receive_ns[order] - origin),
+        part.values[order],
+        RECEIVE,
     )
 
 
-def _seconds(ns: Nanoseconds) -> Array:
+def _convert_to_seconds(ns: Nanoseconds) -> Array:
     return np.asarray(ns * S_PER_NS, dtype=np.float64)
 
 
-def joined(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
+def join_stamps(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
     """Joins stamps that were split into seconds and nanoseconds [s]."""
     return np.asarray(seconds + nanoseconds * S_PER_NS, dtype=np.float64)
 
 
-def overflow(
+def find_overflow(
     values: Array, scale: tuple[float, ...], bits: tuple[int, ...]
 ) -> float | None:
     """Returns the range of a register that overflows in values (T,), which are counts x scale.
@@ -252,21 +256,21 @@ def overflow(
     return None
 
 
-def unwrapped(values: Array, size: float) -> tuple[Array, int]:
+def unwrap_counter(values: Array, size: float) -> tuple[Array, int]:
     """Continues values (T,) over the overflows of a register; returns them and their number."""
     step = np.diff(values)
     turns = -np.round(step / size) * (np.abs(step) > size / 2.0)
     return values + size * np.append(0.0, np.cumsum(turns)), int(np.abs(turns).sum())
 
 
-def counter(values: Array) -> str:
+def describe_counter(values: Array) -> str:
     """Returns what whole numbers (T,) do as a counter's alone: they overflow, or go on and on."""
     step = np.abs(np.diff(values))
     whole = bool((values == np.round(values)).all())
     gone = float(abs(values[-1] - values[0]))
     if whole and gone > max(GROWN, ONE_WAY * step.sum()):
         return f"went on by {gone:.10g}"
-    size = overflow(values, (1.0,), BITS) if whole else None
+    size = find_overflow(values, (1.0,), BITS) if whole else None
     if size is None:
         return ""
     usual = float(np.percentile(step, 95))
@@ -277,7 +281,7 @@ def counter(values: Array) -> str:
     return ""
 
 
-def comes_back(values: Array) -> bool:
+def is_oscillating(values: Array) -> bool:
     """True for values (T,) that go up and down within few of their steps, as no counter's do."""
     step = np.diff(values)
     step = step[step != 0.0]
@@ -287,7 +291,7 @@ def comes_back(values: Array) -> bool:
     return bool(near and back > BACK * size.sum())
 
 
-def rows_a_second(t: Array) -> int:
+def count_rows_a_second(t: Array) -> int:
     """Returns how many stamps (T,) in whole seconds repeat, as if their rest were lost; else 0."""
     seconds = np.unique(t)
     usual = np.median(np.diff(seconds)) if len(seconds) > 1 else 0.0
@@ -299,21 +303,21 @@ def rows_a_second(t: Array) -> int:
     return round(len(t) / len(seconds)) if lost else 0
 
 
-def without_overflow(t: Array, name: str) -> tuple[Array, str]:
+def remove_overflow(t: Array, name: str) -> tuple[Array, str]:
     """Continues stamps (T,) of a clock of 32 bits or less that began anew."""
     if not (np.diff(t) < 0.0).any():
         return t, ""
-    size = overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
+    size = find_overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
     if size is None:
         return t, ""
-    made, count = unwrapped(t, size)
+    made, count = unwrap_counter(t, size)
     return (
         made,
-        f"{name}: its clock overflowed at {size:.10g} {times(count)}, and was continued.",
+        f"{name}: its clock overflowed at {size:.10g} {format_times(count)}, and was continued.",
     )
 
 
-def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
+def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     """Sorts the few late rows; joins parts between which the clock was set.
 
     Returns stamps (T,) [s] that never decrease, and the row of each.
@@ -324,7 +328,7 @@ def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         t = t[::-1]
         rows = rows[::-1]
         notes.append(f"{name}: its rows began with the last, and were turned round.")
-    if (stray := _stray(t)).any():
+    if (stray := _find_stray(t)).any():
         where = f"(row {rows[stray][0]}: {t[stray][0]:.10g} s)"
         notes.append(
             f"{name}: {stray.sum()} stamps fit none beside them {where}; left out."
@@ -351,13 +355,13 @@ def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         k = int(np.argmax(jump))
         first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
         said = f"{name}: the clock was set {'back' if step[k] < 0.0 else 'ahead'}"
-        joined = f"the parts were joined, a usual step of {usual:.3g} s apart"
-        notes.append(f"{said} {times(int(jump.sum()))} ({first}); {joined}.")
+        joining = f"the parts were joined, a usual step of {usual:.3g} s apart"
+        notes.append(f"{said} {format_times(int(jump.sum()))} ({first}); {joining}.")
         t = t + np.append(0.0, np.cumsum(np.where(jump, usual - step, 0.0)))
     return t, rows, " ".join(notes)
 
 
-def _stray(t: Array) -> NDArray[np.bool_]:
+def _find_stray(t: Array) -> NDArray[np.bool_]:
     """Selects few stamps (T,) that break the order and are far from those on both sides."""
     if len(t) < 5:
         return np.zeros(len(t), dtype=np.bool_)
@@ -368,12 +372,14 @@ def _stray(t: Array) -> NDArray[np.bool_]:
     return np.asarray(stray if stray.mean() <= MOST_STRAY else stray & False)
 
 
-def times(count: int) -> str:
+def format_times(count: int) -> str:
     """Says how often."""
     return "once" if count == 1 else f"{count} times"
 
 
-def not_repeated(t: Array, values: Array, name: str) -> tuple[NDArray[np.bool_], str]:
+def select_new_rows(
+    t: Array, values: Array, name: str
+) -> tuple[NDArray[np.bool_], str]:
     """Selects rows (T,) that do not repeat the one before them, stamp and values (T, D)."""
     again = (np.diff(t) == 0.0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
     if not again.any():

@@ -11,10 +11,14 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.names import quoted, words_of
-from nics_drl_bridge.recording.recording import IRREGULAR, UNITS_OF_STEP, likely_unit
+from nics_drl_bridge.recording.names import split_words, write_reference
+from nics_drl_bridge.recording.recording import (
+    IRREGULAR,
+    UNITS_OF_STEP,
+    guess_time_unit,
+)
 from nics_drl_bridge.recording.table import Column, Source, Table
-from nics_drl_bridge.recording.values import dates_of
+from nics_drl_bridge.recording.values import parse_dates
 
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # of a table
@@ -98,17 +102,17 @@ IN_BRACKETS = {
 NO_UNIT = ("", "-", "1", "none", "unitless")
 
 
-def unit_in(name: str) -> tuple[list[str], str | None]:
+def split_unit(name: str) -> tuple[list[str], str | None]:
     """Returns the words of a name, and the unit that it ends with: `x(m)`, `x [mm]`, `yaw_deg`."""
     if bracket := re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", name):
         said = bracket[1]
         unit = said if said in UNITS else IN_BRACKETS.get(said.lower())
         unitless = said.lower() in NO_UNIT and not said.isdecimal()
         if unit is not None and said != "1":
-            return words_of(name[: bracket.start()]), unit
+            return split_words(name[: bracket.start()]), unit
         if unitless:
-            return words_of(name[: bracket.start()]), None
-    words = words_of(name) or [""]
+            return split_words(name[: bracket.start()]), None
+    words = split_words(name) or [""]
     if "rpm" in words:
         return [word for word in words if word != "rpm"], "rpm"
     for ending, unit in ENDINGS.items():
@@ -144,7 +148,7 @@ class TableSurvey:
         """The stamps for a mapping, as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
         if self.stamps is None:
             return None
-        columns = [quoted(column) for column in self.stamp_columns]
+        columns = [write_reference(column) for column in self.stamp_columns]
         listed = columns[0] if len(columns) == 1 else f"[{', '.join(columns)}]"
         return f"{{from: {listed}, unit: {self.unit}}}" if self.unit else listed
 
@@ -166,20 +170,20 @@ class TableSurvey:
         """Sentences on rate, gaps, stamps that run backwards, repeated rows and missing values."""
         if self.t is None or len(self.t) < 2:
             return []
-        return list(_regularity(self.t, self.data))
+        return list(_describe_regularity(self.t, self.data))
 
-    def reference(self, column: str, alone: bool) -> str:
+    def refer_to(self, column: str, alone: bool) -> str:
         """Returns how a mapping refers to a column."""
-        return quoted(column if alone else f"{self.name}:{column}")
+        return write_reference(column if alone else f"{self.name}:{column}")
 
 
-def survey(source: Source) -> list[TableSurvey]:
+def inspect_tables(source: Source) -> list[TableSurvey]:
     """Surveys every table of a source; RecordingError if none is readable."""
     found = []
     unread = None
     for name in source.names:
         try:
-            found.append(_surveyed(name, source.table(name)))
+            found.append(_inspect_table(name, source.get_table(name)))
         except RecordingError as error:  # one unreadable table leaves the others
             found.append(TableSurvey(name, 0, [], findings=[str(error)]))
             unread = unread or error
@@ -202,13 +206,13 @@ def survey(source: Source) -> list[TableSurvey]:
     return found
 
 
-def _surveyed(name: str, table: Table) -> TableSurvey:
+def _inspect_table(name: str, table: Table) -> TableSurvey:
     columns = []
     data = {}
     for k, title in list(enumerate(table.names))[:MOST_COLUMNS]:
         which = title if title and table.names.count(title) == 1 else str(k)
         data[which] = column = table.column(which)
-        columns.append(Survey(which, *_range(column)))
+        columns.append(Survey(which, *_find_range(column)))
     rows = max((len(column) for column in data.values()), default=0)
     found = TableSurvey(name, rows, columns, findings=list(table.notes), data=data)
     found.kind = table.kind
@@ -216,17 +220,19 @@ def _surveyed(name: str, table: Table) -> TableSurvey:
     if given is not None:
         found.t = given.t
     else:
-        found.stamps, raw = _time(data)
+        found.stamps, raw = _guess_stamps(data)
         if raw is not None:
             raw = raw[np.isfinite(raw)]
-            found.unit = likely_unit(raw) or _unit_by_name(found.stamps or "", raw)
+            found.unit = guess_time_unit(raw) or _guess_unit_by_name(
+                found.stamps or "", raw
+            )
             found.t = raw * UNITS[found.unit or "s"].factor
     return found
 
 
-def _unit_by_name(name: str, raw: Array) -> str | None:
+def _guess_unit_by_name(name: str, raw: Array) -> str | None:
     """Returns the unit below a second that a name says of its stamps, as `time_ms`."""
-    said = unit_in(name)[1] or (words_of(name) or [""])[-1]
+    said = split_unit(name)[1] or (split_words(name) or [""])[-1]
     step = np.diff(raw)
     usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
     if said not in UNITS_OF_STEP or usual * UNITS[said].factor < SHORTEST_STEP_S:
@@ -234,27 +240,29 @@ def _unit_by_name(name: str, raw: Array) -> str | None:
     return said
 
 
-def _range(column: Column) -> tuple[float, float]:
+def _find_range(column: Column) -> tuple[float, float]:
     values = np.zeros(0) if column.dtype.kind in "US" else column.astype(np.float64)
     if not np.isfinite(values).any():
         return np.nan, np.nan
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
+def _guess_stamps(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     """Guesses the column of stamps: by its name, and by how steadily it rises."""
     for seconds, rest in stamping.SPLIT:
         if all(
             each in data and data[each].dtype.kind not in "US"
             for each in (seconds, rest)
         ):
-            return f"[{seconds}, {rest}]", stamping.joined(data[seconds], data[rest])
+            return f"[{seconds}, {rest}]", stamping.join_stamps(
+                data[seconds], data[rest]
+            )
 
-    def merit(name: str) -> float:
+    def score_column(name: str) -> float:
         step = np.diff(values[name][np.isfinite(values[name])])
         if not len(step) or np.mean(step < 0.0) > MOST_BACK or not (step > 0.0).any():
             return 0.0
-        named = bool(TIMES & set(unit_in(name)[0]))
+        named = bool(TIMES & set(split_unit(name)[0]))
         counts = bool((step == 1.0).all())  # an index, unless its name says otherwise
         anonymous = name.isdecimal() and not counts
         return (named + 0.5 * anonymous) * float(np.mean(step > 0.0))
@@ -264,15 +272,19 @@ def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
         for name, c in data.items()
         if c.dtype.kind not in "US"
     }
-    texts = {name: dates_of(c) for name, c in data.items() if c.dtype.kind in "US"}
+    texts = {name: parse_dates(c) for name, c in data.items() if c.dtype.kind in "US"}
     values = numbers | {
         name: dates for name, dates in texts.items() if dates is not None
     }
-    best = max(values, key=merit, default=None)
-    return (None, None) if best is None or merit(best) < 0.25 else (best, values[best])
+    best = max(values, key=score_column, default=None)
+    return (
+        (None, None)
+        if best is None or score_column(best) < 0.25
+        else (best, values[best])
+    )
 
 
-def _regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:
+def _describe_regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:
     """Yields sentences on rate, gaps, stamps that run backwards, and rows that lack or repeat."""
     step = np.diff(t)
     usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else np.nan

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.names import words_of
+from nics_drl_bridge.recording.names import split_words
 from nics_drl_bridge.recording.survey import Survey, TableSurvey
 
 ENABLING = {
@@ -54,13 +54,13 @@ class Switch(NamedTuple):
     column: str
     on: str  # the value, as a mapping has it
 
-    def reference(self, alone: bool) -> str:
+    def refer_to(self, alone: bool) -> str:
         """Returns how a mapping refers to the column."""
-        text = self.table.reference(self.column, alone)
-        return text if text.startswith('"') or ":" not in text else quoted_key(text)
+        text = self.table.refer_to(self.column, alone)
+        return text if text.startswith('"') or ":" not in text else write_key(text)
 
 
-def quoted_key(text: str) -> str:
+def write_key(text: str) -> str:
     """Returns a reference with a colon as a key of YAML."""
     return f'"{text}"'
 
@@ -72,15 +72,15 @@ def guess_switch(
     found = []
     for table in tables:
         for column in table.columns:
-            words = words_of(column.name)
-            words = words_of(table.name) if words == ["data"] else words
-            on = _on_value({*words}, table, column)
+            words = split_words(column.name)
+            words = split_words(table.name) if words == ["data"] else words
+            on = _find_on_value({*words}, table, column)
             if on is not None and not _is_denied(table, column, on, pose):
                 found.append(Switch(table, column.name, on))
     return found[0] if len(found) == 1 else None
 
 
-def _on_value(words: set[str], table: TableSurvey, column: Survey) -> str | None:
+def _find_on_value(words: set[str], table: TableSurvey, column: Survey) -> str | None:
     """Returns the value at which the commands count, by the names of column and values."""
     data = table.data.get(column.name)
     if data is None or not len(data):
@@ -112,7 +112,7 @@ def _is_denied(
     order = np.argsort(table.t, kind="stable")
     row = np.searchsorted(table.t[order], t, side="right") - 1
     known = (row >= 0) & (t <= table.t[order[-1]])
-    is_on = _is(data, on)[order][np.clip(row, 0, None)]
+    is_on = _match_value(data, on)[order][np.clip(row, 0, None)]
     step = np.hypot(*np.diff(place[:, :2], axis=0).T)
     span = np.diff(t)
     moved = known[1:] & known[:-1] & (span > 0.0)
@@ -126,7 +126,7 @@ def _is_denied(
     return speeds[0] < FASTER * speeds[1]
 
 
-def _is(data: NDArray[np.generic], value: str) -> NDArray[np.bool_]:
+def _match_value(data: NDArray[np.generic], value: str) -> NDArray[np.bool_]:
     if data.dtype.kind in "US":
         return np.asarray(data.astype(np.str_) == value)
     return np.asarray(data.astype(np.float64) == float(value))

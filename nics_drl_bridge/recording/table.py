@@ -33,7 +33,7 @@ class Table:
     kind: str = ""  # message type, of a topic
 
 
-def table_of(
+def make_table(
     place: str,
     names: tuple[str, ...],
     data: Sequence[Column],
@@ -42,11 +42,15 @@ def table_of(
 ) -> Table:
     """Makes a table of columns in memory."""
 
-    def row(k: int) -> str:
+    def name_row(k: int) -> str:
         return f"row {k}" if lines is None else f"line {lines[k]}"
 
     return Table(
-        place, names, lambda which: data[_number(place, names, which)], row, notes
+        place,
+        names,
+        lambda which: data[_find_column(place, names, which)],
+        name_row,
+        notes,
     )
 
 
@@ -63,7 +67,7 @@ class Source:
         """Delays of scan and odometry, if they show."""
         return Latency()
 
-    def table(self, name: str) -> Table:
+    def get_table(self, name: str) -> Table:
         """Returns a table; RecordingError if it is unreadable."""
         if name not in self._read:
             self._read[name] = self.read(name)
@@ -74,7 +78,7 @@ class Source:
         raise NotImplementedError
 
 
-def _number(place: str, names: Sequence[str], which: str | int) -> int:
+def _find_column(place: str, names: Sequence[str], which: str | int) -> int:
     """Returns the number of a column that is given by name or number."""
     if isinstance(which, str) and which in names:
         if (count := Counter(names)[which]) > 1:
@@ -97,7 +101,7 @@ def _number(place: str, names: Sequence[str], which: str | int) -> int:
     raise RecordingError(f"{place}: has no column {which!r}; {hint}")
 
 
-def numbers_of(table: Table, which: str | int) -> Array:
+def read_numbers(table: Table, which: str | int) -> Array:
     """Returns a column of numbers (T,), NaN where there is none; RecordingError for text."""
     column = table.column(which)
     if column.dtype.kind not in "USO":
@@ -114,7 +118,7 @@ def numbers_of(table: Table, which: str | int) -> Array:
     return np.array([float(text or "nan") for text in column])
 
 
-def flattened(arrays: Mapping[str, Column]) -> Iterator[tuple[str, Column]]:
+def flatten_arrays(arrays: Mapping[str, Column]) -> Iterator[tuple[str, Column]]:
     """Yields columns of arrays: 1-D as they are, `name[k]` of 2-D, the fields of records."""
     for name, array in arrays.items():
         if array.dtype.names:
@@ -122,7 +126,7 @@ def flattened(arrays: Mapping[str, Column]) -> Iterator[tuple[str, Column]]:
                 f"{name}.{field}".lstrip("."): array[field]
                 for field in array.dtype.names
             }
-            yield from flattened(inner)
+            yield from flatten_arrays(inner)
         elif array.ndim == 1:
             yield name, array
         elif array.ndim > 1:

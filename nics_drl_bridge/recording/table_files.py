@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.config import check_no_device
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.table import Column, Source, Table, flattened, table_of
+from nics_drl_bridge.recording.table import (
+    Column,
+    Source,
+    Table,
+    flatten_arrays,
+    make_table,
+)
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".tum", ".log", ".data", ".asc")
 MOST_FILES = 500  # of a folder
@@ -38,33 +44,35 @@ WORDS = {"true": "1", "false": "0", **dict.fromkeys(MISSING, "nan")}
 
 def read_text_table(path: Path) -> Table:
     """Reads a table; RecordingError names the file, the line and the fix."""
-    lines, comments = _lines(path)
-    separator = _separator([text for _, text in lines[:TRIED]])
+    lines, comments = _read_lines(path)
+    separator = _find_separator([text for _, text in lines[:TRIED]])
     at = np.array([line for line, _ in lines], dtype=np.intp)
     rows = [_split(text, separator) for _, text in lines]
-    first, width = _first_row(path, rows)
+    first, width = _find_first_row(path, rows)
     above = rows[:first]
-    rows, at, notes = _of_one_width(path, rows[first:], at[first:], above, width)
+    rows, at, notes = _keep_one_width(path, rows[first:], at[first:], above, width)
     columns = [list(column) for column in zip(*rows, strict=True)]
     # The last title that has most names: one of units, below it, repeats some.
     titles = [row for row in above if len(row) > 1 or width == 1]
     head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
     if head is None and comments:
-        head = _title_in_comment(comments[-1], separator, width)
+        head = _find_title(comments[-1], separator, width)
     if (
         head is None
         and width == len(TUM)
         and (separator is None or path.suffix == TUM_SUFFIX)
     ):
         head = list(TUM) if _is_tum(columns) else None
-    if head is None and (named := _labelled(columns)):
+    if head is None and (named := _split_labels(columns)):
         columns, head = named
-    columns = [_with_points(column) for column in columns]
+    columns = [_replace_commas(column) for column in columns]
     names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
-    return table_of(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
+    return make_table(
+        str(path), names, tuple(map(_convert_column, columns)), at, tuple(notes)
+    )
 
 
-def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
+def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     """Returns the lines with their numbers, from 1, without empty ones, and those of comments."""
     check_no_device(path)
     try:
@@ -109,9 +117,7 @@ def _split(line: str, separator: str | None) -> list[str]:
     return list(map(str.strip, fields))
 
 
-def _title_in_comment(
-    comment: str, separator: str | None, width: int
-) -> list[str] | None:
+def _find_title(comment: str, separator: str | None, width: int) -> list[str] | None:
     """Returns the names of the columns if a comment lists them; wide gaps may separate them."""
     for fields in (
         _split(comment, separator),
@@ -131,7 +137,7 @@ def _is_value(text: str) -> bool:
     return True
 
 
-def _separator(lines: Sequence[str]) -> str | None:
+def _find_separator(lines: Sequence[str]) -> str | None:
     """Returns the separator that leaves most numbers, and fewest fields that are none."""
 
     def score(separator: str | None) -> int:
@@ -143,26 +149,26 @@ def _separator(lines: Sequence[str]) -> str | None:
     return best if score(best) > 0 or not others else max(others, key=score)
 
 
-def _first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
+def _find_first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
     """Returns the first row of numbers, and how many fields the rows from there on have."""
 
-    def numeric(row: Sequence[str]) -> bool:
+    def is_numeric(row: Sequence[str]) -> bool:
         full = [field for field in row if field]
         return 2 * sum(map(_is_value, full)) > len(full)
 
     widths = Counter(
-        len(row) for row in rows[:: 1 + len(rows) // MOST_SAMPLED] if numeric(row)
+        len(row) for row in rows[:: 1 + len(rows) // MOST_SAMPLED] if is_numeric(row)
     )
     if not widths:
         advice = "give a table of numbers, a column each, with or without a header"
         raise RecordingError(f"{path}: holds no row of numbers; {advice}.")
     width = widths.most_common(1)[0][0]
     return next(
-        k for k, row in enumerate(rows) if len(row) == width and numeric(row)
+        k for k, row in enumerate(rows) if len(row) == width and is_numeric(row)
     ), width
 
 
-def _of_one_width(
+def _keep_one_width(
     path: Path,
     rows: list[list[str]],
     at: NDArray[np.intp],
@@ -208,7 +214,9 @@ def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
     )
 
 
-def _labelled(columns: Sequence[list[str]]) -> tuple[list[list[str]], list[str]] | None:
+def _split_labels(
+    columns: Sequence[list[str]],
+) -> tuple[list[list[str]], list[str]] | None:
     """Names columns by labels that stand in each row, as in `time: 1.2 ticks: 3 4`."""
     found: dict[str, list[list[str]]] = {}
     for column in columns:
@@ -227,7 +235,7 @@ def _labelled(columns: Sequence[list[str]]) -> tuple[list[list[str]], list[str]]
     return list(chain.from_iterable(found.values())), names
 
 
-def _with_points(column: list[str]) -> list[str]:
+def _replace_commas(column: list[str]) -> list[str]:
     """Writes decimal commas as points."""
     if not any("," in field for field in column):
         return column
@@ -235,7 +243,7 @@ def _with_points(column: list[str]) -> list[str]:
     return changed if all(map(_is_value, changed)) else column
 
 
-def _typed(column: Sequence[str]) -> Column:
+def _convert_column(column: Sequence[str]) -> Column:
     """Returns numbers if all fields are, of true and false too, and else text."""
     for words in ({}, WORDS):
         try:
@@ -255,12 +263,12 @@ def read_arrays(path: Path) -> Table:
         advice = "write numbers with numpy.save or numpy.savez, without pickle"
         why = " ".join(str(error).split())[:200]
         raise RecordingError(f"{path}: can't be read ({why}); {advice}.") from None
-    columns = list(flattened(arrays))
+    columns = list(flatten_arrays(arrays))
     if not columns:
         raise RecordingError(
             f"{path}: holds no columns; give arrays of one value or more a row."
         )
-    return table_of(
+    return make_table(
         str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns)
     )
 
@@ -285,7 +293,7 @@ def read_parquet(path: Path) -> Table:
     texts = [
         np.array([*map(str, c)], np.str_) if c.dtype.kind == "O" else c for c in stamps
     ]
-    return table_of(str(path), tuple(table.column_names), tuple(texts))
+    return make_table(str(path), tuple(table.column_names), tuple(texts))
 
 
 READERS: dict[str, Callable[[Path], Table]] = {

@@ -11,7 +11,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 INTEGRATION_STEP_S = 1e-3
 
 
-def _arc(
+def _integrate_substep(
     book: Textbook, state: Array, goal: Array, since: Array | float, h: float
 ) -> Array:
     """Returns body twist x duration (..., 3) of a substep that begins `since` [s] after `state`."""
@@ -52,7 +52,7 @@ def record(
     arcs = []
     for goal in book.target(held):
         states.append(book.respond(now, goal, since))
-        arcs.append(_arc(book, now, goal, since, h))
+        arcs.append(_integrate_substep(book, now, goal, since, h))
         now = book.respond(now, goal, per_hold * inner * h)
     # Relative poses (T, 3) are chained to the poses (T, 3) at their starts, from the origin on.
     state = np.concatenate(states)

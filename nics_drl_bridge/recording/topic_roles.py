@@ -81,7 +81,7 @@ class TopicRoles(Schema):
     stamps: Stamps = "auto"
 
 
-def imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
+def list_imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
     """Returns the topics on which a gyro may speak: the wanted one, of `auto` the usual ones.
 
     `auto` is none unless `by_default`, as for a model that was made with a gyro; so is `none`.
@@ -91,7 +91,7 @@ def imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
     return () if wanted in (NONE, "") else (wanted,)
 
 
-def topic_roles(
+def load_topic_roles(
     file: str | Path | None = None, options: Iterable[str] = ()
 ) -> TopicRoles:
     """Reads roles from a YAML file and options `ROLE=TOPIC`, which override it (ConfigError)."""
@@ -131,7 +131,7 @@ def assign(
             found[role] = topic
     for needed, words in ((("cmd_vel",), "commands"), (("pose", "odom"), "poses")):
         if not found.keys() & set(needed):
-            raise RecordingError(f"{place}: {table.missing(needed, words)}")
+            raise RecordingError(f"{place}: {table.describe_missing(needed, words)}")
     return found
 
 
@@ -150,7 +150,7 @@ class _Topics:
         topic = wanted if wanted.startswith("/") else f"/{wanted}"
         if topic not in self.types or topic in self.empty:
             lack = "holds no messages of the" if topic in self.empty else "has no"
-            listed = self._listed((role,))
+            listed = self._list_topics((role,))
             raise RecordingError(
                 f"{self.place}: {lack} topic {topic!r} ({role}); {listed}"
             )
@@ -163,7 +163,7 @@ class _Topics:
 
     def _guess(self, role: str) -> str | None:
         """Returns the only topic with the most reliable usual name; None if no name matches."""
-        fitting = self._fitting(role)
+        fitting = self._find_fitting(role)
         for pattern in USUAL[role]:
             # A simulator tells the true pose as odometry; other odometry is no pose by itself.
             never: tuple[str, ...] = (TRANSFORMS,)
@@ -184,7 +184,7 @@ class _Topics:
                 return found[0]
         return None
 
-    def missing(self, roles: Sequence[str], words: str) -> str:
+    def describe_missing(self, roles: Sequence[str], words: str) -> str:
         """Tells that no topic has any of the roles, with the fix."""
         kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
         advice = f"record one of type {', '.join(kinds)}"
@@ -194,19 +194,21 @@ class _Topics:
             )
         advice += ", or, if another topic holds them, name it with --map, which "
         advice += "`nics inspect BAG --map my.yaml` begins"
-        fitting = [f"{role}={topic}" for role in roles for topic in self._fitting(role)]
+        fitting = [
+            f"{role}={topic}" for role in roles for topic in self._find_fitting(role)
+        ]
         if fitting:
             advice = f"say which does, as in --topic {fitting[0]}"
-        return f"no topic is known to hold the {words}; {advice}; {self._listed(roles)}"
+        return f"no topic is known to hold the {words}; {advice}; {self._list_topics(roles)}"
 
-    def _fitting(self, *roles: str) -> list[str]:
+    def _find_fitting(self, *roles: str) -> list[str]:
         kinds = {kind for role in roles for kind in TYPES[role]}
         return sorted(
             t for t, kind in self.types.items() if kind in kinds and t not in self.empty
         )
 
-    def _listed(self, roles: Sequence[str]) -> str:
-        fitting = self._fitting(*roles)
+    def _list_topics(self, roles: Sequence[str]) -> str:
+        fitting = self._find_fitting(*roles)
         topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
         told = [
             f"{topic} ({self.types[topic]}{', empty' if topic in self.empty else ''})"

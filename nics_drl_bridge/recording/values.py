@@ -20,8 +20,8 @@ from nics_drl_bridge.recording.mapping import (
     UnitOfData,
     Value,
 )
-from nics_drl_bridge.recording.recording import Stream, likely_unit
-from nics_drl_bridge.recording.table import Column, Source, Table, numbers_of
+from nics_drl_bridge.recording.recording import Stream, guess_time_unit
+from nics_drl_bridge.recording.table import Column, Source, Table, read_numbers
 
 ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
 CLOCK = re.compile(r"\d\d:\d\d:\d\d")  # a time of day
@@ -57,23 +57,23 @@ class MappedReader:
         self.notes: list[str] = []
         self._stamped: dict[tuple[str, str], Stamped] = {}
 
-    def say(self, *notes: str) -> None:
+    def add_notes(self, *notes: str) -> None:
         """Adds sentences, each once."""
         self.notes += [note for note in notes if note and note not in self.notes]
 
-    def place(
+    def locate(
         self, reference: Reference, within: str | None = None
     ) -> tuple[Table, Reference]:
         """Returns the table of a reference, and the column there; RecordingError: no such table."""
         names = self.source.names
         if isinstance(reference, str):
             for k in (k for k, sign in enumerate(reference) if sign == ":"):
-                if (name := _table_name(reference[:k], names)) is not None:
-                    return self._table(name), reference[k + 1 :]
+                if (name := _match_table(reference[:k], names)) is not None:
+                    return self._read_table(name), reference[k + 1 :]
         wanted = within or self.mapping.in_ or (names[0] if len(names) == 1 else None)
-        name = None if wanted is None else _table_name(wanted, names)
+        name = None if wanted is None else _match_table(wanted, names)
         if name is not None:
-            table = self._table(name)
+            table = self._read_table(name)
             if (
                 not isinstance(reference, str)
                 or ":" not in reference
@@ -90,12 +90,12 @@ class MappedReader:
         fault = f"{self.source.place}: {reference!r} is of no table"
         raise ConfigError(f"{fault}; {advice}; its tables are {listed}.")
 
-    def _table(self, name: str) -> Table:
-        table = self.source.table(name)
-        self.say(*table.notes)
+    def _read_table(self, name: str) -> Table:
+        table = self.source.get_table(name)
+        self.add_notes(*table.notes)
         return table
 
-    def stamped(
+    def stamp_rows(
         self, table: Table, column: Column, time: schema.Time | None
     ) -> Stamped:
         """Returns the rows of a column in order, by their stamps."""
@@ -105,7 +105,7 @@ class MappedReader:
             return Stamped(np.arange(count) / time.rate, np.arange(count), "", count)
         key = table.place, repr(time)
         if key not in self._stamped:
-            self._stamped[key] = self._of_stamps(table, time)
+            self._stamped[key] = self._read_stamps(table, time)
         found = self._stamped[key]
         if found.total != count:
             fault = (
@@ -114,7 +114,7 @@ class MappedReader:
             raise RecordingError(f"{fault}; say which are, by `time:` beside `from:`.")
         return found
 
-    def _of_stamps(self, table: Table, time: schema.Time | None) -> Stamped:
+    def _read_stamps(self, table: Table, time: schema.Time | None) -> Stamped:
         which = "" if time is None else str(time.from_)
         if time is None or which in (schema.HEADER, schema.ARRIVAL):
             given = table.stamps(which)
@@ -123,7 +123,7 @@ class MappedReader:
                 raise RecordingError(
                     f"{table.place}: which column is the time? Say {example}."
                 )
-            self.say(*table.notes)
+            self.add_notes(*table.notes)
             rows = given.values[:, 0].astype(np.intp)
             asked = getattr(self.mapping.time, "from_", None) == schema.HEADER
             main = (
@@ -131,11 +131,11 @@ class MappedReader:
             )  # the mapping's own clock
             clock = "" if given.clock == main else given.clock
             return Stamped(given.t, rows, clock, len(table.column(0)))
-        raw = self._raw_stamps(table, time)
+        raw = self._read_raw_stamps(table, time)
         name = table.place.rpartition("/")[2]
         known = np.flatnonzero(np.isfinite(raw))
         alone = len(time.columns) == 1 and time.unit in (None, "s")
-        if alone and (each := stamping.rows_a_second(raw[known])):
+        if alone and (each := stamping.count_rows_a_second(raw[known])):
             column = time.columns[0]  # lacks the part below a second
             rest = (b for a, b in stamping.SPLIT if a == column and b in table.names)
             line = next(
@@ -145,45 +145,47 @@ class MappedReader:
             fix = f"write `{line}` into the mapping, or choose another column"
             raise RecordingError(f"{fault}; {fix}.")
         if len(known) < len(raw):
-            self.say(
+            self.add_notes(
                 f"{name}: {len(raw) - len(known)} rows without a stamp were left out."
             )
-        t, note = stamping.without_overflow(raw[known], name)
-        self.say(note)
-        if (unit := likely_unit(t)) is not None and time.unit is None:
+        t, note = stamping.remove_overflow(raw[known], name)
+        self.add_notes(note)
+        if (unit := guess_time_unit(t)) is not None and time.unit is None:
             usual = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
             fault = f"{table.place}: the stamps {time.columns[0]!r} are {usual}"
             advice = f"write `time: {{from: {time.columns[0]}, unit: {unit}}}` into the mapping"
             raise RecordingError(f"{fault}; {advice} (`unit: s` if they are).")
-        t, order, note = stamping.in_order(
+        t, order, note = stamping.repair_order(
             t * schema.UNITS[time.unit or "s"].factor, name
         )
-        self.say(note)
+        self.add_notes(note)
         return Stamped(t, known[order], "", len(raw))
 
-    def _raw_stamps(self, table: Table, time: schema.Time) -> Array:
+    def _read_raw_stamps(self, table: Table, time: schema.Time) -> Array:
         first, *others = time.columns
-        which = self._beside(table, first)[1]
+        which = self._locate_beside(table, first)[1]
         if others:
-            nanoseconds = numbers_of(table, self._beside(table, others[0])[1])
-            return stamping.joined(numbers_of(table, which), nanoseconds)
+            nanoseconds = read_numbers(table, self._locate_beside(table, others[0])[1])
+            return stamping.join_stamps(read_numbers(table, which), nanoseconds)
         column = table.column(which)
         if column.dtype.kind in "US":
-            dates = dates_of(column)
-            return numbers_of(table, which) if dates is None else dates
+            dates = parse_dates(column)
+            return read_numbers(table, which) if dates is None else dates
         return column.astype(np.float64)
 
-    def _beside(self, table: Table, reference: Reference) -> tuple[Table, Reference]:
+    def _locate_beside(
+        self, table: Table, reference: Reference
+    ) -> tuple[Table, Reference]:
         """Returns table and column of a reference that, without a table, is of the values'."""
         if (
             isinstance(reference, str)
             and ":" in reference
             and reference not in table.names
         ):
-            return self.place(reference)
+            return self.locate(reference)
         return table, reference
 
-    def series(
+    def read_series(
         self,
         name: str,
         value: Value,
@@ -196,10 +198,10 @@ class MappedReader:
         What is `infinite` is refused, or else unknown.
         """
         stream = stream or Measured()
-        table, which = self.place(value.from_, stream.in_)
-        column = numbers_of(table, which)
+        table, which = self.locate(value.from_, stream.in_)
+        column = read_numbers(table, which)
         time = value.time or stream.time
-        at = self.stamped(table, column, time)
+        at = self.stamp_rows(table, column, time)
         clock = (
             value.clock
             or stream.clock
@@ -219,58 +221,66 @@ class MappedReader:
             raise RecordingError(f"{fault}; choose another column.")
         if not known.all():
             missing = f"{int((~known).sum())} of {len(raw)} rows have no value"
-            self.say(f"{name}: {missing}, and were left out.")
+            self.add_notes(f"{name}: {missing}, and were left out.")
         made = Series(at.t[known], raw[known], clock)
         plain = (
-            unit_of(value).si in ("", "rad/s", "m/s", "ticks/s") and value.wrap is None
+            get_unit(value).si in ("", "rad/s", "m/s", "ticks/s") and value.wrap is None
         )
-        if plain and not value.counts and (does := stamping.counter(made.values)):
+        if (
+            plain
+            and not value.counts
+            and (does := stamping.describe_counter(made.values))
+        ):
             fault = f"{table.place}: {which!r} is a counter that {does}"
             advice = f"write `{{from: {which}, unit: ticks, ticks_per_turn: ...}}`"
             raise RecordingError(f"{fault}, no speed: {advice} for {name}.")
-        made = self._in_si(name, value, made, held)
-        return self._where(value, made, table, time) if value.when else made
+        made = self._convert_to_si(name, value, made, held)
+        return self._apply_flags(value, made, table, time) if value.when else made
 
-    def _in_si(self, name: str, value: Value, raw: Series, held: bool) -> Series:
-        factor = unit_of(value).factor * value.scale
+    def _convert_to_si(
+        self, name: str, value: Value, raw: Series, held: bool
+    ) -> Series:
+        factor = get_unit(value).factor * value.scale
         factor *= 1.0 if value.maximum is None else value.maximum
         if value.wrap is not None or value.counts:
-            raw = self._continued(name, value, raw)
-        if value.counts and stamping.comes_back(raw.values):
+            raw = self._unwrap(name, value, raw)
+        if value.counts and stamping.is_oscillating(raw.values):
             fault = (
                 f"{self.source.place}: {value.from_!r} goes up and down like a speed"
             )
             advice = f"write `unit: {value.unit or 'ticks'}/s` for {name}"
             raise RecordingError(f"{fault}, and is no counter: {advice}.")
         if value.counts:
-            raw = _rate(raw, held)
+            raw = _derive_rate(raw, held)
         return raw._replace(values=raw.values * factor + value.offset)
 
-    def _continued(self, name: str, value: Value, raw: Series) -> Series:
+    def _unwrap(self, name: str, value: Value, raw: Series) -> Series:
         """Continues a counter over its overflows; an absolute angle begins near zero."""
-        size = value.wrap or stamping.overflow(raw.values, (1.0,), stamping.BITS)
+        size = value.wrap or stamping.find_overflow(raw.values, (1.0,), stamping.BITS)
         if size is None:
             return raw
-        values, count = stamping.unwrapped(raw.values, size)
+        values, count = stamping.unwrap_counter(raw.values, size)
         if not value.counts:
             values = values - size * np.round(values[0] / size)
         if count:
             found = "" if value.wrap else ", as it seems"
-            end = f"{stamping.times(count)}, at {size:.10g}{found}"
-            self.say(f"{name}: the counter overflowed {end}, and was continued.")
+            end = f"{stamping.format_times(count)}, at {size:.10g}{found}"
+            self.add_notes(f"{name}: the counter overflowed {end}, and was continued.")
         return raw._replace(values=values)
 
-    def _where(
+    def _apply_flags(
         self, value: Value, made: Series, table: Table, time: schema.Time | None
     ) -> Series:
         """Puts `otherwise` where a flag is not as it must be."""
         on = np.ones(len(made.t), dtype=np.bool_)
         for reference, wanted in value.when.items():
-            other, which = self._beside(table, reference)
+            other, which = self._locate_beside(table, reference)
             column = other.column(which)
-            at = self.stamped(other, column, time if other is table else None)
+            at = self.stamp_rows(other, column, time if other is table else None)
             row = np.searchsorted(at.t, made.t, side="right") - 1
-            on &= _equals(column, wanted)[at.rows][np.clip(row, 0, None)] & (row >= 0)
+            on &= _match_values(column, wanted)[at.rows][np.clip(row, 0, None)] & (
+                row >= 0
+            )
         if not on.any():
             wanted = " and ".join(
                 f"{name} is {each!r}" for name, each in value.when.items()
@@ -282,7 +292,7 @@ class MappedReader:
         return made._replace(values=np.where(on, made.values, value.otherwise))
 
 
-def unit_of(value: Value) -> UnitOfData:
+def get_unit(value: Value) -> UnitOfData:
     """Returns the unit in SI and the factor of a value, of a counter those of its rate."""
     unit = value.unit or ("ticks" if value.ticks_per_turn else None)
     si, factor = (
@@ -291,7 +301,7 @@ def unit_of(value: Value) -> UnitOfData:
     return UnitOfData(schema.RATES.get(si, si) if value.counts else si, factor)
 
 
-def _table_name(wanted: str, names: Sequence[str]) -> str | None:
+def _match_table(wanted: str, names: Sequence[str]) -> str | None:
     """Returns a table by its name, by its name without suffix, or by a topic without slash."""
     alike = (
         name
@@ -301,7 +311,7 @@ def _table_name(wanted: str, names: Sequence[str]) -> str | None:
     return wanted if wanted in names else next(alike, None)
 
 
-def dates_of(column: Column) -> Array | None:
+def parse_dates(column: Column) -> Array | None:
     """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None if they are none."""
     text = [ZONE.sub("", str(each)).replace("/", "-") for each in column]
     if text and CLOCK.match(text[0]):
@@ -310,12 +320,12 @@ def dates_of(column: Column) -> Array | None:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:
         return None
-    return stamping.joined(
+    return stamping.join_stamps(
         ns // NS_PER_S, ns % NS_PER_S
     )  # exact to a quarter of a microsecond
 
 
-def _rate(raw: Series, held: bool) -> Series:
+def _derive_rate(raw: Series, held: bool) -> Series:
     """Differentiates a counter: exact between two stamps, so that its integral stays.
 
     Of rows that come at once only the last is used: ticks between them would be of no time.
@@ -328,7 +338,7 @@ def _rate(raw: Series, held: bool) -> Series:
     return Series(t[:-1] if held else (t[:-1] + t[1:]) / 2.0, rate, raw.clock)
 
 
-def _equals(column: Column, wanted: schema.Condition) -> NDArray[np.bool_]:
+def _match_values(column: Column, wanted: schema.Condition) -> NDArray[np.bool_]:
     """Selects rows (T,) in which a flag has one of the wanted values."""
     on = np.zeros(len(column), dtype=np.bool_)
     for each in wanted if isinstance(wanted, list) else [wanted]:
@@ -339,7 +349,7 @@ def _equals(column: Column, wanted: schema.Condition) -> NDArray[np.bool_]:
     return on
 
 
-def together(name: str, parts: Sequence[Series], held: bool) -> Stream:
+def combine_series(name: str, parts: Sequence[Series], held: bool) -> Stream:
     """Joins values to a stream: commands hold, others are interpolated at the first's rows."""
     clocks = sorted({part.clock for part in parts})
     if len(clocks) > 1:

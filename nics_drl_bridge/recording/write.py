@@ -72,13 +72,13 @@ def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None
 def write_bag(
     recording: Recording, path: str | Path, spec: RobotSpec, storage: Storage = "mcap"
 ) -> None:
-    """Writes a recording as a bag that `load_bag` reads back; for errors see `bag_sink`."""
+    """Writes a recording as a bag that `load_bag` reads back; for errors see `open_bag_sink`."""
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
     # or `/pose` on its own clock or beside odometry.
-    with bag_sink(path, storage) as sink:
+    with open_bag_sink(path, storage) as sink:
         messages = _Messages(store := sink.store)
         command = recording.command
-        for topic, kind, stream, make in _topics(recording, spec, messages):
+        for topic, kind, stream, make in _list_topics(recording, spec, messages):
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
             # By their receipt, streams of other clocks start together with the commands.
@@ -87,13 +87,13 @@ def write_bag(
                 receive = stamps + round(float(command.t[0] - stream.t[0]) * NS_PER_S)
                 stamps = stamps - APART_NS
             for k, values in enumerate(stream.values):
-                message = make(messages.header(int(stamps[k])), values)
+                message = make(messages.make_header(int(stamps[k])), values)
                 sink.write(
                     topic, int(receive[k]), bytes(store.serialize_cdr(message, kind))
                 )
 
 
-def _topics(
+def _list_topics(
     recording: Recording, spec: RobotSpec, messages: "_Messages"
 ) -> Iterator[tuple[str, str, Stream, Make]]:
     beside = (
@@ -110,26 +110,26 @@ def _topics(
             "/cmd_vel",
             topic_roles.TWIST,
             recording.command,
-            lambda _, row: messages.twist(spec.to_cmd_vel(row)),
+            lambda _, row: messages.make_twist(spec.to_cmd_vel(row)),
         ),
-        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
+        ("/pose", topic_roles.POSE, recording.pose, messages.make_pose_stamped)
         if beside
-        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
+        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.make_odometry),
         (
             "/odom",
             topic_roles.ODOMETRY,
             recording.odometry,
-            lambda header, row: messages.odometry(header, row, pose_known=False),
+            lambda header, row: messages.make_odometry(header, row, pose_known=False),
         ),
         (
             "/joint_states",
             topic_roles.JOINTS,
             joints,
-            lambda header, row: messages.joints(
+            lambda header, row: messages.make_joints(
                 header, names, row * still, row * ~still
             ),
         ),
-        ("/imu", topic_roles.IMU, recording.imu, messages.imu),
+        ("/imu", topic_roles.IMU, recording.imu, messages.make_imu),
     ]
     for topic, kind, stream, make in topics:
         if stream is not None:
@@ -140,73 +140,75 @@ class _Messages:
     def __init__(self, store: "Typestore") -> None:
         self._types = store.types
 
-    def _new(self, kind: str, *values: Any) -> Any:
+    def _make(self, kind: str, *values: Any) -> Any:
         package, name = kind.split("/")
         return self._types[f"{package}/msg/{name}"](*values)
 
-    def header(self, stamp_ns: int) -> Any:
-        stamp = self._new(
+    def make_header(self, stamp_ns: int) -> Any:
+        stamp = self._make(
             "builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S
         )
-        return self._new("std_msgs/Header", stamp, FRAMES[0])
+        return self._make("std_msgs/Header", stamp, FRAMES[0])
 
-    def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
-        return self._new("geometry_msgs/Vector3", x, y, z)
+    def _make_vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
+        return self._make("geometry_msgs/Vector3", x, y, z)
 
-    def twist(self, row: Array) -> Any:
+    def make_twist(self, row: Array) -> Any:
         x, y, w = (float(value) for value in row)
-        return self._new("geometry_msgs/Twist", self._vector(x, y), self._vector(z=w))
+        return self._make(
+            "geometry_msgs/Twist", self._make_vector(x, y), self._make_vector(z=w)
+        )
 
-    def _pose(self, row: Array) -> Any:
+    def _make_pose(self, row: Array) -> Any:
         x, y, heading = (float(value) for value in row)
         z = float(np.sin(heading / 2.0))
         w = float(np.cos(heading / 2.0))
-        turned = self._new("geometry_msgs/Quaternion", 0.0, 0.0, z, w)
-        return self._new(
-            "geometry_msgs/Pose", self._new("geometry_msgs/Point", x, y, 0.0), turned
+        turned = self._make("geometry_msgs/Quaternion", 0.0, 0.0, z, w)
+        return self._make(
+            "geometry_msgs/Pose", self._make("geometry_msgs/Point", x, y, 0.0), turned
         )
 
-    def pose_stamped(self, header: Any, row: Array) -> Any:
-        return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
+    def make_pose_stamped(self, header: Any, row: Array) -> Any:
+        return self._make("geometry_msgs/PoseStamped", header, self._make_pose(row))
 
-    def odometry(self, header: Any, row: Array, pose_known: bool = True) -> Any:
+    def make_odometry(self, header: Any, row: Array, pose_known: bool = True) -> Any:
         """Makes an odometry message of which only the pose or only the twist was recorded."""
         pose, twist = (row, np.zeros(3)) if pose_known else (np.zeros(3), row)
         covariance = np.append(0.0 if pose_known else -1.0, np.zeros(35))
-        where = self._new(
-            "geometry_msgs/PoseWithCovariance", self._pose(pose), covariance
+        where = self._make(
+            "geometry_msgs/PoseWithCovariance", self._make_pose(pose), covariance
         )
-        speed = self._new(
-            "geometry_msgs/TwistWithCovariance", self.twist(twist), np.zeros(36)
+        speed = self._make(
+            "geometry_msgs/TwistWithCovariance", self.make_twist(twist), np.zeros(36)
         )
-        return self._new("nav_msgs/Odometry", header, FRAMES[1], where, speed)
+        return self._make("nav_msgs/Odometry", header, FRAMES[1], where, speed)
 
-    def joints(
+    def make_joints(
         self, header: Any, names: list[str], position: Array, velocity: Array
     ) -> Any:
-        return self._new(
+        return self._make(
             "sensor_msgs/JointState", header, names, position, velocity, np.zeros(0)
         )
 
-    def imu(self, header: Any, row: Array) -> Any:
+    def make_imu(self, header: Any, row: Array) -> Any:
         ax, ay, w = (float(value) for value in row)
-        level = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        level = self._make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
         absent = np.full(9, -1.0)
-        rates = self._vector(z=w)
-        pulls = self._vector(ax, ay)
+        rates = self._make_vector(z=w)
+        pulls = self._make_vector(ax, ay)
         measured = np.zeros(9)
-        return self._new(
+        return self._make(
             "sensor_msgs/Imu", header, level, absent, rates, measured, pulls, measured
         )
 
 
 class BagSink:
-    """An open bag, created by `bag_sink` with an open writer of rosbags."""
+    """An open bag, created by `open_bag_sink` with an open writer of rosbags."""
 
     def __init__(self, writer: "Writer") -> None:
         # the known message types
         self._writer = writer
-        self.store = msgs.typestore()
+        self.store = msgs.make_typestore()
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
         # the first one of the file or the database
@@ -231,8 +233,8 @@ class BagSink:
             given = {}
         else:
             given = {"msgdef": definition or "", "rihs01": NO_HASH}
-        profiles = [msgs.profile_of(offer) for offer in offers]
-        with self._noting_faults():
+        profiles = [msgs.make_profile(offer) for offer in offers]
+        with self._record_fault():
             self._connections[topic] = self._writer.add_connection(
                 topic,
                 kind,
@@ -245,7 +247,7 @@ class BagSink:
     def write(self, topic: str, receive_ns: int, data: bytes) -> None:
         """Writes a serialized message."""
         storage: Any = self._writer.storage
-        with self._noting_faults():
+        with self._record_fault():
             self._writer.write(self._connections[topic], receive_ns, data)
             self.counts[topic] += 1
             if (
@@ -257,7 +259,7 @@ class BagSink:
     def flush(self) -> None:
         """Flushes written messages to the file, so that a crash of this process can't lose them."""
         storage: Any = self._writer.storage
-        with self._noting_faults():
+        with self._record_fault():
             if hasattr(storage, "close_chunk"):
                 if storage.chunk.msgs:
                     storage.close_chunk()
@@ -266,7 +268,7 @@ class BagSink:
                 storage.conn.commit()
 
     @contextmanager
-    def _noting_faults(self) -> Iterator[None]:
+    def _record_fault(self) -> Iterator[None]:
         """Notes that the storage failed; a full disk is an error of SQLite, or of the system."""
         try:
             yield
@@ -276,7 +278,7 @@ class BagSink:
 
 
 @contextmanager
-def bag_sink(
+def open_bag_sink(
     path: str | Path, storage: Storage = "mcap", keep: bool = False
 ) -> Iterator[BagSink]:
     """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
@@ -360,10 +362,10 @@ def _set_apart(unfinished: Path, path: Path) -> Path:
 
 def _finish(unfinished: Path, path: Path, storage: Storage) -> None:
     """Makes a closed bag safe on the disk, and gives it its name."""
-    from nics_drl_bridge.recording.mcap import seal
+    from nics_drl_bridge.recording.mcap import write_checksums
 
     if storage == "mcap":
-        seal(unfinished / f"{path.name}.mcap")
+        write_checksums(unfinished / f"{path.name}.mcap")
     sync_folder(unfinished)
     if path.exists():
         raise RecordingError(

@@ -17,10 +17,10 @@ from nics_drl_bridge.lidar.sectors import ScanLayout, plan_of, reader_of
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.recording import messages
-from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.bag_file import open_bag
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import Offer, Row
-from nics_drl_bridge.recording.topic_roles import IMU, IMU_NAMES, imu_topics
+from nics_drl_bridge.recording.topic_roles import IMU, IMU_NAMES, list_imu_topics
 from nics_drl_bridge.robot.spec import RobotSpec
 
 SCAN = "scan"
@@ -111,7 +111,7 @@ class Facts:
         heard = self.heard.setdefault(role, TopicFacts())
         heard.arrivals_ns.append(arrival_ns)
         if hasattr(message, "header"):
-            heard.stamps_ns.append(messages.stamp(message))
+            heard.stamps_ns.append(messages.get_stamp(message))
             heard.frames.add(str(message.header.frame_id))
         if role == SCAN:
             fields = {
@@ -125,16 +125,16 @@ class Facts:
                 self.ranges.append(np.array(message.ranges, dtype=np.float32))
         elif role == ODOM:
             heard.children.add(str(message.child_frame_id))
-            self.poses.append(messages.pose_row(message))
-            self.twists.append(messages.twist_row(message))
-            self.lengths.append(math.hypot(*messages.quaternion(message)))
+            self.poses.append(messages.read_pose(message))
+            self.twists.append(messages.read_twist(message))
+            self.lengths.append(math.hypot(*messages.read_quaternion(message)))
             covariances = message.pose.covariance, message.twist.covariance
             self.uncovered += any(not np.any(one) for one in covariances)
         elif role == CMD_VEL:
-            self.commands.append(messages.command_row(message))
+            self.commands.append(messages.read_command(message))
         elif role == GYRO:
             if (measured := self.gyro.read(message)) is not None:
-                self.yaw_rates.append((messages.stamp(message), measured[0]))
+                self.yaw_rates.append((messages.get_stamp(message), measured[0]))
         else:
             self.clock_ns.append(
                 int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec)
@@ -145,7 +145,7 @@ def names_in(namespace: str, imu: str = "auto") -> dict[str, str]:
     """Role -> topic of a robot in a namespace; none of a gyro if `imu` is none."""
     space = parse_namespace(namespace)
     names = {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
-    if gyros := imu_topics(imu, by_default=True):
+    if gyros := list_imu_topics(imu, by_default=True):
         names[GYRO] = gyros[0] if gyros[0].startswith("/") else f"{space}/{gyros[0]}"
     return names
 
@@ -169,7 +169,7 @@ def collect_facts_of_bag(
 ) -> Facts:
     """Collects the facts of a robot from a bag. Raises RecordingError if it is damaged."""
     facts = Facts(str(path), False, names_in(namespace, imu))
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         if GYRO in facts.names:
             types = {topic: kind.split(" and ") for topic, kind in bag.types.items()}
             facts.names[GYRO] = name_of_gyro(facts.names, imu, types)
@@ -180,7 +180,7 @@ def collect_facts_of_bag(
             )
         for role, topic in facts.names.items():
             if bag.types.get(topic) in KINDS[role]:
-                for message in bag.messages(topic):
+                for message in bag.read_messages(topic):
                     facts.take(role, message.receive_ns, message.content)
     return facts
 

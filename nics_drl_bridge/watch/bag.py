@@ -15,7 +15,7 @@ from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, merge_messages, read_messages
-from nics_drl_bridge.recording.messages import commanded
+from nics_drl_bridge.recording.messages import read_robot_command
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
@@ -112,7 +112,7 @@ def _read(
     for role, message in merge_messages(messages):
         used = playback.take(role, message)
         if role == CMD_VEL:
-            command = commanded(message.content, model.robot)
+            command = read_robot_command(message.content, model.robot)
         if role != every or not used or ODOM not in middleware.cache.newest:
             continue
         stamps.append(middleware.newest_ns or 0)

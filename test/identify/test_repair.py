@@ -23,7 +23,7 @@ from nics_drl_bridge.identify.repair import (
 )
 from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.mapping import load_mapping
-from nics_drl_bridge.recording.readers import robot_and_drive
+from nics_drl_bridge.recording.readers import read_robot_and_drive
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,
@@ -258,13 +258,17 @@ def test_two_commands_a_quarter_of_a_period_apart_are_not_swapped(differential):
 @pytest.mark.parametrize("name", ["DS1", "DS3", "DS4"])
 def test_the_speed_and_steering_of_a_real_car_are_refused_if_they_are_swapped(name):
     mapping = load_mapping(ROOT / "examples" / "recordings" / "f110_folder.yaml")
-    spec, plain = robot_and_drive(JUMPING.parent / name, None, TopicRoles(), mapping)
+    spec, plain = read_robot_and_drive(
+        JUMPING.parent / name, None, TopicRoles(), mapping
+    )
     assert check_commands(Drive(plain, spec)) == ()
     columns = dict(
         zip(mapping.command, reversed(mapping.command.values()), strict=True)
     )
     swapped = mapping.model_copy(update={"command": columns})
-    spec, drive = robot_and_drive(JUMPING.parent / name, None, TopicRoles(), swapped)
+    spec, drive = read_robot_and_drive(
+        JUMPING.parent / name, None, TopicRoles(), swapped
+    )
     with pytest.raises(
         RecordingError, match="the column of `steering_command:` behind `speed_"
     ):
@@ -320,7 +324,7 @@ def test_wheels_in_rpm_are_told_if_their_radius_is_known():
 @pytest.mark.skipif(not JUMPING.exists(), reason=f"no recording of others at {JUMPING}")
 def test_the_jump_of_a_real_localiser_is_found_and_told():
     mapping = ROOT / "examples" / "recordings" / "f110_folder.yaml"
-    spec, recording = robot_and_drive(JUMPING, None, TopicRoles(), mapping)
+    spec, recording = read_robot_and_drive(JUMPING, None, TopicRoles(), mapping)
     _, notes = repaired(Drive(recording, spec))
     assert [note for note in notes if "jumps at 27.46 s (0.95 m, 0.12 rad)" in note]
 

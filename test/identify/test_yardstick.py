@@ -14,7 +14,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import windows
 from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist, twists_before
-from nics_drl_bridge.recording.readers import robot_and_drive
+from nics_drl_bridge.recording.readers import read_robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -108,7 +108,9 @@ def test_it_is_as_good_as_models_made_by_hand_on_real_drives(
     if not (RECORDINGS / source).exists():
         pytest.skip(f"the recordings of others are not at {RECORDINGS}")
     mapping = ROOT / "examples" / "recordings" / f"{mapping}.yaml"
-    spec, recording = robot_and_drive(RECORDINGS / source, None, TopicRoles(), mapping)
+    spec, recording = read_robot_and_drive(
+        RECORDINGS / source, None, TopicRoles(), mapping
+    )
     driven = Drive(recording, spec)
     learnt = 2.0 / 3.0 * driven.duration_s
     chosen = windows(driven, Calibration(), learnt, driven.duration_s, 5.0, 0.1)

@@ -20,7 +20,7 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.middleware.playback import estimate
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.bag_file import open_bag
 from nodes.peer import stamp_ns
 
 pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.timeout(240)]
@@ -123,7 +123,7 @@ def test_a_recorder_writes_a_whole_bag_at_ctrl_c(words, meet, domain_id, tmp_pat
         lines = [f"{topic}: {counts[topic]} messages" for topic in sorted(counts)]
         assert out.splitlines() == [*lines, f"bag written to {tmp_path / 'drive'}"]
     assert min(counts["/odom"], counts["/cmd_vel"]) >= 30
-    with opened(tmp_path / "drive") as bag:
+    with open_bag(tmp_path / "drive") as bag:
         assert [offer.reliable for offer in bag.offers("/odom")] == [False]
         assert [offer.depth for offer in bag.offers("/cmd_vel")] == [1]
     assert {path.name for path in tmp_path.iterdir()} == {"drive"}

@@ -15,7 +15,7 @@ from sensor_msgs.msg import Imu
 from nics_drl_bridge.errors import BackendError, RecordingError
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.record_node import DriveLog
-from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp
+from nics_drl_bridge.recording.messages import get_stamp, read_imu, read_pose
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
@@ -98,8 +98,8 @@ def test_the_pose_of_motion_capture_and_the_imu_are_taken():
         pose.pose.position.y = 0.2 * k
         pose.pose.orientation = conversions.heading_to_ros(0.5)
         imu.linear_acceleration.x, imu.angular_velocity.z = 0.3, -0.7
-        drive.log.add("pose", stamp(pose), pose_row(pose))
-        drive.log.add("imu", stamp(imu), imu_row(imu))
+        drive.log.add("pose", get_stamp(pose), read_pose(pose))
+        drive.log.add("imu", get_stamp(imu), read_imu(imu))
     recording = drive.log.recording()
     assert recording.pose.values[-1] == pytest.approx([0.0, 3.8, 0.5])
     assert recording.imu.values[-1] == pytest.approx([0.3, 0.0, -0.7])
@@ -112,7 +112,7 @@ def test_beside_a_pose_of_motion_capture_the_twist_of_the_odometry_is_taken():
         drive.hears(k, twist=(0.1 * k, 0.0, math.nan if k == 5 else -0.2))
         pose = PoseStamped()
         pose.header.stamp = conversions.stamp_to_ros(START_NS + k * PERIOD_NS)
-        drive.log.add("pose", stamp(pose), pose_row(pose))
+        drive.log.add("pose", get_stamp(pose), read_pose(pose))
     recording = check(drive.log.recording(), CAR)
     assert recording.odometry.values[-1] == pytest.approx([1.9, 0.0, -0.2])
     assert len(recording.odometry.t) == 19

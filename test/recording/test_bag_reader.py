@@ -8,8 +8,13 @@ import bags
 import numpy as np
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.bag_file import Message, opened
-from nics_drl_bridge.recording.bag_reader import gather, latency_of, state_of, wheels_of
+from nics_drl_bridge.recording.bag_file import Message, open_bag
+from nics_drl_bridge.recording.bag_reader import (
+    extract_state,
+    extract_wheels,
+    gather_joints,
+    measure_latency,
+)
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
@@ -256,7 +261,7 @@ def table(*messages):
         Message(k, bags.new(kind, bags.header(k), names, position, velocity, ()))
         for k, (names, position, velocity) in enumerate(messages)
     ]
-    return gather("/joint_states", made)
+    return gather_joints("/joint_states", made)
 
 
 def roles(**given) -> TopicRoles:
@@ -265,7 +270,7 @@ def roles(**given) -> TopicRoles:
 
 def refuse(joints, spec, **given) -> str:
     with pytest.raises(RecordingError) as caught:
-        state_of(joints, spec, roles(**given), "drive")
+        extract_state(joints, spec, roles(**given), "drive")
     return str(caught.value)
 
 
@@ -279,9 +284,9 @@ def refuse(joints, spec, **given) -> str:
 )
 def test_wheels_are_known_by_the_words_of_their_names(names):
     joints = table((names, (0.0, 0.0), (1.0, 2.0)), (names, (0.1, 0.2), (3.0, 4.0)))
-    state = state_of(joints, CART, roles(), "drive")
+    state = extract_state(joints, CART, roles(), "drive")
     assert state.values.tolist() == [[1.0, 2.0], [3.0, 4.0]]
-    assert wheels_of(joints, roles(), "drive").values.tolist() == [
+    assert extract_wheels(joints, roles(), "drive").values.tolist() == [
         [1.0, 2.0],
         [3.0, 4.0],
     ]
@@ -292,7 +297,7 @@ def test_wheels_in_another_order_are_put_in_the_robots():
         f"{end}_{side}_wheel" for end in ("rear", "front") for side in ("right", "left")
     ]
     joints = table((names, np.zeros(4), (4.0, 3.0, 2.0, 1.0)))
-    assert state_of(joints, MECANUM, roles(), "drive").values.tolist() == [
+    assert extract_state(joints, MECANUM, roles(), "drive").values.tolist() == [
         [1.0, 2.0, 3.0, 4.0]
     ]
 
@@ -300,29 +305,33 @@ def test_wheels_in_another_order_are_put_in_the_robots():
 def test_angles_are_positions_and_speeds_are_velocities_unless_the_mapping_says_otherwise():
     joints = table((("rack", "motor"), (0.3, 7.0), (9.0, 0.5)))
     named = roles(state={"speed": "motor", "steering": "rack"})
-    assert state_of(joints, CAR, named, "drive").values.tolist() == [[0.5, 0.3]]
+    assert extract_state(joints, CAR, named, "drive").values.tolist() == [[0.5, 0.3]]
     motor = {"joint": "motor", "field": "position", "scale": 0.1}
     named = roles(state={"speed": motor, "steering": "rack"})
-    assert np.allclose(state_of(joints, CAR, named, "drive").values, [[0.7, 0.3]])
+    assert np.allclose(extract_state(joints, CAR, named, "drive").values, [[0.7, 0.3]])
 
 
 def test_messages_about_other_joints_are_left_out():
     arm = (("elbow",), (0.0,), (1.0,))
     both = ("left_wheel", "right_wheel")
     joints = table(arm, (both, (), (1.0, 2.0)), arm, (both, (), (np.nan, 2.0)))
-    state = state_of(joints, CART, roles(), "drive")
+    state = extract_state(joints, CART, roles(), "drive")
     assert state.values.tolist() == [[1.0, 2.0]]
     assert state.receive_ns.tolist() == [1]
 
 
 def test_a_state_that_follows_its_command_need_not_be_measured():
-    assert state_of(table((("elbow",), (0.0,), (1.0,))), CAR, roles(), "drive") is None
+    assert (
+        extract_state(table((("elbow",), (0.0,), (1.0,))), CAR, roles(), "drive")
+        is None
+    )
 
 
 def test_a_component_of_the_twist_is_told_by_the_pose():
     husky = build_robot({"kind": "skid_steer", "footprint_radius": 0.6})
     assert (
-        state_of(table((("elbow",), (0.0,), (1.0,))), husky, roles(), "drive") is None
+        extract_state(table((("elbow",), (0.0,), (1.0,))), husky, roles(), "drive")
+        is None
     )
 
 
@@ -348,7 +357,10 @@ def test_joints_without_velocity_are_refused():
             "no message tells the position or velocity that is needed of left_wheel"
             in sentence
         )
-        assert wheels_of(table((names, (0.0, 0.0), velocity)), roles(), "drive") is None
+        assert (
+            extract_wheels(table((names, (0.0, 0.0), velocity)), roles(), "drive")
+            is None
+        )
 
 
 def test_names_that_are_not_there_come_with_the_nearest():
@@ -361,7 +373,7 @@ def test_names_that_are_not_there_come_with_the_nearest():
         joints, CART, state={"left_weel": "wheel_l"}
     )
     with pytest.raises(RecordingError, match="has no joint 'left'"):
-        wheels_of(joints, roles(wheels=["left", "wheel_r"]), "drive")
+        extract_wheels(joints, roles(wheels=["left", "wheel_r"]), "drive")
 
 
 LEAST_S = 0.012
@@ -388,8 +400,8 @@ def drive(path, ahead=0.0, sweep=0.0, scans=300):
 
 
 def measured(path):
-    with opened(path) as bag:
-        return latency_of(bag)
+    with open_bag(path) as bag:
+        return measure_latency(bag)
 
 
 @pytest.mark.parametrize("sweep", [0.0, 0.09])

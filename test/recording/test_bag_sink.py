@@ -13,9 +13,9 @@ import bags
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording import write
-from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.bag_file import open_bag
 from nics_drl_bridge.recording.messages import Offer
-from nics_drl_bridge.recording.write import bag_sink
+from nics_drl_bridge.recording.write import open_bag_sink
 
 STORAGES = ("mcap", "sqlite3")
 
@@ -27,15 +27,15 @@ def storage_file(bag):
 
 def held(bag):
     """All messages of a bag."""
-    with opened(bag) as whole:
-        return {topic: whole.serialized(topic) for topic in whole.types}
+    with open_bag(bag) as whole:
+        return {topic: whole.read_serialized(topic) for topic in whole.types}
 
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_of_a_killed_recorder_all_that_was_flushed_is_there(tmp_path, storage):
     """A process that is killed leaves the hidden folder as it is."""
     message = bags.STORE.serialize_cdr(bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST)
-    writing = bag_sink(tmp_path / "drive", storage)
+    writing = open_bag_sink(tmp_path / "drive", storage)
     sink = writing.__enter__()
     sink.add_topic("/cmd_vel", bags.kinds.TWIST, [Offer(depth=1)])
     for k in range(50):
@@ -67,7 +67,7 @@ def small_disk(tmp_path):
 def record(place, storage, count, keep=True, then=None, flush_every=10):
     """Messages of a second, as the recorder writes them; `then` is raised after the last one."""
     message = bags.STORE.serialize_cdr(bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST)
-    with bag_sink(place, storage, keep=keep) as sink:
+    with open_bag_sink(place, storage, keep=keep) as sink:
         sink.add_topic("/cmd_vel", bags.kinds.TWIST, [Offer(depth=1)])
         for k in range(count):
             sink.write("/cmd_vel", bags.ns(0.1 * k), bytes(message))
@@ -159,10 +159,10 @@ def test_a_bag_whose_place_was_taken_meanwhile_is_kept(tmp_path, monkeypatch):
 def test_what_publishers_offer_is_kept(tmp_path, storage):
     offers = (Offer(depth=1, transient_local=True), Offer(depth=7, reliable=False))
     message = bags.STORE.serialize_cdr(bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST)
-    with bag_sink(tmp_path / "bag", storage) as sink:
+    with open_bag_sink(tmp_path / "bag", storage) as sink:
         sink.add_topic("/cmd_vel", bags.kinds.TWIST, offers)
         sink.write("/cmd_vel", bags.ns(0.0), bytes(message))
-    with opened(tmp_path / "bag") as bag:
+    with open_bag(tmp_path / "bag") as bag:
         assert bag.offers("/cmd_vel") == offers
 
 
@@ -172,7 +172,7 @@ def test_a_type_that_nobody_knows_is_written_with_its_text(tmp_path):
         "my_msgs/msg/Part": "float64 y",
     }
     data = b"\x00\x01\x00\x00\x01\x00\x00\x00\x00\x00\x00\x00" + b"\x00" * 8
-    with bag_sink(tmp_path / "bag") as sink:
+    with open_bag_sink(tmp_path / "bag") as sink:
         sink.add_topic("/own", "my_msgs/msg/Own", texts=texts)
         sink.write("/own", bags.ns(0.0), data)
     assert b"float64 y" in storage_file(tmp_path / "bag").read_bytes()
@@ -182,8 +182,8 @@ def test_a_type_that_nobody_knows_is_written_with_its_text(tmp_path):
 KILLED = """
 import sys
 from pathlib import Path
-from nics_drl_bridge.recording.write import bag_sink
-with bag_sink(Path(sys.argv[1]), keep=sys.argv[2] == "keep") as sink:
+from nics_drl_bridge.recording.write import open_bag_sink
+with open_bag_sink(Path(sys.argv[1]), keep=sys.argv[2] == "keep") as sink:
     sink.add_topic("/chatter", "std_msgs/msg/String")
     sink.write("/chatter", 1, b"\\0\\1\\0\\0\\2\\0\\0\\0x\\0\\0\\0")
     sink.flush()

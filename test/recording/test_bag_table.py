@@ -13,11 +13,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.bag_file import opened
-from nics_drl_bridge.recording.guess import first_mapping
+from nics_drl_bridge.recording.bag_file import open_bag
+from nics_drl_bridge.recording.guess import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
-from nics_drl_bridge.recording.survey import survey
+from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.robot.spec import load_robot
 
 FOREIGN = "my_car_msgs/msg/Drive"
@@ -88,8 +88,8 @@ def test_a_bag_of_ros_1_is_read_by_any_number_in_it(tmp_path):
 def test_a_bag_of_ros_1_is_read_by_roles_of_topics_too(tmp_path):
     with pytest.raises(RecordingError, match="no topic is known to hold the commands"):
         read_recording(ros_1_bag(tmp_path / "drive.bag"), load_robot("ackermann"))
-    with opened(tmp_path / "drive.bag") as bag:
-        (_, first), *_ = bag.serialized("/pose")
+    with open_bag(tmp_path / "drive.bag") as bag:
+        (_, first), *_ = bag.read_serialized("/pose")
     x = bags.STORE.deserialize_cdr(first, bags.kinds.POSE).pose.position.x
     assert x == pytest.approx(0.0)
 
@@ -215,8 +215,8 @@ def test_the_covariance_of_a_message_gives_deviations(tmp_path):
 
 def test_a_bag_is_surveyed_to_a_first_mapping(tmp_path):
     with open_source(foreign_bag(tmp_path / "bag")) as source:
-        tables = {table.name: table for table in survey(source)}
-        guess = parse_yaml(first_mapping(list(tables.values())), "guess")
+        tables = {table.name: table for table in inspect_tables(source)}
+        guess = parse_yaml(propose_mapping(list(tables.values())), "guess")
     assert [column.name for column in tables["/drive"].columns][-2:] == [
         "armed",
         "mode",

@@ -9,10 +9,10 @@ import pytest
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.recording.guess import first_mapping
+from nics_drl_bridge.recording.guess import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
-from nics_drl_bridge.recording.survey import survey, unit_in
+from nics_drl_bridge.recording.survey import inspect_tables, split_unit
 from nics_drl_bridge.robot.spec import load_robot
 
 from .tables import write
@@ -513,7 +513,7 @@ TABLES: dict[str, tuple[dict[str, Any], str | None, Any, dict[str, str]]] = {
 
 def drafted(path) -> tuple[str, dict[str, Any]]:
     with open_source(path) as source:
-        text = first_mapping(survey(source))
+        text = propose_mapping(inspect_tables(source))
     return text, parse_yaml(text, "draft")
 
 
@@ -648,7 +648,7 @@ def test_they_are_refused_by_number_and_by_short_names_too(tmp_path, which, name
     ],
 )
 def test_units_are_read_from_names(column, unit):
-    assert unit_in(column)[1] == unit
+    assert split_unit(column)[1] == unit
 
 
 def switched(name: str, on: float, off: float) -> dict[str, np.ndarray]:

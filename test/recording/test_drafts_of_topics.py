@@ -8,7 +8,7 @@ import pytest
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.recording import topic_roles as kinds
-from nics_drl_bridge.recording.guess import first_mapping
+from nics_drl_bridge.recording.guess import propose_mapping
 from nics_drl_bridge.recording.survey import Survey, TableSurvey
 
 from .test_drafts import COUNT, M
@@ -158,7 +158,7 @@ BAGS: dict[str, tuple[list[TableSurvey], str, list[str]]] = {
 @pytest.mark.parametrize("bag", BAGS)
 def test_a_draft_of_a_bag_is_right_or_blank(bag):
     tables, place, commands = BAGS[bag]
-    text = first_mapping(tables)
+    text = propose_mapping(tables)
     draft = parse_yaml(text, "draft")
     assert draft["pose"] == place, text
     assert list((draft["command"] or {}).values()) == commands, text

@@ -18,7 +18,7 @@ from nics_drl_bridge.recording.excite import (
     DrivePlan,
     Exploration,
     Pattern,
-    expected_motion,
+    predict_motion,
 )
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot.kinds import textbook
@@ -113,16 +113,16 @@ def test_a_seed_tells_a_drive():
 def drive_another(robot, really, gain, seed):
     """Greatest distance of a robot that moves otherwise than expected, and is watched."""
     drive = DrivePlan(robot, bound=2.0, duration=60.0, seed=seed).begin()
-    motion = expected_motion(really)
+    motion = predict_motion(really)
     pose = np.zeros((1, 3))
     state = np.zeros((1, motion.size))
     away = 0.0
     while not drive.done:
-        command = gain * drive.next()
-        poses, states = motion.roll(pose, state, command[None, None], PERIOD_S)
+        command = gain * drive.choose_command()
+        poses, states = motion.predict(pose, state, command[None, None], PERIOD_S)
         pose = poses[:, -1]
         state = states[:, -1]
-        drive.see(pose[0])
+        drive.observe(pose[0])
         away = max(away, float(np.hypot(*pose[0, :2])))
     return away + robot.footprint_radius
 
@@ -164,9 +164,9 @@ def test_what_is_seen_moves_the_expected_pose():
     drive = DrivePlan(ROBOTS[1]).begin()
     while not np.hypot(*drive.pose[:2]) > 0.1:
         before = drive.pose
-        drive.next()
+        drive.choose_command()
     step = geometry.between(before, drive.pose)
-    drive.see(np.array([5.0, 0.0, 1.0]))
+    drive.observe(np.array([5.0, 0.0, 1.0]))
     assert geometry.between([5.0, 0.0, 1.0], drive.pose) == pytest.approx(step)
 
 
@@ -176,7 +176,7 @@ CAR = load_robot("ackermann")
 def test_the_drive_that_begins_is_the_one_that_was_previewed():
     plan = DrivePlan(CAR, bound=1.2, duration=20.0, seed=1)
     drive = plan.begin()
-    commands = [drive.next() for _ in plan.preview().command]
+    commands = [drive.choose_command() for _ in plan.preview().command]
     assert drive.done
     assert np.array_equal(commands, plan.preview().command)
 
@@ -224,7 +224,7 @@ def test_it_tells_duration_path_speeds_and_space(quarter_circle):
 
 
 def test_its_lines_hold_what_somebody_has_to_know(quarter_circle):
-    drive, space, bound = quarter_circle.lines()
+    drive, space, bound = quarter_circle.describe()
     assert "3 s: a path of 3.1 m, up to 1.00 m/s and 0.50 rad/s" in drive
     assert "x -0.50 to +2.50 m and y -0.50 to +2.50 m" in space
     assert "circle of 3.5 m" in bound
@@ -242,7 +242,7 @@ def test_it_is_the_textbook_but_for_a_centimetre(name):
     command = np.repeat(held, 8, axis=1)
     pose = np.zeros((3, 3))
     state = np.zeros((3, len(spec.state)))
-    poses, states = expected_motion(spec).roll(pose, state, command, PERIOD_S)
+    poses, states = predict_motion(spec).predict(pose, state, command, PERIOD_S)
     assert poses.shape == (3, 81, 3)
     for n in range(80):
         pose, state = integrate(textbook(spec), pose, state, command[:, n], PERIOD_S)
@@ -251,7 +251,7 @@ def test_it_is_the_textbook_but_for_a_centimetre(name):
 
 
 def test_without_a_textbook_cmd_vel_is_the_twist():
-    poses, states = expected_motion(DIRECT).roll(
+    poses, states = predict_motion(DIRECT).predict(
         np.zeros((1, 3)),
         np.zeros((1, 0)),
         np.tile([1.0, -0.5, 0.0], (1, 20, 1)),
@@ -266,4 +266,4 @@ def test_a_steering_angle_without_a_textbook_can_not_be_predicted():
     with pytest.raises(
         ConfigError, match=r"'steering_command' in rad.*add `textbook:`"
     ):
-        expected_motion(car)
+        predict_motion(car)

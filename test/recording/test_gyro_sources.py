@@ -6,11 +6,11 @@ import bags
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.guess import first_mapping
-from nics_drl_bridge.recording.pose_source import source_by_names
+from nics_drl_bridge.recording.guess import propose_mapping
+from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
-from nics_drl_bridge.recording.survey import survey
+from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.topic_roles import ODOMETRY, POSE, TRANSFORMS, TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -33,7 +33,7 @@ HEADER = "t,cmd_v,cmd_w,odom_x,odom_y,odom_yaw,second\n"
     ],
 )
 def test_the_names_tell_what_measured_a_pose(names, kind, measured_by):
-    assert source_by_names(names, kind) == measured_by
+    assert guess_source_by_names(names, kind) == measured_by
 
 
 @pytest.mark.parametrize("topic", ["/imu", "/imu/data", "/front/imu_raw", "/gyroscope"])
@@ -99,6 +99,6 @@ def test_a_draft_of_a_bag_with_an_imu_names_its_yaw_rate(tmp_path):
     ]
     bag = bags.write(tmp_path / "bag", bags.drive() | {"/imu/data": rows})
     with open_source(bag) as source:
-        draft = first_mapping(survey(source))
+        draft = propose_mapping(inspect_tables(source))
     assert "yaw_rate: /imu/data:angular_velocity.z" in draft
     assert "not used: /imu/data: angular_velocity.z" not in draft

@@ -6,10 +6,10 @@ import bags
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.guess import first_mapping
-from nics_drl_bridge.recording.imu_axis import GyroReader, UpAxis, up_axis_of
+from nics_drl_bridge.recording.guess import propose_mapping
+from nics_drl_bridge.recording.imu_axis import GyroReader, UpAxis, find_up_axis
 from nics_drl_bridge.recording.readers import open_source, read_recording
-from nics_drl_bridge.recording.survey import survey
+from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.topic_roles import IMU, TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -44,7 +44,7 @@ def test_a_live_imu_gives_its_yaw_rate_however_it_is_mounted(axis, sign):
     "acceleration", [[0.0, 0.0, 0.0], [0.2, 0.1, 0.0], [6.0, 6.0, 6.0]]
 )
 def test_without_gravity_along_an_axis_z_points_up(acceleration):
-    assert up_axis_of(np.array(acceleration)) == UpAxis()
+    assert find_up_axis(np.array(acceleration)) == UpAxis()
 
 
 def test_a_bump_does_not_turn_the_axis():
@@ -67,6 +67,6 @@ def test_the_imu_of_a_bag_and_of_its_draft_is_read_as_it_is_mounted(
     assert read.imu.values[:, 2].mean() == pytest.approx(0.25, abs=0.08)
     assert any("points up" in told for told in read.repairs)
     with open_source(bag) as source:
-        draft = first_mapping(survey(source))
+        draft = propose_mapping(inspect_tables(source))
     assert f"/imu/data:angular_velocity.{'xyz'[axis]}" in draft
     assert ("scale: -1" in draft) == (sign < 0.0)

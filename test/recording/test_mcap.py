@@ -14,17 +14,17 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording import mcap, messages
-from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.bag_file import open_bag
 from nics_drl_bridge.recording.mcap import (
     MAGIC,
     PREFIX,
     DamageError,
     check_mcap,
     check_message,
-    records,
-    seal,
+    read_records,
     unpack,
     unpack_file,
+    write_checksums,
 )
 
 TWIST = "geometry_msgs/msg/Twist"
@@ -69,9 +69,9 @@ def framed(op, content):
 def test_files_of_another_writer_are_whole(tmp_path, form):
     path = written(tmp_path / "drive.mcap", **FORMS[form])
     check_mcap(path)
-    with opened(path) as bag:
-        assert len(bag.serialized("/cmd_vel")) == COUNT
-    seal(path)  # changes nothing that is read
+    with open_bag(path) as bag:
+        assert len(bag.read_serialized("/cmd_vel")) == COUNT
+    write_checksums(path)  # changes nothing that is read
     check_mcap(path)
 
 
@@ -116,12 +116,12 @@ def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
     good = framed(15, bytes(4))
     for data in (good + record, good + record + bytes(40) * (said != "cut off")):
         if said is None:
-            found = list(records(memoryview(good + record + good)))
+            found = list(read_records(memoryview(good + record + good)))
             assert [each.offset for each in found] == [0, 13, 13 + len(record)]
             assert found[-1].end == 26 + len(record)
             continue
         with pytest.raises(DamageError, match=said) as caught:
-            list(records(memoryview(data)))
+            list(read_records(memoryview(data)))
         assert caught.value.offset == len(good)
 
 
@@ -137,20 +137,20 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(
         path.write_bytes(data)
         with (
             pytest.raises(RecordingError, match="more than 1048576 bytes"),
-            opened(path),
+            open_bag(path),
         ):
             pass
         bag = packed_as_a_whole(tmp_path / "bag", data)
         with (
             pytest.raises(RecordingError, match="more than 1048576 bytes"),
-            opened(bag),
+            open_bag(bag),
         ):
             pass
 
 
 def packed_as_a_whole(folder, data):
     folder.mkdir(exist_ok=True)
-    (folder / "drive.mcap.zstd").write_bytes(mcap._zstd().compress(data))
+    (folder / "drive.mcap.zstd").write_bytes(mcap._import_zstd().compress(data))
     about = {"compression_mode": "FILE", "relative_file_paths": ["drive.mcap.zstd"]}
     text = yaml.safe_dump({"rosbag2_bagfile_information": about})
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")
@@ -161,17 +161,19 @@ def test_a_chunk_that_says_that_it_is_terabytes_is_refused(tmp_path):
     path = written(tmp_path / "drive.mcap", **FORMS["bare"])
     data = bytearray(path.read_bytes())
     (chunk, *_) = (
-        r for r in records(memoryview(bytes(data)), len(MAGIC)) if data[r.offset] == 6
+        r
+        for r in read_records(memoryview(bytes(data)), len(MAGIC))
+        if data[r.offset] == 6
     )
     struct.pack_into("<Q", data, chunk.offset + PREFIX + 16, 2**42)
     path.write_bytes(data)
-    with pytest.raises(RecordingError, match="not as long as it says"), opened(path):
+    with pytest.raises(RecordingError, match="not as long as it says"), open_bag(path):
         pass
 
 
 def without_summary(data):
     end = next(
-        r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15
+        r for r in read_records(memoryview(data), len(MAGIC)) if data[r.offset] == 15
     ).end
     return data[: end - 4] + bytes(4) + framed(2, bytes(20)) + MAGIC
 
@@ -180,8 +182,8 @@ def test_a_file_without_summary_is_read(tmp_path):
     path = written(tmp_path / "drive.mcap")
     path.write_bytes(without_summary(path.read_bytes()))
     check_mcap(path)
-    with opened(path) as bag:
-        assert len(bag.serialized("/cmd_vel")) == COUNT
+    with open_bag(path) as bag:
+        assert len(bag.read_serialized("/cmd_vel")) == COUNT
 
 
 @pytest.mark.slow
@@ -189,7 +191,7 @@ def test_a_flipped_bit_of_a_sealed_file_is_found(tmp_path):
     path = written(tmp_path / "drive.mcap", **FORMS["sealed"])
     data = path.read_bytes()
     end = next(
-        r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15
+        r for r in read_records(memoryview(data), len(MAGIC)) if data[r.offset] == 15
     ).offset
     assert zlib.crc32(data[:end]) == struct.unpack_from("<I", data, end + PREFIX)[0]
     for place in range(len(MAGIC), len(data), 41):
@@ -204,11 +206,11 @@ def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
         messages, "find_spec", lambda name: None if name == "mcap" else name
     )
     said = r"library mcap; .*nics_drl_bridge\[bags\]"
-    with pytest.raises(RecordingError, match=said), opened(path):
+    with pytest.raises(RecordingError, match=said), open_bag(path):
         pass
 
 
-ZSTD = mcap._zstd()
+ZSTD = mcap._import_zstd()
 PACK = {"zstd": ZSTD.compress, "lz4": lz4.frame.compress}
 PLAIN = bytes(range(256)) * 40
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.recording.recording import (
-    along_path,
-    clockwise_line,
-    implausible_pose,
+    find_clockwise_keys,
+    find_implausible_pose,
+    select_along_path,
 )
 
 T = np.arange(3000) * 0.02
@@ -26,52 +26,54 @@ def wrapped(values):
 
 
 def test_a_drive_in_si_is_plausible_and_so_is_a_heading_that_turns_on():
-    assert implausible_pose(T, pose()) is None
-    assert implausible_pose(T, pose(2.0, 3.0)) is None
-    assert implausible_pose(T, pose(60.0, 0.2), radius=2.5) is None  # a race car
+    assert find_implausible_pose(T, pose()) is None
+    assert find_implausible_pose(T, pose(2.0, 3.0)) is None
+    assert find_implausible_pose(T, pose(60.0, 0.2), radius=2.5) is None  # a race car
 
 
 @pytest.mark.parametrize("unwrapped", [True, False])
 def test_degrees_are_told(unwrapped):
     values = pose()
     values[:, 2] = np.degrees(values[:, 2] if unwrapped else wrapped(values[:, 2]))
-    assert implausible_pose(T, values).line == "heading_unit: deg"
+    assert find_implausible_pose(T, values).line == "heading_unit: deg"
 
 
 @pytest.mark.parametrize("turn", [0.05, 0.3])
 def test_degrees_of_a_slow_turn_are_told_by_the_path(turn):
     values = pose(turn=turn)
-    assert implausible_pose(T, values) is None
+    assert find_implausible_pose(T, values) is None
     values[:, 2] = np.degrees(values[:, 2])
-    assert implausible_pose(T, values).line == "heading_unit: deg"
+    assert find_implausible_pose(T, values).line == "heading_unit: deg"
 
 
 @pytest.mark.parametrize("unwrapped", [True, False])
 def test_radians_that_are_taken_as_degrees_are_told(unwrapped):
     values = pose()
     values[:, 2] = np.radians(values[:, 2] if unwrapped else wrapped(values[:, 2]))
-    assert implausible_pose(T, values).line == "heading_unit: rad"
+    assert find_implausible_pose(T, values).line == "heading_unit: rad"
 
 
 def test_a_robot_that_spins_on_a_line_has_no_heading_in_degrees():
     values = np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])
-    assert implausible_pose(T, values) is None
+    assert find_implausible_pose(T, values) is None
 
 
 @pytest.mark.parametrize(
     ("factor", "line"), [(100.0, "unit: cm"), (1000.0, "unit: mm")]
 )
 def test_positions_that_are_no_metres_are_told(factor, line):
-    assert implausible_pose(T, pose() * [factor, factor, 1.0]).line == line
+    assert find_implausible_pose(T, pose() * [factor, factor, 1.0]).line == line
 
 
 def test_milliseconds_are_told():
-    assert "(microseconds look like this)" in implausible_pose(T * 1e6, pose()).cause
-    assert implausible_pose(T * 1e3, pose()).line == "time: {from: ..., unit: ms}"
+    assert (
+        "(microseconds look like this)" in find_implausible_pose(T * 1e6, pose()).cause
+    )
+    assert find_implausible_pose(T * 1e3, pose()).line == "time: {from: ..., unit: ms}"
 
 
 def line_of(values, size=0.05):
-    return clockwise_line(values[along_path(values, size)])
+    return find_clockwise_keys(values[select_along_path(values, size)])
 
 
 @pytest.mark.parametrize(("speed", "turn"), [(0.6, 0.5), (20.0, 0.2)])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.stamping import HEADER, RECEIVE, TopicData, streams
+from nics_drl_bridge.recording.stamping import HEADER, RECEIVE, TopicData, stamp_streams
 
 START = 1_700_000_000_000_000_000
 T = np.arange(0.0, 30.0, 0.02)
@@ -24,7 +24,7 @@ def topic(name: str, header=None, receive=T, start=START) -> TopicData:
 
 def refused(data, stamps="auto") -> str:
     with pytest.raises(RecordingError) as caught:
-        streams(data, stamps, "drive")
+        stamp_streams(data, stamps, "drive")
     assert str(caught.value).startswith("drive: topic '/")
     return str(caught.value)
 
@@ -34,7 +34,7 @@ COMMAND = topic("/cmd_vel")
 
 def test_headers_of_the_recorders_clock_share_it_with_what_has_none():
     shaken = np.random.default_rng(0).uniform(0.001, 0.02, len(T))
-    made = streams(
+    made = stamp_streams(
         {"command": COMMAND, "pose": topic("/pose", T, T + shaken)}, "auto", "drive"
     )
     assert made["pose"].clock == made["command"].clock == RECEIVE
@@ -45,7 +45,7 @@ def test_headers_of_the_recorders_clock_share_it_with_what_has_none():
 @pytest.mark.parametrize("delay", [0.02, 0.07, 0.3, 0.9])
 def test_the_time_that_a_localiser_needs_is_no_other_clock(delay):
     late = delay + np.random.default_rng(0).uniform(-0.01, 0.02, len(T))
-    made = streams(
+    made = stamp_streams(
         {"command": COMMAND, "pose": topic("/pose", T, T + late)}, "auto", "drive"
     )
     assert made["pose"].clock == made["command"].clock == RECEIVE
@@ -57,7 +57,7 @@ def test_what_is_late_on_a_foreign_clock_shares_it():
         "command": topic("/cmd_vel", T + 12.0, T + TRANSPORT),
         "pose": topic("/pose", T + 12.0, T + 0.3),
     }
-    made = streams(data, "auto", "drive")
+    made = stamp_streams(data, "auto", "drive")
     assert made["pose"].clock == made["command"].clock == HEADER
     assert np.allclose(made["pose"].t, made["command"].t)
 
@@ -65,7 +65,7 @@ def test_what_is_late_on_a_foreign_clock_shares_it():
 @pytest.mark.parametrize("offset", [-3600.0, -1.5, 0.1, 0.5, 1e6])
 def test_headers_of_a_foreign_clock_keep_their_steps_and_lose_the_offset(offset):
     pose = topic("/pose", T + offset, T + TRANSPORT)
-    made = streams({"command": COMMAND, "pose": pose}, "auto", "drive")
+    made = stamp_streams({"command": COMMAND, "pose": pose}, "auto", "drive")
     assert made["pose"].clock == HEADER
     assert np.allclose(np.diff(made["pose"].t), np.diff(T))
     assert np.allclose(made["pose"].t, T + TRANSPORT)
@@ -73,7 +73,7 @@ def test_headers_of_a_foreign_clock_keep_their_steps_and_lose_the_offset(offset)
 
 def test_a_simulated_time_is_a_foreign_clock():
     pose = topic("/pose", T + 12.0, start=0)
-    made = streams({"command": COMMAND, "pose": pose}, "auto", "drive")
+    made = stamp_streams({"command": COMMAND, "pose": pose}, "auto", "drive")
     assert made["pose"].clock == HEADER
     assert np.allclose(made["pose"].t, T)
 
@@ -84,7 +84,7 @@ def test_what_a_robot_makes_is_put_on_one_clock():
         "state": topic("/joint_states", T + 1.0, start=0),
         "pose": topic("/pose", T - TRANSPORT),
     }
-    made = streams(data, "auto", "drive")
+    made = stamp_streams(data, "auto", "drive")
     assert {stream.clock for stream in made.values()} == {RECEIVE}
     assert np.allclose(made["state"].t, T)
 
@@ -96,13 +96,14 @@ def test_two_foreign_clocks_are_told_apart():
         "state": topic("/joint_states", T + 100.001),
     }
     clocks = {
-        name: stream.clock for name, stream in streams(data, "auto", "drive").items()
+        name: stream.clock
+        for name, stream in stamp_streams(data, "auto", "drive").items()
     }
     assert clocks["command"] == clocks["state"] != clocks["pose"]
 
 
 def test_headers_without_a_stamp_give_way_to_the_time_of_receipt():
-    made = streams(
+    made = stamp_streams(
         {"command": COMMAND, "pose": topic("/pose", 0 * T, start=0)}, "auto", "drive"
     )
     assert made["pose"].clock == RECEIVE
@@ -118,14 +119,16 @@ def test_headers_of_which_some_have_no_stamp_are_refused():
         in sentence
     )
     assert (
-        streams({"command": COMMAND, "pose": pose}, "receive", "drive")["pose"].t[0]
+        stamp_streams({"command": COMMAND, "pose": pose}, "receive", "drive")["pose"].t[
+            0
+        ]
         == 0.0
     )
 
 
 def test_what_a_simulation_sent_before_it_had_a_time_is_left_out():
     pose = topic("/pose", np.maximum(T - 0.5, 0.0), start=0)
-    made = streams({"command": COMMAND, "pose": pose}, "auto", "drive")["pose"]
+    made = stamp_streams({"command": COMMAND, "pose": pose}, "auto", "drive")["pose"]
     assert made.values[0, 0] == np.argmax(T > 0.5)
     assert np.allclose(made.t, T[T > 0.5])
 
@@ -134,7 +137,7 @@ def test_a_few_late_messages_are_put_in_order():
     order = np.arange(len(T))
     order[[100, 101]] = 101, 100
     pose = topic("/pose", T[order])
-    made = streams({"command": COMMAND, "pose": pose}, "auto", "drive")
+    made = stamp_streams({"command": COMMAND, "pose": pose}, "auto", "drive")
     assert np.allclose(made["pose"].t, T)
     assert made["pose"].values[[99, 100, 101], 0].tolist() == [99.0, 101.0, 100.0]
 
@@ -153,7 +156,7 @@ def test_a_recorder_that_stalled_is_forgiven():
     receive[stalled] = 13.0
     pose = topic("/pose", T, np.maximum.accumulate(receive))
     pose.receive_ns[T >= 10.4] = START + ns(T[T >= 10.4])
-    made = streams({"command": COMMAND, "pose": pose}, "auto", "drive")
+    made = stamp_streams({"command": COMMAND, "pose": pose}, "auto", "drive")
     assert np.allclose(made["pose"].t, T)
 
 
@@ -175,14 +178,14 @@ def test_a_stamp_from_another_age_is_refused(at, by):
 def test_repeated_messages_stay_in_order():
     twice = np.repeat(T, 2)
     pose = topic("/pose", twice, twice + TRANSPORT)
-    made = streams({"command": COMMAND, "pose": pose}, "auto", "drive")
+    made = stamp_streams({"command": COMMAND, "pose": pose}, "auto", "drive")
     assert np.allclose(made["pose"].t, twice)
 
 
 def test_receipt_out_of_order_is_sorted():
     order = np.random.default_rng(0).permutation(len(T))
     data = topic("/cmd_vel", None, T[order])
-    made = streams({"command": data, "pose": topic("/pose", T)}, "auto", "drive")[
+    made = stamp_streams({"command": data, "pose": topic("/pose", T)}, "auto", "drive")[
         "command"
     ]
     assert np.allclose(made.t, T)
@@ -191,7 +194,7 @@ def test_receipt_out_of_order_is_sorted():
 
 def test_header_stamps_are_taken_on_request_and_must_be_there():
     data = {"command": topic("/cmd_vel", T + 5.0), "pose": topic("/pose", T + 7.0)}
-    made = streams(data, "header", "drive")
+    made = stamp_streams(data, "header", "drive")
     assert {stream.clock for stream in made.values()} == {HEADER}
     assert np.allclose(made["pose"].t - made["command"].t, 2.0)
     sentence = refused({"command": COMMAND, "pose": topic("/pose", T)}, "header")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.recording import likely_unit
+from nics_drl_bridge.recording.recording import guess_time_unit
 
 T = 100.0 + np.arange(300) * 0.02
 
@@ -13,7 +13,7 @@ T = 100.0 + np.arange(300) * 0.02
 def test_a_clock_that_overflows_is_continued(size):
     step = size * 1e-4
     wrapped = (0.99 * size + np.arange(300) * step) % size
-    made, note = stamping.without_overflow(wrapped, "log")
+    made, note = stamping.remove_overflow(wrapped, "log")
     assert np.allclose(np.diff(made), step)
     assert "overflowed at" in note
     assert "once" in note
@@ -21,20 +21,22 @@ def test_a_clock_that_overflows_is_continued(size):
 
 def test_a_clock_that_is_set_back_by_any_time_is_no_overflow():
     t = np.concatenate([T[:150], T[150:] - 3.0])
-    assert stamping.without_overflow(t, "log") == (pytest.approx(t), "")
+    assert stamping.remove_overflow(t, "log") == (pytest.approx(t), "")
 
 
 def test_few_late_rows_are_sorted():
     order = np.arange(300)
     order[[100, 102]] = order[[102, 100]]
-    t, rows, note = stamping.in_order(T[order], "log")
+    t, rows, note = stamping.repair_order(T[order], "log")
     assert np.array_equal(t, T)
     assert np.array_equal(rows, order)
     assert "2 of 300 rows came after later ones" in note
 
 
 def test_parts_after_a_clock_was_set_back_are_joined():
-    t, rows, note = stamping.in_order(np.concatenate([T[:100], T[:200] - 99.0]), "log")
+    t, rows, note = stamping.repair_order(
+        np.concatenate([T[:100], T[:200] - 99.0]), "log"
+    )
     assert np.allclose(np.diff(t), 0.02)
     assert np.array_equal(rows, np.arange(300))
     assert "set back once (row 100, by 101 s)" in note
@@ -44,21 +46,21 @@ def test_parts_after_a_clock_was_set_back_are_joined():
 def test_a_stamp_that_fits_none_beside_it_is_left_out(row, value):
     t = T.copy()
     t[row] = value
-    made, rows, note = stamping.in_order(t, "log")
+    made, rows, note = stamping.repair_order(t, "log")
     assert np.array_equal(made, np.delete(T, row))
     assert row not in rows
     assert f"1 stamps fit none beside them (row {row}: {value:.10g} s)" in note
 
 
 def test_rows_that_begin_with_the_last_are_turned_round():
-    t, rows, note = stamping.in_order(T[::-1], "log")
+    t, rows, note = stamping.repair_order(T[::-1], "log")
     assert np.array_equal(t, T)
     assert rows[0] == 299
     assert "turned round" in note
 
 
 def test_a_clock_that_was_set_ahead_by_years_goes_on():
-    t, _, note = stamping.in_order(np.append(T[:100], T[100:] + 1.7e9), "log")
+    t, _, note = stamping.repair_order(np.append(T[:100], T[100:] + 1.7e9), "log")
     assert np.allclose(np.diff(t), 0.02, atol=1e-6)
     assert "set ahead once (row 100, by 1.7e+09 s)" in note
 
@@ -66,7 +68,7 @@ def test_a_clock_that_was_set_ahead_by_years_goes_on():
 def test_rows_that_repeat_stamp_and_values_are_left_out():
     t = np.array([0.0, 0.0, 0.0, 1.0])
     values = np.array([[1.0], [1.0], [2.0], [2.0]])
-    keep, note = stamping.not_repeated(t, values, "pose")
+    keep, note = stamping.select_new_rows(t, values, "pose")
     assert keep.tolist() == [True, False, True, True]
     assert "1 of 4 rows repeat" in note
 
@@ -75,7 +77,7 @@ def test_rows_that_repeat_stamp_and_values_are_left_out():
     ("step", "unit"), [(0.02, None), (20.0, "ms"), (2e4, "us"), (2e7, "ns")]
 )
 def test_the_unit_of_stamps_that_are_no_seconds_is_named(step, unit):
-    assert likely_unit(np.arange(50) * step) == unit
+    assert guess_time_unit(np.arange(50) * step) == unit
 
 
 @pytest.mark.parametrize(("bits", "low"), [(16, 0.0), (32, 0.0), (16, -(2.0**15))])
@@ -84,28 +86,28 @@ def test_a_counter_that_overflows_is_continued(bits, low):
     steps = np.tile([5.0, 9.0, 0.0, -3.0], 500) * 2.0 ** (bits - 12)
     raw = np.cumsum(steps)
     wrapped = (raw - low) % size + low
-    found = stamping.overflow(wrapped, (1.0,), stamping.BITS)
+    found = stamping.find_overflow(wrapped, (1.0,), stamping.BITS)
     assert found == size
-    made, count = stamping.unwrapped(wrapped, found)
+    made, count = stamping.unwrap_counter(wrapped, found)
     assert np.allclose(np.diff(made), steps[1:])
     assert count > 0
 
 
 def test_a_counter_that_was_reset_has_no_overflow():
     raw = np.concatenate([np.arange(0, 30_000, 100), np.arange(0, 9000, 100)])
-    assert stamping.overflow(raw.astype(float), (1.0,), stamping.BITS) is None
+    assert stamping.find_overflow(raw.astype(float), (1.0,), stamping.BITS) is None
 
 
 def test_stamps_in_whole_seconds_lack_their_rest_but_rows_that_share_milliseconds_do_not():
-    assert stamping.rows_a_second(np.floor(T)) == 50
-    assert stamping.rows_a_second(np.repeat(np.arange(50) * 20.0, 6)) == 0
-    assert stamping.rows_a_second(np.arange(50.0)) == 0
+    assert stamping.count_rows_a_second(np.floor(T)) == 50
+    assert stamping.count_rows_a_second(np.repeat(np.arange(50) * 20.0, 6)) == 0
+    assert stamping.count_rows_a_second(np.arange(50.0)) == 0
 
 
 def test_a_counter_is_told_from_commands_that_jump_to_and_fro():
     raw = np.cumsum(np.tile([50.0, 90.0, 0.0, -30.0], 5000))
-    assert stamping.counter(raw % 2.0**16) == "overflows at 65536"
-    assert stamping.counter(raw) == ""
-    assert stamping.counter(-np.maximum.accumulate(raw)) == "went on by 549980"
+    assert stamping.describe_counter(raw % 2.0**16) == "overflows at 65536"
+    assert stamping.describe_counter(raw) == ""
+    assert stamping.describe_counter(-np.maximum.accumulate(raw)) == "went on by 549980"
     full = np.where(np.arange(400) % 100 < 50, -127.0, 127.0)
-    assert stamping.counter(full + np.arange(400) % 2) == ""
+    assert stamping.describe_counter(full + np.arange(400) % 2) == ""

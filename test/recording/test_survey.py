@@ -5,14 +5,15 @@ import pytest
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.guess import first_mapping
+from nics_drl_bridge.recording.guess import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.names import split_words
 from nics_drl_bridge.recording.readers import (
+    explain_no_mapping,
     open_source,
     read_recording,
-    why_no_mapping,
 )
-from nics_drl_bridge.recording.survey import survey, words_of
+from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.write import write_drive
 from nics_drl_bridge.robot.spec import load_robot
@@ -35,8 +36,8 @@ def surveyed(path):
 
 def written(path):
     with open_source(path) as source:
-        tables = survey(source)
-    return tables, first_mapping(tables)
+        tables = inspect_tables(source)
+    return tables, propose_mapping(tables)
 
 
 def test_a_first_mapping_reads_a_table_whose_columns_are_called_as_usual(tmp_path):
@@ -140,7 +141,7 @@ def test_a_pose_of_streams_of_different_lengths_is_listed_and_guessed_by_its_nam
 def test_dates_and_empty_arrays_are_listed(tmp_path, column):
     np.save(tmp_path / "log.npy", column)
     with open_source(tmp_path / "log.npy") as source:
-        (table,) = survey(source)
+        (table,) = inspect_tables(source)
     assert table.rows == len(column)
 
 
@@ -183,7 +184,7 @@ def test_gaps_backward_stamps_and_repeated_rows_are_listed(tmp_path):
     ],
 )
 def test_names_are_split_into_words(name, words):
-    assert words_of(name) == words
+    assert split_words(name) == words
 
 
 SAID = {"x": "utm_easting", "y": "utm_northing", "yaw": "tracker_heading_deg"}
@@ -407,6 +408,6 @@ def test_a_recording_that_this_package_wrote_needs_no_mapping(tmp_path):
     driven = record(robot, np.random.default_rng(0), 5.0)
     write_drive(driven, tmp_path / "drive.npz", robot)
     write_drive(driven, tmp_path / "bag", robot)
-    assert why_no_mapping(tmp_path / "drive.npz") == "was written by this package"
-    assert "/cmd_vel and /odom" in why_no_mapping(tmp_path / "bag")
-    assert why_no_mapping(write(tmp_path / "log.csv", drive())) == ""
+    assert explain_no_mapping(tmp_path / "drive.npz") == "was written by this package"
+    assert "/cmd_vel and /odom" in explain_no_mapping(tmp_path / "bag")
+    assert explain_no_mapping(write(tmp_path / "log.csv", drive())) == ""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.table import numbers_of
+from nics_drl_bridge.recording.table import read_numbers
 from nics_drl_bridge.recording.table_files import read_text_table
 
 NUMBERS = [(0.0, 1.5, -2.0), (0.1, 1.6, -2.5), (0.2, 1.7, -3.0)]
@@ -35,7 +35,7 @@ def test_any_separator_is_found_with_header_or_without(
     rows += [[f"{v}".replace(".", point) for v in row] for row in NUMBERS]
     found = table(tmp_path, "\n".join(separator.join(row) for row in rows))
     assert np.array_equal(
-        np.stack([numbers_of(found, k) for k in range(3)], axis=1), NUMBERS
+        np.stack([read_numbers(found, k) for k in range(3)], axis=1), NUMBERS
     )
     assert found.names == (header or ("", "", ""))
 
@@ -45,7 +45,7 @@ def test_titles_a_separator_at_the_end_and_repeated_headers_are_no_rows(tmp_path
     rows = "1 | 2.5 | 3 | 4 |\n2 | 2.6 | 3 | 5 |\n"
     found = table(tmp_path, head + rows + head + rows)
     assert found.names == ("time", "pose.x", "cov[1,1]", "Left")
-    assert numbers_of(found, "Left").tolist() == [4, 5, 4, 5]
+    assert read_numbers(found, "Left").tolist() == [4, 5, 4, 5]
     assert found.notes == ("log.csv: 2 lines repeat the header, and were left out.",)
     assert found.row(2) == "line 7"
 
@@ -63,7 +63,7 @@ def test_labels_within_the_rows_name_the_columns(tmp_path):
     )
     poses = tuple(f"tracker_pose[{k}]" for k in range(3))
     assert found.names == ("time", "ticks[0]", "ticks[1]", *poses)
-    assert numbers_of(found, "ticks[1]").tolist() == [4294859756.0] * 2
+    assert read_numbers(found, "ticks[1]").tolist() == [4294859756.0] * 2
 
 
 def test_a_tum_trajectory_needs_no_header(tmp_path):
@@ -77,14 +77,14 @@ def test_flags_may_be_words_and_cells_empty(tmp_path):
     found = table(
         tmp_path, "t,on,mode,x\n0,True,AUTO,1\n1,False,MANUAL,\n2,True,AUTO,3\n"
     )
-    assert numbers_of(found, "on").tolist() == [1.0, 0.0, 1.0]
+    assert read_numbers(found, "on").tolist() == [1.0, 0.0, 1.0]
     assert found.column("mode").tolist() == ["AUTO", "MANUAL", "AUTO"]
-    assert np.isnan(numbers_of(found, "x")[1])
+    assert np.isnan(read_numbers(found, "x")[1])
 
 
 def test_a_header_of_an_old_windows_tool_is_read(tmp_path):
     found = table(tmp_path, "t;Winkel [°]\n0;1,5\n1;2,5\n", encoding="latin-1")
-    assert numbers_of(found, "Winkel [°]").tolist() == [1.5, 2.5]
+    assert read_numbers(found, "Winkel [°]").tolist() == [1.5, 2.5]
 
 
 def test_a_row_that_was_cut_short_is_left_out_and_told(tmp_path):
@@ -123,7 +123,7 @@ def test_what_is_no_table_is_refused(tmp_path, text, sentence):
 def test_a_column_that_is_not_there_is_named(tmp_path, which, sentence):
     found = table(tmp_path, "time,x,x,word\n0,1,2,3\n1,2,3,oops\n")
     with pytest.raises(RecordingError) as refused:
-        numbers_of(found, which)
+        read_numbers(found, which)
     assert sentence in str(refused.value)
 
 
@@ -131,7 +131,7 @@ def test_a_column_that_is_not_there_is_named(tmp_path, which, sentence):
 def test_an_odd_separator_is_found_if_no_usual_one_fits(tmp_path, separator):
     found = table(tmp_path, "t x y\n0 1.5 2\n1 2.5 3\n".replace(" ", separator))
     assert found.names == ("t", "x", "y")
-    assert numbers_of(found, "x").tolist() == [1.5, 2.5]
+    assert read_numbers(found, "x").tolist() == [1.5, 2.5]
 
 
 def test_the_names_stand_above_a_row_of_units(tmp_path):
@@ -141,12 +141,12 @@ def test_the_names_stand_above_a_row_of_units(tmp_path):
 
 def test_numbers_with_decimal_commas_may_be_quoted(tmp_path):
     found = table(tmp_path, 't,x\n"0,5","1,25"\n"0,6","1,75"\n')
-    assert numbers_of(found, "x").tolist() == [1.25, 1.75]
+    assert read_numbers(found, "x").tolist() == [1.25, 1.75]
 
 
 @pytest.mark.parametrize("word", ["NA", "null", "None", "-", "nan", ""])
 def test_words_for_a_missing_value_are_none(tmp_path, word):
-    assert np.isnan(numbers_of(table(tmp_path, f"t,x\n0,{word}\n1,2\n"), "x")[0])
+    assert np.isnan(read_numbers(table(tmp_path, f"t,x\n0,{word}\n1,2\n"), "x")[0])
 
 
 def test_excel_in_utf_16_and_comments_of_matlab_are_read(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording import topic_roles as kinds
-from nics_drl_bridge.recording.topic_roles import TopicRoles, assign, topic_roles
+from nics_drl_bridge.recording.topic_roles import TopicRoles, assign, load_topic_roles
 
 USUAL = {
     "/cmd_vel": kinds.TWIST,
@@ -139,12 +139,12 @@ def test_the_options_go_before_the_file(tmp_path):
         "wheels: [left, right]\nstamps: receive\n",
         encoding="utf-8",
     )
-    roles = topic_roles(file, ["pose=/vrpn/pose", "imu = none"])
+    roles = load_topic_roles(file, ["pose=/vrpn/pose", "imu = none"])
     assert (roles.cmd_vel, roles.pose, roles.imu) == ("/drive", "/vrpn/pose", "none")
     assert roles.wheels == ("left", "right")
     assert roles.state["steering"] == "rack"
     assert roles.state["speed"].scale == 0.05  # type: ignore[union-attr]
-    assert topic_roles() == TopicRoles()
+    assert load_topic_roles() == TopicRoles()
 
 
 def test_the_example_of_the_docs_is_a_mapping(tmp_path):
@@ -154,7 +154,7 @@ def test_the_example_of_the_docs_is_a_mapping(tmp_path):
     )
     file = tmp_path / "topics.yaml"
     file.write_text(example, encoding="utf-8")
-    assert set(topic_roles(file).state) == {"speed", "steering"}
+    assert set(load_topic_roles(file).state) == {"speed", "steering"}
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_the_example_of_the_docs_is_a_mapping(tmp_path):
 )
 def test_a_wrong_option_is_refused(options, sentence):
     with pytest.raises(ConfigError) as caught:
-        topic_roles(None, options)
+        load_topic_roles(None, options)
     assert sentence in str(caught.value)
 
 
@@ -185,6 +185,6 @@ def test_a_wrong_file_is_refused(tmp_path, text, sentence):
     file = tmp_path / "topics.yaml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
-        topic_roles(file)
+        load_topic_roles(file)
     assert sentence in str(caught.value)
     assert str(caught.value).startswith(str(file))

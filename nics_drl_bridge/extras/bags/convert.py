@@ -10,9 +10,9 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.playback import SCAN_TYPE
 from nics_drl_bridge.recording import topic_roles
-from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.bag_file import BagFile, Message, open_bag
 from nics_drl_bridge.recording.messages import Offer
-from nics_drl_bridge.recording.write import FRAMES, bag_sink
+from nics_drl_bridge.recording.write import FRAMES, open_bag_sink
 
 MOVING = "/tf"
 FIXED = "/tf_static"
@@ -29,13 +29,13 @@ def convert(
     A bag without transforms gets those of its odometry and, with a model, of the lidar's mount:
     without them a viewer can't tell where a scan lies. Raises RecordingError.
     """
-    with opened(path) as bag, bag_sink(out) as sink:
+    with open_bag(path) as bag, open_bag_sink(out) as sink:
         rows = list[Row]()
         for topic, kind in bag.types.items():
             sink.add_topic(
-                topic, kind, bag.offers(topic), definition=bag.definition(topic)
+                topic, kind, bag.offers(topic), definition=bag.get_definition(topic)
             )
-            rows += ((topic, ns, data) for ns, data in bag.serialized(topic))
+            rows += ((topic, ns, data) for ns, data in bag.read_serialized(topic))
         made = [
             *_convert_moving(bag, sink.store),
             *_convert_fixed(bag, sink.store, model),
@@ -88,7 +88,7 @@ def _convert_fixed(
 
 
 def _make_messages(bag: BagFile, topic: str, kind: str) -> list[Message]:
-    return bag.messages(topic) if bag.types.get(topic) == kind else []
+    return bag.read_messages(topic) if bag.types.get(topic) == kind else []
 
 
 def _transform(

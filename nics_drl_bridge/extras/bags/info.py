@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.recording.bag_file import BagFile, opened, times_of
+from nics_drl_bridge.recording.bag_file import BagFile, open_bag, read_times
 from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S, Nanoseconds
 
 GAP = 3.0  # a silence longer than this many usual periods is a gap
@@ -52,7 +52,7 @@ class BagInfo:
 def read_bag_info(path: str | Path) -> BagInfo:
     """Reads a whole bag and describes its contents; a damaged one raises RecordingError."""
     path = Path(path)
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         received = {topic: _read_receipt(bag, topic) for topic in sorted(bag.types)}
         times = np.concatenate([ns for ns, _ in received.values()])
         start = int(times.min())
@@ -70,11 +70,11 @@ def read_bag_info(path: str | Path) -> BagInfo:
 
 
 def _read_receipt(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
-    if not bag.knows(topic):
+    if not bag.can_decode(topic):
         return np.array(
-            [ns for ns, _ in bag.serialized(topic)], dtype=np.int64
+            [ns for ns, _ in bag.read_serialized(topic)], dtype=np.int64
         ), UNKNOWN
-    receive, stamps = times_of(bag.messages(topic))
+    receive, stamps = read_times(bag.read_messages(topic))
     if stamps is None:
         return receive, NO_HEADER
     return receive, receive - stamps if stamps.any() else UNSTAMPED

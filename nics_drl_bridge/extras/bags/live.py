@@ -30,9 +30,9 @@ from nics_drl_bridge.nodes.runner import (
     run_node,
     steadily,
 )
-from nics_drl_bridge.recording.bag_file import BagFile, opened
+from nics_drl_bridge.recording.bag_file import BagFile, open_bag
 from nics_drl_bridge.recording.messages import Offer
-from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
+from nics_drl_bridge.recording.write import BagSink, Storage, open_bag_sink
 
 ROBOT = (  # topics of a robot, in its namespace
     "scan",
@@ -168,7 +168,7 @@ class BagRecorder(QosWatch):
 
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     """Records until the duration or a signal; counts by topic. BackendError, RecordingError."""
-    with bag_sink(order.out, order.storage, keep=True) as sink:
+    with open_bag_sink(order.out, order.storage, keep=True) as sink:
         node = run_node(
             lambda context: BagRecorder(context, order, sink, say), ["nics"]
         )
@@ -303,10 +303,10 @@ def play_bag(
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         kinds = {topic: bag.types[topic] for topic in _wanted(bag, topics, clock)}
         offers = {topic: bag.offers(topic) for topic in kinds}
-        messages = {topic: bag.serialized(topic) for topic in kinds}
+        messages = {topic: bag.read_serialized(topic) for topic in kinds}
     context = open_context([])
     node = Node("bag_player", context=context, start_parameter_services=False)
     try:
