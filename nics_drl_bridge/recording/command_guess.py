@@ -13,228 +13,58 @@ import numpy as np
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.mapped import NEAR_DEG, SHORT_OF_EARTH
 from nics_drl_bridge.recording.mapping import NO_COMMANDS
-from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.pose_guess import PoseGuess
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.robot.spec import find_kind, kind_names
 from nics_drl_bridge.robot.template import list_names
 
 # Words that say that something was sent to the robot: beyond doubt, and of a goal of a controller.
-COMMANDING = {
-    "cmd",
-    "command",
-    "commanded",
-    "commands",
-    "cmdvel",
-    "ctrl",
-    "control",
-    "controls",
-}
-WISHING = {
-    "ref",
-    "reference",
-    "setpoint",
-    "target",
-    "desired",
-    "des",
-    "input",
-    "inputs",
-    "set",
-}
-WISHING |= {"u", "req", "request", "requested", "demand"}
+COMMANDING = word_set("cmd command commanded commands cmdvel ctrl control controls")
+WISHING = word_set("""
+    ref reference setpoint target desired des input inputs set u req request
+    requested demand
+""")
 # Words that say that something was measured or computed from measurements.
-MEASURING = {
-    *(
-        "odom",
-        "odometry",
-        "imu",
-        "measured",
-        "measurement",
-        "meas",
-        "encoder",
-        "enc",
-        "feedback",
-    ),
-    *(
-        "fb",
-        "model",
-        "actual",
-        "act",
-        "state",
-        "states",
-        "real",
-        "true",
-        "truth",
-        "gt",
-        "est",
-    ),
-    *(
-        "groundtruth",
-        "estimated",
-        "estimate",
-        "sensor",
-        "sensors",
-        "gyro",
-        "gps",
-        "gnss",
-        "fix",
-    ),
-    *(
-        "ekf",
-        "vicon",
-        "mocap",
-        "vrpn",
-        "optitrack",
-        "pf",
-        "filtered",
-        "predicted",
-        "pred",
-        "joint",
-    ),
-    *(
-        "core",
-        "telemetry",
-        "status",
-        "current",
-        "voltage",
-        "battery",
-        "temp",
-        "temperature",
-    ),
-}
+MEASURING = word_set("""
+    odom odometry imu measured measurement meas encoder enc feedback fb model
+    actual act state states real true truth gt est groundtruth estimated
+    estimate sensor sensors gyro gps gnss fix ekf vicon mocap vrpn optitrack pf
+    filtered predicted pred joint core telemetry status current voltage battery
+    temp temperature
+""")
 # Words of columns that no robot is driven by.
-NEVER = {
-    *(
-        "header",
-        "stamp",
-        "seq",
-        "index",
-        "id",
-        "row",
-        "frame",
-        "time",
-        "timestamp",
-        "layout",
-    ),
-    *(
-        "range",
-        "ranges",
-        "scan",
-        "laser",
-        "lidar",
-        "beam",
-        "beams",
-        "intensity",
-        "intensities",
-    ),
-    *("depth", "image", "pixel", "sonar", "ultrasonic", "bumper", "cliff"),
-    *(
-        "slam",
-        "amcl",
-        "orb",
-        "lio",
-        "loam",
-        "cartographer",
-        "rtabmap",
-        "localization",
-        "map",
-    ),
-    *(
-        "pose",
-        "position",
-        "orientation",
-        "quaternion",
-        "quat",
-        "pos",
-        "translation",
-        "rotation",
-    ),
-    *(
-        "yaw",
-        "heading",
-        "roll",
-        "pitch",
-        "easting",
-        "northing",
-        "utm",
-        "goal",
-        "waypoint",
-        "path",
-    ),
-    *(
-        "acc",
-        "accel",
-        "acceleration",
-        "jerk",
-        "mag",
-        "magnetic",
-        "magnetometer",
-        "gravity",
-    ),
-    *(
-        "gear",
-        "brake",
-        "error",
-        "err",
-        "std",
-        "stddev",
-        "sigma",
-        "var",
-        "fps",
-        "latency",
-    ),
-    *("torque", "force", "status", "axes", "buttons", "level", "line"),
-}
+NEVER = word_set("""
+    header stamp seq index id row frame time timestamp layout range ranges scan
+    laser lidar beam beams intensity intensities depth image pixel sonar
+    ultrasonic bumper cliff slam amcl orb lio loam cartographer rtabmap
+    localization map pose position orientation quaternion quat pos translation
+    rotation yaw heading roll pitch easting northing utm goal waypoint path acc
+    accel acceleration jerk mag magnetic magnetometer gravity gear brake error
+    err std stddev sigma var fps latency torque force status axes buttons level
+    line
+""")
 NEVER_WORDS = NEVER | NO_COMMANDS
-TICKS = {"tick", "ticks", "encoder", "enc", "encoders", "count", "counts"}
-WHEEL_WORDS = TICKS | {"wheel", "wheels", "rpm"}
-NO_SPEED = {
-    "pos",
-    "position",
-    "angle",
-    "current",
-    "force",
-    "torque",
-    "slip",
-    "distance",
-    "dist",
-}
-NO_SPEED |= {
-    "pressure",
-    "load",
-    "temp",
-    "effort",
-    "travel",
-    "accel",
-    "acc",
-    "steer",
-    "steering",
-}
-LEFT = {"left", "l", "lw", "wl", "vl", "le"}
-RIGHT = {"right", "r", "rw", "wr", "vr", "ri"}
-FRONT = {"front", "f"}
-REAR = {"rear", "back", "b"}
+TICKS = word_set("tick ticks encoder enc encoders count counts")
+WHEEL_WORDS = TICKS | word_set("wheel wheels rpm")
+NO_SPEED = word_set("""
+    pos position angle current force torque slip distance dist pressure load
+    temp effort travel accel acc steer steering
+""")
+LEFT = word_set("left l lw wl vl le")
+RIGHT = word_set("right r rw wr vr ri")
+FRONT = word_set("front f")
+REAR = word_set("rear back b")
 CORNERS = {
     "front_left": {"fl", "lf"},
     "front_right": {"fr", "rf"},
     "rear_left": {"rl", "bl", "lr"},
     "rear_right": {"rr", "br"},
 }
-STEERING = {"steering", "steer", "delta", "servo"}
-THROTTLE = {"throttle", "gas", "accelerator", "pedal", "pwm", "duty"}
-TURNING = {"angular", "ang", "omega", "yawrate", "wz", "w", "turn", "rot", "rotational"}
-SPEED = {
-    "speed",
-    "velocity",
-    "vel",
-    "v",
-    "vx",
-    "linear",
-    "lin",
-    "forward",
-    "trans",
-    "cmdvel",
-}
+STEERING = word_set("steering steer delta servo")
+THROTTLE = word_set("throttle gas accelerator pedal pwm duty")
+TURNING = word_set("angular ang omega yawrate wz w turn rot rotational")
+SPEED = word_set("speed velocity vel v vx linear lin forward trans cmdvel")
 # Kinds of robots by the meaning of their commands, and their names for them; kinds that a file of
 # its own describes have theirs in `words`.
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -254,18 +84,8 @@ STANDARD_PACKAGES = re.compile(
     r"|rcl_interfaces|dynamic_reconfigure|map|stereo|shape|trajectory|bond|theora_image_transport"
     r"|gazebo|gps_common|geographic)(_msgs)?/"
 )
-ROUNDABOUT = {
-    "raw",
-    "mux",
-    "nav",
-    "navi",
-    "teleop",
-    "joy",
-    "smoother",
-    "unfiltered",
-    "key",
-}
-BARE_TWIST = {"cmd", "vel"}
+ROUNDABOUT = word_set("raw mux nav navi teleop joy smoother unfiltered key")
+BARE_TWIST = word_set("cmd vel")
 
 CERTAIN = 3
 LIKELY = 2

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_up_axis
-from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 
 OF_MESSAGE = "angular_velocity.z"  # of sensor_msgs/Imu
@@ -18,17 +18,8 @@ TURNING = (
     {"yawrate"},
 )
 TURNING_OF_IMU = (*TURNING, {"w"}, {"wz"}, {"omega"}, {"angular", "z"}, {"z", "rate"})
-NOT_MEASURED = {
-    "cmd",
-    "command",
-    "commanded",
-    "ref",
-    "setpoint",
-    "target",
-    "desired",
-    "covariance",
-}
-NOT_OF_GYRO = {"odom", "odometry", "vicon", "mocap", "gt", "truth"}
+NOT_MEASURED = word_set("cmd command commanded ref setpoint target desired covariance")
+NOT_OF_GYRO = word_set("odom odometry vicon mocap gt truth")
 USUAL_NAMES = ("/imu", "/imu/data")  # of topics; the first that is there is chosen
 FASTEST_RADPS = 20.0  # a robot that seems to turn faster does so in degrees
 

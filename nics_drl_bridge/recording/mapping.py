@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import suggest
-from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.names import split_words, word_set
 
 TURN = 2.0 * math.pi
 
@@ -89,8 +89,8 @@ def to_si(unit: str, ticks_per_turn: float | None = None) -> UnitOfData:
 
 
 # Words of columns that can't have been sent to a robot: where it is, and how uncertain that is.
-PLACES_ON_EARTH = {"latitude", "longitude", "altitude"}
-NO_COMMANDS = PLACES_ON_EARTH | {"covariance", "covariances", "cov", "variance"}
+PLACES_ON_EARTH = word_set("latitude longitude altitude")
+NO_COMMANDS = PLACES_ON_EARTH | word_set("covariance covariances cov variance")
 
 NO_COMMAND_NAMED = (
     "command: names none, but a model learns what the robot does from what was sent to it; name "

@@ -3,6 +3,11 @@
 import re
 
 
+def word_set(text: str) -> frozenset[str]:
+    """Returns the words of a text that white space separates."""
+    return frozenset(text.split())
+
+
 def split_words(name: str) -> list[str]:
     """Splits a name into its words: `vicon x`, `q.x`, `Left_Tick`, `cmdVel`."""
     parts = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)

@@ -9,7 +9,7 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.recording import measure_alignment
 from nics_drl_bridge.recording.survey import TableSurvey, split_unit
 
@@ -36,101 +36,22 @@ HEADINGS = (
     "phi",
 )
 # Words of columns that are places of something else, and of motions, sensors and deviations.
-OTHERS = {
-    *(
-        "goal",
-        "target",
-        "waypoint",
-        "waypoints",
-        "ref",
-        "reference",
-        "setpoint",
-        "desired",
-    ),
-    *(
-        "initialpose",
-        "marker",
-        "markers",
-        "obstacle",
-        "obstacles",
-        "landmark",
-        "landmarks",
-    ),
-    *(
-        "person",
-        "people",
-        "leg",
-        "detection",
-        "detections",
-        "tag",
-        "plan",
-        "path",
-        "cmd",
-        "command",
-    ),
-}
-NOT_PLACES = OTHERS | {
-    *(
-        "linear",
-        "angular",
-        "twist",
-        "velocity",
-        "vel",
-        "acc",
-        "accel",
-        "acceleration",
-        "speed",
-    ),
-    *(
-        "rate",
-        "gyro",
-        "mag",
-        "magnetic",
-        "magnetometer",
-        "gravity",
-        "force",
-        "torque",
-        "jerk",
-    ),
-    *("steer", "steering", "wheel", "joy", "axes", "user", "pixel", "image", "camera"),
-    *("laser", "scan", "lidar", "range", "beam", "info", "map"),
-    *("error", "err", "std", "stddev", "sigma", "var", "variance", "cov", "covariance"),
-}
-TURNS = {"q", "quat", "quaternion", "rotation", "orientation"}
+OTHERS = word_set("""
+    goal target waypoint waypoints ref reference setpoint desired initialpose
+    marker markers obstacle obstacles landmark landmarks person people leg
+    detection detections tag plan path cmd command
+""")
+NOT_PLACES = OTHERS | word_set("""
+    linear angular twist velocity vel acc accel acceleration speed rate gyro mag
+    magnetic magnetometer gravity force torque jerk steer steering wheel joy
+    axes user pixel image camera laser scan lidar range beam info map error err
+    std stddev sigma var variance cov covariance
+""")
+TURNS = word_set("q quat quaternion rotation orientation")
 # The source of a pose by its name: a tracker before a localiser before odometry.
-TRACKERS = {
-    "vicon",
-    "mocap",
-    "vrpn",
-    "optitrack",
-    "qualisys",
-    "gt",
-    "truth",
-    "groundtruth",
-}
-TRACKERS |= {"tracker"}
-LOCALISERS = {
-    "pose",
-    "amcl",
-    "pf",
-    "slam",
-    "cartographer",
-    "rtabmap",
-    "filtered",
-    "fused",
-    "ekf",
-}
-SENSORS = {
-    "odom",
-    "odometry",
-    "imu",
-    "gyro",
-    "measured",
-    "encoder",
-    "wheel",
-    "feedback",
-    "model",
-}
+TRACKERS = word_set("vicon mocap vrpn optitrack qualisys gt truth groundtruth tracker")
+LOCALISERS = word_set("pose amcl pf slam cartographer rtabmap filtered fused ekf")
+SENSORS = word_set("odom odometry imu gyro measured encoder wheel feedback model")
 SOURCES = TRACKERS | LOCALISERS | SENSORS | {"ground"}
 # Types of messages that hold positions of something else, or of a goal.
 OTHER_PLACES = re.compile(

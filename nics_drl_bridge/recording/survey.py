@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.names import split_words, write_reference
+from nics_drl_bridge.recording.names import split_words, word_set, write_reference
 from nics_drl_bridge.recording.recording import (
     IRREGULAR,
     UNITS_OF_STEP,
@@ -25,19 +25,10 @@ MOST_COLUMNS = 200  # of a table
 # stamps that would be closer are not in the unit that their name says
 SHORTEST_STEP_S = 1e-4
 MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
-TIMES = {
-    "time",
-    "times",
-    "stamp",
-    "timestamp",
-    "t",
-    "s",
-    "sec",
-    "secs",
-    "seconds",
-    "elapsed",
-}
-TIMES |= {"ms", "us", "ns", "millis", "micros", "nanos", "date", "datetime"}
+TIMES = word_set("""
+    time times stamp timestamp t s sec secs seconds elapsed ms us ns millis
+    micros nanos date datetime
+""")
 # Units as they end a name (`yaw_deg`, `v_m_s`), the longest first.
 ENDINGS: dict[tuple[str, ...], str] = {
     ("m", "per", "s"): "m/s",

@@ -7,42 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.survey import Survey, TableSurvey
 
-ENABLING = {
-    "safety",
-    "enable",
-    "enabled",
-    "armed",
-    "active",
-    "activated",
-    "auto",
-    "autonomous",
-}
-ENABLING |= {"autonomy", "deadman", "engaged", "engage"}
-DISABLING = {
-    "estop",
-    "emergency",
-    "kill",
-    "stop",
-    "stopped",
-    "disabled",
-    "manual",
-    "fault",
-}
-ON_WORDS = {
-    "auto",
-    "autonomous",
-    "autonomy",
-    "enabled",
-    "on",
-    "armed",
-    "active",
-    "offboard",
-    "run",
-}
-MODES = {"mode", "state", "status", "safety", "switch"} | ENABLING
+ENABLING = word_set("""
+    safety enable enabled armed active activated auto autonomous autonomy
+    deadman engaged engage
+""")
+DISABLING = word_set("estop emergency kill stop stopped disabled manual fault")
+ON_WORDS = word_set("auto autonomous autonomy enabled on armed active offboard run")
+MODES = ENABLING | word_set("mode state status safety switch")
 FASTER = 2.0  # the robot moves so much faster while the switch is on
 FEWEST = 20  # rows of each value of the switch, from which on the motion tells
 
