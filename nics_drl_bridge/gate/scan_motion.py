@@ -87,6 +87,9 @@ class Verdict(NamedTuple):
     sectors: int  # that tell something
     share: float  # median share of the motion that they show; NaN if too few tell something
     held: bool  # they contradict odometry
+    reference: ReducedScan | None = (
+        None  # the older of the two scans, if they were compared
+    )
 
 
 UNDECIDED = Verdict(0, math.nan, False)
@@ -125,7 +128,7 @@ def watch_scan(
         since_ns = _update_held_since(
             before.held_since_ns, verdict, scan.stamp_ns, settings
         )
-    held = _explain_contradiction(kept, newest, verdict, since_ns, settings)
+    held = _explain_contradiction(newest, verdict, since_ns, settings)
     apart_ns = round(settings.kept_every_s / S_PER_NS)
     if not kept or newest.stamp_ns - kept[-1].stamp_ns >= apart_ns:
         kept = (*kept, newest)
@@ -153,19 +156,19 @@ def _update_held_since(
 
 
 def _explain_contradiction(
-    kept: tuple[ReducedScan, ...],
     newest: ReducedScan,
     verdict: Verdict,
     held_since_ns: int | None,
     settings: Settings,
 ) -> str:
     """Returns a sentence once scans have contradicted odometry for long enough, else nothing."""
-    if not verdict.held or held_since_ns is None:
+    reference = verdict.reference
+    if not verdict.held or held_since_ns is None or reference is None:
         return ""
     if (newest.stamp_ns - held_since_ns) * S_PER_NS < settings.confirmed_s:
         return ""
-    x, y, turn = between(kept[0].pose, newest.pose).tolist()
-    seconds = (newest.stamp_ns - kept[0].stamp_ns) * S_PER_NS
+    x, y, turn = between(reference.pose, newest.pose).tolist()
+    seconds = (newest.stamp_ns - reference.stamp_ns) * S_PER_NS
     claimed = f"odometry shows {math.hypot(x, y):.2f} m and {abs(turn):.2f} rad in {seconds:.2f} s"
     return f"{claimed}, the scans show none of it: the body is held, or the wheels slip"
 
@@ -207,7 +210,7 @@ def judge_motion(
         and abs(share) < settings.held_share
         and np.median(changed[known]) < settings.greatest_changed
     )
-    return Verdict(sectors, share, bool(held))
+    return Verdict(sectors, share, bool(held), old)
 
 
 def _select_reference(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -166,6 +168,17 @@ def test_a_body_that_is_held_while_its_wheels_spin_is_stopped_within_a_second(
     assert scene.stops_after(1.5) <= 1.0
     assert scene.rule == "body_held"
     assert "the scans show none of it" in scene.decision.cause.line
+
+
+def test_the_message_reports_the_motion_between_the_two_scans_that_were_compared():
+    scene = started(twist=(0.0, 0.0, 1.5))
+    scene.stops_after(1.0)
+    assert scene.rule == "body_held"
+    turn, seconds = map(
+        float, re.findall(r"([\d.]+) rad in ([\d.]+) s", scene.decision.cause.line)[0]
+    )
+    assert turn <= SETTINGS.usual_turn
+    assert turn == pytest.approx(1.5 * seconds, abs=0.02)
 
 
 def test_a_body_that_is_held_from_the_start_is_stopped_within_a_second():
