@@ -1,49 +1,60 @@
 """The shield: passes only commands from which the robot can stop before the nearest obstacle."""
-# The footprint is swept along all arcs between recent commands, odometry and the present command,
-# while the scan is old, the next decision takes and the robot reacts, then brakes; a command is
-# scaled down, on its path, until no obstacle is swept (dynamic window of Fox, Burgard, Thrun 1997).
-# An obstacle may approach if it is where the robot saw free space a moment ago.
+# The footprint is swept along all arcs between recent commands, odometry and the present command
+# for as long as the scan is old, the next decision takes and the robot reacts; then it brakes. A
+# command is reduced until no obstacle is swept (dynamic window of Fox, Burgard, Thrun 1997). An
+# obstacle may approach if it stands where the robot saw free space a moment ago.
 
 import math
 from collections.abc import Callable
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.gate import ground, shield_kernels
-from nics_drl_bridge.gate import state as records
 from nics_drl_bridge.gate.inputs import Scan
 from nics_drl_bridge.gate.scan_motion import extrapolate_pose
+from nics_drl_bridge.gate.shield_kernels import Body, MountedBeams, Tolerance
 from nics_drl_bridge.gate.state import (
     GateConfig,
     GateState,
     Ground,
     Motion,
+    Ranges,
     ShieldConfig,
     View,
+    replace,
 )
 from nics_drl_bridge.gate.stops import compute_age
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.sim.collision_kernels import Outline
 
-Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-ALIKE = 0.9  # share of a bound from which on a stop that is shorter needs no sweep of its own
-FINEST = 6  # bisections of the scale
-SPEEDS, TURNS = 3, 9
-"""Arcs of the family: number of speeds along each axis, and number of turn rates."""
-CREEP = 0.1  # a speed that is not safe at this [m/s] would use up what a turn on the spot needs
-# above this speed the ratio of turn rate to speed gives the curvature [m/s]
-MOVING = 0.1
-CALM = 0.5  # share of its deceleration with which the robot should stop when nothing is sudden
-STEP = 0.02  # distance between two checked places of the footprint on an arc [m]
-WALL_M = 0.05  # greatest distance between places of a wall on the footprint [m]
-MEMORY_S, SPACING_S = 0.45, 0.09
-"""Greatest age of a scan that the newest is compared with, and least time between them [s]."""
-TOLERANCE_M, DEVIATIONS = 0.03, 3.0
-"""Margin before the end of an old beam [m], plus this many standard deviations of its range."""
+BISECTIONS = 6  # of the scale by which a motion is reduced
+# A robot that turns on the spot does not approach an obstacle slower than this [m/s]: it would use
+# up the space that a turn on the spot needs.
+CREEP_SPEED = 0.1
+# Grid of twists that are swept: speeds along each axis, turn rates, and curvatures of a car.
+SPEED_COUNT = 3
+TURN_RATE_COUNT = 9
+CURVATURE_COUNT = 18
+# Above this speed [m/s] the curvature of a car is computed from its odometry.
+CURVATURE_SPEED = 0.1
+CALM_BRAKING = (
+    0.5  # fraction of the deceleration that a stop may need if nothing is sudden
+)
+# A stop that is shorter than its bound gets a sweep of its own below this fraction of the bound.
+SHORT_STOP = 0.9
+STEP = 0.02  # distance between two places at which the footprint is checked [m]
+WALL_SPACING = 0.05  # maximum distance between the points of a wall [m]
+MEMORY_S = 0.45  # maximum age of a scan that the newest one is compared with [s]
+SPACING_S = 0.09  # minimum time between two such scans [s]
+# A beam ends in space that was free if it ends this far [m], plus this many standard deviations of
+# its range, before the end of an old beam.
+TOLERANCE = 0.03
+DEVIATIONS = 3.0
 
 
 def add_view(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
@@ -53,10 +64,9 @@ def add_view(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
     pose = extrapolate_pose(state.odometry, scan.stamp_ns, MEMORY_S)
     kept: list[View] = []
     for view in state.views:
-        young = (scan.stamp_ns - view.stamp_ns) * S_PER_NS <= MEMORY_S
-        if young and (
-            not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S
-        ):
+        if (scan.stamp_ns - view.stamp_ns) * S_PER_NS > MEMORY_S:
+            continue
+        if not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S:
             kept.append(view)
     return (*kept, View(scan.stamp_ns, pose, scan.ranges))
 
@@ -66,100 +76,107 @@ def find_movers(
 ) -> Flags:
     """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
     newest = views[-1]
-    angles = config.beam_angles
-    marked = np.zeros(len(newest.ranges), np.bool_)
-    if len(angles) < 2 or shield.obstacle_speed == 0.0:
-        return marked
+    entered = np.zeros(len(newest.ranges), np.bool_)
+    if len(config.beam_angles) < 2 or shield.obstacle_speed == 0.0:
+        return entered
     lidar = _get_beams(config)
-    noise, share = (DEVIATIONS * std for std in shield.range_noise)
+    constant, proportional = shield.range_noise
+    tolerance = Tolerance(TOLERANCE + DEVIATIONS * constant, DEVIATIONS * proportional)
     for view in views[:-1]:
-        moved = geometry.between(view.pose, newest.pose)
         shield_kernels.mark_entered(
-            marked,
+            entered,
             newest.ranges,
             view.ranges,
             lidar,
-            moved,
+            geometry.between(view.pose, newest.pose),
             shield.range_max,
-            (TOLERANCE_M + noise, share),
+            tolerance,
         )
-    beside = np.zeros_like(marked)
-    beside[1:] |= marked[:-1]
-    beside[:-1] |= marked[1:]
-    return marked & beside
+    neighbour_entered = np.zeros_like(entered)
+    neighbour_entered[1:] |= entered[:-1]
+    neighbour_entered[:-1] |= entered[1:]
+    return entered & neighbour_entered
 
 
-def returns(
-    config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
+def place_returns(
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, is_mover: Flags
 ) -> Array:
     """Returns end points (P, 3) of the beams [m], and how fast each may approach [m/s]."""
     hit = np.isfinite(ranges)
-    speeds = np.where(moves[hit], shield.obstacle_speed, 0.0)
-    return _ends(
+    speeds = np.where(is_mover[hit], shield.obstacle_speed, 0.0)
+    return _compute_ends(
         config, config.beam_angles[hit], ranges[hit].astype(np.float64), speeds
     )
 
 
 def place_too_close(
-    config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, is_mover: Flags
 ) -> Array:
-    """Returns points (P, 3) at the least range for beams too close to measure (`-inf`) [m]."""
+    """Returns points (P, 3) at the minimum range for beams too close to measure (`-inf`) [m]."""
     near = np.isneginf(ranges)
-    return _ends(
+    return _compute_ends(
         config, config.beam_angles[near], np.full(near.sum(), config.range_min), 0.0
     )
 
 
 def place_unknown(
-    config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, is_mover: Flags
 ) -> Array:
     """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown."""
     bearings, wall = _sample_footprint(shield, config.mount, len(ranges))
     angles = config.beam_angles + config.mount[2]
-    half = shield.unknown_width / 2.0
-    known, every = (
-        _count_within(bearings, some, half)
-        for some in (angles[~np.isnan(ranges)], angles)
-    )
-    spacing = angles[1] - angles[0] if len(ranges) > 1 else 2.0 * np.pi
-    whole = (
-        shield.unknown_width / spacing
-    )  # at the end of the lidar's view it has fewer
-    least = (1.0 - shield.unknown_share) * np.where(every < int(whole), every, whole)
-    return np.pad(wall[known < least], ((0, 0), (0, 1)))
+    half_width = shield.unknown_width / 2.0
+    known_count = _count_within(bearings, angles[~np.isnan(ranges)], half_width)
+    count = _count_within(bearings, angles, half_width)
+    spacing = 2.0 * np.pi
+    if len(ranges) > 1:
+        spacing = angles[1] - angles[0]
+    full_count = shield.unknown_width / spacing
+    # At the edge of the lidar's view there are fewer beams than in a whole window.
+    expected_count = np.where(count < int(full_count), count, full_count)
+    is_unknown = known_count < (1.0 - shield.unknown_share) * expected_count
+    return _as_static(wall[is_unknown])
 
 
 @cache
 def _sample_footprint(
     shield: ShieldConfig, mount: tuple[float, float, float], count: int
 ) -> tuple[Array, Array]:
-    """Returns places (M, 2) around the footprint, and their bearings (M,) from the lidar."""
+    """Returns the bearings (M,) from the lidar of points around the footprint, and these (M, 2).
+
+    Bearings of a circle, which gets `count` points, are those from its centre.
+    """
     corners = np.array(shield.outline)
-    if not len(corners):  # as seen from the middle
+    if not len(corners):
         bearings = np.linspace(-np.pi, np.pi, count, endpoint=False)
         wall = shield.footprint_radius * np.stack([np.cos(bearings), np.sin(bearings)])
         return bearings, wall.T
-    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    parts = [(a, b, math.ceil(np.hypot(*(b - a)) / WALL_M)) for a, b in sides]
-    wall = np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in parts])
+    edges = []
+    for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        pieces = math.ceil(np.hypot(*(end - begin)) / WALL_SPACING)
+        edges.append(np.linspace(begin, end, pieces, endpoint=False))
+    wall = np.concatenate(edges)
     return np.arctan2(wall[:, 1] - mount[1], wall[:, 0] - mount[0]), wall
 
 
-def _count_within(bearings: Array, angles: Array, half: float) -> NDArray[np.int64]:
-    """Returns how many angles (B,) lie around each bearing (M,), up to an angle [rad] beside it."""
+def _count_within(
+    bearings: Array, angles: Array, half_width: float
+) -> NDArray[np.int64]:
+    """Returns how many angles (B,) lie within half a width of each bearing (M,) [rad]."""
     angles = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
-    around = np.concatenate([angles - 2.0 * np.pi, angles, angles + 2.0 * np.pi])
-    return np.searchsorted(around, bearings + half) - np.searchsorted(
-        around, bearings - half
-    )
+    turns = np.concatenate([angles - 2.0 * np.pi, angles, angles + 2.0 * np.pi])
+    begin = np.searchsorted(turns, bearings - half_width)
+    return np.searchsorted(turns, bearings + half_width) - begin
 
 
-EVIDENCE = (returns, place_too_close, place_unknown)
+# What counts as an obstacle in a scan.
+EVIDENCE = (place_returns, place_too_close, place_unknown)
 
 
-def _ends(
+def _compute_ends(
     config: GateConfig, angles: Array, ranges: Array, speeds: Array | float
 ) -> Array:
+    """Returns ends (P, 3) of beams in the robot's frame [m], and the speeds of what is there."""
     x, y, heading = config.mount
     angles = angles + heading
     speeds = np.broadcast_to(speeds, ranges.shape)
@@ -168,20 +185,25 @@ def _ends(
     )
 
 
+def _as_static(points: Array) -> Array:
+    """Returns obstacles (P, 3) at points (P, 2), with a speed of zero."""
+    return np.pad(points, ((0, 0), (0, 1)))
+
+
 def update_ground(
     config: GateConfig, views: tuple[View, ...], before: Ground | None
 ) -> Ground | None:
-    """Returns what is known after the newest view of where the lidar never looks, if anywhere."""
-    given = config.shield
-    angles = config.beam_angles
-    if given is None or not views or len(angles) < 2:
+    """Returns the ground known after the newest view; None for a lidar that sees all around."""
+    shield = config.shield
+    beams = len(config.beam_angles)
+    if shield is None or not views or beams < 2:
         return None
     lidar = _get_beams(config)
-    seen = abs(lidar.step) * len(angles)
-    if 2.0 * np.pi - seen < given.unknown_share * given.unknown_width:
+    blind_angle = 2.0 * np.pi - abs(lidar.step) * beams
+    if blind_angle < shield.unknown_share * shield.unknown_width:
         return None
     return ground.look(
-        before, views[-1], lidar, get_body(given), given.range_max, TOLERANCE_M
+        before, views[-1], lidar, get_body(shield), shield.range_max, TOLERANCE
     )
 
 
@@ -191,218 +213,264 @@ def find_obstacles(
     views: tuple[View, ...],
     known: Ground | None = None,
 ) -> Array | None:
-    """Returns obstacles (P, 3) in a scan (B,): x, y [m], greatest speed [m/s]; None if off."""
-    given = config.shield
-    if given is None:
+    """Returns obstacles (P, 3) in a scan (B,): x, y [m], maximum speed [m/s]; None if off."""
+    shield = config.shield
+    if shield is None:
         return None
-    moves = (
-        find_movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
-    )
-    found = [evidence(config, given, ranges, moves) for evidence in EVIDENCE]
-    unseen = [] if known is None else [np.pad(known.unseen, ((0, 0), (0, 1)))]
-    return np.concatenate([*found, *unseen])
+    is_mover = np.zeros(len(ranges), np.bool_)
+    if views:
+        is_mover = find_movers(config, shield, views)
+    obstacles = [place(config, shield, ranges, is_mover) for place in EVIDENCE]
+    if known is not None:
+        obstacles.append(_as_static(known.unseen))
+    return np.concatenate(obstacles)
 
 
-def _get_beams(config: GateConfig) -> shield_kernels.MountedBeams:
+def _get_beams(config: GateConfig) -> MountedBeams:
     angles = config.beam_angles
     step = float(angles[1] - angles[0])
-    return shield_kernels.MountedBeams(float(angles[0]), step, *config.mount)
+    return MountedBeams(float(angles[0]), step, *config.mount)
 
 
 @cache
-def get_body(shield: ShieldConfig) -> shield_kernels.Body:
+def get_body(shield: ShieldConfig) -> Body:
     """Returns the footprint that is swept."""
     corners = np.array(shield.outline, np.float64).reshape(-1, 2)
     reach = float(np.hypot(*corners.T).max(initial=0.0))
     outline = Outline(corners, 0, len(corners))
-    radius = shield.footprint_radius
-    return shield_kernels.Body(
-        outline, radius, reach, shield.margin, shield.lever, shield.order
+    return Body(
+        outline,
+        shield.footprint_radius,
+        reach,
+        shield.margin,
+        shield.lever,
+        shield.order,
     )
 
 
 def warm_up() -> None:
-    """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
+    """Compiles the kernels of `shield`; that takes seconds, which a moving robot does not have."""
     shield_kernels.fill_grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
     body = get_body(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
     shield_kernels.is_free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
-    lidar = shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0)
-    scan = np.ones(1, np.float32)
+    lidar = MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0)
+    ranges = np.ones(1, np.float32)
     shield_kernels.mark_entered(
-        np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0)
+        np.zeros(1, np.bool_),
+        ranges,
+        ranges,
+        lidar,
+        np.zeros(3),
+        1.0,
+        Tolerance(0.0, 0.0),
     )
-    view = View(0, np.zeros(3), scan)
-    ground.look(
-        ground.look(None, view, lidar, body, 1.0, 0.0), view, lidar, body, 1.0, 0.0
-    )
+    view = View(0, np.zeros(3), ranges)
+    before: Ground | None = None
+    for _ in range(2):
+        before = ground.look(before, view, lidar, body, 1.0, 0.0)
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Returns the greatest part of a motion from which it can stop, braking harder if needed."""
+    """Reduces a motion until the robot can stop before every obstacle.
+
+    A motion from which the robot can stop passes as it is. Otherwise:
+
+    - If the turn without any speed is safe, the turn rate stays and only the speed is reduced: an
+      obstacle ahead must not keep the robot from turning away.
+    - If it is not, speed and turn rate are scaled alike, which keeps the robot on its path. If that
+      leaves a creep, but straight on the robot could drive faster, the turn is left out instead: an
+      obstacle at its side must not keep the robot from leaving straight.
+
+    A creep is a speed below `CREEP_SPEED` of a robot that can turn on the spot. It would end so
+    near to an obstacle that the robot could not turn any more. So a commanded creep only passes
+    where the robot could also stop from `CREEP_SPEED`, and beside a full turn it becomes zero.
+    """
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
-    linear = config.limits.linear
-    turn = config.limits.turn
-    turning = motion.value[turn].any()
-    speed = np.abs(motion.value[linear]).max(initial=0.0)
-    if not (turning or speed):
+    is_speed = config.limits.linear
+    is_turn_rate = config.limits.turn
+    speed = float(np.abs(motion.value[is_speed]).max(initial=0.0))
+    turns = bool(motion.value[is_turn_rate].any())
+    turns_on_the_spot = turns and config.shield.wheelbase == 0.0
+    if speed == 0.0 and not turns:
         return motion
 
-    def part(ahead: float, about: float) -> Array:
-        return motion.value * np.where(linear, ahead, np.where(turn, about, 1.0))
+    def scale_motion(speed_scale: float, turn_scale: float) -> Array:
+        scales = np.where(
+            is_speed, speed_scale, np.where(is_turn_rate, turn_scale, 1.0)
+        )
+        return motion.value * scales
 
-    def safe(ahead: float, about: float) -> bool:
-        return _is_safe(config, state, part(ahead, about), now)
+    def can_stop(speed_scale: float, turn_scale: float) -> bool:
+        return _can_stop(config, state, scale_motion(speed_scale, turn_scale), now)
 
-    on_the_spot = bool(turning) and config.shield.wheelbase == 0.0
-    creeps = on_the_spot and 0.0 < speed < CREEP
-    if safe(1.0, 1.0) and (not creeps or safe(CREEP / speed, 1.0)):
+    def can_stop_from_creep_speed(turn_scale: float) -> bool:
+        return can_stop(CREEP_SPEED / speed, turn_scale)
+
+    is_creep = turns_on_the_spot and 0.0 < speed < CREEP_SPEED
+    if can_stop(1.0, 1.0) and (not is_creep or can_stop_from_creep_speed(1.0)):
         return motion
-    # A way that is barred bars no turn on the spot: else a robot could not turn away from it.
-    turns = bool(turning) and safe(0.0, 1.0)
-    low = _find_maximum(lambda share: safe(share, 1.0 if turns else share))
-    if on_the_spot and low * speed < CREEP:
-        if turns:
-            low = 0.0
-        elif speed and safe(
-            CREEP / speed, 0.0
-        ):  # nor does a turn that is barred bar the way back
-            value = part(_find_maximum(lambda share: safe(share, 0.0)), 0.0)
-            return records.replace(
-                motion, value=value, slope=0.0 * value, shielded=True
-            )
-    value = part(low, 1.0 if turns else low)
-    slope = np.where(turn & turns, motion.slope, 0.0)
-    return records.replace(motion, value=value, slope=slope, shielded=True)
+    slope = np.zeros_like(motion.slope)
+    if turns and can_stop(0.0, 1.0):
+        turn_scale = 1.0
+        slope[is_turn_rate] = motion.slope[is_turn_rate]
+        speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, 1.0))
+        if turns_on_the_spot and speed_scale * speed < CREEP_SPEED:
+            speed_scale = 0.0
+    else:
+        speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, scale))
+        turn_scale = speed_scale
+        would_creep = turns_on_the_spot and speed_scale * speed < CREEP_SPEED
+        if would_creep and speed > 0.0 and can_stop_from_creep_speed(0.0):
+            speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, 0.0))
+            turn_scale = 0.0
+    value = scale_motion(speed_scale, turn_scale)
+    return replace(motion, value=value, slope=slope, shielded=True)
 
 
-def _find_maximum(safe: Callable[[float], bool]) -> float:
-    """Greatest safe share of a motion, found by bisection."""
-    if safe(1.0):
+def _find_maximum_scale(can_stop: Callable[[float], bool]) -> float:
+    """Returns the maximum scale in [0, 1] from which the robot can stop, by bisection."""
+    if can_stop(1.0):
         return 1.0
     low = 0.0
     high = 1.0
-    for _ in range(FINEST):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2.0
-        low, high = (middle, high) if safe(middle) else (low, middle)
+        if can_stop(middle):
+            low = middle
+        else:
+            high = middle
     return low
 
 
-def _is_safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
-    """True if the robot could still stop, and could do so without a jolt."""
-    given = config.shield
-    points = state.obstacles
-    if given is None or points is None:
+def _can_stop(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
+    """True if the robot can stop from a command (C,) in a calm stop and in a sudden one.
+
+    Calm: obstacles stand still, and the robot brakes with half its deceleration once the next scan
+    has shown them. Sudden: obstacles approach, the robot moves by any twist between its odometry
+    and the commands that the scan does not show yet, and brakes as hard as it can.
+    """
+    shield = config.shield
+    if shield is None or state.obstacles is None:
         return True
-    # What further sensors show counts as standing.
-    seen_further = [np.pad(sensor.points, ((0, 0), (0, 1))) for sensor in state.sensors]
-    points = np.concatenate([points, *seen_further])
-    body = get_body(given)
-    odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
-    old = max(
-        0.0,
-        compute_age(state.scans, now),
-        *(compute_age(s.arrivals, now) for s in state.sensors),
+    sensor_points = [_as_static(sensor.points) for sensor in state.sensors]
+    obstacles = np.concatenate([state.obstacles, *sensor_points])
+    # Against fast obstacles a calm stop is no use.
+    static_obstacles = obstacles * (1.0, 1.0, 0.0)
+    reaction_s = shield.hold_s + shield.latency_s
+    twists = _span_twists(config, shield, value[None], None)
+    calm_s = 1.0 / config.scan_rate + reaction_s + shield.latency_s
+    for stop in list_stops(shield, calm_s, CALM_BRAKING, latencies=2.0):
+        if not shield_kernels.is_free(static_obstacles, twists, *stop, STEP):
+            return False
+    data_age_s = _compute_data_age(state, now)
+    commands = _list_unshown_commands(shield, state, now, data_age_s)
+    odometry = np.zeros(3)
+    if state.odometry is not None:
+        odometry = state.odometry.twist
+    twists = _span_twists(
+        config, shield, np.array([*commands, state.value, value]), odometry
     )
-    # Commands that the scan does not show yet: since it was taken, or within the latency before.
-    if given.turn is None:
-        late = given.latency_s
-    else:
-        late = max(given.latency_s, given.turn.reaction_s)
-    since = now - old - late
-    ends = [time for time, _ in state.recent[1:]]
-    past = [
-        one[1]
-        for one, end in zip(state.recent, [*ends, now], strict=False)
-        if end >= since
-    ]
-    react = given.hold_s + given.latency_s
-    calm = 1.0 / config.scan_rate + react + given.latency_s
-    hard = old + react
-    standing = points * (
-        1.0,
-        1.0,
-        0.0,
-    )  # static: against fast obstacles a calm stop is no use
-    for seen, commands, twist, blind, share, latencies in (
-        (standing, [value], None, calm, CALM, 2.0),
-        (points, [*past, state.value, value], odometry, hard, 1.0, 1.0),
-    ):
-        twists = _span_twists(config, given, np.array(commands), twist)
-        for stop in list_sweeps(given, body, blind, share, latencies):
-            if not shield_kernels.is_free(seen, twists, *stop, STEP):
-                return False
+    for stop in list_stops(shield, data_age_s + reaction_s, 1.0, latencies=1.0):
+        if not shield_kernels.is_free(obstacles, twists, *stop, STEP):
+            return False
     return True
 
 
-def list_sweeps(
-    given: ShieldConfig,
-    body: shield_kernels.Body,
-    blind: float,
-    share: float,
-    latencies: float,
-) -> list[tuple[shield_kernels.Body, float, float]]:
-    """Returns body, time before it brakes [s] and deceleration [m/s^2] of the stops to sweep.
+def _compute_data_age(state: GateState, now: float) -> float:
+    """Returns the age of the oldest data that show obstacles [s], at least 0."""
+    arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
+    return max(0.0, *(compute_age(topic, now) for topic in arrivals))
 
-    Where the turn brakes apart from the speed, either may end sooner than it is bound to.
+
+def _list_unshown_commands(
+    shield: ShieldConfig, state: GateState, now: float, data_age_s: float
+) -> list[Array]:
+    """Returns the commands (C,) in force since the scan was taken, or within the latency before."""
+    latency_s = shield.latency_s
+    if shield.turn is not None:
+        latency_s = max(latency_s, shield.turn.reaction_s)
+    since = now - data_age_s - latency_s
+    # A command is in force until the next one.
+    ends = [*(time for time, _ in state.recent[1:]), now]
+    return [
+        command
+        for (_, command), end in zip(state.recent, ends, strict=False)
+        if end >= since
+    ]
+
+
+class Stop(NamedTuple):
+    """A stop to be swept: the robot keeps its twist for a reaction time, then brakes."""
+
+    body: Body
+    reaction_s: float  # [s]
+    deceleration: float  # [m/s^2]
+
+
+def list_stops(
+    shield: ShieldConfig, reaction_s: float, braking: float, latencies: float
+) -> list[Stop]:
+    """Returns the stops to sweep. If the turn brakes by itself, either may end early.
 
     Args:
-        given: the stopping behaviour.
-        body: that is swept.
-        blind: time before the speed is braked, with as many latencies as given [s].
-        share: of the decelerations with which the robot brakes.
-        latencies: number of them within that time.
+        shield: the stopping behaviour.
+        reaction_s: time until the speed is braked [s], which includes the latencies.
+        braking: fraction of the decelerations with which the robot brakes.
+        latencies: number of latencies in the reaction time.
     """
-    turn = given.turn
-    deceleration = share * given.deceleration
+    body = get_body(shield)
+    deceleration = braking * shield.deceleration
+    turn = shield.turn
     if turn is None:
-        return [(body, blind, deceleration)]
+        return [Stop(body, reaction_s, deceleration)]
+    fractions = [(1.0, 1.0)]
+    if turn.least_turn < SHORT_STOP:
+        fractions.append((1.0, turn.least_turn))
+    if turn.least_path < SHORT_STOP:
+        fractions.append((turn.least_path, 1.0))
     stops = []
-    shares = [(1.0, 1.0)]
-    if turn.least_turn < ALIKE:
-        shares.append((1.0, turn.least_turn))
-    if turn.least_path < ALIKE:
-        shares.append((turn.least_path, 1.0))
-    for path_share, turn_share in shares:
-        path_blind = blind - (1.0 - path_share) * given.latency_s
-        turn_latencies = latencies - (1.0 - turn_share)
-        turn_blind = (
-            blind - latencies * given.latency_s + turn_latencies * turn.reaction_s
+    for path_fraction, turn_fraction in fractions:
+        path_reaction_s = reaction_s - (1.0 - path_fraction) * shield.latency_s
+        turn_latencies = latencies - (1.0 - turn_fraction)
+        turn_reaction_s = (
+            reaction_s - latencies * shield.latency_s + turn_latencies * turn.reaction_s
         )
-        braked = body._replace(
-            turn_later=turn_blind - path_blind,
-            turn_deceleration=share * turn.deceleration / turn_share,
+        turning_body = body._replace(
+            turn_later=turn_reaction_s - path_reaction_s,
+            turn_deceleration=braking * turn.deceleration / turn_fraction,
         )
-        stops.append((braked, path_blind, deceleration / path_share))
+        stops.append(Stop(turning_body, path_reaction_s, deceleration / path_fraction))
     return stops
 
 
 def _span_twists(
-    config: GateConfig, given: ShieldConfig, commands: Array, odometry: Array | None
+    config: GateConfig, shield: ShieldConfig, commands: Array, odometry: Array | None
 ) -> Array:
     """Returns body twists (K, 3) between those of commands (n, C) and of odometry (3,), if any."""
     twists = np.zeros((len(commands), 3))
     twists[:, list(config.fields)] = commands
-    if given.wheelbase > 0.0:
-        return _span_car_twists(given.wheelbase, twists, odometry)
+    if shield.wheelbase > 0.0:
+        return _span_car_twists(shield.wheelbase, twists, odometry)
     if odometry is not None:
         twists = np.concatenate([twists, odometry[None]])
-    twists = _add_drift(given, twists)
+    twists = _add_drift(shield, twists)
     low = twists.min(axis=0)
     high = twists.max(axis=0)
-    counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
+    counts = np.where(high > low, (SPEED_COUNT, SPEED_COUNT, TURN_RATE_COUNT), 1)
     return np.asarray(shield_kernels.fill_grid(low, high, counts))
 
 
-def _add_drift(given: ShieldConfig, twists: Array) -> Array:
+def _add_drift(shield: ShieldConfig, twists: Array) -> Array:
     """Returns twists (n, 3), and those of the arcs between which the robot leaves theirs."""
-    drift = given.drift
+    drift = shield.drift
     if drift.is_none:
         return twists
-    scale = np.array([1.0, 1.0, given.footprint_radius])
-    greatest = np.abs(twists * scale).max(axis=1, keepdims=True)
-    is_lesser = np.abs(twists * scale) < greatest
-    bound = drift.share * greatest / scale
+    scale = np.array([1.0, 1.0, shield.footprint_radius])
+    speeds = np.abs(twists * scale)
+    maximum = speeds.max(axis=1, keepdims=True)
+    is_lesser = speeds < maximum
+    bound = drift.share * maximum / scale
     rows = [twists]
     for factor in (drift.least, drift.greatest):
         changed = np.clip(factor * twists, -bound, bound)
@@ -414,15 +482,16 @@ def _span_car_twists(
     wheelbase: float, commands: Array, odometry: Array | None
 ) -> Array:
     """Returns a car's twists: curvature does not depend on speed; braking steers it straight."""
-    bends = [0.0, *np.tan(commands[:, 2]) / wheelbase]
+    curvatures = [0.0, *np.tan(commands[:, 2]) / wheelbase]
     speeds = list(commands[:, 0])
     if odometry is not None:
         speeds.append(odometry[0])
-        if abs(odometry[0]) > MOVING:
-            bends.append(odometry[2] / odometry[0])
-    grid = np.linspace(
-        min(bends), max(bends), 2 * TURNS if max(bends) > min(bends) else 1
-    )
-    ends = [speed for speed in sorted({max(speeds), min(speeds)}) if speed != 0.0]
-    speed, bend = np.meshgrid(ends, grid)
-    return np.stack([speed, np.zeros_like(speed), speed * bend], axis=-1).reshape(-1, 3)
+        if abs(odometry[0]) > CURVATURE_SPEED:
+            curvatures.append(odometry[2] / odometry[0])
+    low = min(curvatures)
+    high = max(curvatures)
+    count = CURVATURE_COUNT if high > low else 1
+    extremes = [speed for speed in sorted({max(speeds), min(speeds)}) if speed != 0.0]
+    speed, curvature = np.meshgrid(extremes, np.linspace(low, high, count))
+    twists = np.stack([speed, np.zeros_like(speed), speed * curvature], axis=-1)
+    return twists.reshape(-1, 3)

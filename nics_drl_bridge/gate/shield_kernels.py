@@ -286,6 +286,13 @@ class MountedBeams(NamedTuple):
     heading: float
 
 
+class Tolerance(NamedTuple):
+    """Tolerance of a range, as a + b * range."""
+
+    constant: float  # [m]
+    proportional: float
+
+
 @kernel(allocates=True)
 def mark_entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
     """Marks in `out` (B,) the beams of a scan (B,) that end where an old one saw free space."""
@@ -314,7 +321,7 @@ def mark_entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignor
             beyond = old[index] if index < beams else np.nan
             # Not `min`: with NaN, or an old beam that was too close, the beam must stay unmarked.
             seen = beyond if not beyond >= seen else seen
-        if away < seen - tolerance[0] - tolerance[1] * away:
+        if away < seen - tolerance.constant - tolerance.proportional * away:
             out[b] = True
 
 

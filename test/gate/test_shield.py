@@ -13,7 +13,7 @@ from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
 from nics_drl_bridge.gate.shield import (
-    CREEP,
+    CREEP_SPEED,
     MEMORY_S,
     SPACING_S,
     add_view,
@@ -129,7 +129,7 @@ def test_what_bars_a_turn_bars_no_way_straight_back():
     box = replace(CAR, wheelbase=0.0, outline=corners, footprint_radius=radius)
     at_a_corner = ranges(0.46, where=np.abs(LIDAR.angles - 0.5) < 0.1)
     rig = Faced(at_a_corner, box, (-0.3, 0.0, 0.5), "differential")
-    assert rig.settles(0.5) < -CREEP
+    assert rig.settles(0.5) < -CREEP_SPEED
     assert rig.decision.shielded
     behind = at_a_corner.copy()
     behind[np.abs(LIDAR.angles) > 3.0] = 0.46  # so near that only a creep would be safe
@@ -144,7 +144,7 @@ def test_a_robot_that_turns_does_not_creep_nearer():
         )
         for name, wish in wishes.items()
     }
-    assert 0.0 < rigs["ahead"].settles(0.5) < CREEP
+    assert 0.0 < rigs["ahead"].settles(0.5) < CREEP_SPEED
     assert rigs["turning"].settles(0.5) == 0.0
     assert rigs["turning"].decision.twist[2] == pytest.approx(0.5)
 

@@ -9,7 +9,7 @@ from skid_rover import kinematics, limits_in, pillars, rover, rover_model
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.shield import STEP, get_body, list_sweeps
+from nics_drl_bridge.gate.shield import STEP, get_body, list_stops
 from nics_drl_bridge.gate.shield_kernels import compute_clearance, is_free
 from nics_drl_bridge.gate.stopping import shield_config
 from nics_drl_bridge.interface import Start
@@ -152,7 +152,7 @@ def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
     state = np.array(command) * (10.6 / 10.7, 3.21 / 4.45)
     twist = np.array([[state[0], 0.0, state[1]]])
     body = get_body(shield)
-    stops = list_sweeps(shield, body, HELD_S + shield.latency_s, 1.0, 1.0)
+    stops = list_stops(shield, HELD_S + shield.latency_s, 1.0, 1.0)
     count = 0
     for x, y in np.random.default_rng(0).uniform(-1.5, 1.5, (1500, 2)):
         if compute_clearance(x, y, body) < shield.margin:

@@ -233,8 +233,8 @@ def test_it_does_not_listen_before_its_shield_is_compiled(domain_id):
     code = f"""
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.gate.shield_kernels import free
-CommandGate._listen = lambda _: print(len(free.signatures))
+from nics_drl_bridge.gate.shield_kernels import is_free
+CommandGate._listen = lambda _: print(len(is_free.signatures))
 node = CommandGate(open_context([], domain_id={domain_id}))
 node.destroy_node()
 node.context.try_shutdown()
