@@ -28,9 +28,6 @@ from nics_drl_bridge.kernels import kernel
     PLANNER_STREAM,
 ) = range(1, 12)
 
-# signs of the draws, and two places in the pool
-Run = tuple[np.uint32, np.uintp, np.uintp]
-
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 RUN = 32
 POOL_SIZE = 2**16
@@ -38,7 +35,7 @@ PER_STD = 1.0 / 5300.0  # so that the sum of two numbers of the pool fits 16 bit
 
 
 @kernel(allocates=True)
-def _mix(z: np.uint64) -> np.uint64:
+def _mix(z):  # type: ignore[no-untyped-def]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
@@ -58,44 +55,40 @@ POOL = _pool()
 
 
 @kernel(allocates=True)
-def uniform(seed: int, stream: int, counter: int) -> float:
+def uniform(seed, stream, counter):  # type: ignore[no-untyped-def]
     """A draw from the uniform distribution over [0, 1)."""
-    draw: float = uniform_of(source(seed, stream), counter)
-    return draw
+    return uniform_of(source(seed, stream), counter)
 
 
 @kernel(allocates=True)
-def source(seed: int, stream: int) -> np.uint64:
+def source(seed, stream):  # type: ignore[no-untyped-def]
     """Returns what all draws of a seed and stream have in common, for `uniform_of`."""
     z = _mix(np.uint64(seed) * GOLDEN + GOLDEN)
-    mixed: np.uint64 = _mix(z + (np.uint64(stream) + np.uint64(1)) * GOLDEN)
-    return mixed
+    return _mix(z + (np.uint64(stream) + np.uint64(1)) * GOLDEN)
 
 
 @kernel(allocates=True)
-def uniform_of(source: np.uint64, counter: int) -> float:
+def uniform_of(source, counter):  # type: ignore[no-untyped-def]
     """The same draw as `uniform`."""
     z = _mix(source + (np.uint64(counter) + np.uint64(1)) * GOLDEN)
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @kernel(allocates=True)
-def normal(seed: int, stream: int, counter: int) -> float:
+def normal(seed, stream, counter):  # type: ignore[no-untyped-def]
     """A draw from the standard normal distribution."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, stream, 2 * counter)))
     return radius * math.cos(2.0 * math.pi * uniform(seed, stream, 2 * counter + 1))
 
 
 @kernel(allocates=True)
-def key(seed: int, stream: int, counter: int) -> np.uint64:
+def key(seed, stream, counter):  # type: ignore[no-untyped-def]
     """Returns 64 bits, the key of many draws."""
-    offset = (np.uint64(counter) + np.uint64(1)) * GOLDEN
-    mixed: np.uint64 = _mix(source(seed, stream) + offset)
-    return mixed
+    return _mix(source(seed, stream) + (np.uint64(counter) + np.uint64(1)) * GOLDEN)
 
 
 @kernel(inline=True)
-def bits(by: np.uint64, i: int) -> np.uint32:
+def bits(by, i):  # type: ignore[no-untyped-def]
     """Returns 32 random bits, the i-th of a key."""
     z = np.uint32(np.uint32(i) * np.uint32(0x9E3779B9) + np.uint32(by))
     z = np.uint32((z ^ (z >> np.uint32(16))) * np.uint32(0x7FEB352D))
@@ -105,14 +98,14 @@ def bits(by: np.uint64, i: int) -> np.uint32:
 
 
 @kernel(contracts=True, inline=True)
-def share_of(drawn: np.uint32) -> np.float32:
+def share_of(drawn):  # type: ignore[no-untyped-def]
     """A uniform draw between 0 and 1, float32, of 32 random bits."""
     whole = np.float32(np.int32(drawn >> np.uint32(1)))
     return (whole + np.float32(0.5)) * np.float32(2.0**-31)
 
 
 @kernel(inline=True)
-def run(by: np.uint64, k: int) -> Run:
+def run(by, k):  # type: ignore[no-untyped-def]
     """Returns the k-th run of normal draws of a key: their signs, and two places in the pool."""
     z = _mix(by + np.uint64(k) * GOLDEN)
     one = (z >> np.uint64(32)) & np.uint64(POOL_SIZE - 1)
@@ -121,7 +114,7 @@ def run(by: np.uint64, k: int) -> Run:
 
 
 @kernel(contracts=True, inline=True)
-def normal_of(run: Run, j: int) -> np.float32:
+def normal_of(run, j):  # type: ignore[no-untyped-def]
     """The j-th draw of a run, times PER_STD standard normal, float32; below 6.2 / PER_STD.
 
     The sum of two normal numbers, from a pool (Wallace 1996), is normal. Signs of their own leave
@@ -135,7 +128,7 @@ def normal_of(run: Run, j: int) -> np.float32:
 
 
 @kernel(allocates=True)
-def episode_seed(seed: int, number: int) -> np.int64:
+def episode_seed(seed, number):  # type: ignore[no-untyped-def]
     """Seed of an env's episode: the first is the env's own seed, the others are below 2**53."""
     if number == 0:
         return np.int64(seed)
@@ -143,15 +136,7 @@ def episode_seed(seed: int, number: int) -> np.int64:
 
 
 @kernel
-def uniform_between(
-    out: NDArray[np.float64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    seeds: NDArray[np.int64],
-    stream: int,
-    first: int,
-    stride: int,
-) -> None:
+def uniform_between(out, low, high, seeds, stream, first, stride):  # type: ignore[no-untyped-def]
     """Draws out (n, M, Q) in [low, high) (Q,), by seeds (n,) and counters first + m stride + q."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
