@@ -202,7 +202,7 @@ def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]
             now += int(rng.integers(1, 3 * PERIOD))
             estimator.predict(now)
         elif kind == 1:
-            estimator.command(now, rng.uniform(low, high))
+            estimator.add_command(now, rng.uniform(low, high))
         elif kind == 2:
             estimator.update(
                 Kind.TWIST, rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 2.0)

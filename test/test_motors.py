@@ -205,7 +205,7 @@ def test_the_estimator_predicts_the_path_of_the_model(model, commands, path):
     estimator.reset(0, np.zeros(3))
     poses = [estimator.belief.mean[:3]]
     for k, command in enumerate(commands):
-        estimator.command(k * NS_PER_S // 10, command)
+        estimator.add_command(k * NS_PER_S // 10, command)
         estimator.predict((k + 1) * NS_PER_S // 10)
         poses.append(estimator.belief.mean[:3])
     assert_same_path(poses, path[0])
@@ -219,8 +219,8 @@ def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(
 
     def ahead(speed: float) -> tuple[float, float]:
         mean = np.array([0.0, 0.0, 0.0, speed, 0.0])
-        transition = kernels.unmoved(5, 0.0)
-        kernels.predict(mean, transition, np.array([throttle, 0.0]), 0.01, 10, motion)
+        transition = kernels.make_transition(5, 0.0)
+        kernels.step_mean(mean, transition, np.array([throttle, 0.0]), 0.01, 10, motion)
         return mean[3], transition[3, 3]
 
     slight = 1e-6
@@ -235,9 +235,9 @@ def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
     sent = replace(model, kinematics=kinematics)
     estimator = Estimator(sent)
     estimator.reset(0, np.zeros(3))
-    estimator.command(0, np.array([0.3, 0.0]))
+    estimator.add_command(0, np.array([0.3, 0.0]))
     for time, speed in ((0.01, 0.0), (0.02, 0.0), (0.021, 0.3 - DEAD)):
-        twist = estimator.at(round(time * NS_PER_S))[1]
+        twist = estimator.look_ahead(round(time * NS_PER_S))[1]
         assert twist == pytest.approx([speed, 0.0, 0.0]), (
             f"the throttle acts after 0.02 s: {time}"
         )

@@ -526,7 +526,7 @@ def report_end(episode: Episode) -> str:
     end = ENDS_BELIEVED.get(episode.result, episode.result)
     end = f"{end}, as believed"
     if episode.uncertain is not None:
-        end = f"{end}; {episode.uncertain.told_since('the start')}"
+        end = f"{end}; {episode.uncertain.describe_since('the start')}"
     return f"{end}; {episode.steps} steps, {episode.length:.2f} m"
 
 

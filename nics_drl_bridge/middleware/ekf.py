@@ -1,6 +1,26 @@
-"""The state estimator: filterpy's extended Kalman filter around the fitted model."""
+"""The state estimator: filterpy's extended Kalman filter around the fitted model.
 
-from typing import Any
+How it works:
+
+1. **Prediction.** The mean (pose in `map`, state of the RobotSpec) follows the model under the
+   logged commands; the covariance follows its Jacobians and grows by the model's drift.
+2. **Absolute measurements.** A pose corrects by the usual update, which filterpy computes. A yaw
+   rate corrects nothing by itself: the next odometry's turn is fused with it, see `turning`.
+3. **Odometry** is two measurements. The twist is a snapshot and corrects by the usual update. The
+   pose relative to the odometry before integrates the wheels' motion in between: it measures the
+   difference of two states, the present one and an earlier one. The filter therefore keeps a
+   `Clone` of the state at the newest odometry used, and its covariance with the present state
+   (stochastic cloning; Roumeliotis and Burdick 2002). Predictions and other measurements keep the
+   clone up to date; the next relative pose corrects the present state, and a new clone is made.
+   `kernels.correct_by_odometry` computes both updates at once.
+4. **Gates.** A measurement whose normalised innovation squared (NIS) is too large is an outlier,
+   unless it is news (the robot is stuck or pushed), or the last one of a row that is believed (a
+   jump).
+5. **Late measurements** are not handled here: `timeline` sets the filter back to the `Belief`
+   before them, and replays everything since.
+"""
+
+from typing import TypeVar
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -9,8 +29,19 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.belief import Belief, Unseen, parted
-from nics_drl_bridge.middleware.kernels import Anchor, Log, MotionModel, log_of
+from nics_drl_bridge.middleware.belief import (
+    Belief,
+    UnobservedMotion,
+    decorrelate_pose,
+)
+from nics_drl_bridge.middleware.kernels import (
+    Clone,
+    CommandLog,
+    MotionModel,
+    Odometry,
+    OdometryModel,
+    make_log,
+)
 from nics_drl_bridge.middleware.measurement import (
     Acceptance,
     Judgement,
@@ -18,46 +49,43 @@ from nics_drl_bridge.middleware.measurement import (
     Measurement,
 )
 from nics_drl_bridge.middleware.turning import (
-    Turned,
-    believable_variance,
+    FusedOdometry,
+    check_variance,
+    fuse_odometry,
     take_rate,
-    turn_odometry,
 )
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, wrap
 
-LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 1e-2, 2e-2
-"""Lower bounds on the model's error after a second, of the pose [m or rad / sqrt(s)], and of the
-state as a share of its range [1 / sqrt(s)]."""
-LEAST_SLIP = 5e-3  # Lower bound on the motion that wheels miss [m or rad / sqrt(s)]
-LEAST_TWIST_STD = LEAST_POSE_STD = START_STD = 1e-3
-"""Lower bounds on the standard deviations of a twist [m/s, rad/s] and of a pose [m, rad], and that
-of the pose at a reset."""
-# Gates on the squared, normalised innovation: 99.9 % of chi-squared with 3 degrees of freedom.
-GATE = {Kind.TWIST: 16.27, Kind.POSE: 16.27}
-PATIENCE = {
-    Kind.TWIST: 3,
-    Kind.POSE: 5,
-}  # consecutive outliers after which they are believed
-# Factors of variances, after each outlier and after each measurement that fits well, and the
-# greatest: noise may be more than was told, and nearly all measurements would then be outliers.
-ROUGHER = 4.0
-SMOOTHER = 0.93
-ROUGHEST = 100.0
-WELL = 2.37  # less is half of the squared, normalised innovations of three numbers
-NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
-STILL = np.zeros(3)
-REACHABLE = 2.0  # States and commands are cut at this many times their range
-FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
-ANYWHERE = (
-    100.0,
-    100.0,
-    np.pi,
-)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
-# of a robot at rest: expected and measured speeds [m/s, rad/s]
-STANDS = 0.01
-ABOUT_STANDS = 0.05
-# Longest gap that is predicted [s]: beyond, the robot may be anywhere
+# Lower bounds on the model's error after a second: of the pose [m or rad / sqrt(s)], and of the
+# state as a fraction of its range [1 / sqrt(s)]
+MIN_POSE_DRIFT = 1e-2
+MIN_STATE_DRIFT = 2e-2
+MIN_SLIP = 5e-3  # lower bound on the motion that wheels miss [m or rad / sqrt(s)]
+# Lower bounds on the standard deviations of a twist [m/s, rad/s] and of a pose [m, rad]
+MIN_TWIST_STD = 1e-3
+MIN_POSE_STD = 1e-3
+START_STD = 1e-3  # standard deviation of the pose at a reset [m, rad]
+# Standard deviations of a pose in a pose sensor's map before the first such pose [m, m, rad]
+ANYWHERE = (100.0, 100.0, np.pi)
+GATE = 16.27  # 99.9 % of chi-squared with 3 degrees of freedom
+MEDIAN_NIS = 2.37  # median of chi-squared with 3 degrees of freedom
+# Consecutive outliers after which they are believed
+PATIENCE = {Kind.TWIST: 3, Kind.POSE: 5}
+# The noise may be larger than stated, and nearly all measurements would then be outliers. Factors
+# on its variance: after each outlier, after each measurement that fits well, and their upper bound
+NOISE_GROWTH = 4.0
+NOISE_DECAY = 0.93
+MAX_NOISE_SCALE = 100.0
+# Possible error of the state of a stuck or pushed robot, as a fraction of its range
+STUCK_DEVIATION = 0.5
+RANGE_FACTOR = 2.0  # states and commands are clipped to this multiple of their range
+MAX_INNOVATION = 1e8  # larger ones [m, rad, m/s, rad/s] are never believed
+# Maximum speeds [m/s, rad/s] of a robot at rest: by the model, and by odometry
+REST_EXPECTED = 0.01
+REST_MEASURED = 0.05
+# Longest gap that is predicted [s]; after a longer one, the robot may be anywhere within reach
 LONGEST_GAP_S = 10.0
+T = TypeVar("T")
 
 
 class Estimator:
@@ -69,90 +97,122 @@ class Estimator:
 
     def __init__(self, model: SimulatorModel) -> None:
         dt, _, delay = model.timing
-        steps = round(dt * NS_PER_S), round(LONGEST_GAP_S * NS_PER_S)
-        self._motion = MotionModel(make_terms(model.kinematics), SERIES, *steps)
+        self._motion = MotionModel(
+            make_terms(model.kinematics),
+            SERIES,
+            round(dt * NS_PER_S),
+            round(LONGEST_GAP_S * NS_PER_S),
+        )
         self._delay_ns = round(dt * delay * NS_PER_S)
         size = len(model.robot.state)
-        reach = np.array([v.max - v.min for v in model.robot.state])
-        least = np.concatenate(
-            [np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach]
-        )
-        self._process = np.diag(np.maximum(model.noise.drift(model.robot), least) ** 2)
-        self._news = np.concatenate([np.zeros(3), NEWS * reach]) ** 2
-        low, high = (
-            np.array([(v.min, v.max) for v in model.robot.state]).reshape(-1, 2).T
-        )
-        self._limits = _widened(low, high)
-        self._least, self._most = _widened(
+        low = np.array([v.min for v in model.robot.state])
+        high = np.array([v.max for v in model.robot.state])
+        self._state_limits = _widen_range(low, high)
+        self._command_limits = _widen_range(
             model.robot.command_low, model.robot.command_high
         )
-        linear, angular = (max(std, LEAST_TWIST_STD) for std in model.noise.odometry)
+        drift = model.noise.drift(model.robot)
+        min_drift = np.concatenate(
+            [np.full(3, MIN_POSE_DRIFT), MIN_STATE_DRIFT * (high - low)]
+        )
+        self._process = np.diag(np.maximum(drift, min_drift) ** 2)
+        self._stuck_variance = (
+            np.concatenate([np.zeros(3), STUCK_DEVIATION * (high - low)]) ** 2
+        )
+        linear, angular = np.maximum(model.noise.odometry, MIN_TWIST_STD)
         self._noise = {
             Kind.TWIST: np.diag([linear, linear, angular]) ** 2,
-            Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
+            Kind.POSE: np.diag(np.maximum(model.noise.pose, MIN_POSE_STD) ** 2),
         }
-        # Measured drift is motion that the model misses, wheels do not; an assumed one may be slip.
-        missed = (
-            model.noise.drift(model.robot) ** 2
-            - model.noise.simulated_drift(model.robot) ** 2
+        # Measured drift is motion that the model misses, but not the wheels. Assumed drift may be
+        # slip.
+        assumed = drift**2 - model.noise.simulated_drift(model.robot) ** 2
+        self._odometry_model = OdometryModel(
+            random_walk=self._noise[Kind.TWIST] * model.control_period,
+            slip=np.diag(np.maximum(assumed[:3], MIN_SLIP**2)),
+            gate=GATE,
+            state_low=self._state_limits[0],
+            state_high=self._state_limits[1],
         )
-        slip = np.diag(np.maximum(missed[:3], LEAST_SLIP**2))
-        walk = self._noise[Kind.TWIST] * model.control_period
-        self._wheels = kernels.Wheels(walk, slip, *self._limits)
-        self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
-        self._observe_pose = np.eye(3, 3 + size)
-        self._suddenly = np.eye(3 + size, size, -3)
+        self.unobserved = UnobservedMotion(
+            model, self._process, self._noise[Kind.TWIST], self._stuck_variance
+        )
+        self._pose_jacobian = np.eye(3, 3 + size)
+        # Of a prediction over no time: an error of the rates moved the state, and not yet the pose.
+        self._start_jacobian = np.eye(3 + size, size, -3)
         self._filter = ExtendedKalmanFilter(3 + size, 3)
-        self._anchor: Anchor | None = None
-        # Expected twist and its derivative, of the present belief and commands.
-        self._expected: tuple[Array, Array] | None = None
+        self._clone: Clone | None = None
+        # Predicted twist and its Jacobian, if belief and commands have not changed since
+        self._twist: tuple[Array, Array] | None = None
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Begins at a time [ns] and a pose (3,) in `map`, of a deviation [m, rad], at rest."""
+        """Starts at a time [ns], at rest at a pose (3,) in `map` with a deviation [m, rad]."""
         mean = np.zeros(self._filter.dim_x)
         deviation = np.full(self._filter.dim_x, START_STD)
         mean[:3] = pose
         deviation[:3] = std
-        spread = np.diag(deviation**2)
-        error = self._suddenly
-        self.belief = Belief(time_ns, mean, spread, (0, 0, 0), None, False, error)
-        self._log = log_of(np.zeros(len(self._least)))
-
-    def anchor(self, odom: Array, twist: Array = STILL) -> None:
-        """Records the present pose (3,) in `odom` and body twist (3,)."""
-        mean = self._filter.x
-        covariance = self._filter.P
-        self._anchor = Anchor(
-            self.time_ns, odom, twist, mean, covariance, covariance[:, :3].copy()
+        self.belief = Belief(
+            time_ns,
+            mean,
+            np.diag(deviation**2),
+            outliers=(0, 0, 0),
+            clone=None,
+            lost=False,
+            rates_jacobian=self._start_jacobian,
         )
+        self._log = make_log(np.zeros(len(self._command_limits[0])))
 
     def restart(self, time_ns: int, seconds: float, command: Array) -> None:
-        """Begins anew at the last pose, at a time [ns] to which the clock was set.
+        """Starts again at the last pose, at a time [ns] to which the clock was set.
 
         The robot may be anywhere that it reaches in the seconds since the last odometry. The
         command (C,) is in effect.
         """
-        mean = self._filter.x
-        covariance = self.unseen.doubted(self._filter.P, seconds)
-        gyro = None if self._gyro is None else self._gyro.restarted()
-        begun = mean, covariance, (0, 0, 0), None, False, self._suddenly
-        self.belief = Belief(time_ns, *begun, self._roughness, self._missed, gyro)
-        self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
+        gyro = self._gyro
+        if gyro is not None:
+            gyro = gyro.restart()
+        self.belief = self.belief._replace(
+            time_ns=time_ns,
+            covariance=self.unobserved.widen(self._filter.P, seconds),
+            outliers=(0, 0, 0),
+            clone=None,
+            lost=False,
+            rates_jacobian=self._start_jacobian,
+            gyro=gyro,
+        )
+        low, high = self._command_limits
+        self._log = make_log(np.minimum(np.maximum(command, low), high))
 
     @property
     def belief(self) -> Belief:
         """State of the filter; set to an earlier one when the past has changed."""
-        own = self._filter
-        known = self.time_ns, own.x, own.P, self._outliers, self._anchor, self._lost
-        return Belief(*known, self._error, self._roughness, self._missed, self._gyro)
+        return Belief(
+            self.time_ns,
+            self._filter.x,
+            self._filter.P,
+            self._outliers,
+            self._clone,
+            self._lost,
+            self._rates_jacobian,
+            self._noise_scale,
+            self._innovations,
+            self._gyro,
+        )
 
     @belief.setter
     def belief(self, belief: Belief) -> None:
-        self.time_ns, self._filter.x, self._filter.P = belief[:3]
-        self._outliers, self._anchor, self._lost, self._error = belief[3:7]
-        self._roughness, self._missed, self._gyro = belief[7:]
-        self._expected = None
+        self.time_ns = belief.time_ns
+        self._filter.x = belief.mean
+        self._filter.P = belief.covariance
+        self._outliers = belief.outliers
+        self._clone = belief.clone
+        self._lost = belief.lost
+        self._rates_jacobian = belief.rates_jacobian
+        self._noise_scale = belief.noise_scale
+        self._innovations = belief.innovations
+        self._gyro = belief.gyro
+        self._twist = None
 
     @property
     def covariance(self) -> Array:
@@ -162,311 +222,339 @@ class Estimator:
     @property
     def twist_covariance(self) -> Array:
         """(3, 3) of the body twist that follows from pose and state."""
-        _, derivative = self._expect(Kind.TWIST)
-        spread: Array = derivative @ self._filter.P @ derivative.T
-        return spread + LEAST_TWIST_STD**2 * np.eye(3)
+        _, jacobian = self._predict_measurement(Kind.TWIST)
+        covariance: Array = jacobian @ self._filter.P @ jacobian.T
+        return covariance + MIN_TWIST_STD**2 * np.eye(3)
 
-    def effective_ns(self, stamp_ns: int) -> int:
-        """Time at which a command sent at `stamp_ns` takes effect [ns]."""
+    def clone_state(self, odom: Array, twist: Array) -> None:
+        """Clones the present state, for an odometry with a pose (3,) and a body twist (3,)."""
+        covariance = self._filter.P
+        odometry = Odometry(self.time_ns, odom, twist)
+        cross = covariance[:, :3].copy()
+        self._clone = Clone(odometry, self._filter.x, covariance, cross)
+
+    def compute_effect_time(self, stamp_ns: int) -> int:
+        """Returns the time at which a command sent at `stamp_ns` takes effect [ns]."""
         return stamp_ns + self._delay_ns
 
-    def command(
+    def add_command(
         self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None
     ) -> bool:
         """Adds a command (C,) sent at a time [ns]; False if there is one of that time.
 
         The estimate may be set back as far as `needed_ns`, by default not at all.
         """
-        needed_ns = self.time_ns if needed_ns is None else needed_ns
-        self._expected = None
-        # By the longest delay of a command after the common latency.
+        if needed_ns is None:
+            needed_ns = self.time_ns
+        self._twist = None
+        # Individual delays of commands come on top of the common latency.
         needed_ns -= int(self._motion.terms.late.max(initial=0)) * self._motion.step_ns
-        given = np.asarray(command, np.float64), self._least, self._most, needed_ns
-        log = Log(*kernels.logged(self._log, self.effective_ns(stamp_ns), *given))
-        self._log = log if len(log.effective) else self._log
-        return log is self._log
+        effective, commands = kernels.insert_command(
+            self._log,
+            self.compute_effect_time(stamp_ns),
+            np.asarray(command, np.float64),
+            *self._command_limits,
+            needed_ns,
+        )
+        if not len(effective):
+            return False
+        self._log = CommandLog(effective, commands)
+        return True
 
-    def at(self, time_ns: int) -> tuple[Array, Array]:
+    def look_ahead(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
-        now = self.time_ns
-        motion = self._motion
         mean, twist = kernels.look_ahead(
-            self._filter.x, now, time_ns, motion, self._log
+            self._filter.x, self.time_ns, time_ns, self._motion, self._log
         )
         return mean[:3], twist
 
     def predict(self, time_ns: int) -> None:
         """Moves the estimate forward to a time; an earlier time changes nothing."""
-        now = self.time_ns
-        if time_ns <= now:
+        passed_ns = time_ns - self.time_ns
+        if passed_ns <= 0:
             return
-        own = self._filter
-        motion = self._motion
-        log = self._log
-        mean, covariance, expected, error, transition = kernels.forecast(
-            own.x, own.P, self._process, now, time_ns, motion, log
+        mean, covariance, twist, rates_jacobian, mean_jacobian = (
+            kernels.predict_estimate(
+                self._filter.x,
+                self._filter.P,
+                self._process,
+                self.time_ns,
+                time_ns,
+                self._motion,
+                self._log,
+            )
         )
-        if time_ns - now > motion.longest_ns:
-            covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
+        if passed_ns > self._motion.longest_ns:
+            covariance = self.unobserved.widen(covariance, passed_ns / NS_PER_S)
             self._lost = True
-        anchor = self._anchor
-        if anchor is not None and anchor.cross is not None:
-            self._anchor = anchor._replace(cross=transition @ anchor.cross)
+        if self._clone is not None:
+            cross = mean_jacobian @ self._clone.cross
+            self._clone = self._clone._replace(cross=cross)
         self.time_ns = time_ns
-        own.x = mean
-        own.P = covariance
-        self._error = error
-        self._expected = expected
+        self._filter.x = mean
+        self._filter.P = covariance
+        self._rates_jacobian = rates_jacobian
+        self._twist = twist
 
     def update(
         self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None
     ) -> Judgement:
         """Corrects by a measured value (n,), with its standard deviations or the model's."""
-        noise = None if std is None else np.diag(np.atleast_1d(std) ** 2.0)
-        return self.correct(
-            Measurement(kind, np.atleast_1d(value).astype(np.float64), noise)
-        )
+        noise = None
+        if std is not None:
+            noise = np.diag(np.atleast_1d(std) ** 2.0)
+        measured = np.atleast_1d(value).astype(np.float64)
+        return self.correct(Measurement(kind, measured, noise))
 
-    def turn(self, time_ns: int, measurement: Measurement) -> Judgement:
+    def take_yaw_rate(self, time_ns: int, measurement: Measurement) -> Judgement:
         """Takes a yaw rate measured at a time; the next odometry turns by it, see `turning`."""
-        variance = None if measurement.noise is None else float(measurement.noise[0, 0])
+        variance = None
+        if measurement.noise is not None:
+            variance = float(measurement.noise[0, 0])
         rate = float(measurement.value[0])
-        fastest = self.unseen.fastest[1]
-        self._gyro, distance, used = take_rate(
-            self._gyro, time_ns, rate, variance, fastest
-        )
-        outcome = Acceptance.USED if used else Acceptance.OUTLIER
-        self._count(Kind.YAW_RATE, 0 if used else self._outliers[Kind.YAW_RATE] + 1)
-        return Judgement(distance, outcome)
-
-    def _turned(self, measurement: Measurement) -> tuple[Measurement, Turned | None]:
-        """Returns an odometry that turns by the gyro; the same one where there is none."""
-        if self._gyro is None or self._anchor is None or measurement.odom is None:
-            return measurement, None
-        variance = believable_variance(measurement.turn_variance)
-        known = float(self._noise[Kind.TWIST][2, 2]) if variance is None else variance
-        turned = turn_odometry(
-            self._gyro,
-            self._anchor.odom,
-            measurement.odom,
-            measurement.value,
-            self.time_ns,
-            known,
-            self._rests(measurement.value),
-        )
-        noise = measurement.noise
-        if turned.rate_variance > self._noise[Kind.TWIST][2, 2]:
-            noise = np.array(self._noise[Kind.TWIST])
-            noise[2, 2] = turned.rate_variance
-        return measurement._replace(
-            value=turned.twist, odom=turned.odom, noise=noise
-        ), turned
-
-    def _rests(self, twist: Array) -> bool:
-        """True if the robot is expected to stand, and odometry does not say otherwise."""
-        expected, _ = self._expect(Kind.TWIST)
-        return bool(
-            (np.abs(expected) < STANDS).all() and (np.abs(twist) < ABOUT_STANDS).all()
-        )
+        max_rate = self.unobserved.max_speeds[1]
+        self._gyro, nis, used = take_rate(self._gyro, time_ns, rate, variance, max_rate)
+        if used:
+            self._count_outliers(Kind.YAW_RATE, 0)
+            return Judgement(nis, Acceptance.USED)
+        self._count_outliers(Kind.YAW_RATE, self._outliers[Kind.YAW_RATE] + 1)
+        return Judgement(nis, Acceptance.OUTLIER)
 
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at this time, after bridging unobserved motion."""
         if measurement.kind is Kind.YAW_RATE:
-            return self.turn(self.time_ns, measurement)
-        measurement, turned = self._turned(measurement)
+            return self.take_yaw_rate(self.time_ns, measurement)
+        fused = self._fuse_gyro(measurement)
+        if fused is not None:
+            measurement = self._replace_turn(measurement, fused)
+        bridged = self._bridge(measurement)
+        judgement = self._correct(measurement, not bridged)
+        if judgement.outcome is Acceptance.OUTLIER and not bridged:
+            return (
+                judgement  # the relative pose of the next odometry then spans this one
+            )
+        if fused is not None:
+            self._gyro = fused.gyro
+            if fused.heading_variance > 0.0:
+                covariance = np.array(self._filter.P)
+                covariance[2, 2] += fused.heading_variance
+                self._filter.P = covariance
+        if measurement.odom is not None:
+            self.clone_state(np.array(measurement.odom), np.array(measurement.value))
+        elif measurement.kind is Kind.POSE:
+            self._lost = False
+        return judgement
+
+    def _fuse_gyro(self, measurement: Measurement) -> FusedOdometry | None:
+        """Fuses the turn of an odometry with the gyro's; None if there is no gyro."""
+        if self._gyro is None or self._clone is None or measurement.odom is None:
+            return None
+        variance = check_variance(measurement.turn_variance)
+        if variance is None:
+            variance = float(self._noise[Kind.TWIST][2, 2])
+        return fuse_odometry(
+            self._gyro,
+            self._clone.odometry.pose,
+            measurement.odom,
+            measurement.value,
+            self.time_ns,
+            variance,
+            self._is_at_rest(measurement.value),
+        )
+
+    def _replace_turn(
+        self, measurement: Measurement, fused: FusedOdometry
+    ) -> Measurement:
+        noise = measurement.noise
+        if fused.rate_variance > self._noise[Kind.TWIST][2, 2]:
+            noise = np.array(self._noise[Kind.TWIST])
+            noise[2, 2] = fused.rate_variance
+        return measurement._replace(value=fused.twist, odom=fused.odom, noise=noise)
+
+    def _is_at_rest(self, twist: Array) -> bool:
+        """Returns True if the model expects a robot at rest, and odometry does not disagree."""
+        expected, _ = self._predict_measurement(Kind.TWIST)
+        return bool(
+            (np.abs(expected) < REST_EXPECTED).all()
+            and (np.abs(twist) < REST_MEASURED).all()
+        )
+
+    def _bridge(self, measurement: Measurement) -> bool:
+        """Moves the estimate by odometry over a time without data; False if there was none."""
+        if not self._lost or measurement.odom is None:
+            return False
+        self._lost = False
+        if self._clone is not None:
+            seconds = (self.time_ns - self._clone.odometry.time_ns) / NS_PER_S
+            bridge = self.unobserved.bridge(self._clone, measurement.odom, seconds)
+            if bridge is not None:
+                self._set_pose(*bridge)
+                self._twist = None
+        return True
+
+    def _correct(self, measurement: Measurement, is_continuous: bool) -> Judgement:
         kind = measurement.kind
-        odom = measurement.odom
-        anchor = self._anchor
-        lost = self._lost
-        if lost and odom is not None:
-            self._lost = False
-            if anchor is None:
-                seconds = 0.0
-            else:
-                seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
-            if (
-                anchor
-                and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None
-            ):
-                self._jump(*bridged)
-                self._expected = None
-        verdict = self._correct(measurement, odom is not None and not lost)
-        if verdict.outcome is Acceptance.OUTLIER and not (lost and odom is not None):
-            return verdict  # the next odometry's way then leads past this one
-        if turned is not None:
-            self._gyro = turned.gyro
-            if turned.heading_variance > 0.0:
-                spread = np.array(self._filter.P)
-                spread[2, 2] += turned.heading_variance
-                self._filter.P = spread
-        if odom is not None:
-            self.anchor(np.array(odom), np.array(measurement.value))
-        elif kind is Kind.POSE:
-            self._lost = False
-        return verdict
-
-    def _correct(self, measurement: Measurement, follows: bool) -> Judgement:
-        kind, value, given_noise, odom, _ = measurement
-        noise = self._noise_of(kind, given_noise)
-        expected, derivative = self._expect(kind)
-        residual = _between_poses if kind is Kind.POSE else np.subtract
-        innovation = residual(value, expected)
-        distance = kernels.distance(innovation, derivative, self._filter.P, noise)
-        outcome = Acceptance.USED
-        scattered = self._scatters(kind, innovation)
-        if not distance <= GATE[kind]:
-            outcome = self._surprise(kind, innovation, derivative, noise, scattered)
-        if outcome is Acceptance.OUTLIER:
-            self._count(kind, self._outliers[kind] + 1)
-            return Judgement(distance, outcome)
-        anchor = self._anchor
-        own = self._filter
-        way = None
-        if follows and anchor is not None and anchor.cross is not None:
-            way = (
-                np.array(odom),
-                np.array(value),
-                self.time_ns,
-                self._wheels_now,
-                GATE[Kind.POSE],
-            )
-        if way and outcome is Acceptance.USED and given_noise is None:
-            # A twist is but a moment's, the way between two odometries all that wheels did since.
-            recall = kernels.recall(anchor, derivative, own.P, noise)
-            gain = kernels.gain(own.P, derivative, noise)
-            own.x, own.P = kernels.follow(own.x, innovation, gain, recall, anchor, *way)
-        else:
-            self._recall(innovation, derivative, noise)
-            if kind is Kind.POSE and outcome is Acceptance.JUMP:
-                self._jump(value, noise)
-            else:
-                own.update(
-                    value,
-                    HJacobian=lambda _: derivative,
-                    Hx=lambda _: expected,
-                    R=noise,
-                    residual=residual,
-                )
-            kernels.settle(own.x, own.P, *self._limits)
-            if way:
-                since: Any = self._anchor
-                done = (
-                    np.zeros((own.dim_x, 3)),
-                    own.P,
-                )  # nothing is left to correct but by the way
-                kept = np.zeros((3, 3)), since.covariance, since.cross
-                own.x, own.P = kernels.follow(own.x, STILL, done, kept, since, *way)
-        if self._outliers[kind] and not (
-            outcome is Acceptance.JUMP and kind is Kind.TWIST
-        ):
-            self._count(kind, 0)
-        self._expected = None
-        if outcome is Acceptance.USED and not (scattered and distance > WELL):
-            self._roughen(kind, SMOOTHER)
-        return Judgement(distance, outcome)
-
-    def _noise_of(self, kind: Kind, given: Array | None = None) -> Array:
-        """Returns the noise (n, n) of measurements, that told or as much more as was seen."""
-        return self._roughness[kind] * (self._noise[kind] if given is None else given)
-
-    @property
-    def _wheels_now(self) -> kernels.Wheels:
-        wheels = self._wheels
-        rough = self._roughness[Kind.TWIST]
-        return wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
-
-    def _scatters(self, kind: Kind, innovation: Array) -> bool:
-        """True if a measurement errs in another way than the one before, as noise alone does."""
-        before = self._missed[kind]
-        size = len(innovation)
-        self._missed = self._missed.copy()
-        self._missed[kind, :size] = np.clip(innovation, -FARTHEST, FARTHEST)
-        return bool(self._missed[kind] @ before < 0.0)
-
-    def _roughen(self, kind: Kind, factor: float) -> None:
-        rough = min(max(1.0, factor * self._roughness[kind]), ROUGHEST)
-        if rough != self._roughness[kind]:
-            self._roughness = _with(self._roughness, kind, rough)
-
-    def _recall(self, innovation: Array, derivative: Array, noise: Array) -> None:
-        """Corrects where the newest odometry was, by what is about to correct the present."""
-        if (anchor := self._anchor) is not None and anchor.cross is not None:
-            spread = self._filter.P
-            mean = anchor.mean.copy()
-            gain, covariance, cross = kernels.recall(anchor, derivative, spread, noise)
-            mean[:3] += innovation @ gain
-            self._anchor = anchor._replace(
-                mean=mean, covariance=covariance, cross=cross
-            )
-
-    def _expect(self, kind: Kind) -> tuple[Array, Array]:
+        noise = self._scale_noise(kind, measurement.noise)
+        expected, jacobian = self._predict_measurement(kind)
+        innovation = measurement.value - expected
         if kind is Kind.POSE:
-            return self._filter.x[:3], self._observe_pose
-        if self._expected is not None:
-            return self._expected
-        now = self.time_ns
-        twist, derivative = kernels.expect(self._filter.x, now, self._motion, self._log)
-        return twist, derivative
+            innovation[2] = wrap(innovation[2])
+        nis = kernels.compute_nis(innovation, jacobian, self._filter.P, noise)
+        alternates = self._is_alternating(kind, innovation)
+        outcome = Acceptance.USED
+        if not nis <= GATE:
+            outcome = self._judge_outlier(kind, innovation, jacobian, noise, alternates)
+        if outcome is Acceptance.OUTLIER:
+            self._count_outliers(kind, self._outliers[kind] + 1)
+            return Judgement(nis, outcome)
+        has_relative_pose = (
+            is_continuous
+            and measurement.odom is not None
+            and self._clone is not None
+            and self._clone.correlated
+        )
+        is_plain = outcome is Acceptance.USED and measurement.noise is None
+        if has_relative_pose and is_plain:
+            self._correct_by_odometry(measurement, innovation, jacobian, noise)
+        else:
+            self._correct_alone(measurement, outcome, innovation, jacobian, noise)
+            if has_relative_pose:
+                # The twist has been used: with a Jacobian of zeros only the relative pose corrects.
+                # The same kernel serves, so that none has to be compiled while the robot moves.
+                zeros = np.zeros_like(jacobian)
+                self._correct_by_odometry(measurement, np.zeros(3), zeros, noise)
+        if outcome is not Acceptance.JUMP or kind is not Kind.TWIST:
+            self._count_outliers(kind, 0)
+        self._twist = None
+        if outcome is Acceptance.USED and not (alternates and nis > MEDIAN_NIS):
+            self._change_noise(kind, NOISE_DECAY)
+        return Judgement(nis, outcome)
 
-    def _surprise(
+    def _correct_by_odometry(
+        self, measurement: Measurement, innovation: Array, jacobian: Array, noise: Array
+    ) -> None:
+        odometry = Odometry(
+            self.time_ns, np.array(measurement.odom), np.array(measurement.value)
+        )
+        model = self._odometry_model
+        scale = self._noise_scale[Kind.TWIST]
+        if scale != 1.0:
+            model = model._replace(random_walk=scale * model.random_walk)
+        self._filter.x, self._filter.P = kernels.correct_by_odometry(
+            self._filter.x,
+            self._filter.P,
+            innovation,
+            jacobian,
+            noise,
+            self._clone,
+            odometry,
+            model,
+        )
+
+    def _correct_alone(
+        self,
+        measurement: Measurement,
+        outcome: Acceptance,
+        innovation: Array,
+        jacobian: Array,
+        noise: Array,
+    ) -> None:
+        """Corrects clone and present state by a pose, or by a twist alone."""
+        if self._clone is not None and self._clone.correlated:
+            self._clone = kernels.correct_clone(
+                self._clone, innovation, jacobian, self._filter.P, noise
+            )
+        if measurement.kind is Kind.POSE and outcome is Acceptance.JUMP:
+            self._set_pose(measurement.value, noise)
+        else:
+            # The innovation is known, so that filterpy subtracts an expected value of zero from it.
+            self._filter.update(
+                innovation, lambda _: jacobian, lambda _: np.zeros(3), R=noise
+            )
+        kernels.repair_estimate(self._filter.x, self._filter.P, *self._state_limits)
+
+    def _judge_outlier(
         self,
         kind: Kind,
         innovation: Array,
-        derivative: Array,
+        jacobian: Array,
         noise: Array,
-        scattered: bool,
+        alternates: bool,
     ) -> Acceptance:
-        """Decides on a measurement beyond its gate; that of a stuck or pushed robot is news."""
-        if not (np.abs(innovation) < FARTHEST).all():
+        """Decides on a measurement beyond its gate; prepares the filter to use it."""
+        if not (np.abs(innovation) < MAX_INNOVATION).all():
             return Acceptance.OUTLIER
-        most = noise * (ROUGHEST / self._roughness[kind])
-        far = (
-            kernels.distance(innovation, derivative, self._filter.P, most) > GATE[kind]
-        )
-        noisy = scattered and not far  # neither off in one way, nor a glitch
-        believed = self._outliers[kind] + 1 >= PATIENCE[kind] and not noisy
+        covariance = self._filter.P
+        max_noise = noise * (MAX_NOISE_SCALE / self._noise_scale[kind])
+        nis = kernels.compute_nis(innovation, jacobian, covariance, max_noise)
+        # Errors that point to alternate sides are noise; larger ones are a glitch.
+        is_noise = alternates and not nis > GATE
+        is_believed = self._outliers[kind] + 1 >= PATIENCE[kind] and not is_noise
         if kind is Kind.TWIST:
-            doubt = np.maximum(self._news - np.diag(self._filter.P), 0.0)
-            # What moved the state moved the pose, too, since the prediction began.
-            moved = self._error @ np.linalg.inv(self._error[3:])
-            doubtful = self._filter.P + (moved * doubt[3:]) @ moved.T
-            if kernels.distance(innovation, derivative, doubtful, noise) <= GATE[kind]:
-                self._filter.P = doubtful
+            doubt = np.maximum(self._stuck_variance - np.diag(covariance), 0.0)
+            # What moved the state also moved the pose, since the prediction began.
+            moved = self._rates_jacobian @ np.linalg.inv(self._rates_jacobian[3:])
+            doubted = covariance + (moved * doubt[3:]) @ moved.T
+            if kernels.compute_nis(innovation, jacobian, doubted, noise) <= GATE:
+                self._filter.P = doubted
                 return Acceptance.NEWS
-            if believed:
-                self._filter.P = parted(doubtful)
-                self._part()
-        if noisy:
-            self._roughen(kind, ROUGHER)
-        return Acceptance.JUMP if believed else Acceptance.OUTLIER
+            if is_believed:
+                self._filter.P = decorrelate_pose(doubted)
+                self._end_correlation()
+        if is_noise:
+            self._change_noise(kind, NOISE_GROWTH)
+        return Acceptance.JUMP if is_believed else Acceptance.OUTLIER
 
-    def _part(self) -> None:
-        if (anchor := self._anchor) is not None:
-            self._anchor = anchor._replace(cross=None)
+    def _predict_measurement(self, kind: Kind) -> tuple[Array, Array]:
+        """Returns the expected value (3,) of a measurement and its Jacobian (3, 3 + S)."""
+        if kind is Kind.POSE:
+            return self._filter.x[:3], self._pose_jacobian
+        if self._twist is not None:
+            return self._twist
+        twist, jacobian = kernels.predict_twist(
+            self._filter.x, self.time_ns, self._motion, self._log
+        )
+        return twist, jacobian
 
-    def _jump(self, pose: Array, noise: Array) -> None:
-        self._part()
-        self._filter.P = parted(self._filter.P)
+    def _is_alternating(self, kind: Kind, innovation: Array) -> bool:
+        """Returns True if an innovation points away from the one before, as noise makes it do."""
+        before = self._innovations[kind]
+        self._innovations = self._innovations.copy()
+        self._innovations[kind] = np.clip(innovation, -MAX_INNOVATION, MAX_INNOVATION)
+        return bool(self._innovations[kind] @ before < 0.0)
+
+    def _scale_noise(self, kind: Kind, noise: Array | None) -> Array:
+        """Returns the noise (n, n) of a measurement, by default the model's, as scaled by now."""
+        if noise is None:
+            noise = self._noise[kind]
+        return self._noise_scale[kind] * noise
+
+    def _change_noise(self, kind: Kind, factor: float) -> None:
+        scale = min(max(1.0, factor * self._noise_scale[kind]), MAX_NOISE_SCALE)
+        self._noise_scale = _replace_item(self._noise_scale, kind, scale)
+
+    def _count_outliers(self, kind: Kind, count: int) -> None:
+        self._outliers = _replace_item(self._outliers, kind, count)
+
+    def _end_correlation(self) -> None:
+        if self._clone is not None:
+            self._clone = self._clone._replace(correlated=False)
+
+    def _set_pose(self, pose: Array, covariance: Array) -> None:
+        """Sets the pose (3,) with a covariance (3, 3), and keeps the state."""
+        self._end_correlation()
         mean = np.array(self._filter.x)
         mean[:3] = pose
-        self._filter.P[:3, :3] = noise
         self._filter.x = mean
-
-    def _count(self, kind: Kind, outliers: int) -> None:
-        self._outliers = _with(self._outliers, kind, outliers)
-
-
-def _with(values: tuple[Any, ...], kind: Kind, value: Any) -> tuple[Any, ...]:
-    return *values[:kind], value, *values[kind + 1 :]
+        self._filter.P = decorrelate_pose(self._filter.P)
+        self._filter.P[:3, :3] = covariance
 
 
-def _widened(low: Array, high: Array) -> tuple[Array, Array]:
+def _replace_item(values: tuple[T, ...], index: int, value: T) -> tuple[T, ...]:
+    return *values[:index], value, *values[index + 1 :]
+
+
+def _widen_range(low: Array, high: Array) -> tuple[Array, Array]:
     center = (high + low) / 2.0
-    half = REACHABLE * (high - low) / 2.0
+    half = RANGE_FACTOR * (high - low) / 2.0
     return center - half, center + half
-
-
-def _between_poses(measured: Array, expected: Array) -> Array:
-    difference = measured - expected
-    difference[2] = wrap(difference[2])
-    return difference

@@ -1,11 +1,13 @@
-"""Compiled parts of the estimator: motion under the commands of the recent past, gates, health.
+"""Compiled parts of the estimator: prediction under the logged commands, and odometry's update.
 
-Shared arguments: `mean` (3 + S,) and `transition` (3 + S, 3 + S), the Jacobian of its motion;
-`begin`, `end` and `now` are times [ns]; `motion` is `MotionModel`, `log` is `Log`.
+Shared arguments: `mean` is (3 + S,), `covariance` (3 + S, 3 + S); `begin`, `end` and `now` are
+times [ns]; `motion` is the `MotionModel`, `log` the `CommandLog`. A `transition` (3 + S, 3 + 2 S)
+is the Jacobian of a predicted mean with respect to the mean before and to a constant error of the S
+rates of the state in between. See `ekf` for how the parts work together.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,40 +16,48 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot import kernels as robot
 
-# Bound on poses, states and their derivatives; beyond, the model has diverged
-RUNAWAY = 1e9
-SHORT_S = 0.25  # longest time in which the way is that of the twists at its ends
-# Lower bound on a variance given the variables before, as a share of its own
-LEAST_PIVOT = 1e-12
-LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
+DIVERGED = 1e9  # bound on means and Jacobians; beyond, the model has diverged
+# Longest time between two odometries over which the mean of their twists gives the displacement [s]
+MAX_ARC_S = 0.25
+# Lower bound on a variable's variance given the variables before it, as a fraction of its variance
+MIN_PIVOT = 1e-12
+MIN_VARIANCE = 1e-18  # absolute lower bound on that variance
 
 
-class Anchor(NamedTuple):
-    """The newest odometry used: time [ns], pose in `odom`, twist, mean and covariance after it.
+class Odometry(NamedTuple):
+    """One odometry message."""
 
-    What was measured since corrects them, too. `cross` (3 + S, 3) is the covariance of the present
-    mean with that pose; None if the pose was set anew since.
+    time_ns: int  # stamp
+    pose: Array  # (3,) in `odom`
+    twist: Array  # (3,) in the robot's frame
+
+
+class Clone(NamedTuple):
+    """Copy of the state at the newest odometry used (stochastic cloning).
+
+    Measurements since then correct the copy, too. It is no longer `correlated` once the pose has
+    been set anew since: its covariance with the present state is then unknown.
     """
 
-    time_ns: int
-    odom: Array  # (3,)
-    twist: Array  # (3,)
+    odometry: Odometry
     mean: Array
     covariance: Array
-    cross: Array | None = None
+    cross: Array  # (3 + S, 3) covariance of the present state with the cloned pose
+    correlated: bool = True
 
 
-class Wheels(NamedTuple):
-    """Odometry's noise and slip (3, 3) in a second, and limits (S,) of the state."""
+class OdometryModel(NamedTuple):
+    """What odometry's relative poses can be trusted with."""
 
-    walk: Array
-    slip: Array
-    low: Array
-    high: Array
+    random_walk: Array  # (3, 3) covariance that wheel noise adds in a second
+    slip: Array  # (3, 3) covariance of motion that wheels miss in a second
+    gate: float  # largest normalised innovation squared (NIS) of a relative pose
+    state_low: Array  # (S,) limits of the state
+    state_high: Array
 
 
 class MotionModel(NamedTuple):
-    """Model of the motion."""
+    """The fitted model and its time step."""
 
     terms: robot.Terms  # `terms`, `series`: see `robot.kernels`
     series: Array
@@ -55,46 +65,50 @@ class MotionModel(NamedTuple):
     longest_ns: int  # longest gap that is predicted [ns]
 
 
-class Log(NamedTuple):
-    """Commands in the order in which they take effect; the first is in effect before, too."""
+class CommandLog(NamedTuple):
+    """Commands in the order in which they take effect; the first one also holds before that."""
 
-    effective: NDArray[np.int64]  # (K,) of those that are not delayed further [ns]
+    effective: NDArray[np.int64]  # (K,) times without individual delays [ns]
     commands: Array  # (K, C)
 
 
-def log_of(command: ArrayLike) -> Log:
-    """Returns the log of one command (C,), which is always in effect."""
-    return Log(np.full(1, np.iinfo(np.int64).min), np.array([command], np.float64))
+def make_log(command: ArrayLike) -> CommandLog:
+    """Returns a log in which one command (C,) holds at all times."""
+    times = np.full(1, np.iinfo(np.int64).min)
+    return CommandLog(times, np.array([command], np.float64))
 
 
 @kernel(allocates=True)
-def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
-    """Computes the derivative (3 + S, V) of `rates` with respect to X."""
-    dof = terms.dof
-    coefficient = terms.coefficient
-    factors = terms.factors
-    count = terms.degree
+def compute_rates_jacobian(jacobian: Array, x: Array, terms: robot.Terms) -> None:
+    """Computes the Jacobian (3 + S, V) of `robot.kernels.rates` with respect to X."""
     jacobian[:] = 0.0
-    for k in range(dof.shape[0]):
-        for f in range(count[k]):
-            product = coefficient[k]
-            for other in range(count[k]):
+    for k in range(terms.dof.shape[0]):
+        for f in range(terms.degree[k]):
+            product = terms.coefficient[k]
+            for other in range(terms.degree[k]):
                 if other != f:
-                    product *= x[factors[k, other]]
-            jacobian[dof[k], factors[k, f]] += product
+                    product *= x[terms.factors[k, other]]
+            jacobian[terms.dof[k], terms.factors[k, f]] += product
     for i in range(terms.emf.shape[0]):
         jacobian[3 + i, i] -= robot.sum_back_emf(i, x, terms)
 
 
 @kernel
-def _kept(value, dt, drag):  # type: ignore[no-untyped-def]
-    """Returns the share of a change of a state that drag leaves in a step."""
+def compute_drag_slope(value: float, dt: float, drag: float) -> float:
+    """Returns the derivative of a state after a step's drag with respect to it before."""
     return 1.0 / (1.0 + dt * drag * abs(value)) ** 2
 
 
 @kernel(allocates=True)
-def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-untyped-def]
-    """Moves the mean by `steps` of `dt` [s] under a command (C,), and its `unmoved` derivative."""
+def step_mean(
+    mean: Array,
+    transition: Array,
+    command: Array,
+    dt: float,
+    steps: int,
+    motion: MotionModel,
+) -> None:
+    """Moves a mean and its transition in place by `steps` of `dt` [s] under a command (C,)."""
     size = mean.shape[0] - 3
     width = command.shape[0]
     x = np.ones(size + width + 1)
@@ -105,7 +119,7 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
     for _ in range(steps):
         x[:size] = mean[3:]
         robot.rates(dq, x, motion.terms)
-        rates_jacobian(jacobian, x, motion.terms)
+        compute_rates_jacobian(jacobian, x, motion.terms)
         # The arc is short, so the derivative at its middle heading is good to second order.
         middle = mean[2] + dq[2] * dt / 2.0
         c = math.cos(middle)
@@ -122,11 +136,14 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
                 dt * (s * jacobian[0, i] + c * jacobian[1, i]) + step[1, 2] * turn
             )
             step[2, 3 + i] = dt * jacobian[2, i]
-            for d in range(size):  # a limited rate does not depend on the state
-                free = motion.terms.fall[d] <= dq[3 + d] <= motion.terms.rise[d]
-                slope = dt * jacobian[3 + d, i] if free else 0.0
-                kept = _kept(mean[3 + d] + dt * dq[3 + d], dt, motion.terms.drag[d])
-                step[3 + d, 3 + i] = kept * ((1.0 if d == i else 0.0) + slope)
+            for d in range(size):
+                slope = 1.0 if d == i else 0.0
+                # A limited rate does not depend on the state.
+                if motion.terms.fall[d] <= dq[3 + d] <= motion.terms.rise[d]:
+                    slope += dt * jacobian[3 + d, i]
+                free = mean[3 + d] + dt * dq[3 + d]
+                drag_slope = compute_drag_slope(free, dt, motion.terms.drag[d])
+                step[3 + d, 3 + i] = drag_slope * slope
         transition[:] = step @ transition
         for i in range(size):
             transition[3 + i, 3 + size + i] += dt
@@ -137,287 +154,364 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
 
 
 @kernel(allocates=True)
-def in_effect(log, time):  # type: ignore[no-untyped-def]
-    """Index of the command in effect just before a time: the last that took effect earlier."""
-    low = 0
-    high = log.effective.shape[0]
-    while low < high:
-        middle = (low + high) // 2
-        if log.effective[middle] < time:
-            low = middle + 1
-        else:
-            high = middle
-    return max(low - 1, 0)
+def find_command(log: CommandLog, time: int) -> int:
+    """Returns the index of the last command that took effect before a time; 0 if there is none."""
+    following = int(np.searchsorted(log.effective, time))
+    return max(following - 1, 0)
 
 
 @kernel(allocates=True)
-def logged(log, effective_ns, command, low, high, needed_ns):  # type: ignore[no-untyped-def]
-    """Adds a command (C,), clipped; drops those over before `needed_ns`; empty for a duplicate."""
-    effective = log.effective
-    commands = log.commands
-    place = count = effective.shape[0]
-    while place > 0 and effective[place - 1] >= effective_ns:
-        place -= 1
-    first = min(place, in_effect(log, needed_ns))
-    size = count - first + 1
-    if place < count and effective[place] == effective_ns:
-        size = 0
-    times = np.empty(size, np.int64)
-    values = np.empty((size, command.shape[0]))
-    for i in range(size):
-        k = first + i
-        if k == place:
-            times[i], values[i] = (
-                effective_ns,
-                np.minimum(np.maximum(command, low), high),
-            )
-        else:
-            k -= 1 if k > place else 0
-            times[i], values[i] = effective[k], commands[k]
+def insert_command(
+    log: CommandLog,
+    effective_ns: int,
+    command: Array,
+    low: Array,
+    high: Array,
+    needed_ns: int,
+) -> tuple[NDArray[np.int64], Array]:
+    """Returns the fields of a log with one more command (C,), clipped to [low, high].
+
+    Commands that ended before `needed_ns` are dropped. The result is empty for a duplicate time.
+    """
+    count = log.effective.shape[0]
+    place = int(np.searchsorted(log.effective, effective_ns))
+    if place < count and log.effective[place] == effective_ns:
+        return np.empty(0, np.int64), np.empty((0, command.shape[0]))
+    first = min(place, find_command(log, needed_ns))
+    times = np.empty(count - first + 1, np.int64)
+    values = np.empty((count - first + 1, command.shape[0]))
+    middle = place - first
+    times[:middle] = log.effective[first:place]
+    times[middle] = effective_ns
+    times[middle + 1 :] = log.effective[place:]
+    values[:middle] = log.commands[first:place]
+    values[middle] = np.minimum(np.maximum(command, low), high)
+    values[middle + 1 :] = log.commands[place:]
     return times, values
 
 
 @kernel(allocates=True)
-def take(command, time, motion, log):  # type: ignore[no-untyped-def]
+def read_commands(
+    command: Array, time: int, motion: MotionModel, log: CommandLog
+) -> int:
     """Writes the commands (C,) in effect just before a time; returns when the next one is [ns]."""
     following = np.iinfo(np.int64).max
     for c in range(command.shape[0]):
-        late = motion.terms.late[c] * motion.step_ns
-        k = in_effect(log, time - late)
+        delay = motion.terms.late[c] * motion.step_ns
+        k = find_command(log, time - delay)
         command[c] = log.commands[k, c]
         if k + 1 < log.effective.shape[0]:
-            following = min(following, log.effective[k + 1] + late)
+            following = min(following, log.effective[k + 1] + delay)
     return following
 
 
 @kernel(allocates=True)
-def unmoved(width, time):  # type: ignore[no-untyped-def]
-    """Derivative (3 + S, 3 + 2 S) to the mean (3 + S,) and to a constant error of the S rates."""
+def make_transition(width: int, time: float) -> Array:
+    """Returns the transition (3 + S, 3 + 2 S) over a time [s] in which the robot did not move."""
     size = width - 3
-    derivative = np.zeros((width, width + size))
-    derivative[:, :width] = np.eye(width)
-    for i in range(size):  # after a time [s] for which nothing else moved
-        derivative[3 + i, width + i] = time
-    return derivative
+    transition = np.zeros((width, width + size))
+    transition[:, :width] = np.eye(width)
+    for i in range(size):
+        transition[3 + i, width + i] = time
+    return transition
 
 
 @kernel(allocates=True)
-def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped-def]
-    """Moves a mean between two times, command by command, in place, see `predict`.
+def propagate_mean(
+    mean: Array,
+    transition: Array,
+    begin: int,
+    end: int,
+    motion: MotionModel,
+    log: CommandLog,
+) -> None:
+    """Moves a mean and its transition in place between two times, command by command.
 
-    Over a gap that is too long, or if the model diverges, the pose is kept and the state zero.
+    After a gap that is too long, or if the model diverges, the pose is kept and the state is zero.
     """
     step = motion.step_ns
     if end - begin > motion.longest_ns:
         mean[3:] = 0.0
-        transition[:] = unmoved(mean.shape[0], (end - begin) / NS_PER_S)
+        transition[:] = make_transition(mean.shape[0], (end - begin) / NS_PER_S)
         return
-    before = mean[:3].copy()
+    start_pose = mean[:3].copy()
     command = np.empty(log.commands.shape[1])
     now = begin
     while now < end:
-        until = min(take(command, now + 1, motion, log), end)
+        until = min(read_commands(command, now + 1, motion, log), end)
         steps = (until - now) // step
         rest = (until - now) % step
-        predict(mean, transition, command, step / NS_PER_S, steps, motion)
+        step_mean(mean, transition, command, step / NS_PER_S, steps, motion)
         if rest > 0:
-            predict(mean, transition, command, rest / NS_PER_S, 1, motion)
+            step_mean(mean, transition, command, rest / NS_PER_S, 1, motion)
         now = until
-    if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
-        mean[:3] = before
+    if not (np.all(np.abs(mean) < DIVERGED) and np.all(np.abs(transition) < DIVERGED)):
+        mean[:3] = start_pose
         mean[3:] = 0.0
-        transition[:] = unmoved(mean.shape[0], (end - begin) / NS_PER_S)
+        transition[:] = make_transition(mean.shape[0], (end - begin) / NS_PER_S)
 
 
 @kernel(allocates=True)
-def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
-    """Expected body twist (3,) at the time of the mean, and its derivative (3, 3 + S)."""
+def predict_twist(
+    mean: Array, now: int, motion: MotionModel, log: CommandLog
+) -> tuple[Array, Array]:
+    """Returns the expected body twist (3,) at the time of a mean, and its Jacobian (3, 3 + S)."""
     command = np.empty(log.commands.shape[1])
-    take(command, now, motion, log)
+    read_commands(command, now, motion, log)
     size = mean.shape[0] - 3
     width = command.shape[0]
     x = np.ones(size + width + 1)
     dq = np.zeros(3 + size)
-    jacobian = np.zeros((3 + size, size + width))
-    derivative = np.zeros((3, 3 + size))
+    rates_jacobian = np.zeros((3 + size, size + width))
+    jacobian = np.zeros((3, 3 + size))
     x[:size] = mean[3:]
     robot.put_command(x, command, motion.terms)
     robot.rates(dq, x, motion.terms)
-    rates_jacobian(jacobian, x, motion.terms)
-    derivative[:, 3:] = jacobian[:3, :size]
-    return dq[:3].copy(), derivative
+    compute_rates_jacobian(rates_jacobian, x, motion.terms)
+    jacobian[:, 3:] = rates_jacobian[:3, :size]
+    return dq[:3].copy(), jacobian
 
 
 @kernel(allocates=True)
-def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignore[no-untyped-def]
-    """Predicts mean, covariance, `expect`, and derivatives to a rates' error and to the mean.
+def predict_estimate(
+    mean: Array,
+    covariance: Array,
+    process: Array,
+    begin: int,
+    end: int,
+    motion: MotionModel,
+    log: CommandLog,
+) -> tuple[Array, Array, tuple[Array, Array], Array, Array]:
+    """Predicts an estimate between two times; `process` (3 + S, 3 + S) is its noise per second.
 
-    `process` is added per second.
+    Returns mean, covariance, `predict_twist` there, and the Jacobians of the mean with respect to
+    an error of the state's rates (3 + S, S) and to the mean before (3 + S, 3 + S).
     """
     # A model that is wrong stays wrong for a while: the error of the state's rates is constant in
     # between, so that it moves the pose, too. A correction of the state then corrects the pose.
     moved = mean.copy()
     width = mean.shape[0]
     time = (end - begin) / NS_PER_S
-    derivative = unmoved(width, 0.0)
-    carry(moved, derivative, begin, end, motion, log)
-    transition = derivative[:, :width].copy()
-    error = derivative[:, width:].copy()
-    spread = (
-        transition @ covariance @ transition.T
-        + error @ (process[3:, 3:] / time) @ error.T
+    transition = make_transition(width, 0.0)
+    propagate_mean(moved, transition, begin, end, motion, log)
+    by_mean = transition[:, :width].copy()
+    by_rates = transition[:, width:].copy()
+    predicted = (
+        by_mean @ covariance @ by_mean.T
+        + by_rates @ (process[3:, 3:] / time) @ by_rates.T
     )
-    spread[:3, :3] += process[:3, :3] * time
-    return (
-        moved,
-        (spread + spread.T) * 0.5,
-        expect(moved, end, motion, log),
-        error,
-        transition,
-    )
+    predicted[:3, :3] += process[:3, :3] * time
+    predicted = (predicted + predicted.T) * 0.5
+    twist = predict_twist(moved, end, motion, log)
+    return moved, predicted, twist, by_rates, by_mean
 
 
 @kernel(allocates=True)
-def look_ahead(mean, begin, end, motion, log):  # type: ignore[no-untyped-def]
+def look_ahead(
+    mean: Array, begin: int, end: int, motion: MotionModel, log: CommandLog
+) -> tuple[Array, Array]:
     """Predicts mean and body twist (3,) at a time; the present ones if that is earlier."""
     moved = mean.copy()
     if end > begin:
-        carry(moved, unmoved(mean.shape[0], 0.0), begin, end, motion, log)
-    return moved, expect(moved, max(begin, end), motion, log)[0]
+        transition = make_transition(mean.shape[0], 0.0)
+        propagate_mean(moved, transition, begin, end, motion, log)
+    return moved, predict_twist(moved, max(begin, end), motion, log)[0]
 
 
 @kernel(allocates=True)
-def distance(innovation, derivative, covariance, noise):  # type: ignore[no-untyped-def]
-    """Squared, normalised innovation (Mahalanobis): chi-squared if the filter is consistent."""
-    spread = derivative @ covariance @ derivative.T + noise
-    return innovation @ np.linalg.solve(spread, innovation)
+def compute_nis(
+    innovation: Array, jacobian: Array, covariance: Array, noise: Array
+) -> float:
+    """Returns the normalised innovation squared: chi-squared if the filter is consistent."""
+    spread = jacobian @ covariance @ jacobian.T + noise
+    return float(innovation @ np.linalg.solve(spread, innovation))
 
 
 @kernel(allocates=True)
-def gain(covariance, derivative, noise):  # type: ignore[no-untyped-def]
-    """Kalman gain (3 + S, n) of a measurement, and the covariance after it, as filterpy's."""
-    shared = covariance @ derivative.T
-    weight = np.linalg.solve(derivative @ shared + noise, shared.T).T.copy()
-    left = np.eye(covariance.shape[0]) - weight @ derivative
-    return weight, left @ covariance @ left.T + weight @ noise @ weight.T
+def compute_update(
+    covariance: Array, jacobian: Array, noise: Array
+) -> tuple[NDArray[np.floating[Any]], Array]:
+    """Returns a measurement's Kalman gain (3 + S, n) and the covariance after it, as filterpy."""
+    shared: Array = covariance @ jacobian.T
+    gain = np.linalg.solve(jacobian @ shared + noise, shared.T).T.copy()
+    left = np.eye(covariance.shape[0]) - gain @ jacobian
+    return gain, left @ covariance @ left.T + gain @ noise @ gain.T
 
 
 @kernel(allocates=True)
-def recall(anchor, derivative, covariance, noise):  # type: ignore[no-untyped-def]
-    """Corrects the `Anchor` by a present measurement of `derivative` (n, 3 + S) and noise (n, n).
+def correct_clone(
+    clone: Clone, innovation: Array, jacobian: Array, covariance: Array, noise: Array
+) -> Clone:
+    """Returns the clone after a measurement of the present state, whose `covariance` is given.
 
-    Returns the gain (n, 3) of its pose, its covariance, and the present mean's with that pose.
+    The measurement has an innovation (n,), a Jacobian (n, 3 + S) and a noise (n, n).
     """
-    seen = derivative @ anchor.cross
-    gain = np.linalg.solve(derivative @ covariance @ derivative.T + noise, seen)
-    less = anchor.cross - covariance @ (derivative.T @ gain)
-    spread = anchor.covariance.copy()
-    spread[:3, :3] -= seen.T @ gain
-    return gain.copy(), spread, less
+    seen = jacobian @ clone.cross
+    gain = np.linalg.solve(jacobian @ covariance @ jacobian.T + noise, seen)
+    cross = clone.cross - covariance @ (jacobian.T @ gain)
+    mean = clone.mean.copy()
+    mean[:3] += innovation @ gain.copy()
+    corrected = clone.covariance.copy()
+    corrected[:3, :3] -= seen.T @ gain
+    return Clone(clone.odometry, mean, corrected, cross, True)
+
+
+@kernel
+def compute_displacement(start: Array, end: Array) -> tuple[float, float]:
+    """Returns how far ahead and left of a pose another one lies [m]."""
+    c = math.cos(start[2])
+    s = math.sin(start[2])
+    x = end[0] - start[0]
+    y = end[1] - start[1]
+    return c * x + s * y, c * y - s * x
 
 
 @kernel(allocates=True)
-def retrace(  # type: ignore[no-untyped-def]
-    mean, covariance, anchor, odom, twist, now, wheels, gate
-):
-    """Corrects by the way from the `Anchor` to odometry's pose and twist (3,), if that is likely.
+def agrees_with_twists(
+    relative: Array,
+    slack: Array,
+    clone: Clone,
+    odometry: Odometry,
+    model: OdometryModel,
+) -> bool:
+    """Returns True if a relative pose (3,) is the arc of the twists at its ends.
 
-    One that is unlikely, but that of the twists at its ends, replaces what was predicted. Returns
-    mean and covariance; `wheels` is `Wheels`.
+    `slack` (3, 3) is the variance of the relative pose if the robot had either twist all the time.
     """
-    seconds = (now - anchor.time_ns) / NS_PER_S
-    then = anchor.mean
-    size = mean.shape[0]
-    c = math.cos(anchor.odom[2])
-    s = math.sin(anchor.odom[2])
-    x = odom[0] - anchor.odom[0]
-    y = odom[1] - anchor.odom[1]
-    along = c * x + s * y
-    aside = c * y - s * x
-    turned = robot.wrap(odom[2] - anchor.odom[2])
-    c = math.cos(then[2])
-    s = math.sin(then[2])
-    x = mean[0] - then[0]
-    y = mean[1] - then[1]
-    ahead = c * x + s * y
-    before = c * y - s * x
-    here = np.zeros((3, size))
-    there = np.zeros((3, 3))
-    here[0, 0] = c
-    here[0, 1] = s
-    here[1, 0] = -s
-    here[1, 1] = c
-    here[2, 2] = 1.0
-    there[0, 0] = -c
-    there[0, 1] = -s
-    there[1, 0] = s
-    there[1, 1] = -c
-    there[2, 2] = -1.0
-    there[0, 2] = before
-    there[1, 2] = -ahead
-    shared = covariance @ here.T + anchor.cross @ there.T
-    past = anchor.cross.T @ here.T + anchor.covariance[:3, :3].copy() @ there.T
-    total = here @ shared + there @ past + wheels.walk * seconds
+    seconds = (odometry.time_ns - clone.odometry.time_ns) / NS_PER_S
+    if seconds > MAX_ARC_S:
+        return False
+    ahead = relative[0]
+    left = relative[1]
+    turn = relative[2]
+    arc = np.array([ahead + 0.5 * turn * left, left - 0.5 * turn * ahead, turn])
+    residual = arc - 0.5 * seconds * (odometry.twist + clone.odometry.twist)
+    spread = model.random_walk * seconds + 0.25 * slack
+    # Nobody knows where on its path the robot turned.
+    spread += np.diag((0.25 * turn * np.array([left, ahead, 0.0])) ** 2)
+    return bool(residual @ np.linalg.solve(spread, residual) <= model.gate)
+
+
+@kernel(allocates=True)
+def replace_pose(
+    mean: Array,
+    covariance: Array,
+    clone: Clone,
+    relative: Array,
+    random_walk: Array,
+) -> tuple[Array, Array]:
+    """Returns an estimate whose pose is the clone's, moved by a relative pose (3,).
+
+    `random_walk` (3, 3) is the covariance of the relative pose.
+    """
+    start = clone.mean
+    c = math.cos(start[2])
+    s = math.sin(start[2])
+    moved = mean.copy()
+    moved[0] = start[0] + c * relative[0] - s * relative[1]
+    moved[1] = start[1] + s * relative[0] + c * relative[1]
+    moved[2] = start[2] + relative[2]
+    jacobian = np.eye(3)
+    jacobian[0, 2] = start[1] - moved[1]
+    jacobian[1, 2] = moved[0] - start[0]
+    start_covariance = clone.covariance[:3, :3].copy()
+    replaced = covariance.copy()
+    replaced[:3, 3:] = 0.0
+    replaced[3:, :3] = 0.0
+    replaced[:3, :3] = jacobian @ start_covariance @ jacobian.T + random_walk
+    return moved, replaced
+
+
+@kernel(allocates=True)
+def correct_by_relative_pose(
+    mean: Array,
+    covariance: Array,
+    clone: Clone,
+    odometry: Odometry,
+    model: OdometryModel,
+) -> tuple[Array, Array]:
+    """Corrects an estimate by odometry's pose relative to the clone's.
+
+    An unlikely relative pose is ignored, unless the twists at its ends confirm it: then the
+    prediction is wrong, and the relative pose replaces it.
+    """
+    seconds = (odometry.time_ns - clone.odometry.time_ns) / NS_PER_S
+    start = clone.odometry.pose
+    ahead, left = compute_displacement(start, odometry.pose)
+    turn = robot.wrap(odometry.pose[2] - start[2])
+    relative = np.array([ahead, left, turn])
+    expected_ahead, expected_left = compute_displacement(clone.mean, mean)
     innovation = np.array(
-        [along - ahead, aside - before, robot.wrap(turned - mean[2] + then[2])]
+        [
+            ahead - expected_ahead,
+            left - expected_left,
+            robot.wrap(turn - mean[2] + clone.mean[2]),
+        ]
     )
-    # Between two twists the robot may have had either.
-    slack = np.diag((0.5 * seconds * (twist - anchor.twist)) ** 2)
-    if innovation @ np.linalg.solve(total + slack, innovation) <= gate:
-        gain = np.linalg.solve(total, shared.T)
-        less = covariance - shared @ gain
+    c = math.cos(clone.mean[2])
+    s = math.sin(clone.mean[2])
+    jacobian = np.zeros((3, mean.shape[0]))
+    jacobian[0, 0] = c
+    jacobian[0, 1] = s
+    jacobian[1, 0] = -s
+    jacobian[1, 1] = c
+    jacobian[2, 2] = 1.0
+    clone_jacobian = np.array(
+        [[-c, -s, expected_left], [s, -c, -expected_ahead], [0.0, 0.0, -1.0]]
+    )
+    clone_covariance = clone.covariance[:3, :3].copy()
+    shared = covariance @ jacobian.T + clone.cross @ clone_jacobian.T
+    clone_shared = clone.cross.T @ jacobian.T + clone_covariance @ clone_jacobian.T
+    random_walk = model.random_walk * seconds
+    spread = jacobian @ shared + clone_jacobian @ clone_shared + random_walk
+    # Between two odometries the robot may have had the twist of either.
+    slack = np.diag((0.5 * seconds * (odometry.twist - clone.odometry.twist)) ** 2)
+    if innovation @ np.linalg.solve(spread + slack, innovation) <= model.gate:
+        gain = np.linalg.solve(spread, shared.T)
         moved = mean + innovation @ gain
-        less = (less + less.T) * 0.5
+        corrected = covariance - shared @ gain
+        corrected = (corrected + corrected.T) * 0.5
+    elif agrees_with_twists(relative, slack, clone, odometry, model):
+        moved, corrected = replace_pose(mean, covariance, clone, relative, random_walk)
     else:
-        arc = np.array(
-            [along + 0.5 * turned * aside, aside - 0.5 * turned * along, turned]
-        )
-        off = arc - 0.5 * seconds * (twist + anchor.twist)
-        spread = wheels.walk * seconds + 0.25 * slack
-        spread += np.diag(
-            (0.25 * turned * np.array([aside, along, 0.0])) ** 2
-        )  # where it turned
-        if seconds > SHORT_S or not off @ np.linalg.solve(spread, off) <= gate:
-            return mean, covariance
-        # The way is that of its twists: what was predicted is wrong.
-        moved = mean.copy()
-        less = covariance.copy()
-        turning = np.eye(3)
-        moved[0], moved[1] = (
-            then[0] + c * along - s * aside,
-            then[1] + s * along + c * aside,
-        )
-        moved[2] = then[2] + turned
-        less[:3, 3:] = 0.0
-        less[3:, :3] = 0.0
-        turning[0, 2], turning[1, 2] = then[1] - moved[1], moved[0] - then[0]
-        spread = anchor.covariance[:3, :3].copy()
-        less[:3, :3] = turning @ spread @ turning.T + wheels.walk * seconds
-    less[:3, :3] += wheels.slip * seconds
-    settle(moved, less, wheels.low, wheels.high)
-    return moved, less
+        return mean, covariance
+    corrected[:3, :3] += model.slip * seconds
+    repair_estimate(moved, corrected, model.state_low, model.state_high)
+    return moved, corrected
 
 
 @kernel(allocates=True)
-def follow(  # type: ignore[no-untyped-def]
-    mean, innovation, update, recall, anchor, odom, twist, now, wheels, gate
-):
-    """Corrects by an innovation (3,) of a twist, by `gain` and `recall`, and then by `retrace`."""
-    weight = update[0]
-    covariance = update[1].copy()
-    here = mean + weight @ innovation
-    then = anchor.mean.copy()
-    settle(here, covariance, wheels.low, wheels.high)
-    then[:3] += innovation @ recall[0]
-    since = Anchor(
-        anchor.time_ns, anchor.odom, anchor.twist, then, recall[1], recall[2]
+def correct_by_odometry(
+    mean: Array,
+    covariance: Array,
+    innovation: Array,
+    jacobian: Array,
+    noise: Array,
+    clone: Clone,
+    odometry: Odometry,
+    model: OdometryModel,
+) -> tuple[Array, Array]:
+    """Corrects an estimate by odometry's twist, then by its pose relative to the clone's.
+
+    The twist has an innovation (3,), a Jacobian (3, 3 + S) and a noise (3, 3); with a Jacobian of
+    zeros only the relative pose corrects.
+    """
+    corrected_clone = correct_clone(clone, innovation, jacobian, covariance, noise)
+    gain, corrected = compute_update(covariance, jacobian, noise)
+    moved = mean + gain @ innovation
+    repair_estimate(moved, corrected, model.state_low, model.state_high)
+    estimate: tuple[Array, Array] = correct_by_relative_pose(
+        moved, corrected, corrected_clone, odometry, model
     )
-    return retrace(here, covariance, since, odom, twist, now, wheels, gate)
+    return estimate
 
 
 @kernel(allocates=True)
-def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
-    """Wraps the heading, clips the state to [low, high] (S,), repairs the covariance's rounding."""
+def repair_estimate(mean: Array, covariance: Array, low: Array, high: Array) -> None:
+    """Wraps the heading, clips the state to [low, high] (S,), repairs the covariance's rounding.
+
+    The covariance becomes symmetric, and each pivot of its Cholesky factor at least `MIN_PIVOT`.
+    """
     size = mean.shape[0]
     mean[2] = robot.wrap(mean[2])
     for i in range(3, size):
@@ -425,16 +519,16 @@ def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
     factor = np.zeros((size, size))
     for i in range(size):
         for j in range(i + 1):
-            both = 0.5 * (covariance[i, j] + covariance[j, i])
-            covariance[i, j] = both
-            covariance[j, i] = both
+            entry = 0.5 * (covariance[i, j] + covariance[j, i])
+            covariance[i, j] = entry
+            covariance[j, i] = entry
             for k in range(j):
-                both -= factor[i, k] * factor[j, k]
+                entry -= factor[i, k] * factor[j, k]
             if j < i:
-                factor[i, j] = both / factor[j, j]
+                factor[i, j] = entry / factor[j, j]
                 continue
-            least = max(LEAST_PIVOT * covariance[i, i], LEAST_VARIANCE)
-            if both < least:
-                covariance[i, i] += least - both
-                both = least
-            factor[i, i] = math.sqrt(both)
+            least = max(MIN_PIVOT * covariance[i, i], MIN_VARIANCE)
+            if entry < least:
+                covariance[i, i] += least - entry
+                entry = least
+            factor[i, i] = math.sqrt(entry)

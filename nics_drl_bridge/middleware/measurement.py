@@ -1,5 +1,6 @@
-"""Measurements of a robot's sensors, the estimator's verdicts on them, and health of the topics."""
+"""Measurements of a robot's sensors, their outcomes in the estimator, and health of the topics."""
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple
@@ -34,62 +35,59 @@ class Measurement(NamedTuple):
 
     kind: Kind
     value: Array
-    noise: Array | None = None  # covariance of the value; None for the model's
-    # (3,) pose that came with a twist: how far the robot came
-    odom: Array | None = None
-    # of a twist's yaw rate, as told; None for the model's
+    noise: Array | None = None  # covariance of the value; None: the model's
+    odom: Array | None = None  # (3,) pose in `odom` that came with a twist
+    # Stated variance of a twist's yaw rate; None: the model's
     turn_variance: float | None = None
 
 
 class Acceptance(IntEnum):
-    """Outcome of a measurement."""
+    """What the estimator did with a measurement."""
 
-    USED = 0  # within its gate
-    NEWS = 1  # beyond it, but plausible for a robot that is stuck or pushed; used
-    JUMP = 2  # beyond it so many times in a row that it is believed
+    USED = 0  # within its gate, used
+    NEWS = 1  # beyond it, but plausible for a robot that is stuck or pushed, used
+    JUMP = 2  # beyond it too many times in a row to be an outlier, used
     OUTLIER = 3  # rejected
 
 
 class Judgement(NamedTuple):
-    """The estimator's verdict on a measurement, with its squared, normalised innovation."""
+    """What the estimator made of a measurement."""
 
-    distance: float
+    nis: float  # normalised innovation squared
     outcome: Acceptance
 
 
 def check_covariance(
-    covariance: ArrayLike | None, size: int, least_std: float
+    covariance: ArrayLike | None, size: int, min_std: float
 ) -> Array | None:
-    """Returns a covariance that the filter can use, of at least `least_std` in any direction.
+    """Returns a covariance (size, size) with at least `min_std` in any direction.
 
-    None if it is unknown (or zeros). Raises ValueError if it is no covariance (size, size).
+    None if it is unknown (or zeros). Raises ValueError if it is not a covariance.
     """
     if covariance is None:
         return None
-    given = np.array(covariance, dtype=np.float64)
-    if given.shape != (size, size) or not np.isfinite(given).all():
+    matrix = np.array(covariance, dtype=np.float64)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise ValueError("covariance: NaN or inf")
-    if not given.any():
+    if not matrix.any():
         return None
-    if not np.allclose(given, given.T, rtol=1e-6, atol=1e-12):
+    if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12):
         raise ValueError("covariance: not symmetric")
-    given = 0.5 * (given + given.T)
-    least = float(np.linalg.eigvalsh(given)[0])
-    if least <= 0.0:
+    matrix = 0.5 * (matrix + matrix.T)
+    min_variance = float(np.linalg.eigvalsh(matrix)[0])
+    if min_variance <= 0.0:
         raise ValueError("covariance: not positive definite")
-    return given + max(least_std**2 - least, 0.0) * np.eye(size)
+    return matrix + max(min_std**2 - min_variance, 0.0) * np.eye(size)
 
 
 @dataclass(frozen=True)
 class TopicHealth:
-    """Accepted data of a topic, their rate of arrival (0 before the second) and age by arrival."""
+    """Accepted data of a topic."""
 
     received: int
-    rate_hz: float
-    age_s: float
-    innovation: float = float(
-        "nan"
-    )  # distance of the newest `Judgement`; NaN if none corrects
+    rate_hz: float  # of arrival; 0 before the second
+    age_s: float  # since arrival
+    innovation: float = math.nan  # NIS of the newest `Judgement`; NaN without one
 
 
 @dataclass(frozen=True)
@@ -97,10 +95,7 @@ class Health:
     """Health of all topics of a robot that have data."""
 
     topics: dict[str, TopicHealth] = field(default_factory=dict)
-    rejected: dict[str, int] = field(
-        default_factory=dict
-    )  # by reasons that begin with the topic
-    noticed: dict[str, int] = field(
-        default_factory=dict
-    )  # surprised but used (`odom: news`)
-    replayed: int = 0  # late ones, inserted at their time
+    # Counts by reason, which begins with the topic
+    rejected: dict[str, int] = field(default_factory=dict)
+    noticed: dict[str, int] = field(default_factory=dict)  # used (`odom: news`)
+    replayed: int = 0  # late data, inserted at their stamps

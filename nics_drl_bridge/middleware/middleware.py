@@ -11,12 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sensor import unread
-from nics_drl_bridge.middleware import measurement as measured
-from nics_drl_bridge.middleware import timeline
-from nics_drl_bridge.middleware.belief import parted
+from nics_drl_bridge.middleware.belief import decorrelate_pose
 from nics_drl_bridge.middleware.ekf import (
-    LEAST_POSE_STD,
-    LEAST_TWIST_STD,
+    MIN_POSE_STD,
+    MIN_TWIST_STD,
     START_STD,
     Estimator,
 )
@@ -24,14 +22,18 @@ from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
     ODOM,
     SCAN,
+    Acceptance,
+    Health,
     Kind,
     Measurement,
+    TopicHealth,
+    check_covariance,
 )
-from nics_drl_bridge.middleware.timeline import Stamps
+from nics_drl_bridge.middleware.timeline import Refusal, Stamps, Timeline
 
 NOT_FINITE = "NaN or inf"
-LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
-RATE_OVER = 32  # Number of arrivals over which rates are computed
+MIN_STD = {Kind.YAW_RATE: MIN_TWIST_STD, Kind.POSE: MIN_POSE_STD}
+RATE_WINDOW = 32  # number of arrivals over which rates are computed
 
 
 class Datum(NamedTuple):
@@ -54,34 +56,35 @@ class TopicCache:
 
     def put(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> bool:
         """Stores a datum unless it is older than the cached one, or a duplicate; True if stored."""
-        held = self.newest.get(topic)
-        if held is not None and stamp_ns <= held.stamp_ns:
-            late = stamp_ns < held.stamp_ns
-            return self.reject(
-                f"{topic}: out of order" if late else f"{topic}: duplicate"
-            )
+        newest = self.newest.get(topic)
+        if newest is not None and stamp_ns < newest.stamp_ns:
+            return self.reject(f"{topic}: out of order")
+        if newest is not None and stamp_ns == newest.stamp_ns:
+            return self.reject(f"{topic}: duplicate")
         self.take(topic, stamp_ns, arrival_ns, value)
         return True
 
     def take(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> None:
-        """Counts a datum, and stores it if it is the newest: late data may be useful, too."""
-        held = self.newest.get(topic)
-        if held is None or stamp_ns > held.stamp_ns:
+        """Counts a datum, and stores it if it is the newest."""
+        newest = self.newest.get(topic)
+        if newest is None or stamp_ns > newest.stamp_ns:
             self.newest[topic] = Datum(
                 stamp_ns, arrival_ns, self.received[topic], value
             )
         self.received[topic] += 1
-        self.arrivals.setdefault(topic, deque(maxlen=RATE_OVER)).append(arrival_ns)
+        self.arrivals.setdefault(topic, deque(maxlen=RATE_WINDOW)).append(arrival_ns)
 
     def reject(self, reason: str) -> bool:
-        """Counts a rejected datum; False."""
+        """Counts a rejected datum; returns False."""
         self.rejected[reason] += 1
         return False
 
     def age_s(self, topic: str, now_ns: int) -> float:
         """Age of the newest datum by its stamp [s]; inf if there is none."""
-        held = self.newest.get(topic)
-        return math.inf if held is None else (now_ns - held.stamp_ns) * S_PER_NS
+        newest = self.newest.get(topic)
+        if newest is None:
+            return math.inf
+        return (now_ns - newest.stamp_ns) * S_PER_NS
 
     def rate_hz(self, topic: str, arrival_ns: int) -> float:
         """Rate of arrivals by the receiver's clock [Hz]; it falls while a datum is overdue."""
@@ -91,15 +94,17 @@ class TopicCache:
             return 0.0
         overdue_ns = (arrival_ns - arrivals[0]) * intervals / (intervals + 1)
         span_ns = max(arrivals[-1] - arrivals[0], overdue_ns)
-        return intervals / (span_ns * S_PER_NS) if span_ns > 0 else 0.0
+        if span_ns <= 0:
+            return 0.0
+        return intervals / (span_ns * S_PER_NS)
 
 
 class Middleware:
     """Caches the newest datum of a robot's topics and estimates its state.
 
     Simulator, nodes and vehicle all feed this class: the same data give the same view. Times are
-    stamps [ns]; arrivals are on the receiver's clock, which need not be that of the stamps. Data
-    that cannot be used are counted by reason, see `health`, and change nothing else.
+    stamps [ns]; arrivals are on the receiver's clock, which may differ from the stamps' clock. Data
+    that are refused are counted by reason, see `health`, and change nothing else.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -107,7 +112,7 @@ class Middleware:
         self._width = len(model.robot.command)
         self._sensors = model.sensors
         self.estimator = Estimator(model)
-        self._timeline = timeline.Timeline(self.estimator)
+        self._timeline = Timeline(self.estimator)
         self._stamps = Stamps(round(model.control_period * NS_PER_S))
         self.reset(0, np.zeros(3))
 
@@ -117,27 +122,27 @@ class Middleware:
         self._clock_jumps = 0
         self._commanded = np.zeros(self._width)
         self.estimator.reset(time_ns, pose, std)
-        self._begin(time_ns)
+        self._start(time_ns)
 
     def place(self, pose: ArrayLike, covariance: ArrayLike) -> None:
-        """Takes the robot to be at a pose (3,) in `map`, with a covariance (3, 3), from now on.
+        """Moves the estimate to a pose (3,) in `map`, with a covariance (3, 3).
 
-        Its motion, odometry and all topics go on.
+        The robot's state, its odometry and all topics go on.
         """
         belief = self.estimator.belief
         mean = belief.mean.copy()
-        spread = parted(belief.covariance)
         mean[:3] = pose
-        spread[:3, :3] = covariance
-        anchor = belief.anchor and belief.anchor._replace(
-            mean=mean, covariance=spread, cross=None
-        )
+        whole = decorrelate_pose(belief.covariance)
+        whole[:3, :3] = covariance
+        clone = belief.clone
+        if clone is not None:
+            clone = clone._replace(mean=mean, covariance=whole, correlated=False)
         self.estimator.belief = belief._replace(
-            mean=mean, covariance=spread, anchor=anchor
+            mean=mean, covariance=whole, clone=clone
         )
         self._timeline.reset()
 
-    def _begin(self, time_ns: int) -> None:
+    def _start(self, time_ns: int) -> None:
         self._start_ns = time_ns
         self._unstamped_ns = time_ns - 1
         self._stamps.reset()
@@ -161,14 +166,15 @@ class Middleware:
         value = np.array(command, dtype=np.float64)
         if value.shape != (self._width,):
             reason = f"shape {value.shape}, not ({self._width},)"
-        elif not np.isfinite(value).all():
-            reason = NOT_FINITE
-        else:
-            # The robot follows it whatever its stamp: the clock may have been set meanwhile.
-            self._commanded = value
-            reason = self._stamps.fault(stamp_ns, arrival_ns)
-            reason = reason or self._timeline.command(stamp_ns, value)
-        return not reason or self.cache.reject(f"{CMD_VEL}: {reason}")
+            return self.cache.reject(f"{CMD_VEL}: {reason}")
+        if not np.isfinite(value).all():
+            return self.cache.reject(f"{CMD_VEL}: {NOT_FINITE}")
+        # The robot follows it whatever its stamp: the clock may have been set meanwhile.
+        self._commanded = value
+        refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
+        if refusal is None:
+            refusal = self._timeline.command(stamp_ns, value)
+        return refusal is None or self.cache.reject(f"{CMD_VEL}: {refusal.reason}")
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); True if it was used. Only the newest scan is kept."""
@@ -180,7 +186,7 @@ class Middleware:
     def sense(
         self, name: str, stamp_ns: int, arrival_ns: int, reading: NDArray[np.float32]
     ) -> bool:
-        """Takes a reading (S,) of a further sensor; True if it was used. The newest is kept."""
+        """Takes a reading (S,) of another sensor; True if it was used. Only the newest is kept."""
         size = next(sensor.size for sensor in self._sensors if sensor.name == name)
         return self._keep(name, stamp_ns, arrival_ns, reading, size)
 
@@ -192,11 +198,11 @@ class Middleware:
         values: NDArray[np.float32],
         size: int,
     ) -> bool:
-        fault = self._stamps.fault(stamp_ns, arrival_ns)
         if values.shape != (size,):
-            fault = f"shape {values.shape}, not ({size},)"
-        if fault:
-            return self.cache.reject(f"{topic}: {fault}")
+            return self.cache.reject(f"{topic}: shape {values.shape}, not ({size},)")
+        refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
+        if refusal is not None:
+            return self.cache.reject(f"{topic}: {refusal.reason}")
         return self.cache.put(topic, stamp_ns, arrival_ns, values)
 
     def odometry(
@@ -209,33 +215,31 @@ class Middleware:
     ) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
 
-        The twist corrects the estimate, and so does the way between two poses; the pose, which
-        drifts, bridges motion for which there are no other data. With a gyro both turn by it, as
-        far as the variance of the twist's yaw rate, by default the model's, is the greater.
+        The twist corrects the estimate, and so does the pose relative to the odometry before; the
+        pose itself, which drifts, bridges motion without other data. The gyro's turn counts the
+        more, the larger the variance of the twist's yaw rate is, by default the model's.
         """
         value = np.array((pose, twist), dtype=np.float64)
         if not np.isfinite(value).all():
             return self.cache.reject(f"{ODOM}: {NOT_FINITE}")
-        if fault := self._stamps.fault(stamp_ns, None):
-            return self.cache.reject(f"{ODOM}: {fault}")
+        refusal = self._stamps.find_fault(stamp_ns, None)
+        if refusal is not None:
+            return self.cache.reject(f"{ODOM}: {refusal.reason}")
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
             # At a reset the pose is known: the odometry of that time adds nothing.
-            self._timeline.anchor(value[0])
+            self._timeline.clone_start(value[0])
             self._stamps.accept(stamp_ns, arrival_ns)
             self.cache.take(ODOM, stamp_ns, arrival_ns, value)
             return True
         measurement = Measurement(
             Kind.TWIST, value[1], odom=value[0], turn_variance=turn_variance
         )
-        reason = self._measure(stamp_ns, arrival_ns, measurement, value)
-        of_clock = (
-            self._stamps.from_the_future,
-            timeline.TOO_OLD,
-            timeline.BEFORE_START,
-        )
-        if reason in of_clock and self._stamps.refuse():
+        refusal = self._measure(stamp_ns, arrival_ns, measurement, value)
+        if refusal is None:
+            return True
+        if refusal.may_be_clock and self._stamps.refuse():
             self._follow_clock(stamp_ns, arrival_ns, measurement)
-        return not reason
+        return False
 
     def pose(
         self,
@@ -245,7 +249,7 @@ class Middleware:
         covariance: ArrayLike | None = None,
     ) -> bool:
         """Takes a pose (3,) in `map`, by default with the model's covariance; True if used."""
-        return self._optional(Kind.POSE, stamp_ns, arrival_ns, pose, covariance)
+        return self._take_optional(Kind.POSE, stamp_ns, arrival_ns, pose, covariance)
 
     def imu(
         self,
@@ -259,52 +263,54 @@ class Middleware:
         Odometry then turns by it, see `turning`.
         """
         covariance = None if variance is None else [[variance]]
-        return self._optional(
+        return self._take_optional(
             Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance
         )
 
-    def _optional(
+    def _take_optional(
         self,
         kind: Kind,
         stamp_ns: int,
         arrival_ns: int,
-        given: ArrayLike,
-        about: ArrayLike | None,
+        values: ArrayLike,
+        covariance: ArrayLike | None,
     ) -> bool:
-        value = np.array(given, dtype=np.float64)
+        value = np.array(values, dtype=np.float64)
         if not np.isfinite(value).all():
             return self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
         try:
-            noise = measured.check_covariance(about, len(value), LEAST_STD[kind])
+            noise = check_covariance(covariance, len(value), MIN_STD[kind])
         except ValueError as error:
             return self.cache.reject(f"{kind.topic}: {error}")
-        return not self._measure(
-            stamp_ns, arrival_ns, Measurement(kind, value, noise), value
-        )
+        measurement = Measurement(kind, value, noise)
+        return self._measure(stamp_ns, arrival_ns, measurement, value) is None
 
     def _measure(
-        self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any
-    ) -> str:
-        """Takes a measurement; returns the reason if it cannot be used, or an empty string."""
+        self, stamp_ns: int, arrival_ns: int, measurement: Measurement, datum: Array
+    ) -> Refusal | None:
+        """Takes a measurement and caches its datum; returns why it is not used, or None."""
         topic = measurement.kind.topic
-        fault = self._stamps.fault(stamp_ns, arrival_ns)
-        reason = fault or self._timeline.measure(stamp_ns, measurement)
-        if reason:
-            self.cache.reject(f"{topic}: {reason}")
+        refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
+        if refusal is None:
+            refusal = self._timeline.measure(stamp_ns, measurement)
+        if refusal is not None:
+            self.cache.reject(f"{topic}: {refusal.reason}")
         else:
             self._stamps.accept(stamp_ns, arrival_ns)
-            self.cache.take(topic, stamp_ns, arrival_ns, kept)
-        return reason
+            self.cache.take(topic, stamp_ns, arrival_ns, datum)
+        return refusal
 
     def _follow_clock(
         self, stamp_ns: int, arrival_ns: int, odometry: Measurement
     ) -> None:
-        """Begins anew at the last pose, at the stamp of an odometry to which the clock was set."""
-        last = self.cache.newest.get(ODOM)
-        seconds = 0.0 if last is None else (arrival_ns - last.arrival_ns) * S_PER_NS
+        """Starts again at the last pose, at the stamp of an odometry after the clock was set."""
+        seconds = 0.0
+        if ODOM in self.cache.newest:
+            last_ns = self.cache.newest[ODOM].arrival_ns
+            seconds = (arrival_ns - last_ns) * S_PER_NS
         self.estimator.restart(stamp_ns, seconds, self._commanded)
         self.estimator.correct(odometry)
-        self._begin(stamp_ns)
+        self._start(stamp_ns)
         self.cache.newest.clear()
         self._clock_jumps += 1
 
@@ -322,48 +328,55 @@ class Middleware:
 
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
-        scan = self.cache.newest.get(SCAN)
-        newest_ns = self.newest_ns
-        sensed = unread(self._sensors)
         newest = self.cache.newest
+        newest_ns = self.newest_ns
+        if newest_ns is None:
+            newest_ns = now_ns
+        ranges = np.full(self._beams, np.nan, np.float32)
+        if SCAN in newest:
+            ranges = newest[SCAN].value
+        sensed = unread(self._sensors)
         sensed |= {name: newest[name].value for name in sensed if name in newest}
         oldest_s = max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0)
         return RobotView(
-            *self.estimator.at(now_ns),
+            *self.estimator.look_ahead(now_ns),
             sensed=sensed,
             sensed_age_s=oldest_s,
-            ranges=np.full(self._beams, np.nan, np.float32)
-            if scan is None
-            else scan.value,
-            stamp_s=(now_ns if newest_ns is None else newest_ns) * S_PER_NS,
+            ranges=ranges,
+            stamp_s=newest_ns * S_PER_NS,
             scan_age_s=self.cache.age_s(SCAN, now_ns),
             odom_age_s=self.cache.age_s(ODOM, now_ns),
         )
 
-    def health(self, arrival_ns: int) -> measured.Health:
+    def health(self, arrival_ns: int) -> Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""
-        # those that are not 0
         cache = self.cache
-        outcomes = +self._timeline.outcomes
-        distances = {kind.topic: d for kind, d in self._timeline.distances.items()}
-        topics = {}
-        for topic, received in cache.received.items():
-            age_s = (arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS
-            known = received, cache.rate_hz(topic, arrival_ns), age_s
-            topics[topic] = measured.TopicHealth(*known, distances.get(topic, math.nan))
+        innovations = {
+            kind.topic: nis for kind, nis in self._timeline.newest_nis.items()
+        }
+        topics = {
+            topic: TopicHealth(
+                received=received,
+                rate_hz=cache.rate_hz(topic, arrival_ns),
+                age_s=(arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS,
+                innovation=innovations.get(topic, math.nan),
+            )
+            for topic, received in cache.received.items()
+        }
         rejected = dict(cache.rejected)
         noticed = dict[str, int]()
-        for (kind, outcome), count in outcomes.items():
-            if outcome is not measured.Acceptance.USED:
-                counts = rejected if outcome is measured.Acceptance.OUTLIER else noticed
-                counts[f"{kind.topic}: {outcome.name.lower()}"] = count
+        for (kind, outcome), count in self._timeline.outcomes.items():
+            if outcome is Acceptance.USED or not count:  # a replay may have changed it
+                continue
+            counts = rejected if outcome is Acceptance.OUTLIER else noticed
+            counts[f"{kind.topic}: {outcome.name.lower()}"] = count
         if self._clock_jumps:
             noticed["clock: jump"] = self._clock_jumps
-        return measured.Health(topics, rejected, noticed, self._timeline.replayed)
+        return Health(topics, rejected, noticed, self._timeline.replayed)
 
 
 def rehearse(model: SimulatorModel) -> RobotView:
-    """Compiles all by two periods of a robot at rest: it could take seconds while a robot moves."""
+    """Compiles all kernels by two periods at rest; compiling while a robot moves takes seconds."""
     middleware = Middleware(model)
     period_ns = round(model.control_period * 1e9)
     middleware.reset(0, np.zeros(3))

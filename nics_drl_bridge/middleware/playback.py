@@ -1,4 +1,4 @@
-"""Runs a recorded drive, in the order of receipt, through the middleware, to identical bits."""
+"""Runs a recorded drive through the middleware in the order of receipt, with identical bits."""
 
 import io
 from collections.abc import Iterator, Mapping
@@ -38,24 +38,21 @@ TYPES: Mapping[str, tuple[str, ...]] = {
     POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE),
     IMU: (topic_roles.IMU,),
 }
-ALWAYS = (
-    SCAN,
-    ODOM,
-    CMD_VEL,
-)  # roles used if the bag has them; the others only on request
-APART_S = 1.0  # Greatest difference between stamps of one clock at the same time of receipt [s]
+# Roles that are played if the bag has them; the others are played on request only
+DEFAULT_ROLES = (SCAN, ODOM, CMD_VEL)
+MAX_OFFSET_S = 1.0  # between stamps of one clock at the same time of receipt [s]
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 
 @dataclass(frozen=True)
 class EstimatedDrive:
-    """Estimates of the middleware over a drive, after each odometry that was the newest (T)."""
+    """Estimates of the middleware over a drive, after each of T odometries that were the newest."""
 
-    stamp_ns: NDArray[np.int64]
-    pose: Array
-    twist: Array
-    covariance: Array
-    rejected: Mapping[str, int]
+    stamp_ns: NDArray[np.int64]  # (T,)
+    pose: Array  # (T, 3) x [m], y [m], heading [rad] in `map`
+    twist: Array  # (T, 3) vx, vy [m/s], wz [rad/s]
+    covariance: Array  # (T, 3, 3) of the pose
+    rejected: Mapping[str, int]  # data by reason
 
     @cached_property
     def digest(self) -> str:
@@ -69,7 +66,7 @@ class EstimatedDrive:
 def estimate(
     path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
 ) -> EstimatedDrive:
-    """Runs a bag through the middleware, with `topics` by role, see `chosen`.
+    """Runs a bag through the middleware, with `topics` by role, see `choose_topics`.
 
     The estimate is identical on every machine with the same versions. Raises RecordingError if the
     bag is damaged, a topic missing or of a wrong type, or the data are stamped by several clocks.
@@ -98,17 +95,17 @@ def estimate(
     )
 
 
-def with_gyro(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
-    """Returns topics by role with that of a gyro, if a bag has a usual one and none is named."""
+def add_gyro_topic(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
+    """Returns topics by role, with the gyro's topic of a usual name if none is given."""
     if IMU in topics:
-        named = topics[IMU].strip("/") != topic_roles.NONE
-        if named:
+        if topics[IMU].strip("/") != topic_roles.NONE:
             return topics
-        return {role: t for role, t in topics.items() if role != IMU}
+        return {role: topic for role, topic in topics.items() if role != IMU}
     with open_bag(path) as bag:
-        for name in (f"/{name}" for name in topic_roles.IMU_NAMES):
-            if bag.types.get(name) == topic_roles.IMU and name not in bag.empty:
-                return {**topics, IMU: name}
+        for name in topic_roles.IMU_NAMES:
+            topic = f"/{name}"
+            if bag.types.get(topic) == topic_roles.IMU and topic not in bag.empty:
+                return {**topics, IMU: topic}
     return topics
 
 
@@ -116,24 +113,28 @@ def read_messages(
     path: str | Path, topics: Mapping[str, str], use_gyro: bool = False
 ) -> dict[str, list[Message]]:
     """Returns the messages of each role that is played. Raises as `estimate` does."""
-    topics = with_gyro(path, topics) if use_gyro else topics
+    if use_gyro:
+        topics = add_gyro_topic(path, topics)
     with open_bag(path) as bag:
-        roles = chosen(bag, topics)
-        messages = {role: bag.read_messages(topic) for role, topic in roles.items()}
+        roles = choose_topics(bag, topics)
+        read_messages = {
+            role: bag.read_messages(topic) for role, topic in roles.items()
+        }
     _check_clocks(str(path), roles, messages)
     return messages
 
 
-def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
+def choose_topics(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
     """Returns the topic of each role that is played; RecordingError if it is missing or wrong.
 
-    By default, `ALWAYS` are topics of these names; the others play only if `topics` names them.
+    `DEFAULT_ROLES` are played from topics of their names, unless `topics` names others; the other
+    roles are played only if `topics` names them.
     """
     roles = {}
     for role, kinds in TYPES.items():
         topic = topics.get(role) or (f"/{role}" if f"/{role}" in bag.types else "")
         if role not in topics and (
-            role not in ALWAYS or not topic or topic in bag.empty
+            role not in DEFAULT_ROLES or not topic or topic in bag.empty
         ):
             continue
         if topic not in bag.types:
@@ -142,17 +143,17 @@ def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
                 f"{bag.place}: has no topic {topic!r} ({role}); {hint}"
             )
         if bag.types[topic] not in kinds or topic in bag.empty:
-            is_now = "empty" if topic in bag.empty else f"of type {bag.types[topic]}"
+            fault = "empty" if topic in bag.empty else f"of type {bag.types[topic]}"
             needed = f"{role} needs messages of {' or '.join(kinds)}."
             raise RecordingError(
-                f"{bag.place}: the topic {topic!r} is {is_now}; {needed}"
+                f"{bag.place}: the topic {topic!r} is {fault}; {needed}"
             )
         roles[role] = topic
     if ODOM not in roles:
         fix = "say which topic it is, as in --topic odom=/wheel_odom"
-        known = ", ".join(sorted(bag.types))
+        names = ", ".join(sorted(bag.types))
         raise RecordingError(
-            f"{bag.place}: has no odometry; {fix}; its topics are {known}."
+            f"{bag.place}: has no odometry; {fix}; its topics are {names}."
         )
     return roles
 
@@ -162,27 +163,27 @@ def _check_clocks(
 ) -> None:
     stamps = {
         role: np.array(
-            [(m.receive_ns, get_stamp(m.content)) for m in some], dtype=np.int64
+            [(m.receive_ns, get_stamp(m.content)) for m in sent], dtype=np.int64
         )
-        for role, some in messages.items()
-        if hasattr(some[0].content, "header")
+        for role, sent in messages.items()
+        if hasattr(sent[0].content, "header")
     }
     for role, times in stamps.items():
         if not times[:, 1].any():
             if role == CMD_VEL:
                 continue
-            fix = "have the driver stamp them, the middleware orders data by their stamps."
+            fix = "have the driver stamp them: the middleware orders data by their stamps."
             raise RecordingError(
                 f"{place}: topic {roles[role]!r} is not stamped; {fix}"
             )
         clock = stamps[ODOM]
-        there = clock[0, 1] + np.interp(
+        expected = clock[0, 1] + np.interp(
             times[:, 0], clock[:, 0], clock[:, 1] - clock[0, 1]
         )
-        apart = float(np.median(times[:, 1] - there)) * 1e-9
-        if abs(apart) > APART_S:
+        offset_s = float(np.median(times[:, 1] - expected)) * 1e-9
+        if abs(offset_s) > MAX_OFFSET_S:
             raise RecordingError(
-                f"{place}: the stamps of {roles[role]!r} are {apart:+.3f} s off those of "
+                f"{place}: the stamps of {roles[role]!r} are {offset_s:+.3f} s off those of "
                 f"{roles[ODOM]!r}, so they are of two clocks; synchronise the clocks (NTP, or "
                 "use_sim_time on all nodes or none) and record anew, or leave the topic out."
             )
@@ -191,14 +192,15 @@ def _check_clocks(
 class Playback:
     """Feeds the middleware as the nodes do.
 
-    With `posed`, a pose sensor gives the start; with `any_lidar`, the first scan fixes the `lidar`.
+    With `has_pose`, a pose sensor gives the start; with `any_lidar`, the first scan determines the
+    `lidar`.
     """
 
     def __init__(
-        self, model: SimulatorModel, posed: bool, any_lidar: bool = False
+        self, model: SimulatorModel, has_pose: bool, any_lidar: bool = False
     ) -> None:
         self._model = model
-        self._posed = posed
+        self._start_std = ANYWHERE if has_pose else START_STD
         self._any_lidar = any_lidar
         self.middleware = Middleware(model)
         self.lidar = model.lidar
@@ -209,18 +211,18 @@ class Playback:
     def take(self, role: str, message: Message) -> bool:
         """Feeds a message; True if it was used and is the newest of its topic."""
         takes = {
-            SCAN: self._scan,
-            ODOM: self._odometry,
-            CMD_VEL: self._command,
-            POSE: self._pose,
-            IMU: self._imu,
+            SCAN: self._take_scan,
+            ODOM: self._take_odometry,
+            CMD_VEL: self._take_command,
+            POSE: self._take_pose,
+            IMU: self._take_imu,
         }
         if not takes[role](message.receive_ns, message.content):
             return False
         newest = self.middleware.cache.newest.get(role)
         return newest is not None and newest.stamp_ns == get_stamp(message.content)
 
-    def _scan(self, arrival_ns: int, message: Any) -> bool:
+    def _take_scan(self, arrival_ns: int, message: Any) -> bool:
         values = np.asarray(message.ranges, np.float32)
         if self._any_lidar and self._reader is None:
             header = ScanHeader(
@@ -236,25 +238,23 @@ class Playback:
         ranges = from_device(np.ascontiguousarray(values), self.lidar)
         return self.middleware.scan(get_stamp(message), arrival_ns, ranges)
 
-    def _odometry(self, arrival_ns: int, message: Any) -> bool:
+    def _take_odometry(self, arrival_ns: int, message: Any) -> bool:
         stamp_ns = get_stamp(message)
         pose = np.array(read_whole_pose(message))
         if not self._started and np.isfinite(pose).all():
-            self.middleware.reset(
-                stamp_ns, pose, ANYWHERE if self._posed else START_STD
-            )
+            self.middleware.reset(stamp_ns, pose, self._start_std)
             self._started = True
         twist = np.array(read_twist(message))
         variance = read_turn_variance(message)
         return self.middleware.odometry(stamp_ns, arrival_ns, pose, twist, variance)
 
-    def _command(self, _: int, message: Any) -> bool:
+    def _take_command(self, _: int, message: Any) -> bool:
         command = read_robot_command(message, self._model.robot)
         stamp_ns = get_stamp(message) if hasattr(message, "header") else 0
         self.middleware.command(stamp_ns or None, command)
         return True
 
-    def _pose(self, arrival_ns: int, message: Any) -> bool:
+    def _take_pose(self, arrival_ns: int, message: Any) -> bool:
         covariance = getattr(message.pose, "covariance", None)
         if covariance is not None:
             covariance = np.reshape(covariance, (6, 6))[np.ix_([0, 1, 5], [0, 1, 5])]
@@ -262,8 +262,9 @@ class Playback:
             get_stamp(message), arrival_ns, read_whole_pose(message), covariance
         )
 
-    def _imu(self, arrival_ns: int, message: Any) -> bool:
-        if (measured := self._gyro.read(message)) is None:
+    def _take_imu(self, arrival_ns: int, message: Any) -> bool:
+        measured = self._gyro.read(message)
+        if measured is None:
             return self.middleware.cache.reject(f"{IMU}: no angular velocity")
         return self.middleware.imu(get_stamp(message), arrival_ns, *measured)
 
@@ -272,26 +273,27 @@ def merge_messages(
     messages: Mapping[str, list[Message]],
 ) -> Iterator[tuple[str, Message]]:
     """Yields all messages with their roles, in the order of receipt."""
-    every = [(role, message) for role in sorted(messages) for message in messages[role]]
-    yield from sorted(
-        every, key=lambda each: each[1].receive_ns
-    )  # which keeps equals in order
+    merged = [
+        (role, message) for role in sorted(messages) for message in messages[role]
+    ]
+    yield from sorted(merged, key=lambda entry: entry[1].receive_ns)  # a stable sort
 
 
-def write_estimate(made: EstimatedDrive, path: str | Path) -> None:
+def write_estimate(drive: EstimatedDrive, path: str | Path) -> None:
     """Writes an estimate as `.npz`, or otherwise as CSV with numbers in full precision."""
     if Path(path).suffix == ".npz":
         buffer = io.BytesIO()
         np.savez_compressed(
             buffer,
-            stamp_ns=made.stamp_ns,
-            pose=made.pose,
-            twist=made.twist,
-            covariance=made.covariance,
+            stamp_ns=drive.stamp_ns,
+            pose=drive.pose,
+            twist=drive.twist,
+            covariance=drive.covariance,
         )
         write_bytes(path, buffer.getvalue())
         return
     lines = [",".join(("stamp_ns", *COLUMNS))]
-    for ns, pose, twist in zip(made.stamp_ns, made.pose, made.twist, strict=True):
-        lines.append(",".join((str(ns), *(repr(float(v)) for v in (*pose, *twist)))))
+    for ns, pose, twist in zip(drive.stamp_ns, drive.pose, drive.twist, strict=True):
+        numbers = (repr(float(value)) for value in (*pose, *twist))
+        lines.append(",".join((str(ns), *numbers)))
     write_text(path, "\n".join(lines) + "\n")

@@ -1,9 +1,10 @@
-"""Order of a robot's data in time: replay of late ones, and time stamps that can't be right."""
+"""Order of a robot's data in time: late data are replayed, implausible time stamps found."""
 
 from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass
 from operator import attrgetter, index
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,17 +19,26 @@ from nics_drl_bridge.middleware.measurement import (
     Measurement,
 )
 
-HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
-BEFORE_START = "not after the reset"
-TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
-DUPLICATE = "duplicate"
-# By which a stamp may be early [ns], or two control periods if longer
+HISTORY_NS = NS_PER_S  # late data may be so old [ns]
+# A stamp may be ahead by this [ns], or by two control periods if these are longer
 FUTURE_NS = NS_PER_S
-# Odometries rejected in a row for their stamps that show that a clock was set
+# Consecutive odometries rejected for their stamps that show that a clock was set
 CLOCK_JUMP = 10
-Moment = tuple[
-    int, int
-]  # Stamp [ns] and kind: the order of measurements, however they arrive
+
+
+class Refusal(NamedTuple):
+    """Why a datum is not used."""
+
+    reason: str
+    may_be_clock: bool = False  # True if a clock that was set explains it
+
+
+BEFORE_START = Refusal("not after the reset", may_be_clock=True)
+TOO_OLD = Refusal(f"older than {HISTORY_NS / NS_PER_S:g} s", may_be_clock=True)
+DUPLICATE = Refusal("duplicate")
+NO_INTEGER = Refusal("stamp is not an integer")
+# Stamp [ns] and kind: measurements are ordered by both, no matter in which order they arrive.
+Moment = tuple[int, int]
 
 
 @dataclass(slots=True)
@@ -36,14 +46,15 @@ class _Entry:
     moment: Moment
     belief: Belief
     measurement: Measurement | None = None
-    verdict: Judgement | None = None
+    judgement: Judgement | None = None
 
 
 class Timeline:
-    """Feeds the estimator, as nothing else may, with measurements and commands by their stamps.
+    """Feeds the estimator with measurements and commands by their stamps; nothing else may.
 
-    A late one is inserted at its time and the filter re-run from a snapshot before, as in
-    robot_localization's `smooth_lagged_data`: the same bits, if not older than `HISTORY_NS`.
+    Late data are inserted at their stamps, and everything since is replayed from the filter's state
+    before, like robot_localization's `smooth_lagged_data`. The estimate is bit-identical no matter
+    in which order data arrive, unless they are older than `HISTORY_NS`.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -51,11 +62,11 @@ class Timeline:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the past; begins with the present state of the estimator."""
+        """Forgets the past; starts with the present state of the estimator."""
         self._start_ns = self._estimator.time_ns
-        # Numbers of measurements by kind and outcome; the innovation of the newest of each kind.
+        # Counts of measurements by kind and outcome; NIS of the newest of each kind
         self.outcomes: Counter[tuple[Kind, Acceptance]] = Counter()
-        self.distances: dict[Kind, float] = {}
+        self.newest_nis: dict[Kind, float] = {}
         self.replayed = 0
         self._entries = deque([_Entry((self._start_ns, -1), self._estimator.belief)])
 
@@ -64,14 +75,14 @@ class Timeline:
         """Stamp of the newest measurement, or of the reset [ns]."""
         return self._entries[-1].moment[0]
 
-    def anchor(self, odom: NDArray[np.float64]) -> None:
-        """Records the pose (3,) in `odom` of the start, if nothing was measured since."""
+    def clone_start(self, odom: NDArray[np.float64]) -> None:
+        """Clones the start for its pose (3,) in `odom`, if nothing was measured since."""
         if len(self._entries) == 1:
-            self._estimator.anchor(odom)
+            self._estimator.clone_state(odom, np.zeros(3))
             self._entries[0].belief = self._estimator.belief
 
-    def measure(self, stamp_ns: int, measurement: Measurement) -> str:
-        """Takes a measurement; returns the reason if it cannot be used, or an empty string."""
+    def measure(self, stamp_ns: int, measurement: Measurement) -> Refusal | None:
+        """Takes a measurement; returns why it is not used, or None."""
         moment = (stamp_ns, measurement.kind)
         if stamp_ns <= self._start_ns:
             return BEFORE_START
@@ -81,49 +92,52 @@ class Timeline:
         if place == len(self._entries):
             self._entries.append(self._run(moment, measurement))
             while self._entries[1].moment[0] < stamp_ns - HISTORY_NS:
-                self._entries.popleft()  # it can no longer change
+                self._entries.popleft()  # nothing before it can arrive any more
         elif self._entries[place].moment == moment:
             return DUPLICATE
         else:
             self._entries.insert(
                 place, _Entry(moment, self._entries[0].belief, measurement)
             )
-            self._rerun(place)
-        return ""
+            self._replay(place)
+        return None
 
-    def command(self, stamp_ns: int, command: ArrayLike) -> str:
-        """Takes a command (C,); returns the reason if it cannot be used, or an empty string."""
+    def command(self, stamp_ns: int, command: ArrayLike) -> Refusal | None:
+        """Takes a command (C,); returns why it is not used, or None."""
         if stamp_ns < self._start_ns:
             return BEFORE_START
-        effective_ns = self._estimator.effective_ns(stamp_ns)
+        effective_ns = self._estimator.compute_effect_time(stamp_ns)
         if effective_ns < self.newest_ns - HISTORY_NS:
             return TOO_OLD
-        if not self._estimator.command(stamp_ns, command, self._entries[0].moment[0]):
+        first_ns = self._entries[0].moment[0]
+        if not self._estimator.add_command(stamp_ns, command, first_ns):
             return DUPLICATE
         if effective_ns < self.newest_ns:
-            self._rerun(
-                bisect_right(self._entries, effective_ns, key=lambda e: e.moment[0])
+            place = bisect_right(
+                self._entries, effective_ns, key=lambda entry: entry.moment[0]
             )
-        return ""
+            self._replay(place)
+        return None
 
     def _run(self, moment: Moment, measurement: Measurement) -> _Entry:
-        if measurement.kind is Kind.YAW_RATE:  # the next odometry turns by it
-            verdict = self._estimator.turn(moment[0], measurement)
+        if measurement.kind is Kind.YAW_RATE:  # needs no prediction
+            judgement = self._estimator.take_yaw_rate(moment[0], measurement)
         else:
             self._estimator.predict(moment[0])
-            verdict = self._estimator.correct(measurement)
-        self.outcomes[measurement.kind, verdict.outcome] += 1
-        self.distances[measurement.kind] = verdict.distance
-        return _Entry(moment, self._estimator.belief, measurement, verdict)
+            judgement = self._estimator.correct(measurement)
+        self.outcomes[measurement.kind, judgement.outcome] += 1
+        self.newest_nis[measurement.kind] = judgement.nis
+        return _Entry(moment, self._estimator.belief, measurement, judgement)
 
-    def _rerun(self, place: int) -> None:
+    def _replay(self, place: int) -> None:
+        """Runs all measurements again from a place on."""
         self._estimator.belief = self._entries[place - 1].belief
         for k in range(place, len(self._entries)):
             entry = self._entries[k]
             if entry.measurement is None:
                 continue
-            if entry.verdict is not None:
-                self.outcomes[entry.measurement.kind, entry.verdict.outcome] -= 1
+            if entry.judgement is not None:
+                self.outcomes[entry.measurement.kind, entry.judgement.outcome] -= 1
             self._entries[k] = self._run(entry.moment, entry.measurement)
         self.replayed += 1
 
@@ -131,46 +145,44 @@ class Timeline:
 class Stamps:
     """Compares the progress of time stamps with that of the receiver's clock.
 
-    Only differences count: a clock may be off, a simulation slower, or faster within the tolerance,
-    which the control period [ns] widens. The first datum after a reset gives the offset.
+    Only differences count: a clock may be off, and a simulation may be slower, or faster within the
+    tolerance, which grows with the control period [ns]. The first datum after a reset gives the
+    offset.
     """
 
     def __init__(self, period_ns: int = 0) -> None:
         self._tolerance_ns = max(FUTURE_NS, 2 * period_ns)
-        self.from_the_future = (
-            f"more than {self._tolerance_ns * 1e-9:g} s in the future"
-        )
+        tolerance = f"{self._tolerance_ns / NS_PER_S:g} s"
+        self._early = Refusal(f"more than {tolerance} in the future", may_be_clock=True)
         self.reset()
 
     def reset(self) -> None:
         """Forgets the offset of the clocks."""
         self._stamp_ns: int | None = None
         self._arrival_ns = 0
-        self._refused = 0
+        self._rejected = 0
 
-    def fault(self, stamp_ns: int, arrival_ns: int | None) -> str:
-        """Returns the fault of a stamp, or an empty string; without an arrival only its type."""
+    def find_fault(self, stamp_ns: int, arrival_ns: int | None) -> Refusal | None:
+        """Returns what is wrong with a stamp, or None; only its type is checked without arrival."""
         try:
             index(stamp_ns)
         except TypeError:
-            return "stamp is no number"
+            return NO_INTEGER
         if arrival_ns is None or self._stamp_ns is None:
-            return ""
-        latest_ns = self._stamp_ns + self._tolerance_ns
-        if stamp_ns <= latest_ns or stamp_ns <= latest_ns + (
-            arrival_ns - self._arrival_ns
-        ):
-            return ""
-        return self.from_the_future
+            return None
+        passed_ns = max(arrival_ns - self._arrival_ns, 0)
+        if stamp_ns <= self._stamp_ns + self._tolerance_ns + passed_ns:
+            return None
+        return self._early
 
     def accept(self, stamp_ns: int, arrival_ns: int) -> None:
         """Records a datum that is used."""
-        self._refused = 0
+        self._rejected = 0
         if self._stamp_ns is None or stamp_ns > self._stamp_ns:
             self._stamp_ns = stamp_ns
             self._arrival_ns = arrival_ns
 
     def refuse(self) -> bool:
-        """Records an odometry rejected for its stamp; True if the clock has jumped."""
-        self._refused += 1
-        return self._refused >= CLOCK_JUMP
+        """Records an odometry that is refused for its stamp; True if the clock was set."""
+        self._rejected += 1
+        return self._rejected >= CLOCK_JUMP

@@ -1,9 +1,9 @@
-"""Fuses the turns of odometry and of a gyro by their variances, as told and as seen.
+"""Fuses the turns of odometry and of a gyro by their variances, as stated and as observed.
 
 Wheels slip where a robot turns: those of a skid-steer may report a third more than there was. A
 gyro does not slip, but has noise and a bias that changes slowly. The bias is estimated while the
-wheels stand and, with less weight, while they roll. What is fused replaces odometry's own turn, in
-its twist and in the way between two of its poses; the wheels' displacements stay as they are.
+wheels stand and, with less weight, while they roll. The fused turn replaces odometry's own, in its
+twist and in its relative pose; the wheels' displacements stay as they are.
 """
 
 import math
@@ -15,147 +15,159 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 
-# The gyro.
-GYRO_STD = 0.02  # of a yaw rate without a covariance that can be right [rad/s]
-LEAST_STD = 1e-4  # lower bound on that [rad/s]
-GREATEST_VARIANCE = 1.0  # a greater one says that the rate is not known [rad^2/s^2]
+# Gyro
+GYRO_STD = 0.02  # of a yaw rate without a plausible variance [rad/s]
+MIN_GYRO_STD = 1e-4  # [rad/s]
+MAX_VARIANCE = 1.0  # a larger one says that the rate is unknown [rad^2/s^2]
 BIAS_STD = 0.1  # of a gyro that was never at rest [rad/s]
 BIAS_WALK = 1e-4  # random walk of a bias [rad/s / sqrt(s)]
-# by which the rate of standing wheels may differ from the bias [rad/s]
-LEAST_BIAS_STD = 3e-4
-CLAIM = 25.0  # factor by which a variance may differ from what is seen, and is believed
-FEWEST_SEEN = 30  # yaw rates that show their noise
-SMOOTHING = 0.05  # weight of a new yaw rate in that
-# between two yaw rates; beyond, the wheels turn the robot [ns]
-LONGEST_GAP_NS = 250_000_000
-FROZEN = 25  # equal yaw rates in a row of a gyro that is stuck,
-CHANGED_RADPS = 0.1  # if the wheels turn the robot so much faster or slower since
-GREATEST_CHANGE = 40.0  # angular acceleration that no robot exceeds [rad/s^2]
-ALWAYS_ALLOWED = 0.3  # change from one yaw rate to the next [rad/s]
-FASTER = 2.0  # times its greatest turn rate that a robot may be turned
-PUSHED_RADPS = 1.0  # and always so fast, by hand
-PATIENCE = 5  # sudden changes in a row after which they are believed
-MOST_REFUSED = 0.2  # share of the latest yaw rates
-# The wheels.
-SLIP = 0.1  # of their turns, as a share, until more is known
-LEAST_SLIP = 0.05
-SLIP_KNOWN = 1e-3  # square of turns [rad^2] that weighs as much as that assumption
-MEMORY_S = 30.0
-TURN_TO_TELL = 0.5  # rad by the wheels, before gyro and wheels are compared
-SLOPES = (
-    -0.3,
-    3.0,
-)  # of the gyro's turns to the wheels'; beyond, its axis or unit is wrong
-LEAST_CONTRADICTION = 0.005  # rad, between two odometries
-TURNING_RADPS = 0.1  # slower turns of the wheels do not show their slip
-# of driving and standing, from which on the wheels' scatter is known
-SCATTER_KNOWN_S = 5.0
+REST_BIAS_STD = 3e-4  # difference of the rate of standing wheels from the bias [rad/s]
+VARIANCE_RATIO = 25.0  # factor by which stated and observed variance may differ
+MIN_SAMPLES = 30  # yaw rates after which the observed variance counts
+SMOOTHING = 0.05  # weight of a new yaw rate in running means
+MAX_GAP_NS = 250_000_000  # between two yaw rates; beyond, the wheels turn the robot
+# A gyro is stuck if so many yaw rates are equal while the wheels' yaw rate changes by [rad/s]:
+FROZEN_COUNT = 25
+FROZEN_CHANGE = 0.1
+MAX_ACCELERATION = 40.0  # angular acceleration that no robot exceeds [rad/s^2]
+MIN_STEP = 0.3  # change from one yaw rate to the next that is always accepted [rad/s]
+# A robot may be turned by this factor faster than it can turn, or at least at this rate [rad/s].
+RATE_FACTOR = 2.0
+PUSH_RATE = 1.0
+MAX_REJECTED = 5  # sudden changes in a row; the last of them is believed
+MAX_REJECTED_FRACTION = 0.2  # of the latest yaw rates
+# Wheels
+ASSUMED_SLIP = 0.1  # fraction of their turns, until more is known
+ASSUMED_SLIP_WEIGHT = (
+    1e-3  # weight of that assumption, as a sum of squared turns [rad^2]
+)
+MIN_SLIP_FRACTION = 0.05
+MEMORY_S = 30.0  # of slip and scatter
+MIN_COMPARED_TURN = 0.5  # by the wheels, before they judge the gyro [rad]
+# Slope of the gyro's turns over the wheels'; beyond, the gyro's axis or unit is wrong.
+MIN_SLOPE = -0.3
+MAX_SLOPE = 3.0
+CONTRADICTION_MARGIN = 0.005  # between two odometries [rad]
+TURNING_RATE = 0.1  # slower turns of the wheels do not show their slip [rad/s]
+MIN_COMPARED_S = 5.0  # after which the wheels' scatter is known
 WHEELS_BIAS = 0.004  # constant error of rolling wheels [rad/s]
-# other errors of rolling wheels last so long: they are no independent news
-WRONG_FOR_S = 3.0
-ABOUT_RADPS = 0.005  # yaw rate of a robot that about stands, over a second
-STANDING = 4.0  # standard deviations from the bias within which the robot stands, too
+# Other errors of rolling wheels last so long; until then, they are no independent information.
+ERROR_DURATION_S = 3.0
+REST_RATE = 0.005  # yaw rate, averaged over a second, of a robot that is roughly at rest [rad/s]
+SIGMAS = 4.0  # standard deviations beyond which a turn differs from the bias
+NEVER_NS = 2**62
 
 
 class Gyro(NamedTuple):
-    """What is known of a gyro, and of the wheels beside it."""
+    """Estimates of a gyro's errors, and of those of the wheels."""
 
     stamp_ns: int  # of the newest yaw rate
     rate: float  # that rate [rad/s]
-    total: float  # integral of all rates until then [rad]
+    integral: float  # of all rates until then [rad]
     since_ns: int  # first yaw rate after the last gap
     period_s: float  # between two yaw rates
-    noise: float  # variance of a yaw rate, as told or assumed
-    seen: float = 0.0  # variance of yaw rates by their differences
-    seen_count: int = 0
-    change: float = 0.0  # from the yaw rate before to the newest [rad/s]
-    equal: int = 0  # yaw rates in a row that did not change
-    refused: int = 0  # in a row
-    refused_share: float = 0.0  # of the latest yaw rates
+    noise: float  # variance of a yaw rate, as stated or assumed
+    observed: float = 0.0  # variance of yaw rates, from their second differences
+    samples: int = 0
+    change: float = 0.0  # between the two newest yaw rates [rad/s]
+    repeats: int = 0  # consecutive yaw rates that did not change
+    rejected: int = 0  # consecutive ones
+    rejected_fraction: float = 0.0  # of the latest yaw rates
     bias: float = 0.0
     bias_variance: float = BIAS_STD**2
     cross: float = 0.0  # covariance of the robot's heading with the bias
-    # Sums of squares and products of turns between odometries, that fade.
+    # Sums over turns between odometries, which fade: wheels^2, wheels * gyro, (gyro - wheels)^2
     wheels_square: float = 0.0
     product: float = 0.0
     difference_square: float = 0.0
-    wheels_turned: float = 0.0  # sum of the sizes [rad]
-    # mean square difference of both rates while going straight [rad^2/s^2]
+    wheels_turned: float = 0.0  # sum of absolute turns [rad]
+    # Mean squared difference of both rates while going straight [rad^2/s^2]
     scatter: float = 0.0
     compared_s: float = 0.0
-    # Of the newest odometry that was used; None before.
+    # The newest odometry that was used; None before
     odom: Array | None = None  # (3,) its pose, as it was received
     odom_ns: int = 0
-    odom_total: float = 0.0  # integral of all rates until then [rad]
+    odom_integral: float = 0.0  # of all rates until then [rad]
     wheels_rate: float = 0.0  # yaw rate of its twist [rad/s]
-    # the same before the gyro was `FROZEN` times equal
-    wheels_rate_when_equal: float = 0.0
+    # Yaw rate of the wheels before the gyro repeated itself `FROZEN_COUNT` times
+    wheels_rate_before: float = 0.0
 
     @property
     def variance(self) -> float:
-        """Variance of a yaw rate: as told, unless what is seen differs by far."""
-        if self.seen_count < FEWEST_SEEN:
+        """Variance of a yaw rate: the stated one, unless the observed one is far from it."""
+        if self.samples < MIN_SAMPLES:
             return max(self.noise, GYRO_STD**2)
-        seen = max(self.seen, LEAST_STD**2)
-        return self.noise if seen / CLAIM <= self.noise <= seen * CLAIM else seen
+        observed = max(self.observed, MIN_GYRO_STD**2)
+        if observed / VARIANCE_RATIO <= self.noise <= observed * VARIANCE_RATIO:
+            return self.noise
+        return observed
 
     @property
     def slip(self) -> float:
-        """Usual error of the wheels' turns, as a share of these."""
-        square = self.difference_square + SLIP**2 * SLIP_KNOWN
-        return max(LEAST_SLIP, math.sqrt(square / (self.wheels_square + SLIP_KNOWN)))
+        """Usual error of the wheels' turns, as a fraction of these."""
+        square = self.difference_square + ASSUMED_SLIP**2 * ASSUMED_SLIP_WEIGHT
+        ratio = square / (self.wheels_square + ASSUMED_SLIP_WEIGHT)
+        return max(MIN_SLIP_FRACTION, math.sqrt(ratio))
 
     @property
-    def fits(self) -> bool:
-        """False if it is mere noise, or turns unlike the wheels as only a fault explains."""
-        if self.seen > GREATEST_VARIANCE or self.refused_share > MOST_REFUSED:
+    def is_plausible(self) -> bool:
+        """False if it is mere noise, or turns unlike the wheels in a way only a fault explains."""
+        if self.observed > MAX_VARIANCE:
             return False
-        if self.wheels_turned < TURN_TO_TELL or self.wheels_square == 0.0:
+        if self.rejected_fraction > MAX_REJECTED_FRACTION:
+            return False
+        if self.wheels_turned < MIN_COMPARED_TURN or self.wheels_square == 0.0:
             return True
-        return SLOPES[0] < self.product / self.wheels_square < SLOPES[1]
+        return MIN_SLOPE < self.product / self.wheels_square < MAX_SLOPE
 
-    def contradicts(self, unbiased: float, by_wheels: float, spread: float) -> bool:
-        """True for a turn that a gyro which has not shown yet to be in order is not believed.
+    def has_contradiction(
+        self, unbiased: float, by_wheels: float, variance: float
+    ) -> bool:
+        """Returns True for a turn of an unproven gyro that is not believed.
 
-        It is of the opposite sign or several times as large as that of the wheels, beyond the
-        deviation that a `spread` [rad^2] explains. Later the wheels may have slipped so.
+        It has the opposite sign of the wheels' turn or is several times as large, beyond what the
+        `variance` [rad^2] explains. Once the gyro is proven, the wheels may have slipped that much.
         """
-        if self.wheels_turned >= TURN_TO_TELL:
+        if self.wheels_turned >= MIN_COMPARED_TURN:
             return False
-        margin = STANDING * math.sqrt(spread) + LEAST_CONTRADICTION
-        along = unbiased if by_wheels >= 0.0 else -unbiased
-        least, most = (slope * abs(by_wheels) for slope in SLOPES)
-        return not least - margin <= along <= most + margin
+        if by_wheels < 0.0:
+            unbiased = -unbiased
+        margin = SIGMAS * math.sqrt(variance) + CONTRADICTION_MARGIN
+        low = MIN_SLOPE * abs(by_wheels) - margin
+        high = MAX_SLOPE * abs(by_wheels) + margin
+        return not low <= unbiased <= high
 
-    def total_at(self, time_ns: int) -> float:
-        """Integral of all rates until a time, at which the newest rate still holds [rad]."""
-        return self.total + self.rate * (time_ns - self.stamp_ns) / NS_PER_S
+    def integrate_to(self, time_ns: int) -> float:
+        """Returns the integral of all rates until a time, with the newest rate held [rad]."""
+        return self.integral + self.rate * (time_ns - self.stamp_ns) / NS_PER_S
 
-    def restarted(self) -> "Gyro":
+    def reject(self) -> "Gyro":
+        """Returns the estimates after a yaw rate that was rejected."""
+        fraction = self.rejected_fraction + SMOOTHING * (1.0 - self.rejected_fraction)
+        return self._replace(rejected=self.rejected + 1, rejected_fraction=fraction)
+
+    def restart(self) -> "Gyro":
         """Returns what remains known after the clock was set: bias, noise and slip."""
-        return self._replace(since_ns=FAR_AHEAD_NS, refused=0)
+        return self._replace(since_ns=NEVER_NS, rejected=0)
 
 
-FAR_AHEAD_NS = 2**62
-
-
-class Turned(NamedTuple):
+class FusedOdometry(NamedTuple):
     """An odometry whose turn is fused with the gyro's."""
 
     odom: Array  # (3,) pose on a path of the same displacements
     twist: Array  # (3,)
     gyro: Gyro
-    # gained by the heading, beside what the filter adds [rad^2]
+    # Variance of the heading that the bias adds, on top of the filter's own [rad^2]
     heading_variance: float = 0.0
-    # of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
+    # Variance of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
     rate_variance: float = 0.0
 
 
-def believable_variance(variance: float | None) -> float | None:
-    """Returns a variance of a yaw rate if it can be right, else None."""
-    if variance is None or not 0.0 < variance <= GREATEST_VARIANCE:
+def check_variance(variance: float | None) -> float | None:
+    """Returns the variance of a yaw rate, or None if it is not plausible."""
+    if variance is None or not 0.0 < variance <= MAX_VARIANCE:
         return None
-    return max(variance, LEAST_STD**2)
+    return max(variance, MIN_GYRO_STD**2)
 
 
 def take_rate(
@@ -163,200 +175,202 @@ def take_rate(
     stamp_ns: int,
     rate: float,
     variance: float | None,
-    fastest: float,
+    max_rate: float,
 ) -> tuple[Gyro | None, float, bool]:
-    """Takes a yaw rate [rad/s] of a robot that turns at most so fast [rad/s].
+    """Takes a yaw rate [rad/s] of a robot that can turn at `max_rate` [rad/s].
 
-    Returns what is known then, its squared, normalised difference from what the wheels tell, and
-    whether it was used.
+    Returns the estimates after it, its normalised innovation squared with respect to the wheels'
+    yaw rate, and True if it was used.
     """
-    bias = 0.0 if gyro is None else gyro.bias
-    if not abs(rate - bias) <= FASTER * fastest + PUSHED_RADPS:
-        return (None if gyro is None else _refuse(gyro)), math.inf, False
-    noise = believable_variance(variance) or GYRO_STD**2
+    limit = RATE_FACTOR * max_rate + PUSH_RATE
+    noise = check_variance(variance) or GYRO_STD**2
     if gyro is None:
+        if not abs(rate) <= limit:
+            return None, math.inf, False
         return Gyro(stamp_ns, rate, 0.0, stamp_ns, 0.0, noise), 0.0, True
-    distance = _distance(gyro, rate)
-    passed_s = (stamp_ns - gyro.stamp_ns) / NS_PER_S
-    gap = (
-        gyro.since_ns > gyro.stamp_ns
-        or not 0 < stamp_ns - gyro.stamp_ns <= LONGEST_GAP_NS
-    )
-    if gap:
-        fresh = gyro._replace(
+    if not abs(rate - gyro.bias) <= limit:
+        return gyro.reject(), math.inf, False
+    nis = _compute_nis(gyro, rate)
+    passed_ns = stamp_ns - gyro.stamp_ns
+    if gyro.since_ns > gyro.stamp_ns or not 0 < passed_ns <= MAX_GAP_NS:
+        restarted = gyro._replace(
             stamp_ns=stamp_ns,
             rate=rate,
             since_ns=stamp_ns,
             change=0.0,
-            equal=0,
-            refused=0,
+            repeats=0,
+            rejected=0,
         )
-        return fresh, distance, True
+        return restarted, nis, True
+    passed_s = passed_ns / NS_PER_S
     change = rate - gyro.rate
-    allowed = (
-        ALWAYS_ALLOWED
-        + GREATEST_CHANGE * passed_s
-        + STANDING * math.sqrt(gyro.variance)
+    max_change = (
+        MIN_STEP + MAX_ACCELERATION * passed_s + SIGMAS * math.sqrt(gyro.variance)
     )
-    if abs(change) > allowed and gyro.refused + 1 < PATIENCE:
-        return _refuse(gyro), distance, False
-    square = (change - gyro.change) ** 2 / 6.0  # of a second difference of white noise
-    smoothing = max(SMOOTHING, 1.0 / (gyro.seen_count + 1))
-    known = gyro._replace(
+    if abs(change) > max_change and gyro.rejected + 1 < MAX_REJECTED:
+        return gyro.reject(), nis, False
+    period_s = passed_s
+    if gyro.period_s != 0.0:
+        period_s = 0.9 * gyro.period_s + 0.1 * passed_s
+    # The second difference of white noise has six times its variance.
+    square = (change - gyro.change) ** 2 / 6.0
+    smoothing = max(SMOOTHING, 1.0 / (gyro.samples + 1))
+    updated = gyro._replace(
         stamp_ns=stamp_ns,
         rate=rate,
-        total=gyro.total + 0.5 * (gyro.rate + rate) * passed_s,
-        period_s=passed_s
-        if gyro.period_s == 0.0
-        else 0.9 * gyro.period_s + 0.1 * passed_s,
+        integral=gyro.integral + 0.5 * (gyro.rate + rate) * passed_s,
+        period_s=period_s,
         noise=noise,
-        seen=gyro.seen + smoothing * (square - gyro.seen),
-        seen_count=gyro.seen_count + 1,
+        observed=gyro.observed + smoothing * (square - gyro.observed),
+        samples=gyro.samples + 1,
         change=change,
-        equal=gyro.equal + 1 if change == 0.0 else 0,
-        refused=0,
-        refused_share=(1.0 - SMOOTHING) * gyro.refused_share,
+        repeats=gyro.repeats + 1 if change == 0.0 else 0,
+        rejected=0,
+        rejected_fraction=(1.0 - SMOOTHING) * gyro.rejected_fraction,
     )
-    return known, distance, True
+    return updated, nis, True
 
 
-def _refuse(gyro: Gyro) -> Gyro:
-    share = gyro.refused_share + SMOOTHING * (1.0 - gyro.refused_share)
-    return gyro._replace(refused=gyro.refused + 1, refused_share=share)
+def _compute_nis(gyro: Gyro, rate: float) -> float:
+    variance = gyro.variance + gyro.bias_variance + (gyro.slip * gyro.wheels_rate) ** 2
+    return float((rate - gyro.bias - gyro.wheels_rate) ** 2 / variance)
 
 
-def _distance(gyro: Gyro, rate: float) -> float:
-    spread = gyro.variance + gyro.bias_variance + (gyro.slip * gyro.wheels_rate) ** 2
-    return float((rate - gyro.bias - gyro.wheels_rate) ** 2 / spread)
-
-
-def turn_odometry(
+def fuse_odometry(
     gyro: Gyro,
     before: Array,
     odom: Array,
     twist: Array,
     now_ns: int,
     rate_variance: float,
-    resting: bool = False,
-) -> Turned:
-    """Fuses the turn of an odometry, pose (3,) and twist (3,), with the gyro's since the last one.
+    is_at_rest: bool = False,
+) -> FusedOdometry:
+    """Fuses the turn since the last odometry, by wheels and by gyro.
 
-    `before` (3,) is the pose that was returned for the last one; `rate_variance` that of the yaw
-    rate of the twist; `resting` says that the robot stands, as far as is known otherwise. Without
-    a gyro in between, or with a faulty one, the wheels' turn is kept.
+    The odometry has a pose (3,) and a twist (3,), whose yaw rate has a variance; `before` (3,) is
+    the pose that was returned for the last one; `is_at_rest` says that the robot stands by all
+    other data. Without a gyro in between, or with a faulty one, the wheels' turn is kept.
     """
     last = before if gyro.odom is None else gyro.odom
     step = geometry.log(geometry.between(last, odom))
-    here = gyro._replace(
+    updated = gyro._replace(
         odom=np.array(odom),
         odom_ns=now_ns,
-        odom_total=gyro.total_at(now_ns),
+        odom_integral=gyro.integrate_to(now_ns),
         wheels_rate=float(twist[2]),
     )
     seconds = (now_ns - gyro.odom_ns) / NS_PER_S
-    if not _covers(gyro, now_ns) or seconds <= 0.0:
+    if not _covers_odometry(gyro, now_ns) or seconds <= 0.0:
         moved = geometry.compose(before, geometry.exp(step))
-        return Turned(moved, twist, here)
-    by_gyro = here.odom_total - gyro.odom_total
+        return FusedOdometry(moved, twist, updated)
+    by_gyro = updated.odom_integral - gyro.odom_integral
     by_wheels = float(step[2])
-    still = bool((step == 0.0).all() and (twist == 0.0).all())
-    here = _compare(here, by_gyro - gyro.bias * seconds, by_wheels, seconds)
+    wheels_stand = bool((step == 0.0).all() and (twist == 0.0).all())
+    unbiased = by_gyro - gyro.bias * seconds
+    updated = _compare_turns(updated, unbiased, by_wheels, seconds)
     noise = gyro.variance * max(gyro.period_s, 1e-3) * seconds
-    spread = noise + gyro.bias_variance * seconds**2
-    doubted = not still and here.contradicts(
-        by_gyro - gyro.bias * seconds, by_wheels, spread
+    gyro_variance = noise + gyro.bias_variance * seconds**2
+    contradicts = not wheels_stand and updated.has_contradiction(
+        unbiased, by_wheels, gyro_variance
     )
-    if here.equal < FROZEN:
-        here = here._replace(wheels_rate_when_equal=here.wheels_rate)
-    stuck = abs(here.wheels_rate - here.wheels_rate_when_equal) > CHANGED_RADPS
-    if doubted or stuck or not here.fits:
+    if updated.repeats < FROZEN_COUNT:
+        updated = updated._replace(wheels_rate_before=updated.wheels_rate)
+    wheels_change = abs(updated.wheels_rate - updated.wheels_rate_before)
+    if contradicts or wheels_change > FROZEN_CHANGE or not updated.is_plausible:
         moved = geometry.compose(before, geometry.exp(step))
-        return Turned(moved, twist, here)
-    # Wheels may err less than they claim: their scatter beside the gyro is what is seen of it.
-    seen_long = here.compared_s > SCATTER_KNOWN_S
-    rate_variance = min(rate_variance, here.scatter) if seen_long else rate_variance
-    wheels_variance = rate_variance * seconds**2 + (here.slip * by_wheels) ** 2
-    if still or resting:
-        here = _learn_bias_at_rest(here, by_gyro, seconds, noise, still)
+        return FusedOdometry(moved, twist, updated)
+    # Wheels may err less than stated: their scatter relative to the gyro shows how much.
+    if updated.compared_s > MIN_COMPARED_S:
+        rate_variance = min(rate_variance, updated.scatter)
+    wheels_variance = rate_variance * seconds**2 + (updated.slip * by_wheels) ** 2
+    if wheels_stand or is_at_rest:
+        updated = _learn_bias_at_rest(updated, by_gyro, seconds, noise, wheels_stand)
     else:
-        here = _learn_bias(here, by_gyro - by_wheels, seconds, noise, wheels_variance)
-    unbiased = by_gyro - here.bias * seconds
-    spread = noise + here.bias_variance * seconds**2
-    # What neither explains is slip: the gyro's noise and bias are known.
-    wheels_variance = max(wheels_variance, (unbiased - by_wheels) ** 2 - spread)
-    share = wheels_variance / (wheels_variance + spread)
-    if still and abs(unbiased) <= STANDING * math.sqrt(spread):
-        share = 0.0  # wheels that stand do not turn the robot
-    step[2] = share * unbiased + (1.0 - share) * by_wheels
-    turned = np.array(twist)
-    turned[2] = share * (gyro.rate - here.bias) + (1.0 - share) * twist[2]
-    grown = -2.0 * share * here.cross * seconds
-    cross = here.cross - share * here.bias_variance * seconds
-    moved = geometry.compose(before, geometry.exp(step))
-    measured = share**2 * (gyro.variance + here.bias_variance)
-    return Turned(moved, turned, here._replace(cross=cross), max(grown, 0.0), measured)
+        difference = by_gyro - by_wheels
+        updated = _learn_bias(updated, difference, seconds, noise, wheels_variance)
+    unbiased = by_gyro - updated.bias * seconds
+    gyro_variance = noise + updated.bias_variance * seconds**2
+    # A difference beyond the gyro's known noise and bias is slip.
+    slip_variance = (unbiased - by_wheels) ** 2 - gyro_variance
+    wheels_variance = max(wheels_variance, slip_variance)
+    weight = wheels_variance / (wheels_variance + gyro_variance)
+    if wheels_stand and abs(unbiased) <= SIGMAS * math.sqrt(gyro_variance):
+        weight = 0.0  # standing wheels do not turn the robot
+    step[2] = weight * unbiased + (1.0 - weight) * by_wheels
+    fused_twist = np.array(twist)
+    fused_twist[2] = weight * (gyro.rate - updated.bias) + (1.0 - weight) * twist[2]
+    return FusedOdometry(
+        odom=geometry.compose(before, geometry.exp(step)),
+        twist=fused_twist,
+        gyro=updated._replace(
+            cross=updated.cross - weight * updated.bias_variance * seconds
+        ),
+        heading_variance=max(-2.0 * weight * updated.cross * seconds, 0.0),
+        rate_variance=weight**2 * (gyro.variance + updated.bias_variance),
+    )
 
 
-def _covers(gyro: Gyro, now_ns: int) -> bool:
-    """True if there were yaw rates from the last odometry until now."""
+def _covers_odometry(gyro: Gyro, now_ns: int) -> bool:
+    """Returns True if there were yaw rates from the last odometry until now."""
     if gyro.odom is None or gyro.since_ns > gyro.odom_ns:
         return False
-    return 0 <= now_ns - gyro.stamp_ns <= LONGEST_GAP_NS
+    return 0 <= now_ns - gyro.stamp_ns <= MAX_GAP_NS
 
 
-def _compare(gyro: Gyro, by_gyro: float, by_wheels: float, seconds: float) -> Gyro:
-    """Adds turns by both to what is known of how the wheels slip and scatter."""
-    kept = math.exp(-seconds / MEMORY_S)
+def _compare_turns(
+    gyro: Gyro, by_gyro: float, by_wheels: float, seconds: float
+) -> Gyro:
+    """Updates the estimates of the wheels' slip and scatter by the turns of both."""
+    decay = math.exp(-seconds / MEMORY_S)
     difference = by_gyro - by_wheels
-    turning = abs(by_wheels) > TURNING_RADPS * seconds
-    news = 1.0 - kept if gyro.compared_s > 0.0 else 1.0
+    is_turning = abs(by_wheels) > TURNING_RATE * seconds
+    weight = 1.0 - decay if gyro.compared_s > 0.0 else 1.0
     scatter = gyro.scatter
-    if not turning:
-        scatter += news * ((difference / seconds) ** 2 - gyro.scatter)
+    if not is_turning:
+        scatter += weight * ((difference / seconds) ** 2 - gyro.scatter)
     return gyro._replace(
-        wheels_square=kept * gyro.wheels_square + turning * by_wheels**2,
-        product=kept * gyro.product + by_wheels * by_gyro * turning,
-        difference_square=kept * gyro.difference_square + turning * difference**2,
+        wheels_square=decay * gyro.wheels_square + is_turning * by_wheels**2,
+        product=decay * gyro.product + by_wheels * by_gyro * is_turning,
+        difference_square=decay * gyro.difference_square + is_turning * difference**2,
         wheels_turned=gyro.wheels_turned + abs(by_wheels),
-        scatter=max(scatter, LEAST_STD**2),
+        scatter=max(scatter, MIN_GYRO_STD**2),
         compared_s=gyro.compared_s + seconds,
     )
 
 
 def _learn_bias_at_rest(
-    gyro: Gyro, by_gyro: float, seconds: float, noise: float, still: bool
+    gyro: Gyro, by_gyro: float, seconds: float, noise: float, wheels_stand: bool
 ) -> Gyro:
-    """Corrects the bias by how the gyro turned while the robot stood, to the tick or about so."""
-    per_second = LEAST_BIAS_STD**2 if still else ABOUT_RADPS**2 / seconds
+    """Corrects the bias by the gyro's turn while the robot stood, or was roughly at rest."""
+    rest_variance = REST_BIAS_STD**2 if wheels_stand else REST_RATE**2 / seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    return _with_bias(
-        gyro, by_gyro / seconds, variance, noise / seconds**2 + per_second
-    )
+    measured_variance = noise / seconds**2 + rest_variance
+    return _correct_bias(gyro, by_gyro / seconds, variance, measured_variance)
 
 
 def _learn_bias(
     gyro: Gyro, difference: float, seconds: float, noise: float, wheels_variance: float
 ) -> Gyro:
-    """Corrects the bias by how differently both turned [rad], by little, while the wheels roll."""
+    """Corrects the bias a little while the wheels roll, by the difference of both turns [rad]."""
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    if variance < WHEELS_BIAS**2:  # wheels of unequal size turn a robot so much, too
+    if variance < WHEELS_BIAS**2:  # wheels of unequal size also turn a robot that much
         return gyro._replace(bias_variance=variance)
-    repeated = max(1.0, WRONG_FOR_S / seconds)
-    measured = noise / seconds**2 + repeated * wheels_variance / seconds**2
-    return _with_bias(gyro, difference / seconds, variance, measured)
+    repeated = max(1.0, ERROR_DURATION_S / seconds)
+    measured_variance = noise / seconds**2 + repeated * wheels_variance / seconds**2
+    return _correct_bias(gyro, difference / seconds, variance, measured_variance)
 
 
-def _with_bias(gyro: Gyro, seen: float, variance: float, measured: float) -> Gyro:
-    """Corrects a bias by one that was seen, with a variance of `measured`."""
-    apart = seen - gyro.bias
-    spread = variance + measured
-    if apart**2 > STANDING**2 * spread:
-        return gyro._replace(
-            bias_variance=variance
-        )  # it was pushed, or its wheels spin
-    gain = variance / spread
+def _correct_bias(
+    gyro: Gyro, measured: float, variance: float, measured_variance: float
+) -> Gyro:
+    """Corrects a bias of a `variance` by a measured one."""
+    innovation = measured - gyro.bias
+    total = variance + measured_variance
+    if innovation**2 > SIGMAS**2 * total:  # the robot was pushed, or its wheels spin
+        return gyro._replace(bias_variance=variance)
+    gain = variance / total
     return gyro._replace(
-        bias=gyro.bias + gain * apart,
+        bias=gyro.bias + gain * innovation,
         bias_variance=(1.0 - gain) * variance,
         cross=(1.0 - gain) * gyro.cross,
     )

@@ -202,7 +202,7 @@ class PolicyNode(ManagedNode):
     def _told_reached(self) -> str:
         now = self._topics.middleware.estimator.covariance[:3, :3]
         gained = compute_uncertainty_gain(self._covariance, now)
-        return f"goal reached, as believed; {gained.told_since('it was set')}"
+        return f"goal reached, as believed; {gained.describe_since('it was set')}"
 
     def _toward(self, goal: Array) -> Wish:
         view = self._topics.view()

@@ -29,8 +29,8 @@ WITHIN = 98.0  # percentage of the hits of a scan that belong to the place that 
 class BagSource:
     """Plays a bag at the pace of its stamps, a frame for each scan, or odometry without scans.
 
-    `topics` are by role, see `playback.chosen`. Without a world the place is what was seen. Raises
-    RecordingError if the bag can't be used.
+    `topics` are by role, see `playback.choose_topics`. Without a world the place is what was seen.
+    Raises RecordingError if the bag can't be used.
     """
 
     def __init__(

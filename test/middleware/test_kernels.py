@@ -4,20 +4,22 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.kernels import Log, log_of
+from nics_drl_bridge.middleware.kernels import CommandLog, make_log
 
 
 def logged(log, time, command, needed):
     limit = np.full(len(command), np.inf)
-    return Log(*kernels.logged(log, time, np.array(command), -limit, limit, needed))
+    return CommandLog(
+        *kernels.insert_command(log, time, np.array(command), -limit, limit, needed)
+    )
 
 
 def in_effect(log, time):
-    return log.commands[kernels.in_effect(log, time)].tolist()
+    return log.commands[kernels.find_command(log, time)].tolist()
 
 
 def test_before_the_first_command_there_is_none():
-    log = log_of([0.0, 0.0])
+    log = make_log([0.0, 0.0])
     assert in_effect(log, 10**18) == [0.0, 0.0]
     log = logged(log, 100, [1.0, 2.0], 0)
     assert in_effect(log, 100) == [0.0, 0.0]
@@ -27,7 +29,7 @@ def test_before_the_first_command_there_is_none():
 def test_the_order_of_adding_does_not_matter():
     rng = np.random.default_rng(0)
     times = rng.permutation(1000)[:100] * 10
-    log = log_of([0.0])
+    log = make_log([0.0])
     for time in times:
         log = logged(log, int(time), [float(time)], -1)
     assert log.effective[1:].tolist() == sorted(times.tolist())
@@ -39,14 +41,14 @@ def test_the_order_of_adding_does_not_matter():
 
 @pytest.mark.parametrize("time", [10, 20, 30])
 def test_of_two_commands_at_once_the_first_stays(time):
-    log = log_of([0.0])
+    log = make_log([0.0])
     for other in (10, 20, 30):
         log = logged(log, other, [1.0], 0)
     assert not len(logged(log, time, [2.0], 0).effective)
 
 
 def test_what_is_no_longer_needed_is_forgotten_and_all_else_kept():
-    log = log_of([0.0])
+    log = make_log([0.0])
     for k in range(1000):
         log = logged(log, k, [float(k)], k - 50)
         for back in (0, 1, 49, 50):  # just before the time that is needed, too

@@ -303,7 +303,7 @@ def test_a_stamp_that_is_no_whole_number_is_refused(middleware, kind, stamp):
         assert not middleware.scan(stamp, 0, RANGES)
     else:
         assert not SENSORS[kind](middleware, stamp, 0.0)
-    assert middleware.cache.rejected == {f"{kind}: stamp is no number": 1}
+    assert middleware.cache.rejected == {f"{kind}: stamp is not an integer": 1}
     assert_same(before, state(middleware))
 
 

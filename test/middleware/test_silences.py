@@ -8,7 +8,7 @@ from robots import direct_model
 
 from middleware.rig import PERIOD, SECOND, assert_same, state
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.middleware.belief import JITTER_S, greatest_twist
+from nics_drl_bridge.middleware.belief import JITTER_S, find_max_speeds
 from nics_drl_bridge.middleware.ekf import LONGEST_GAP_S
 from nics_drl_bridge.middleware.middleware import Middleware
 
@@ -38,7 +38,7 @@ def test_after_a_jump_it_begins_at_the_last_pose_and_may_be_anywhere_in_reach(ju
     belief = middleware.estimator.belief
     assert belief.time_ns == SECOND + 30 * PERIOD + shift_ns
     assert belief.mean[:2] == pytest.approx(last)
-    far = greatest_twist(direct_model())[0] * (1.0 + JITTER_S)
+    far = find_max_speeds(direct_model())[0] * (1.0 + JITTER_S)
     assert np.sqrt(belief.covariance[0, 0]) == pytest.approx(far / np.sqrt(3), rel=0.02)
     truth = np.array([1.0, 2.0]) + 3.0 * np.array([np.cos(0.5), np.sin(0.5)])
     assert np.hypot(*(truth - last)) < 3.0 * np.sqrt(belief.covariance[0, 0])
@@ -100,7 +100,7 @@ def silent(seconds, pose=None, twist=0.0, robot="differential"):
 
 def test_in_a_long_silence_the_robot_may_have_driven_as_far_as_it_can():
     seconds = LONGEST_GAP_S + 5.0
-    far = greatest_twist(builtin_model("differential"))[0] * (seconds - 0.5 + JITTER_S)
+    far = find_max_speeds(builtin_model("differential"))[0] * (seconds - 0.5 + JITTER_S)
     covariance = silent(seconds).estimator.covariance
     assert np.sqrt(covariance[:2, :2].diagonal()) == pytest.approx(
         far / np.sqrt(3), rel=0.02
@@ -141,5 +141,5 @@ def test_the_end_of_a_silence_may_come_in_any_order():
         assert_same(found[0], other)
 
 
-def test_the_greatest_twist_is_that_of_the_fastest_command():
-    assert greatest_twist(direct_model()) == pytest.approx((np.hypot(2.0, 2.0), 2.0))
+def test_the_find_max_speeds_is_that_of_the_fastest_command():
+    assert find_max_speeds(direct_model()) == pytest.approx((np.hypot(2.0, 2.0), 2.0))

@@ -13,7 +13,7 @@ def test_what_an_estimate_gained_in_uncertainty_is_told():
     after = before + np.diag([0.09, 0.04, 0.0025])
     gained = compute_uncertainty_gain(before, after)
     assert gained == pytest.approx((0.3, 0.05))
-    told = gained.told_since("the start")
+    told = gained.describe_since("the start")
     assert told == "position uncertain by 0.3 m, heading by 0.05 rad since the start"
 
 
