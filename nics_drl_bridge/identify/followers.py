@@ -16,7 +16,7 @@ from nics_drl_bridge.identify.signals import Motors
 from nics_drl_bridge.identify.statistics import clustered_errors, minimise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve, delays
-from nics_drl_bridge.robot.kernels import GREATEST_ORDER
+from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 
 FREE = (
@@ -214,7 +214,7 @@ def _found(
     start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
     for _ in range(2):  # what commands do not explain hides what motors do
         target = (begin, twists.end[rows], twists.twist[rows][:, moving])
-        left = clocks.response_residual(command, spec, target, GREATEST_ORDER)
+        left = clocks.response_residual(command, spec, target, MAX_ORDER)
         unexplained = np.mean(
             left(*vars(start).values()).reshape(len(rows), -1) ** 2, axis=0
         )

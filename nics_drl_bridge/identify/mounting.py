@@ -18,7 +18,7 @@ from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.identify.terms import mirrored, tyres_slip
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.kernels import GREATEST_ORDER
+from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.kinds import compute_steady_twist, has_textbook, slips
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -104,7 +104,7 @@ def by_instruments(
     """Estimates the mounting by functions of the states (n, S); None if these are too weak."""
     # They know nothing of the noise of the twists, and whatever they do along x, they do nothing
     # along y: limited information maximum likelihood (Anderson, Rubin 1949).
-    powers = taylor.list_exponents(states.shape[1], GREATEST_ORDER)
+    powers = taylor.list_exponents(states.shape[1], MAX_ORDER)
     chi = taylor.evaluate(
         states / np.maximum(np.abs(states).max(axis=0), STILL), powers
     )

@@ -1,9 +1,10 @@
 """Compiled motion: the pruned model's rates, and the exact arc of a body twist.
 
-A step of one robot is `rates` then `move`; `run` does the same for a batch, term by term, so that
+A step of one robot is `rates`, then `move`; `run` does the same for a batch, term by term, so that
 vector instructions process several robots at a time. Both give the same bits for every batch size.
-Shared arguments: `terms` are `Terms`; `x` contains state, command in effect and a last entry of 1;
-`dq` are the rates; `series` is `SERIES` in the type of the other arrays.
+Shared arguments: `x` is (S + C + 1,): the state, the commands in effect, and a last entry of 1;
+`dq` (3 + S,) are the rates; `series` is `SERIES` in the type of the other arrays, which may be
+float32 or float64.
 """
 
 import math
@@ -17,38 +18,39 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-# Of sin(t) / t and (1 - cos(t)) / t: to 1e-14 for a turn below 0.1 rad, 1e-8 below WIDE_TURN.
+# Coefficients of sin(t) / t and (1 - cos(t)) / t, which are exact to 1e-14 for turns below 0.1 rad,
+# and to 1e-8 below WIDE_TURN
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
-# For larger turns per step sine and cosine are used, not the series [rad]
-WIDE_TURN = 0.5
-GREATEST_ORDER = 4
-# columns of `Terms.curves`, as in `InputCurve`
+WIDE_TURN = 0.5  # larger turns per step use sine and cosine, not the series [rad]
+MAX_ORDER = 4  # of a term
+# Columns of `Terms.curves`, as in `InputCurve`
 DEAD = 0
-LEAST = 1
-MOST = 2
+LOW = 1
+HIGH = 2
 BACK = 3
+Moved = tuple[float, float, float, float]  # x, y [m], cosine and sine of the heading
 
 
 class Terms(NamedTuple):
     """The kept terms of a model, and what motors do around them."""
 
-    dof: NDArray[np.int64]  # (T,) degree of freedom of each
+    dof: NDArray[np.int64]  # (T,) degree of freedom of each term
     coefficient: Array  # (T,), or (T, n) of n robots
     factors: NDArray[
         np.int64
-    ]  # (T, order) indices into `x`; unused ones of its last entry, 1
+    ]  # (T, order) indices into `x`; unused ones of its last entry
     degree: NDArray[np.int64]  # (T,) number of factors
-    low: Array  # (S,) least and greatest state, at which it is held
-    high: Array
-    fall: Array  # (S,) greatest fall and rise of a state's rate
-    rise: Array
-    friction: Array  # (S,) by which a state is drawn to zero [unit / s]
-    drag: Array  # (S,) times the square of a state, likewise [1 / (unit s)]
+    low: Array  # (S,) minimum state, at which it is held
+    high: Array  # (S,) maximum state, likewise
+    fall: Array  # (S,) minimum rate of a state
+    rise: Array  # (S,) maximum rate of a state
+    friction: Array  # (S,) draws a state to zero [unit / s]
+    drag: Array  # (S,) times the square of a state, draws it to zero [1 / (unit s)]
     curves: Array  # (C, 4) of the commands
     late: NDArray[
         np.int64
-    ]  # (C,) delays of the commands after their common latency [steps]
-    emf: Array  # (S, C) times a state and the size of a command in effect; (0, 0) if all are 0
+    ]  # (C,) delays of commands after their common latency [steps]
+    emf: Array  # (S, C) times a state and the size of a command; (0, 0) if all are 0
 
 
 class Bounds(NamedTuple):
@@ -64,63 +66,70 @@ class Bounds(NamedTuple):
 
 def make_terms(model: TaylorModel) -> Terms:
     """Returns the kept terms of a model. Raises ModelError if the order of one is too high."""
-    one = len(model.variables)
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
-    if order > GREATEST_ORDER:
-        most = f"the greatest is {GREATEST_ORDER}: generate the model anew."
-        raise ModelError(f"the kinematics have a term of order {order}; {most}")
-    dofs, places = np.nonzero(model.coefficients)
-    factors = np.full((len(dofs), order), one, dtype=np.int64)
-    powers = model.powers[places]
-    count = powers.sum(axis=1)
-    factors[np.arange(order) < count[:, None]] = np.repeat(
-        np.tile(np.arange(one), len(dofs)), powers.ravel()
+    if order > MAX_ORDER:
+        fix = f"the maximum is {MAX_ORDER}: generate the model anew."
+        raise ModelError(f"the kinematics have a term of order {order}; {fix}")
+    dofs, columns = np.nonzero(model.coefficients)
+    powers = model.powers[columns]
+    degree = powers.sum(axis=1)
+    variables = len(model.variables)
+    factors = np.full((len(dofs), order), variables, dtype=np.int64)
+    factors[np.arange(order) < degree[:, None]] = np.repeat(
+        np.tile(np.arange(variables), len(dofs)), powers.ravel()
     )
-    coefficients = model.coefficients[dofs, places]
-    fall, rise = np.ascontiguousarray(model.limits.T)
+    low, high = model.state_box
     return Terms(
-        dofs.astype(np.int64),
-        coefficients,
-        factors,
-        count,
-        *model.state_box,
-        fall,
-        rise,
-        np.asarray(model.friction, np.float64),
-        np.asarray(model.drag, np.float64),
-        _curve_rows(model),
-        np.round(model.delays / model.dt).astype(np.int64),
-        model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
+        dof=dofs.astype(np.int64),
+        coefficient=model.coefficients[dofs, columns],
+        factors=factors,
+        degree=degree,
+        low=low,
+        high=high,
+        fall=np.ascontiguousarray(model.limits[:, 0]),
+        rise=np.ascontiguousarray(model.limits[:, 1]),
+        friction=np.asarray(model.friction, np.float64),
+        drag=np.asarray(model.drag, np.float64),
+        curves=_make_curves(model),
+        late=np.round(model.delays / model.dt).astype(np.int64),
+        emf=model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
     )
 
 
-def _curve_rows(model: TaylorModel) -> Array:
+def _make_curves(model: TaylorModel) -> Array:
     commands = model.variables[model.state_size :]
     rows = np.tile([0.0, -np.inf, np.inf, 1.0], (len(commands), 1))
     for curve in model.inputs:
-        row = curve.dead, min(curve.least, 0.0), max(curve.most, 0.0), curve.back
-        rows[commands.index(curve.command)] = row
+        row = rows[commands.index(curve.command)]
+        row[DEAD] = curve.dead
+        row[LOW] = min(curve.least, 0.0)
+        row[HIGH] = max(curve.most, 0.0)
+        row[BACK] = curve.back
     return rows
 
 
 def allocate_scratch(model: TaylorModel) -> tuple[Array, Array]:
-    """Returns scratch memory for `x` and `dq` of one robot."""
+    """Returns memory for `x` and `dq` of one robot."""
     x = np.zeros(len(model.variables) + 1)
     x[-1] = 1.0
     return x, np.zeros(len(model.dofs))
 
 
 @kernel
-def apply_curve(command, curve):  # type: ignore[no-untyped-def]
+def apply_curve(command: float, curve: Array) -> float:
     """Returns the effect of a command by its curve (4,); see `InputCurve`."""
-    held = min(max(command, curve[LEAST]), curve[MOST])
-    if held < -curve[DEAD] and held < 0.0:
-        return curve[BACK] * (held + curve[DEAD])
-    return 0.0 if held <= max(curve[DEAD], 0.0) else held - curve[DEAD]
+    held: float = min(max(command, curve[LOW]), curve[HIGH])
+    dead: float = curve[DEAD]
+    back: float = curve[BACK]
+    if held < -dead and held < 0.0:
+        return back * (held + dead)
+    if held <= max(dead, 0.0):
+        return 0.0
+    return held - dead
 
 
 @kernel
-def put_command(x, command, terms):  # type: ignore[no-untyped-def]
+def put_command(x: Array, command: Array, terms: Terms) -> None:
     """Writes the effect of a command (C,) to `x`."""
     first = x.shape[0] - 1 - command.shape[0]
     for c in range(command.shape[0]):
@@ -128,7 +137,7 @@ def put_command(x, command, terms):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def get_bounds(terms, i):  # type: ignore[no-untyped-def]
+def get_bounds(terms: Terms, i: int) -> Bounds:
     """Returns the bounds of state variable i."""
     return Bounds(
         terms.low[i],
@@ -141,9 +150,10 @@ def get_bounds(terms, i):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def advance_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
-    """Returns a state variable after dt [s]: rate limited, drag, dry friction, then held."""
-    # Conditions on the bounds alone: a loop over robots is compiled once with them, once without.
+def advance_state(value: float, rate: float, dt: float, bounds: Bounds) -> float:
+    """Returns a state variable after dt [s]: rate limited, drag, dry friction, then clipped."""
+    # These conditions depend on the bounds alone, so that the compiler moves them out of a loop
+    # over robots.
     if bounds.fall > -math.inf or bounds.rise < math.inf:
         rate = min(max(rate, bounds.fall), bounds.rise)
     value += dt * rate
@@ -156,8 +166,8 @@ def advance_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def replace_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
-    """Returns terms with other coefficients, those of a robot or of several."""
+def replace_coefficients(terms: Terms, coefficient: Array) -> Terms:
+    """Returns terms with other coefficients, (T,) of a robot or (T, n) of several."""
     return Terms(
         terms.dof,
         coefficient,
@@ -176,8 +186,8 @@ def replace_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def rates(dq, x, terms):  # type: ignore[no-untyped-def]
-    """Computes dQ/dt (3 + S,) of one robot."""
+def rates(dq: Array, x: Array, terms: Terms) -> None:
+    """Computes dQ/dt (3 + S,) of one robot (Eq. 1)."""
     dq[:] = 0.0
     for k in range(terms.dof.shape[0]):
         product = terms.coefficient[k]
@@ -189,8 +199,8 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sum_back_emf(i, x, terms):  # type: ignore[no-untyped-def]
-    """Returns the rate [1/s] at which the commands in effect brake state variable i."""
+def sum_back_emf(i: int, x: Array, terms: Terms) -> float:
+    """Returns the rate at which the commands in effect brake state variable i [1/s]."""
     total = 0.0
     states = terms.emf.shape[0]
     for c in range(terms.emf.shape[1]):
@@ -199,48 +209,84 @@ def sum_back_emf(i, x, terms):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """Returns x, y [m], cosine and sine of the heading after an arc of `turn` [rad] in dt [s]."""
+def move(
+    x: float,
+    y: float,
+    c: float,
+    s: float,
+    vx: float,
+    vy: float,
+    turn: float,
+    dt: float,
+    series: Array,
+) -> Moved:
+    """Moves x, y [m], cosine and sine of the heading along an arc of `turn` [rad] in dt [s]."""
     if abs(turn) > WIDE_TURN:
         one = series[3] + series[3]
         sine = math.sin(turn)
         versine = one - math.cos(turn)
-        ahead, aside = _chord(vx, vy, sine / turn, versine / turn, dt)
-        return _end(x, y, c, s, ahead, aside, sine, versine)
-    return _move_little(x, y, c, s, vx, vy, turn, dt, series)
+        ahead, left = _compute_chord(vx, vy, sine / turn, versine / turn, dt)
+        moved: Moved = _turn_and_shift(x, y, c, s, ahead, left, sine, versine)
+    else:
+        moved = _move_by_series(x, y, c, s, vx, vy, turn, dt, series)
+    return moved
 
 
 @kernel
-def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    t2 = turn * turn
-    a = series[0] - t2 * (series[1] - t2 * series[2])
-    a = (series[3] + series[3]) - t2 * a
-    b = turn * (series[3] - t2 * (series[4] - t2 * series[5]))
-    ahead, aside = _chord(vx, vy, a, b, dt)
-    return _end(x, y, c, s, ahead, aside, turn * a, turn * b)
+def _move_by_series(
+    x: float,
+    y: float,
+    c: float,
+    s: float,
+    vx: float,
+    vy: float,
+    turn: float,
+    dt: float,
+    series: Array,
+) -> Moved:
+    """Does what `move` does, for a turn below WIDE_TURN."""
+    square = turn * turn
+    sinc = series[0] - square * (series[1] - square * series[2])
+    sinc = (series[3] + series[3]) - square * sinc
+    cosc = turn * (series[3] - square * (series[4] - square * series[5]))
+    ahead, left = _compute_chord(vx, vy, sinc, cosc, dt)
+    moved: Moved = _turn_and_shift(x, y, c, s, ahead, left, turn * sinc, turn * cosc)
+    return moved
 
 
 @kernel
-def _chord(vx, vy, a, b, dt):  # type: ignore[no-untyped-def]
-    """Returns the chord of an arc in the body's frame; a = sin(t) / t, b = (1 - cos(t)) / t."""
-    return (a * vx - b * vy) * dt, (b * vx + a * vy) * dt
+def _compute_chord(
+    vx: float, vy: float, sinc: float, cosc: float, dt: float
+) -> tuple[float, float]:
+    """Returns the chord of an arc, ahead and left [m], by sin(t) / t and (1 - cos(t)) / t."""
+    return (sinc * vx - cosc * vy) * dt, (cosc * vx + sinc * vy) * dt
 
 
 @kernel
-def _end(x, y, c, s, ahead, aside, sine, versine):  # type: ignore[no-untyped-def]
-    x = x + (c * ahead - s * aside)
-    y = y + (s * ahead + c * aside)
+def _turn_and_shift(
+    x: float,
+    y: float,
+    c: float,
+    s: float,
+    ahead: float,
+    left: float,
+    sine: float,
+    versine: float,
+) -> Moved:
+    """Returns the place after a shift, and the heading after a turn by its sine and 1 - cosine."""
+    x = x + (c * ahead - s * left)
+    y = y + (s * ahead + c * left)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
 
 @kernel
-def wrap(heading):  # type: ignore[no-untyped-def]
+def wrap(heading: float) -> float:
     """Wraps a heading [rad] to [-pi, pi)."""
     return heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
 
 
 @kernel
-def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
+def advance(pose: Array, twist: Array, dt: float, series: Array) -> None:
     """Moves a pose (3,) in place along the exact arc of a body twist (3,)."""
     turn = twist[2] * dt
     c = math.cos(pose[2])
@@ -252,14 +298,22 @@ def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
+def run(
+    pose: Array,
+    x: Array,
+    dq: Array,
+    terms: Terms,
+    series: Array,
+    dt: float,
+    steps: int,
+) -> None:
     """Moves n robots in place by the same number of steps of dt [s], commands in effect constant.
 
-    `pose` (6, n) is x, y [m], cosine, sine, unwrapped heading, and an upper bound of the path
+    `pose` (6, n) is x, y [m], cosine, sine, unwrapped heading, and an upper bound on the path
     length [m]; `x` is (S + C + 1, n), `dq` (3 + S, n) the last step's rates, coefficients (T, n).
     """
     for _ in range(steps):
-        _rates_of_all(dq, x, terms)
+        _compute_all_rates(dq, x, terms)
         _move_all(pose, dq, dt, series)
         for d in range(3, dq.shape[0]):
             state = x[d - 3]
@@ -270,7 +324,7 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
+def _compute_all_rates(dq: Array, x: Array, terms: Terms) -> None:
     factors = terms.factors
     n = x.shape[1]
     for d in range(dq.shape[0]):
@@ -280,25 +334,25 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
     for k in range(terms.dof.shape[0]):
         rate = dq[terms.dof[k]]
         value = terms.coefficient[k]
-        one = x[factors[k, 0]]
+        first = x[factors[k, 0]]
         if terms.degree[k] == 1:
             for i in range(n):
-                rate[i] += value[i] * one[i]
+                rate[i] += value[i] * first[i]
         elif terms.degree[k] == 2:
-            other = x[factors[k, 1]]
+            second = x[factors[k, 1]]
             for i in range(n):
-                rate[i] += value[i] * one[i] * other[i]
+                rate[i] += value[i] * first[i] * second[i]
         elif terms.degree[k] == 3:
-            other = x[factors[k, 1]]
+            second = x[factors[k, 1]]
             third = x[factors[k, 2]]
             for i in range(n):
-                rate[i] += value[i] * one[i] * other[i] * third[i]
+                rate[i] += value[i] * first[i] * second[i] * third[i]
         elif terms.degree[k] == 4:
-            other = x[factors[k, 1]]
+            second = x[factors[k, 1]]
             third = x[factors[k, 2]]
-            last = x[factors[k, 3]]
+            fourth = x[factors[k, 3]]
             for i in range(n):
-                rate[i] += value[i] * one[i] * other[i] * third[i] * last[i]
+                rate[i] += value[i] * first[i] * second[i] * third[i] * fourth[i]
         else:  # the constant
             for i in range(n):
                 rate[i] += value[i]
@@ -314,7 +368,7 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
+def _move_all(pose: Array, dq: Array, dt: float, series: Array) -> None:
     px = pose[0]
     py = pose[1]
     pc = pose[2]
@@ -324,44 +378,41 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
     vx = dq[0]
     vy = dq[1]
     wz = dq[2]
+    n = px.shape[0]
     wide = np.int32(0)
-    for i in range(px.shape[0]):
+    for i in range(n):
         wide |= np.int32(abs(wz[i] * dt) > WIDE_TURN)
-    if wide:  # in a separate loop, as it is slower
-        _move_widely(pose, dq, dt, series)
-        return
-    for i in range(px.shape[0]):
-        turn = wz[i] * dt
-        px[i], py[i], pc[i], ps[i] = _move_little(
-            px[i], py[i], pc[i], ps[i], vx[i], vy[i], turn, dt, series
-        )
-        heading[i] += turn
-        length[i] += (abs(vx[i]) + abs(vy[i])) * dt
-
-
-@kernel
-def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
-    px = pose[0]
-    py = pose[1]
-    pc = pose[2]
-    ps = pose[3]
-    heading = pose[4]
-    length = pose[5]
-    vx = dq[0]
-    vy = dq[1]
-    wz = dq[2]
-    for i in range(px.shape[0]):
-        turn = wz[i] * dt
-        px[i], py[i], pc[i], ps[i] = move(
-            px[i], py[i], pc[i], ps[i], vx[i], vy[i], turn, dt, series
-        )
-        heading[i] += turn
+    # Two loops, because the one with sine and cosine is slower.
+    if wide:
+        for i in range(n):
+            turn = wz[i] * dt
+            px[i], py[i], pc[i], ps[i] = move(
+                px[i], py[i], pc[i], ps[i], vx[i], vy[i], turn, dt, series
+            )
+    else:
+        for i in range(n):
+            turn = wz[i] * dt
+            px[i], py[i], pc[i], ps[i] = _move_by_series(
+                px[i], py[i], pc[i], ps[i], vx[i], vy[i], turn, dt, series
+            )
+    for i in range(n):
+        heading[i] += wz[i] * dt
         length[i] += (abs(vx[i]) + abs(vy[i])) * dt
 
 
 @kernel(allocates=True)
-def simulate_rollouts(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
-    """Rolls out robots from the first of poses (W, T + 1, 3), commands in effect (W, T, C)."""
+def simulate_rollouts(
+    poses: Array,
+    states: Array,
+    commands: Array,
+    terms: Terms,
+    series: Array,
+    dt: float,
+) -> None:
+    """Simulates W robots from the first of their poses (W, T + 1, 3) and states (W, T + 1, S).
+
+    `commands` (W, T, C) are those in effect.
+    """
     size = states.shape[2]
     width = commands.shape[2]
     x = np.ones(size + width + 1)
@@ -387,8 +438,11 @@ def simulate_rollouts(poses, states, commands, terms, series, dt):  # type: igno
 
 
 @kernel
-def find_delayed_command(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
-    """Returns the index, newest first, of the one of the last `periods` commands in effect."""
+def find_delayed_command(substep: int, delay: int, substeps: int, periods: int) -> int:
+    """Returns which of the last `periods` commands is in effect at a substep, newest first.
+
+    A period has `substeps`; `delay` is in substeps.
+    """
     if delay <= substep:
         return 0
     return min((delay - substep + substeps - 1) // substeps, periods - 1)
