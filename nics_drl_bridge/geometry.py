@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-# of WGS 84
-EQUATOR_M = 6378137.0
-ECCENTRICITY_2 = 0.00669437999014
+# ellipsoid of WGS 84
+EQUATOR_RADIUS_M = 6378137.0
+ECCENTRICITY_SQUARED = 0.00669437999014
 
 
 def wrap_angle(angle: ArrayLike) -> Array:
@@ -32,7 +32,7 @@ def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
 
 
 def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
-    """The pose that lies at `relative` as seen from `pose`; both (..., 3): x, y, heading."""
+    """Returns the pose at `relative` as seen from `pose`; both (..., 3): x, y, heading."""
     pose = np.asarray(pose, dtype=np.float64)
     relative = np.asarray(relative, dtype=np.float64)
     position = pose[..., :2] + rotate(relative[..., :2], pose[..., 2])
@@ -41,7 +41,7 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
 
 
 def between(pose: ArrayLike, other: ArrayLike) -> Array:
-    """The pose `other` as seen from `pose`; both (..., 3). `compose(pose, result) == other`."""
+    """Returns the pose `other` as seen from `pose`; `compose(pose, result) == other`, (..., 3)."""
     pose = np.asarray(pose, dtype=np.float64)
     other = np.asarray(other, dtype=np.float64)
     position = rotate(other[..., :2] - pose[..., :2], -pose[..., 2])
@@ -51,7 +51,7 @@ def between(pose: ArrayLike, other: ArrayLike) -> Array:
 
 
 def exp(twist: ArrayLike) -> Array:
-    """Relative pose (..., 3) along the exact arc of a body twist x duration (..., 3), in SE(2)."""
+    """Returns the relative pose (..., 3) after an exact arc in SE(2): body twist x duration."""
     twist = np.asarray(twist, dtype=np.float64)
     w = twist[..., 2]
     small = np.abs(w) < 1e-4
@@ -64,7 +64,7 @@ def exp(twist: ArrayLike) -> Array:
 
 
 def log(relative: ArrayLike) -> Array:
-    """Inverse of `exp` below half turns: body twist x duration (..., 3) to a pose (..., 3)."""
+    """Inverts `exp` below half turns: returns body twist x duration (..., 3) of a pose (..., 3)."""
     relative = np.asarray(relative, dtype=np.float64)
     w = wrap_angle(relative[..., 2])
     small = np.abs(w) < 1e-4
@@ -77,85 +77,93 @@ def log(relative: ArrayLike) -> Array:
 
 
 def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
-    """Returns places of WGS 84 [rad] on the plane that touches it at the first one [m].
+    """Projects positions of WGS 84 [rad] onto the tangent plane at the first of them [m].
 
-    Off by less than a centimetre within 10 km.
+    The error is below a centimetre within 10 km.
     """
-    share = 1.0 - ECCENTRICITY_2 * np.sin(latitude[0]) ** 2
-    across = EQUATOR_M / np.sqrt(share)  # radii of curvature
-    along = across * (1.0 - ECCENTRICITY_2) / share
-    east = across * np.cos(latitude[0]) * wrap_angle(longitude - longitude[0])
-    return east, along * (latitude - latitude[0])
+    flattening = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude[0]) ** 2
+    east_radius = EQUATOR_RADIUS_M / np.sqrt(flattening)
+    north_radius = east_radius * (1.0 - ECCENTRICITY_SQUARED) / flattening
+    east = east_radius * np.cos(latitude[0]) * wrap_angle(longitude - longitude[0])
+    return east, north_radius * (latitude - latitude[0])
 
 
 def has_crossing_edges(corners: Array) -> bool:
-    """True if edges of a closed outline (K, 2) cross or touch others than their neighbours."""
-    start, stop = corners, np.roll(corners, -1, axis=0)
-    if (start == stop).all(axis=1).any():
+    """True if edges of a closed outline (K, 2) touch or cross edges other than their neighbours."""
+    start = corners
+    end = np.roll(corners, -1, axis=0)
+    edge = end - start
+    if (start == end).all(axis=1).any():
         return True
 
-    def side(points: Array) -> Array:
-        along = (stop - start)[:, None]
-        to = points[None] - start[:, None]
-        return np.asarray(
-            np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
-        )
+    def find_sides(points: Array) -> Array:
+        """Returns the side (K, K) of each edge on which each point lies: 1 is left, -1 right."""
+        to_point = points[None] - start[:, None]
+        along = edge[:, None]
+        cross = along[..., 0] * to_point[..., 1] - along[..., 1] * to_point[..., 0]
+        return np.asarray(np.sign(cross))
 
-    low = np.minimum(start, stop)
-    high = np.maximum(start, stop)
-    boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
-    apart = side(start) * side(stop)
+    low = np.minimum(start, end)
+    high = np.maximum(start, end)
+    starts_below = low[:, None] <= high[None]
+    ends_above = low[None] <= high[:, None]
+    boxes_overlap = (starts_below & ends_above).all(axis=-1)
+    end_sides = find_sides(end)
+    # -1 where the line through one edge separates the ends of another edge
+    separation = find_sides(start) * end_sides
     index = np.arange(len(corners))
     gap = (index[None] - index[:, None]) % len(corners)
-    distant = (gap > 1) & (gap < len(corners) - 1)
+    are_neighbours = (gap <= 1) | (gap >= len(corners) - 1)
+    crossing = boxes_overlap & (separation <= 0.0) & (separation.T <= 0.0)
     # An edge may not run back along its predecessor.
-    folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
-    ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
-    crossing = boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant
-    return bool(crossing.any() or (folded & ~ahead).any())
+    is_parallel = end_sides[index, (index + 1) % len(corners)] == 0.0
+    runs_back = (edge * np.roll(edge, -1, axis=0)).sum(axis=1) <= 0.0
+    return bool((crossing & ~are_neighbours).any() or (is_parallel & runs_back).any())
 
 
 def compute_depths(points: Array, corners: Array) -> Array:
-    """Distances (n,) of points (n, 2) to the border of an outline (V, 2), below 0 outside [m]."""
-    side = np.roll(corners, -1, axis=0) - corners
-    apart = points[:, None] - corners
-    length2 = np.maximum((side * side).sum(axis=-1), 1e-300)  # two corners may coincide
-    share = np.clip((apart * side).sum(axis=-1) / length2, 0.0, 1.0)
-    away = np.linalg.norm(apart - share[..., None] * side, axis=-1).min(axis=1)
-    above = apart[..., 1] >= 0.0
-    crosses = above != np.roll(above, -1, axis=1)
+    """Returns distances (n,) of points (n, 2) to an outline (V, 2) [m], negative outside it."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    to_point = points[:, None] - corners
+    # Two corners may coincide.
+    length_squared = np.maximum((edge * edge).sum(axis=-1), 1e-300)
+    fraction = np.clip((to_point * edge).sum(axis=-1) / length_squared, 0.0, 1.0)
+    to_edge = to_point - fraction[..., None] * edge
+    distance = np.linalg.norm(to_edge, axis=-1).min(axis=1)
+    # A point is inside if a ray from it to the right crosses the outline an odd number of times.
+    is_above = to_point[..., 1] >= 0.0
+    crosses_height = is_above != np.roll(is_above, -1, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        where = apart[..., 0] - apart[..., 1] * side[:, 0] / side[:, 1]
-    return np.asarray(
-        np.where((crosses & (where < 0.0)).sum(axis=1) % 2 == 1, away, -away)
-    )
+        beyond = to_point[..., 0] - to_point[..., 1] * edge[:, 0] / edge[:, 1]
+    crossings = (crosses_height & (beyond < 0.0)).sum(axis=1)
+    return np.where(crossings % 2 == 1, distance, -distance)
 
 
 @dataclass(frozen=True)
 class Bicycle:
-    """Geometry of a robot that steers; `base_link` is the middle of the unsteered axle."""
+    """Geometry of a steered robot whose `base_link` is the middle of the unsteered axle."""
 
     wheelbase: float  # [m]
-    # the speed is that of the steered wheel, along its own direction
+    # True: speeds are those of the steered wheel, along its own direction
     front_drive: bool = False
 
     def twist(self, speed: Array, angle: Array) -> Array:
         """Returns the body twist (..., 3) of speeds [m/s] and steering angles [rad] (...)."""
         if self.front_drive:
             forward = speed * np.cos(angle)
-            turn = speed * np.sin(angle) / self.wheelbase
+            yaw_rate = speed * np.sin(angle) / self.wheelbase
         else:
             forward = speed
-            turn = speed * np.tan(angle) / self.wheelbase
-        return np.stack([forward, np.zeros_like(forward), turn], axis=-1)
+            yaw_rate = speed * np.tan(angle) / self.wheelbase
+        return np.stack([forward, np.zeros_like(forward), yaw_rate], axis=-1)
 
     def command(self, twist: Array) -> tuple[Array, Array]:
-        """Returns speeds and steering angles (...) of twists (..., 3), both 0 of a turn at rest."""
+        """Returns speeds and steering angles (...) of twists (..., 3), or zeros to turn in place."""
         forward = twist[..., 0]
-        turn = twist[..., 2]
-        across = self.wheelbase * turn  # speed of the front wheel to the left
+        # of the front wheel, to the left
+        sideways = self.wheelbase * twist[..., 2]
         sign = np.sign(forward)
-        angle = np.arctan2(across * sign, np.abs(forward))
-        return (
-            sign * np.hypot(forward, across) if self.front_drive else forward
-        ), angle
+        angle = np.arctan2(sideways * sign, np.abs(forward))
+        if self.front_drive:
+            return sign * np.hypot(forward, sideways), angle
+        return forward, angle
