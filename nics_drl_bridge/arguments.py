@@ -17,9 +17,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 ROBOT_WORDS = ("robot", "model")
 LARGEST_COUNT = 2**31 - 1
-KINDS: dict[
-    str, tuple[tuple[type, ...], str]
-] = {  # annotation -> types, name in errors
+# annotation -> types, name in errors
+KINDS: dict[str, tuple[tuple[type, ...], str]] = {
     "bool": ((bool,), "True or False"),
     "int": ((int,), "a whole number"),
     "float": ((int, float), "a finite number"),
@@ -30,12 +29,12 @@ _SHORT.maxother = 80
 
 
 def to_plain(value: Any) -> Any:
-    """Returns the number of a numpy scalar, and other values as they are; it loads no numpy."""
+    """Returns the number of a numpy scalar, and other values unchanged, without loading numpy."""
     return value.item() if getattr(value, "shape", None) == () else value
 
 
 def format_value(value: Any) -> str:
-    """Returns a value as a message quotes it: a number or text itself, else its type."""
+    """Returns a value as a message quotes it: numbers and text in full, else the type."""
     value = to_plain(value)
     if value is None or isinstance(value, str | bool | int | float | PathLike):
         return _SHORT.repr(value)
@@ -45,22 +44,25 @@ def format_value(value: Any) -> str:
 
 
 def check_kind(what: str, value: Any, annotation: Any) -> None:
-    """Raises ConfigError if a value is not of an annotation bool, int or float, maybe `| None`.
+    """Raises ConfigError unless a value fits an annotation bool, int or float, maybe `| None`.
 
-    Other annotations are not checked. A bool is no number, and a number is finite.
+    Other annotations are not checked. A bool is not a number, and numbers must be finite.
     """
     kind, optional, _ = str(getattr(annotation, "__name__", annotation)).partition(
         " | None"
     )
     if kind not in KINDS or (optional and value is None):
         return
-    types, name = KINDS[kind]
-    number = to_plain(value)
-    fits = kind == "bool" if isinstance(number, bool) else isinstance(number, types)
-    if fits and isinstance(number, float):
-        fits = math.isfinite(number)
+    types, kind_name = KINDS[kind]
+    scalar = to_plain(value)
+    if isinstance(scalar, bool):
+        fits = kind == "bool"
+    else:
+        fits = isinstance(scalar, types)
+    if fits and isinstance(scalar, float):
+        fits = math.isfinite(scalar)
     if not fits:
-        needed = f"{name}, or None" if optional else name
+        needed = f"{kind_name}, or None" if optional else kind_name
         raise ConfigError(f"{what}={format_value(value)}: must be {needed}.")
 
 
@@ -99,78 +101,90 @@ def check_path(what: str, value: Any) -> None:
 def list_keywords(function: Callable[..., Any]) -> set[str]:
     """Returns the names of a function's arguments, without `self` and `**others`."""
     several = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)
-    known = signature(function).parameters.values()
-    return {each.name for each in known if each.kind not in several} - {"self"}
+    parameters = signature(function).parameters.values()
+    return {
+        parameter.name for parameter in parameters if parameter.kind not in several
+    } - {"self"}
 
 
-def refuse_unknown(place: str, given: Iterable[str], known: Iterable[str]) -> None:
-    """Raises ConfigError for the first keyword that is not known, with the nearest one."""
-    valid = set(known)
-    for name in given:
-        if name not in valid:
-            hint = suggest(name, valid)
+def refuse_unknown(
+    place: str, names: Iterable[str], valid_names: Iterable[str]
+) -> None:
+    """Raises ConfigError for the first unknown keyword, with the nearest valid name."""
+    valid_set = set(valid_names)
+    for name in names:
+        if name not in valid_set:
+            hint = suggest(name, valid_set)
             raise ConfigError(f"{place}: unknown argument {name!r}; {hint}")
 
 
 def rename_robot_argument(
-    place: str, own: str, named: dict[str, Any], positional: Any = None
+    place: str, word: str, named: dict[str, Any], positional: Any = None
 ) -> None:
-    """Renames the argument `robot` or `model`, in place, to a function's own word for it.
+    """Renames the argument `robot` or `model`, in place, to the word that a function uses.
 
-    `positional` is the value of its own that was given without a name. Raises ConfigError for two
-    different ones.
+    `positional` is the value that was passed without a name. Raises ConfigError if the two words
+    name different robots.
     """
-    (other,) = set(ROBOT_WORDS) - {own}
-    if other not in named:
+    (synonym,) = set(ROBOT_WORDS) - {word}
+    if synonym not in named:
         return
-    value = named.pop(other)
-    first = named.get(own, positional)
+    value = named.pop(synonym)
+    value_by_word = named.get(word, positional)
     if value is None:
         return
-    if first is not None and not _is_same(first, value):
-        both = f"{own}={format_value(first)} and {other}={format_value(value)}"
+    if value_by_word is not None and not _is_same(value_by_word, value):
+        values = (
+            f"{word}={format_value(value_by_word)} and {synonym}={format_value(value)}"
+        )
         raise ConfigError(
-            f"{place}: {both} name two robots by two words for one thing; give one."
+            f"{place}: {values} name two robots by two words for one thing; give one."
         )
     if positional is None:
-        named[own] = value
+        named[word] = value
 
 
-def _is_same(one: Any, other: Any) -> bool:
-    return one is other or (isinstance(one, str | PathLike) and str(one) == str(other))
+def _is_same(first: Any, second: Any) -> bool:
+    return first is second or (
+        isinstance(first, str | PathLike) and str(first) == str(second)
+    )
 
 
 def check_arguments(
     place: str, passes_to: Callable[..., Any] | None = None, without: Iterable[str] = ()
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Makes a function, called `place` in messages, refuse arguments that it can't mean.
+    """Makes a function, called `place` in messages, refuse unknown and mistyped arguments.
 
-    It accepts `robot=` and `model=` alike if it has either. An unknown keyword, and a value that is
-    not of an annotated bool, int or float, is a ConfigError. `passes_to` gets its `**others`, but
-    for those in `without`, which the function gives itself.
+    It accepts both `robot=` and `model=` if it has either. An unknown keyword is a ConfigError, and
+    so is a value that does not fit its annotation bool, int or float. The function passes its
+    `**others` to `passes_to`, except those in `without`, which it sets itself.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         parameters = signature(function).parameters
         order = list(parameters)
-        own = next((word for word in ROBOT_WORDS if word in parameters), None)
-        known = list_keywords(function)
-        annotations = {name: each.annotation for name, each in parameters.items()}
+        robot_word = next((word for word in ROBOT_WORDS if word in parameters), None)
+        names = list_keywords(function)
+        annotations = {
+            name: parameter.annotation for name, parameter in parameters.items()
+        }
         if passes_to is not None:
-            further = signature(passes_to).parameters
-            known |= list_keywords(passes_to) - set(without)
+            target = signature(passes_to).parameters
+            names |= list_keywords(passes_to) - set(without)
             annotations = {
-                name: each.annotation for name, each in further.items()
+                name: parameter.annotation for name, parameter in target.items()
             } | annotations
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
             named: dict[str, Any] = dict(kwargs)
-            given = dict(zip(order, args, strict=False))
-            if own is not None:
-                rename_robot_argument(place, own, named, given.get(own))
-            refuse_unknown(place, named, known)
-            for name, value in {**given, **named}.items():
+            positional = dict(zip(order, args, strict=False))
+            if robot_word is not None:
+                rename_robot_argument(
+                    place, robot_word, named, positional.get(robot_word)
+                )
+            refuse_unknown(place, named, names)
+            for name, value in {**positional, **named}.items():
                 check_kind(f"{place}: {name}", value, annotations[name])
             return function(*args, **named)
 

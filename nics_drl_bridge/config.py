@@ -1,8 +1,8 @@
 """Strict configuration: YAML files checked against a schema.
 
-Errors name file, key and the nearest valid name. Unlike with PyYAML alone, `1e-3` is a number, a
-key that stands twice an error, aliases and merge keys are counted while reading, as a few lines can
-grow to gigabytes, and tags, which build objects, are refused.
+Errors name file, key and the nearest valid name. Unlike with PyYAML alone, `1e-3` is a number, and
+a duplicate key is an error. Aliases and merge keys are counted while reading, because a few lines
+can grow to gigabytes. Tags are refused, because they build objects.
 """
 
 import re
@@ -26,18 +26,20 @@ MAX_VALUES = 50_000
 _LONGEST_PROBLEM = 200
 
 
-def parse_namespace(given: str) -> str:
-    """A namespace of ROS 2 as `/robot_1`, or empty. Raises ConfigError for what can't be one."""
-    space = given.strip("/")
-    if space and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", space, re.ASCII):
+def parse_namespace(name: str) -> str:
+    """Returns a ROS 2 namespace as `/robot_1`, or empty. Raises ConfigError if it is invalid."""
+    namespace = name.strip("/")
+    if namespace and not re.fullmatch(
+        r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", namespace, re.ASCII
+    ):
         needed = "must be words of letters, digits and _, none beginning with a digit, as /robot_1"
-        raise ConfigError(f"namespace {given!r}: {needed}.")
-    return f"/{space}" if space else ""
+        raise ConfigError(f"namespace {name!r}: {needed}.")
+    return f"/{namespace}" if namespace else ""
 
 
-def _within(most: float, needed: str) -> AfterValidator:
+def _within(limit: float, needed: str) -> AfterValidator:
     def check(value: float) -> float:
-        if abs(value) > most:
+        if abs(value) > limit:
             raise ValueError(f"must be {needed}")
         return value
 
@@ -50,9 +52,8 @@ Heading = Annotated[
 _Near = Annotated[
     float, _within(10.0, "in metres, within 10 (millimetres look like this)")
 ]
-Mount = tuple[
-    _Near, _Near, Heading
-]  # x, y [m] and heading [rad] of a sensor in `base_link`
+# x, y [m] and heading [rad] of a sensor in `base_link`
+Mount = tuple[_Near, _Near, Heading]
 
 
 class Schema(BaseModel):
@@ -67,36 +68,38 @@ SchemaT = TypeVar("SchemaT", bound=BaseModel)
 def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> SchemaT:
     """Checks a file's content against a schema. Raises ConfigError with key, value and fix."""
     try:
-        found = schema.model_validate(data)
+        validated = schema.model_validate(data)
     except ValidationError as error:
         raise ConfigError(f"{source}: {_explain_error(error, schema)}") from None
-    for place, given in _find_coerced(data, found):
+    for place, value in _find_coerced(data, validated):
         raise ConfigError(
-            f"{source}: key {place!r}: should be a number, not {given!r}."
+            f"{source}: key {place!r}: should be a number, not {value!r}."
         )
-    return found
+    return validated
 
 
-def _find_coerced(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+def _find_coerced(
+    raw: Any, validated: Any, place: str = ""
+) -> Iterator[tuple[str, Any]]:
     """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
     pairs: list[tuple[Any, Any, Any]] = []
-    if isinstance(given, dict):
-        parts = found if isinstance(found, dict) else getattr(found, "__dict__", {})
-        pairs = [
-            (key, value, parts[key]) for key, value in given.items() if key in parts
-        ]
-    elif isinstance(found, (tuple, list)) and isinstance(given, (tuple, list)):
-        pairs = [(k, *both) for k, both in enumerate(zip(given, found, strict=False))]
-    elif isinstance(given, (str, bool)) and type(found) in (int, float):
-        yield place.removeprefix("."), given
-    for key, value, made in pairs:
-        yield from _find_coerced(value, made, f"{place}.{key}")
+    if isinstance(raw, dict):
+        parts = (
+            validated
+            if isinstance(validated, dict)
+            else getattr(validated, "__dict__", {})
+        )
+        pairs = [(key, value, parts[key]) for key, value in raw.items() if key in parts]
+    elif isinstance(validated, (tuple, list)) and isinstance(raw, (tuple, list)):
+        pairs = [(k, *pair) for k, pair in enumerate(zip(raw, validated, strict=False))]
+    elif isinstance(raw, (str, bool)) and type(validated) in (int, float):
+        yield place.removeprefix("."), raw
+    for key, value, parsed in pairs:
+        yield from _find_coerced(value, parsed, f"{place}.{key}")
 
 
-_UNKNOWN = (
-    "extra_forbidden",
-    "unexpected_keyword_argument",
-)  # keys of a model, of a dataclass
+# unknown keys of a model, and of a dataclass
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 _NO_KEYS = ("model_type", "model_attributes_type", "dict_type", "dataclass_type")
 _NO_LIST = ("tuple_type", "list_type")
 _COUNT = ("too_short", "too_long")
@@ -106,22 +109,22 @@ _SHORT.maxstring = _SHORT.maxother = 80
 
 def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
     details = error.errors(include_url=False)
-    wrong = [d for d in details if d["type"] != "missing"] or details
-    first = next((d for d in wrong if d["type"] in _UNKNOWN), wrong[0])
+    problems = [d for d in details if d["type"] != "missing"] or details
+    first = next((d for d in problems if d["type"] in _UNKNOWN), problems[0])
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] in _UNKNOWN:
-        known = _locate_fields(schema, first["loc"][:-1])
-        hint = suggest(str(first["loc"][-1]), known) if known else "remove it"
+        names = _locate_fields(schema, first["loc"][:-1])
+        hint = suggest(str(first["loc"][-1]), names) if names else "remove it"
         return f"unknown key {key!r}; {hint}"
     if first["type"] == "union_tag_invalid":
         tag = first["ctx"]["tag"]
-        known = re.findall("'([^']*)'", first["ctx"]["expected_tags"])
-        return f"key {key!r}: unknown kind {tag!r}; {suggest(tag, known)}"
+        names = re.findall("'([^']*)'", first["ctx"]["expected_tags"])
+        return f"key {key!r}: unknown kind {tag!r}; {suggest(tag, names)}"
     if first["type"] == "union_tag_not_found":
         return f"the key '{key}.kind' is missing; add it."
-    if first["type"] == "missing" and isinstance(place := first["loc"][-1], int):
+    if first["type"] == "missing" and isinstance(index := first["loc"][-1], int):
         key = ".".join(map(str, first["loc"][:-1]))
-        return f"key {key!r}: number of entries must be more than {place}."
+        return f"key {key!r}: number of entries must be more than {index}."
     if first["type"] == "missing":
         return f"the key {key!r} is missing; add it."
     if first["type"] in _NO_KEYS:
@@ -129,11 +132,11 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
     if first["type"] in _NO_LIST:
         return f"key {key!r}: must be a list, as [a, b], not {_SHORT.repr(first['input'])}."
     if first["type"] in _COUNT:
-        least, most, found = map(
+        minimum, maximum, count = map(
             first["ctx"].get, ("min_length", "max_length", "actual_length")
         )
-        told = f"at most {most}" if least is None else f"at least {least}"
-        return f"key {key!r}: number of entries must be {told}, not {found}."
+        bounds = f"at most {maximum}" if minimum is None else f"at least {minimum}"
+        return f"key {key!r}: number of entries must be {bounds}, not {count}."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     message = message[0].lower() + message[1:]
     if not key:  # an error of several keys, which the message names
@@ -144,7 +147,7 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
 def _locate_fields(
     schema: type[BaseModel], location: tuple[int | str, ...]
 ) -> list[str]:
-    """Field names at a location, which in a union of models names the `kind` that is present."""
+    """Returns the field names at a location; in a union of models it names the present `kind`."""
     current: Any = schema
     candidates: list[type] = []
     for part in location:
@@ -153,10 +156,18 @@ def _locate_fields(
             candidates = _find_inner_models(fields[part])
             current = candidates[0] if candidates else None
         else:
-            kinds = (getattr(one, "model_fields", {}).get("kind") for one in candidates)
+            kinds = (
+                getattr(candidate, "model_fields", {}).get("kind")
+                for candidate in candidates
+            )
             named = zip(candidates, kinds, strict=True)
             current = next(
-                (one for one, kind in named if kind and kind.default == part), current
+                (
+                    candidate
+                    for candidate, kind in named
+                    if kind and kind.default == part
+                ),
+                current,
             )
     return list(_get_annotations(current))
 
@@ -176,19 +187,19 @@ def _find_inner_models(annotation: Any) -> list[type]:
 
 
 def check_no_device(path: Path) -> Path:
-    """Returns the path. Raises ConfigError for a device or a pipe, which may never end."""
+    """Returns the path. Raises ConfigError for a device or a pipe, which might never end."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
     return path
 
 
-def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
-    """Reads a UTF-8 file of at most `most` bytes. Raises ConfigError if that fails."""
+def read_text(path: str | Path, limit: int = MAX_BYTES) -> str:
+    """Reads a UTF-8 file of at most `limit` bytes. Raises ConfigError if that fails."""
     path = Path(path)
     try:
         size = check_no_device(path).stat().st_size
-        if size > most and path.is_file():
-            reason = f"is larger than {most // 2**20} MB, which no such file is"
+        if size > limit and path.is_file():
+            reason = f"is larger than {limit // 2**20} MB, which no such file is"
             raise ConfigError(f"{path}: {reason}; give another.")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -208,9 +219,9 @@ def load_yaml(path: str | Path, schema: type[SchemaT]) -> SchemaT:
 
 
 def share_folder() -> Path:
-    """The folder that contains `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
-    checkout, *others = Path(__file__).resolve().parents[1:]
-    for folder in (checkout, *(parent / "share" / PACKAGE for parent in others)):
+    """Returns the folder of `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
+    checkout, *parents = Path(__file__).resolve().parents[1:]
+    for folder in (checkout, *(parent / "share" / PACKAGE for parent in parents)):
         if (folder / "config" / "robots").is_dir():
             return folder
     raise ConfigError(
@@ -219,20 +230,20 @@ def share_folder() -> Path:
 
 
 def list_shipped(kind: str) -> list[str]:
-    """Names of the YAML files, or policies, in `config/KIND`, sorted."""
+    """Returns the names of the YAML files, or policies, in `config/KIND`, sorted."""
     files = (share_folder() / "config" / kind).glob("*.*")
     return sorted(file.stem for file in files if file.suffix in (".yaml", ".onnx"))
 
 
-def find_config(name: str | Path, kind: str, also: Iterable[str] = ()) -> Path:
-    """Finds `arena` in `config/KIND`, or a YAML file; ConfigError names the nearest, or `also`."""
+def find_config(name: str | Path, kind: str, extra_names: Iterable[str] = ()) -> Path:
+    """Finds `arena` in `config/KIND`, or a YAML file; ConfigError suggests a name."""
     name = str(name)
     if name.endswith((".yaml", ".yml")):
         return Path(name)
     path = share_folder() / "config" / kind / f"{name}.yaml"
     if path.is_file():
         return path
-    hint = suggest(name, (*list_shipped(kind), *also))
+    hint = suggest(name, (*list_shipped(kind), *extra_names))
     word = {"training": "settings", "limits": "limits"}.get(
         kind, kind.removesuffix("s")
     )
@@ -291,15 +302,15 @@ class _Loader(*_BASES):  # type: ignore[misc]
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         if not isinstance(node, yaml.MappingNode):
             self._refuse(node, "`<<` must be followed by the alias of a mapping")
-        seen: set[Any] = set()
+        keys: set[Any] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 self._refuse(key, "a key must be one word or number")
-            if key.value in seen:
+            if key.value in keys:
                 self._refuse(
                     key, f"the key {reprlib.repr(key.value)} stands twice; keep one"
                 )
-            seen.add(key.value)
+            keys.add(key.value)
         return dict(super().construct_mapping(node, deep=deep))
 
     @staticmethod
@@ -330,10 +341,10 @@ _FLOAT = re.compile(
 _Loader.yaml_implicit_resolvers = {
     first: [
         (tag, pattern)
-        for tag, pattern in some
+        for tag, pattern in resolvers
         if tag in (f"{_TAG}null", f"{_TAG}merge")
     ]
-    for first, some in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 for _kind, _type, _pattern, _first in (
     (_Loader, "bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), "tTfF"),
@@ -345,7 +356,7 @@ for _kind, _type, _pattern, _first in (
 
 
 def parse_yaml(text: str, source: str) -> dict[str, Any]:
-    """Reads a YAML mapping from the text of `source`; ConfigError if it is none, or too large."""
+    """Reads a YAML mapping from the text of `source`. Raises ConfigError if it is not one."""
     if len(text) > MAX_BYTES:
         reason = (
             f"is larger than {MAX_BYTES // 2**20} MB; give a configuration instead."
@@ -371,7 +382,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
 
 
 class _QuotingDumper(_Dumper):
-    """Dumper that quotes every text, for readers with other rules of what looks like a number."""
+    """Dumper that quotes every text, for readers that take other texts for numbers."""
 
 
 def _quote(dumper: _QuotingDumper, text: str) -> Any:

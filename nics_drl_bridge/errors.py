@@ -1,4 +1,4 @@
-"""Errors that a user can cause and fix, each of one sentence: what was wrong, where, what to do."""
+"""Errors that a user can cause and fix: one sentence that says what, where, and what to do."""
 
 import difflib
 from collections.abc import Iterable
@@ -10,10 +10,10 @@ LONGEST = 800
 LONGEST_NAME = 100  # characters of a name that are compared with the known names
 
 
-def shorten(text: str, most: int) -> str:
-    """One printable line of about `most` characters: messages quote whatever users gave."""
-    if len(text) > most:
-        text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
+def shorten(text: str, length: int) -> str:
+    """Returns one printable line of about `length` characters, as messages quote user input."""
+    if len(text) > length:
+        text = f"{text[: length // 2]} ... {text[-(length // 2) :]}"
     text = " ".join(text.split())
     if text.isprintable():
         return text
@@ -57,15 +57,12 @@ class PolicyError(BridgeError):
         super().__init__(f"{source}: field {self.field!r}: {self.reason}")
 
     def __reduce__(self) -> "tuple[type[PolicyError], tuple[str, str, str]]":
-        return type(self), (
-            self.source,
-            self.field,
-            self.reason,
-        )  # so that it can be pickled
+        """Lets the error be pickled."""
+        return type(self), (self.source, self.field, self.reason)
 
 
 class StaleDataError(BackendError):
-    """No fresh data arrived on a topic in time; the age is `inf` if there never was a message."""
+    """No fresh data arrived on a topic in time; the age is `inf` if no message ever came."""
 
     def __init__(self, topic: str, age_s: float, limit_s: float) -> None:
         self.topic = topic
@@ -79,16 +76,14 @@ class StaleDataError(BackendError):
         )
 
     def __reduce__(self) -> "tuple[type[StaleDataError], tuple[str, float, float]]":
-        return type(self), (
-            self.topic,
-            self.age_s,
-            self.limit_s,
-        )  # so that it can be pickled
+        """Lets the error be pickled."""
+        return type(self), (self.topic, self.age_s, self.limit_s)
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
+def suggest(name: str, valid_names: Iterable[str]) -> str:
     """Returns a clause: `did you mean 'x'?`, or `valid are: 'x', 'y'` if none is close."""
-    names = sorted(known)
-    for close in difflib.get_close_matches(shorten(name, LONGEST_NAME), names, n=1):
-        return f"did you mean {close!r}?"
-    return "valid are: " + ", ".join(repr(n) for n in names)
+    candidates = sorted(valid_names)
+    close = difflib.get_close_matches(shorten(name, LONGEST_NAME), candidates, n=1)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return "valid are: " + ", ".join(map(repr, candidates))

@@ -1,4 +1,4 @@
-"""Atomic writes and checksums: a reader finds the old file or the new, and notices any damage."""
+"""Atomic writes and checksums: a reader finds the old or the new file, and detects damage."""
 
 import ctypes
 import errno
@@ -43,7 +43,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
-    """Writes a file as `write_bytes` does, but in parts: it is never entirely in memory."""
+    """Writes a file like `write_bytes`, but in parts, so that it need not fit into memory."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _name_path_in_errors(path):
@@ -54,7 +54,7 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
                 file.writelines(parts)
                 file.flush()
                 os.fsync(file.fileno())
-                if _POSIX:  # while its lock tells that its writer lives
+                if _POSIX:  # while the lock still shows that its writer lives
                     os.replace(temporary, path)
             if not _POSIX:  # Windows renames no open file
                 os.replace(temporary, path)
@@ -64,9 +64,9 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
     _fsync(path.parent)
 
 
-# What is not whole yet has a hidden name beside its place. Its writer holds a lock on it, which the
-# system takes back when the writer ends, however that happens. Modes are those of the umask: it is
-# applied by the system when a file or folder is made, which `tempfile` does for its owner alone.
+# An unfinished file or folder has a hidden name beside its final path. Its writer holds a lock on
+# it, which the system releases when the writer ends, even by a crash. `tempfile` would make files
+# that only their owner can read; here the umask applies.
 
 UNFINISHED = "unfinished"
 REPLACED = "replaced"
@@ -74,7 +74,7 @@ _HIDDEN = re.compile(rf"\.(.+)\.[0-9a-f]{{8}}\.({UNFINISHED}|{REPLACED})", re.DO
 
 
 def make_hidden_name(path: Path, ending: str = "") -> Path:
-    """A new hidden name beside a path; `ending` tells what is not needed after a crash."""
+    """Returns a new hidden path beside a path; `ending` marks what a crash may leave behind."""
     return path.parent / f".{path.name}.{secrets.token_hex(4)}{ending and f'.{ending}'}"
 
 
@@ -105,12 +105,11 @@ def begin_folder(path: Path) -> tuple[Path, int | None]:
 
 
 def _lock_new(path: Path, descriptor: int) -> bool:
-    """Locks what was just made; False if somebody took it for a leftover and removed it."""
+    """Locks a new file or folder; False if another process removed it as a leftover."""
     if fcntl is None:
         return True
-    with suppress(
-        OSError
-    ):  # a file system without locks, on which nothing is removed either
+    # On a file system without locks, nothing is removed either.
+    with suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))
@@ -119,16 +118,16 @@ def _lock_new(path: Path, descriptor: int) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes what killed writers left in a folder; never what belongs to a living one."""
+    """Removes what killed writers left in a folder, never what a living one still writes."""
     if fcntl is None:
         return
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
-            found = _HIDDEN.fullmatch(entry.name)
-            if found is None or entry.is_symlink():
+            match = _HIDDEN.fullmatch(entry.name)
+            if match is None or entry.is_symlink():
                 continue
-            # The old version of a folder may be the only one, if its writer was killed just then.
-            if found[2] == REPLACED and not (folder / found[1]).exists():
+            # If its writer was killed while swapping, the old version may be the only one left.
+            if match[2] == REPLACED and not (folder / match[1]).exists():
                 continue
             _remove_if_left(Path(entry.path))
 
@@ -150,28 +149,28 @@ def _remove_if_left(path: Path) -> None:
 
 @contextmanager
 def write_whole_file(path: str | Path) -> Iterator[Path]:
-    """Yields a path for a library that writes files itself; it becomes `path` if the block ends.
+    """Yields a temporary path for a library that writes files itself; renames it to `path`.
 
-    It has the same ending. Nothing is left if the block raises.
+    It has the same file ending. If the block raises, nothing is left.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _name_path_in_errors(path):
         remove_leftovers(path.parent)
-        room, descriptor = begin_folder(path)
+        folder, descriptor = begin_folder(path)
     try:
-        yield room / path.name
-        os.replace(room / path.name, path)
+        yield folder / path.name
+        os.replace(folder / path.name, path)
         _fsync(path.parent)
     finally:
-        shutil.rmtree(room, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         if descriptor is not None:
             os.close(descriptor)
 
 
 @contextmanager
 def _name_path_in_errors(path: Path) -> Iterator[None]:
-    """Lets errors of the system name the path that was asked for, and no temporary one."""
+    """Makes system errors name the requested path instead of a temporary one."""
     try:
         yield
     except OSError as error:
@@ -187,9 +186,9 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def format_json(data: Any, indent: int | None = None) -> str:
-    """JSON of plain data: null for numbers that are not finite, text for the unknown."""
-    known = json.loads(json.dumps(data, default=str), parse_constant=lambda _: None)
-    return json.dumps(known, allow_nan=False, indent=indent)
+    """Formats data as JSON, with null for numbers that are not finite and text for objects."""
+    finite = json.loads(json.dumps(data, default=str), parse_constant=lambda _: None)
+    return json.dumps(finite, allow_nan=False, indent=indent)
 
 
 def check_folder(path: str | Path, marker: str) -> Path:
@@ -223,10 +222,10 @@ def write_whole_folder(
 ) -> Iterator[Path]:
     """Yields a temporary folder that replaces `path` if the block succeeds, else is removed.
 
-    It replaces only an empty folder or one with `marker`, a file of all of this kind, so that a
-    wrong `--out` never deletes work; a symbolic link stays. Of the folder that it replaces, files
-    remain that the block did not write and of which `is_own` is false for their path in it: the
-    user put them there. Raises ConfigError, see `check_folder`.
+    It replaces only an empty folder, or one with the file `marker`, which all folders of this kind
+    hold: a wrong `--out` never deletes work. A symbolic link stays. Files of the user stay, too:
+    those that the block did not write and for whose relative path `is_own` is false. Raises
+    ConfigError, see `check_folder`.
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -246,11 +245,11 @@ def write_whole_folder(
 
 
 def _keep_others(old: Path, new: Path, is_own: Callable[[str], bool]) -> None:
-    """Puts what the user put into an old folder into the new one too."""
+    """Copies the user's own files from the old folder to the new one."""
     for folder, folders, names in os.walk(old):
-        whole = Path(folder).relative_to(old)
-        if not (folders or names or is_own(whole.as_posix())):
-            (new / whole).mkdir(parents=True, exist_ok=True)
+        relative = Path(folder).relative_to(old)
+        if not (folders or names or is_own(relative.as_posix())):
+            (new / relative).mkdir(parents=True, exist_ok=True)
         links = [name for name in folders if Path(folder, name).is_symlink()]
         for name in (*names, *links):
             source = Path(folder, name)
@@ -284,22 +283,19 @@ def _swap(new: Path, path: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _exchange(one: Path, other: Path) -> bool:
-    """Exchanges two paths atomically; False if the system can't (renameat2 is Linux's alone)."""
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchanges two paths atomically; False if the system can't (only Linux has renameat2)."""
     library = ctypes.CDLL(None, use_errno=True) if _POSIX else None
     if (rename := getattr(library, "renameat2", None)) is None:
         return False
-    if (
-        rename(
-            _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
-        )
-        == 0
-    ):
+    source = (_AT_FDCWD, os.fsencode(first))
+    target = (_AT_FDCWD, os.fsencode(second))
+    if rename(*source, *target, _RENAME_EXCHANGE) == 0:
         return True
     code = ctypes.get_errno()
     if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOENT):
         return False
-    raise OSError(code, os.strerror(code), str(other))
+    raise OSError(code, os.strerror(code), str(second))
 
 
 def sync_folder(folder: Path) -> None:
@@ -310,20 +306,19 @@ def sync_folder(folder: Path) -> None:
 
 # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
 SUMS = "SHA256SUMS"
-MOST_BYTES = (
-    256 * 2**20
-)  # of a file of arrays: a day of driving, or a table of a thousand shapes
+# limit of a file of arrays: a day of driving, or a table of a thousand shapes
+MOST_BYTES = 256 * 2**20
 _SEAL = b"sha256 "
 _PART = 2**20
 
 
 def hash_bytes(data: bytes) -> str:
-    """The SHA-256 of some bytes, in hexadecimal."""
+    """Returns the SHA-256 of some bytes, in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
 
 
 def _hash_next(file: BinaryIO, size: int) -> str:
-    """The SHA-256 of the next `size` bytes of a file, which are never all in memory."""
+    """Returns the SHA-256 of the next `size` bytes of a file, read in parts."""
     digest = hashlib.sha256()
     while size > 0 and (part := file.read(min(size, _PART))):
         digest.update(part)
@@ -337,7 +332,7 @@ def seal(data: bytes) -> bytes:
 
 
 def check_sealed(file: BinaryIO) -> None:
-    """Verifies in parts the checksum that `seal` appended, and rewinds; ValueError if wrong."""
+    """Verifies the checksum that `seal` appended, and rewinds. Raises ValueError."""
     size = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
     file.seek(0)
     digest = _hash_next(file, size)
@@ -347,17 +342,17 @@ def check_sealed(file: BinaryIO) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """The content of a file. Raises ValueError if it is larger than any file of arrays."""
+    """Returns the content of a file. Raises ValueError if it is larger than any file of arrays."""
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
     return path.read_bytes()
 
 
 def names_in_sums(folder: Path) -> set[str]:
-    """The names that the `SHA256SUMS` of a folder lists; none if it can't be read."""
+    """Returns the names that the `SHA256SUMS` of a folder lists, or none if it can't be read."""
     try:
-        with (folder / SUMS).open("rb") as file:
-            lines = file.read(_PART).decode(errors="replace").splitlines()
+        with (folder / SUMS).open("rb") as sums:
+            lines = sums.read(_PART).decode(errors="replace").splitlines()
     except OSError:
         return set()
     return {line[66:] for line in lines}
@@ -375,27 +370,31 @@ def write_sums(folder: Path) -> None:
 def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
     """Checks files of a model or a lidar table against the `SHA256SUMS` of their folder.
 
-    All names must be listed, but `editable`, whose line a user may have removed to edit it. Raises
-    ModelError if a file is missing, too large or different, or another is listed.
+    All names must be listed, except `editable`: a user may remove its line to edit it. Raises
+    ModelError if a file is missing, too large or changed, or if another file is listed.
     """
     with _open_file(folder / SUMS) as file:
         listed = file.readlines(_PART)
     expected = {name: _format_line(folder, name) for name in names}
     for name, line in expected.items():
-        free = name == editable
+        is_editable = name == editable
         if line in listed or (
-            free and not any(one.endswith(line[64:]) for one in listed)
+            is_editable and not any(entry.endswith(line[64:]) for entry in listed)
         ):
             continue
-        if free:
-            own = f"if you changed it yourself, remove its line from {SUMS}, otherwise "
+        if is_editable:
+            hint = (
+                f"if you changed it yourself, remove its line from {SUMS}, otherwise "
+            )
         else:
-            own = ""
-        reason = f"does not match its checksum in {SUMS}; {own}generate the model anew."
+            hint = ""
+        reason = (
+            f"does not match its checksum in {SUMS}; {hint}generate the model anew."
+        )
         raise ModelError(f"{folder / name}: {reason}")
     for line in listed:
         if line not in expected.values():
-            reason = f"line {line.decode(errors='replace')!r} is of no file of a model; remove it."
+            reason = f"line {line.decode(errors='replace')!r} names no file of a model; remove it."
             raise ModelError(f"{folder / SUMS}: the {reason}")
 
 

@@ -42,7 +42,7 @@ TABLE_FOLDER = "lidar_table"
 REPORT_FILE = "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
 MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
-# what `nics generate` draws of a fit; some pictures are of earlier versions
+# what `nics generate` draws; earlier versions wrote some of the pictures
 REPORT_PAGE = "report.html"
 PICTURES_FOLDER = "pictures"
 PICTURES = (
@@ -70,39 +70,34 @@ class SimulatorModel:
 
     robot: RobotSpec
     kinematics: TaylorModel  # fitted and pruned
-    calibration: (
-        Calibration  # clock offset, latency, sensor frames, noise of the recording
-    )
+    # clock offset, latency, sensor frames, noise of the recording
+    calibration: Calibration
     lidar: LidarSpec
     table: LidarTable  # baked ranges of the obstacles' shapes and of the robot itself
     noise: Noise = field(default_factory=Noise)  # of sensors and motion
     # between commands; a whole number of `kinematics.dt`
     control_period: float = CONTROL_PERIOD_S
     report: str = ""  # how the model was made, as readable text
-    latency: Latency = field(
-        default_factory=Latency
-    )  # of scan and odometry, where it was shown
-    sensors: tuple[Sensor, ...] = ()  # that the robot has beside its lidar
-    gyro: bool = False  # a gyro turned the recorded poses, or confirmed how they turned
+    # of scan and odometry, if the recording showed it
+    latency: Latency = field(default_factory=Latency)
+    sensors: tuple[Sensor, ...] = ()  # besides the lidar
+    # True: a gyro measured the recorded headings, or confirmed them
+    gyro: bool = False
 
     def __post_init__(self) -> None:
         robot = self.robot
-        known = (self.kinematics.variables, self.kinematics.dofs)
-        needed = robot.variable_names, robot.dof_names
-        if known != needed:
-            reason = (
-                f"the robot {robot.name!r} needs {needed}; generate the model anew."
-            )
+        fitted = (self.kinematics.variables, self.kinematics.dofs)
+        needed = (robot.variable_names, robot.dof_names)
+        if fitted != needed:
+            reason = f"robot {robot.name!r} needs {needed}; generate the model anew."
             raise ModelError(
-                f"the kinematics have variables and rates {known}, {reason}"
+                f"the kinematics have variables and rates {fitted}, {reason}"
             )
         check_sensors(self.sensors, (self.lidar.frame,))
         period = self.control_period
         dt = self.kinematics.dt
-        if (
-            not 0.5 < period / dt < np.inf
-            or abs(period / dt - round(period / dt)) > 1e-6
-        ):
+        steps = period / dt
+        if not 0.5 < steps < np.inf or abs(steps - round(steps)) > 1e-6:
             reason = f"is no multiple of the model's step {dt} s; change one of them."
             raise ModelError(f"control_period {period} s {reason}")
 
@@ -116,7 +111,8 @@ class SimulatorModel:
     @cached_property
     def text(self) -> str:
         """The content of `model.yaml`."""
-        # The kinematics hold what motors do, of which an identification's calibration has a copy.
+        # The kinematics hold the motors' parameters; a calibration that was just identified has a
+        # copy of them.
         calibration = {
             k: v for k, v in asdict(self.calibration).items() if k not in MOTORS
         }
@@ -176,14 +172,19 @@ def generate(
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
-    Several recordings of one robot are fitted together (`identify.joined`). The robot (or `model`)
-    is a RobotSpec, a name, a YAML file, or a model of it; the lidar is by default the robot's own.
-    The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor
-    model, `auto` for the one that predicts best, `alpha` the pruning threshold of Eq. 2. `assume`
-    fills in from the textbook what the drive did not show, marked as assumed; `strict` refuses a
-    drive that did not excite every input alone; `anyway` accepts predictions hardly better than a
-    standing robot's; `sensors` are beside its lidar. Raises RecordingError for a recording that is
-    unfit for the robot, FitError for a useless model.
+    Raises RecordingError if the recording does not fit the robot, FitError if the model is useless.
+
+    Args:
+        recording: a recording, or several of one robot, which are fitted together.
+        robot: a RobotSpec, a name, a YAML file, or a model of the robot; also called `model`.
+        lidar: a LidarSpec, a name or a YAML file; by default the robot's own.
+        shapes: obstacles to bake, besides the robot's own footprint.
+        order: order of the Taylor model; `auto` chooses the one that predicts best.
+        alpha: pruning threshold of Eq. 2; `auto` finds the knee.
+        assume: True fills in from the textbook what the drive did not show, marked as assumed.
+        strict: True refuses a drive that did not excite each input on its own.
+        anyway: True accepts a model that predicts hardly better than a standing robot.
+        sensors: sensors besides the lidar.
     """
     _check_given(recording, shapes, sensors)
     alpha = fit.parse_alpha(str(alpha))
@@ -198,12 +199,11 @@ def generate(
     )
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
-    robot = (
-        identified.drive.spec
-    )  # the state of a textbook that was written may be another
-    # The usual period [s], or that of a slower lidar: nothing new is seen before its next scan.
-    steps = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / identified.model.dt
+    # It may have another state, if the fit fell back to the textbook.
+    robot = identified.drive.spec
+    # A lidar slower than the usual control period brings nothing new before its next scan.
     dt = identified.model.dt
+    steps = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / dt
     model = SimulatorModel(
         robot,
         identified.model,
@@ -222,20 +222,20 @@ def generate(
 
 def _check_given(recording: object, shapes: object, sensors: object) -> None:
     """Raises ConfigError for a recording, shapes or sensors of a wrong type."""
-    every = list(recording) if isinstance(recording, list | tuple) else [recording]
-    if not every or not all(isinstance(one, Recording) for one in every):
+    recordings = list(recording) if isinstance(recording, list | tuple) else [recording]
+    if not recordings or not all(isinstance(item, Recording) for item in recordings):
         needed = "a Recording, as read_recording(path) gives, or a list of them"
         raise ConfigError(
             f"generate: recording={format_value(recording)}: must be {needed}."
         )
-    for name, given in (("shapes", shapes), ("sensors", sensors)):
-        fits = isinstance(given, list | tuple) and all(
-            isinstance(one, Schema) for one in given
+    for name, value in (("shapes", shapes), ("sensors", sensors)):
+        fits = isinstance(value, list | tuple) and all(
+            isinstance(item, Schema) for item in value
         )
         if not fits:
             needed = f"a list of {name} of this package"
             raise ConfigError(
-                f"generate: {name}={format_value(given)}: must be {needed}."
+                f"generate: {name}={format_value(value)}: must be {needed}."
             )
 
 
@@ -251,16 +251,17 @@ def _get_spec(robot: object) -> RobotSpec:
 
 
 def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
-    """Shape of the robot's footprint around its `base_link`."""
+    """Returns the shape of the robot's footprint around its `base_link`."""
     if robot.footprint is None:
         return Circle(radius=robot.footprint_radius)
     return Polygon(points=robot.footprint)
 
 
 def mount_lidar(robot: RobotSpec, name: str | None = None) -> LidarSpec:
-    """A lidar by name or file where the robot has it mounted; by default the robot's usual one.
+    """Returns a lidar, by name or file, mounted where the robot's file says.
 
-    That is the one that its file names, else that of the paper. Raises ConfigError.
+    By default it is the lidar that the robot's file names, or else that of the paper. Raises
+    ConfigError.
     """
     spec = load_lidar(name or robot.lidar or DEFAULT_LIDAR)
     mount = robot.lidar_mount
@@ -269,9 +270,9 @@ def mount_lidar(robot: RobotSpec, name: str | None = None) -> LidarSpec:
 
 @lru_cache(maxsize=8)
 def builtin_model(robot: str, content: str = "") -> SimulatorModel:
-    """The model of a shipped robot, generated from a drive of its textbook kinematics.
+    """Returns a model of a shipped robot or a robot's YAML file, by its textbook kinematics.
 
-    Each is generated once, that of a file once for each `content` of the file.
+    Each model is generated once; that of a file once for each `content`.
     """
     spec = load_robot(robot)
     if Path(robot, MODEL_FILE).is_file():
@@ -285,10 +286,10 @@ def builtin_model(robot: str, content: str = "") -> SimulatorModel:
 def open_model(
     name: str | Path | SimulatorModel, lidar: str | None = None
 ) -> SimulatorModel:
-    """Opens a model by a shipped robot (`ackermann`), by folder (`./mine`), or by a robot's YAML.
+    """Opens a model: a shipped robot (`ackermann`), a folder (`./mine`), or a robot's YAML file.
 
-    A `lidar`, shipped or a YAML file, takes the place of the model's own. A model that is open
-    already is returned as it is.
+    A `lidar`, shipped or a YAML file, replaces the model's own. An open model is returned
+    unchanged.
     """
     if not isinstance(name, str | Path | SimulatorModel) or name == "":
         needed = "a shipped robot's name, a model's folder, a robot's YAML, or a SimulatorModel"
@@ -327,11 +328,10 @@ def check_place(folder: str | Path) -> None:
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
     """Writes a model as a folder, completely or not at all; see `check_place`.
 
-    In the place of an older model, it replaces that with its report and pictures. What the user put
-    into the folder stays there.
+    It replaces an older model with its report and pictures. Other files in the folder stay.
     """
-    own = {*MODEL_FILES, files.SUMS, *DRAWN_FILES, *files.names_in_sums(Path(folder))}
-    with files.write_whole_folder(folder, MODEL_FILE, own.__contains__) as temporary:
+    owned = {*MODEL_FILES, files.SUMS, *DRAWN_FILES, *files.names_in_sums(Path(folder))}
+    with files.write_whole_folder(folder, MODEL_FILE, owned.__contains__) as temporary:
         files.write_text(temporary / MODEL_FILE, model.text)
         files.write_text(temporary / REPORT_FILE, model.report)
         model.table.save(temporary / TABLE_FOLDER)
@@ -339,7 +339,7 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
 
 
 def load_model(folder: str | Path) -> SimulatorModel:
-    """Reads a model that `save_model` wrote; ConfigError, ModelError if it is not whole."""
+    """Reads a model that `save_model` wrote. Raises ConfigError, ModelError."""
     check_path("folder", folder)
     folder = Path(folder)
     path = folder / MODEL_FILE
@@ -353,12 +353,12 @@ def load_model(folder: str | Path) -> SimulatorModel:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
         raise ModelError(f"{path}: {reason}; generate the model anew.")
     files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
-    if isinstance(
-        data.get("robot"), dict
-    ):  # files without the key are older than its default
+    # A file without the key was written before the key's default changed.
+    if isinstance(data.get("robot"), dict):
         data["robot"].setdefault("angular_is", "steering")
     file = validate(data, _File, str(path))
-    for key in fields(Calibration):  # its defaults are those of a robot that needs none
+    # A file must say its calibration; the defaults are for a robot without any offset.
+    for key in fields(Calibration):
         if key.name not in (*data["calibration"], *MOTORS):
             raise ConfigError(
                 f"{path}: the key 'calibration.{key.name}' is missing; add it."

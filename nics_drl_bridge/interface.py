@@ -17,20 +17,19 @@ class RobotView:
     """All that a task or a policy may know about a robot, or about a batch of robots.
 
     The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator. The stamp
-    is the newest data's, ages are at the time of the view; a range of NaN is unknown.
+    is that of the newest data; ages are at the time of the view. NaN is an unknown range.
     """
 
     pose: Array  # (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`
     twist: Array  # (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`
-    ranges: NDArray[
-        np.float32
-    ]  # (..., B) [m], REP-117: `inf` no return, `-inf` too close
+    # (..., B) [m], REP-117: `inf` no return, `-inf` too close
+    ranges: NDArray[np.float32]
     stamp_s: float
     scan_age_s: float
     odom_age_s: float
-    # Name of a further sensor -> (..., S) its reading, see `lidar.sensor`; and the greatest age.
+    # name of an additional sensor -> (..., S) its reading, see `lidar.sensor`
     sensed: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    sensed_age_s: float = 0.0
+    sensed_age_s: float = 0.0  # maximum age of these readings
 
 
 def stack_views(views: Sequence[RobotView]) -> RobotView:
@@ -39,12 +38,12 @@ def stack_views(views: Sequence[RobotView]) -> RobotView:
         name: np.stack([view.sensed[name] for view in views])
         for name in views[0].sensed
     }
-    known: dict[str, Any] = {"sensed": sensed}
+    fields: dict[str, Any] = {"sensed": sensed}
     for name in ("pose", "twist", "ranges"):
-        known[name] = np.stack([getattr(view, name) for view in views])
+        fields[name] = np.stack([getattr(view, name) for view in views])
     for name in ("stamp_s", "scan_age_s", "odom_age_s", "sensed_age_s"):
-        known[name] = max(getattr(view, name) for view in views)
-    return RobotView(**known)
+        fields[name] = max(getattr(view, name) for view in views)
+    return RobotView(**fields)
 
 
 @dataclass(frozen=True)
@@ -61,12 +60,9 @@ class BackendFacts(TypedDict, total=False):
     true_pose: Array  # (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team
     true_collision: bool | NDArray[np.bool_]  # True after a contact; (M,) of a team
     bodies: Array  # (K, 7) obstacles where they are now, see `sim.scenes.Scene`
-    randomisation: dict[
-        str, Any
-    ]  # name -> value that was drawn for the episode, where any was
-    scenes: Callable[
-        [ArrayLike], Any
-    ]  # gives scenes for seeds (n,), if the world alone does not
+    randomisation: dict[str, Any]  # name -> value drawn for the episode, if any
+    # draws scenes for seeds (n,), where the world alone can't
+    scenes: Callable[[ArrayLike], Any]
 
 
 @runtime_checkable
@@ -74,16 +70,16 @@ class Backend(Protocol):
     """Access to a robot: a simulator in process, or whatever is behind ROS 2 topics."""
 
     def reset(self, start: Start) -> RobotView:
-        """Begins an episode and returns its first view."""
+        """Starts an episode and returns its first view."""
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Applies a command (C,) of the RobotSpec for one period: view at its end, and `info`."""
+        """Applies a command (C,) for one period; returns the view at its end, and `info`."""
 
     def facts(self) -> BackendFacts:
-        """Returns what this backend alone knows at present; it may be called at any time."""
+        """Returns what only this backend knows at present; may be called at any time."""
 
     def halt(self) -> None:
-        """Stops the robot and ends the episode, at any time: after an error, twice, when closed."""
+        """Stops the robot and ends the episode; may be called at any time, even when closed."""
 
     def close(self) -> None:
         """Stops the robot with a zero command and frees all resources."""

@@ -1,8 +1,8 @@
-"""`@kernel`: the one decorator by which functions are compiled, kept on disk, and kept up to date.
+"""`@kernel`: compiles functions, caches their machine code on disk, and keeps it up to date.
 
-numba checks the file of the function itself only. Here, machine code on disk is kept as long as no
-module that its own module imports, directly or not, has changed its content: of this package, or of
-the folders in which a kernel of your own lies.
+numba itself checks only the file that defines a function. Here, cached code is valid until its
+module, or any module that this one imports, directly or not, changes. Modules of this package
+count, and those in the folder of a user's own kernel.
 """
 
 import gc
@@ -33,16 +33,16 @@ from numba.np.arrayobj import make_array
 from nics_drl_bridge.status import REPEATED_S, STATUS
 
 PACKAGE = Path(__file__).parent
-PATIENCE_S = 2.0  # Compiling that takes longer is announced, on standard error
-SECONDS_EACH = 0.5  # typical for a kernel with what only it calls [s]
-TRUSTED_AFTER = 5  # kernels after which the pace of this process counts as much as that
-KERNELS: list[Any] = []  # every kernel that was imported so far, as numba's dispatchers
+PATIENCE_S = 2.0  # compiling that takes longer is announced on standard error
+SECONDS_EACH = 0.5  # typical time to compile a kernel with its helpers [s]
+TRUSTED_AFTER = 5  # kernels after which this process's own pace counts as much
+KERNELS: list[Any] = []  # numba's dispatchers of all kernels imported so far
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
 )
 _DEFAULTS = {name: option.default for name, option in Flags.options.items()}
-# numba compares them half a million times, a twentieth of the time of compiling: the same in C.
+# numba calls it half a million times, 5 % of the compile time; this runs in C.
 Flags.values = lambda flags: _DEFAULTS | flags._values
 _ALIAS = re.compile(r"\bas\s+\w+")
 
@@ -55,12 +55,16 @@ def kernel(
     inline: bool = False,
     view: bool = False,
 ) -> Callable[..., Any]:
-    """Compiles a function with numba when it is first called, or loads what was compiled before.
+    """Compiles a function with numba at its first call, or loads it from the cache.
 
-    It runs without the interpreter's lock; a division by zero gives inf or NaN. It `allocates` if
-    it makes arrays or other objects, or calls what does; `contracts` lets products and sums be
-    fused, with one rounding; `inline` compiles it into all callers, where that was measured to pay.
-    A `view` returns parts of its arguments' arrays, for which it is written into its callers.
+    It runs without the interpreter's lock; a division by zero gives inf or NaN.
+
+    Args:
+        function: the function.
+        allocates: True if it, or a kernel that it calls, makes arrays or other objects.
+        contracts: True to fuse products and sums, with one rounding.
+        inline: True to inline the machine code into all callers, where measurements favour it.
+        view: True if it returns parts of its arguments' arrays; its source is inlined.
     """
     if function is None:
         return partial(
@@ -79,25 +83,26 @@ def kernel(
 
 @intrinsic
 def prefetch(_typing: Any, array: Any, index: Any) -> Any:
-    """Asks for array[index] (n,) to be in the cache soon, before a kernel waits for it."""
+    """Prefetches array[index] (n,) into the CPU cache, so that a kernel need not wait for it."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = make_array(signature.args[0])(context, builder, args[0]).data
-        whole = ir.IntType(32)
+        integer = ir.IntType(32)
         byte = ir.IntType(8).as_pointer()
         place = builder.bitcast(builder.gep(data, [args[1]]), byte)
-        kind = ir.FunctionType(ir.VoidType(), [byte, whole, whole, whole])
+        kind = ir.FunctionType(ir.VoidType(), [byte, integer, integer, integer])
         ask = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        builder.call(
-            ask, [place, whole(0), whole(3), whole(1)]
-        )  # to read; to keep; of the data
+        read = integer(0)
+        keep = integer(3)
+        data_cache = integer(1)
+        builder.call(ask, [place, read, keep, data_cache])
         return context.get_dummy_value()
 
     return types.void(array, types.intp), generate
 
 
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Code that only kernels call: it is optimised, and made machine code, as a part of theirs."""
+    """Code that only kernels call; it is optimised and compiled as a part of theirs."""
 
     @property
     def codegen(self) -> Any:
@@ -156,7 +161,7 @@ class _Compiler(Compiler):  # type: ignore[misc]
 
 
 class _Kernel(CPUDispatcher):  # type: ignore[misc]
-    """numba's dispatcher; callable from Python, a third of compiling, only where that calls it."""
+    """numba's dispatcher; makes the wrapper for Python, a third of compiling, only if needed."""
 
     def __init__(
         self, function: Callable[..., Any], targetoptions: dict[str, Any]
@@ -174,7 +179,7 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         return any(cache.is_warm for cache in (self._cache, self._inner_cache))
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Is called when a kernel that calls this one is compiled."""
+        """Is called by numba when it compiles a kernel that calls this one."""
         before = self._inner, self._cache
         self._inner = True
         self._cache = self._inner_cache
@@ -194,7 +199,7 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
             return super().compile(sig)
 
     def add_overload(self, cres: Any) -> None:
-        if not self._inner:  # Python does not see what only kernels can call
+        if not self._inner:  # Python never sees what only kernels call
             super().add_overload(cres)
             for env in cres._find_referenced_environments():
                 cres.library.codegen.set_env(env.env_name, env)
@@ -208,44 +213,36 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
     def _load_index(self) -> dict[Any, Any]:
         try:
             return dict(super()._load_index())
-        except (
-            AttributeError,
-            ImportError,
-        ):  # a class of some arguments is no longer there
+        except (AttributeError, ImportError):  # the class of an argument is gone
             return {}
 
     def save(self, key: Any, data: Any) -> None:
-        """Saves data with what they belong to.
+        """Saves data with their version and key.
 
-        numba gives them a number in the index first. Of two processes at once, each may give the
-        same one; and a process that is ended in between leaves it to data of an earlier version.
+        numba first enters a number into its index. Two processes may choose the same number, and a
+        process that is killed in between leaves the number pointing to older data.
         """
         super().save(key, (self._version, key, data))
 
     def load(self, key: Any) -> Any:
-        """Returns the data of a key, or None if there are none: others' would crash."""
+        """Returns the data of a key, or None; the data of another key would crash."""
         try:
             version, owner, data = super().load(key)
-        except (
-            AttributeError,
-            ImportError,
-            TypeError,
-            ValueError,
-        ):  # none, or of other versions
-            return None
+        except (AttributeError, ImportError, TypeError, ValueError):
+            return None  # there are none, or another version wrote them
         return data if (version, owner) == (self._version, key) else None
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
-    """Machine code on disk, stamped with the content of all that it was compiled from."""
+    """Machine code on disk, stamped with a digest of all the sources it was compiled from."""
 
     def __init__(self, function: Callable[..., Any], kind: str = "") -> None:
         super().__init__(function)
-        # Without the line of the function: it may move, and leaves nothing behind.
+        # Without its line number, a function that moved replaces its old file.
         name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
         stamp = compute_digest(Path(function.__code__.co_filename))
         self._cache_file = _Index(self._cache_path, name, stamp)
-        # It is compared before the types are unpickled, whose classes may have other names now.
+        # It is compared before the types are unpickled: their classes may have been renamed.
         self._cache_file._version += stamp
 
     @property
@@ -259,7 +256,7 @@ class _InnerCache(_Cache):
 
 @cache
 def compute_digest(module: Path) -> str:
-    """SHA-256 of a module and of all modules that it imports, directly or not; no library."""
+    """Returns the SHA-256 of a module and of all its own imports, direct or not, no libraries."""
     files = set[Path]()
     left = [module]
     while left:
@@ -278,12 +275,12 @@ def _read(file: Path) -> str:
 
 @cache
 def imports_of(file: Path) -> tuple[Path, ...]:
-    """The modules that a file imports, wherever it does: of the package and of its own folders."""
-    own = file.is_relative_to(PACKAGE)
+    """Returns the modules of this package, or of its own folders, that a file imports."""
+    is_own = file.is_relative_to(PACKAGE)
     top = next(
         folder for folder in file.parents if not (folder / "__init__.py").is_file()
     )
-    found = list[Path]()
+    places = list[Path]()
     text = re.sub(r"#[^\n]*|\\\n", " ", _read(file))
     for origin, names, plain in _IMPORT.findall(text):
         for module in re.findall(r"[.\w]+", _ALIAS.sub("", origin or plain)):
@@ -291,27 +288,31 @@ def imports_of(file: Path) -> tuple[Path, ...]:
             root = file.parents[len(module) - len(name) - 1] if name != module else top
             if name == module and name.split(".")[0] == PACKAGE.name:
                 root = PACKAGE.parent
-            elif own and name == module:
+            elif is_own and name == module:
                 continue
             place = root.joinpath(*name.split("."))
-            found += [
+            places += [
                 place,
-                *(place / each for each in re.findall(r"\w+", _ALIAS.sub("", names))),
+                *(place / name_ for name_ in re.findall(r"\w+", _ALIAS.sub("", names))),
             ]
-            found += [place / "__init__"] if root != PACKAGE.parent and not own else []
-    files = (place.with_suffix(".py") for place in found if place not in {top, PACKAGE})
+            places += (
+                [place / "__init__"] if root != PACKAGE.parent and not is_own else []
+            )
+    files = (
+        place.with_suffix(".py") for place in places if place not in {top, PACKAGE}
+    )
     return tuple(file for file in files if file.is_file())
 
 
 def measure_pace_s(compiled: int, spent_s: float) -> float:
-    """Returns the time that a kernel takes [s], by those that were compiled so far."""
+    """Returns the time per kernel [s], from those that were compiled so far."""
     return (TRUSTED_AFTER * SECONDS_EACH + spent_s) / (TRUSTED_AFTER + compiled)
 
 
 def estimate(left: int, compiled: int, spent_s: float) -> str:
-    """Tells how long compiling will take: up to `left` kernels, as not all may be called."""
+    """Describes how long compiling will take: up to `left` kernels, because some may be unused."""
     what = "compiling, once on this machine"
-    if left < 1:  # further types of arguments of kernels that were compiled for others
+    if left < 1:  # kernels that were compiled before, but for other types of arguments
         return f"{what}: the last kernels"
     seconds = max(1, round(left * measure_pace_s(compiled, spent_s)))
     kernels = "1 kernel" if left == 1 else f"{left} kernels"
@@ -319,10 +320,10 @@ def estimate(left: int, compiled: int, spent_s: float) -> str:
 
 
 class _Compiling(event.Listener):  # type: ignore[misc]
-    """Counts what this process compiles, and tells whoever waits how long it will take."""
+    """Counts what this process compiles, and tells the user how long it will take."""
 
     def __init__(self) -> None:
-        self.count = 0  # specialisations of kernels, and of what they call
+        self.count = 0  # compiled functions, one for each set of argument types
         self.cpu_s = 0.0  # CPU time that compiling took
         self.quiet = False  # True: nothing is to be said
         self.patience_s = PATIENCE_S
@@ -338,7 +339,7 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             if self._depth == 0:
                 self._begun, self._begun_cpu = time.monotonic(), time.thread_time()
                 self._collects = gc.isenabled()
-                gc.disable()  # a tenth of the time, for next to no garbage
+                gc.disable()  # it would take a tenth of the time, for next to no garbage
             self._depth += 1
             spent = self._spent + time.monotonic() - self._begun
             silent = time.monotonic() - self._told
@@ -350,8 +351,8 @@ class _Compiling(event.Listener):  # type: ignore[misc]
 
     def on_end(self, event: event.Event) -> None:
         with self._lock:
-            self._depth = self._depth - 1
-            self.count = self.count + 1
+            self._depth -= 1
+            self.count += 1
             if self._depth == 0:
                 if self._collects:
                     gc.enable()

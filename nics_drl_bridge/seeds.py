@@ -14,24 +14,24 @@ _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
 
 
 def check_seeds(
-    seeds: ArrayLike | Any, greatest: int = GREATEST_SEED
+    seeds: ArrayLike | Any, maximum: int = GREATEST_SEED
 ) -> NDArray[np.int64]:
     """Returns seeds as (n,); ConfigError if one is negative, too large or not an integer."""
     if (
         isinstance(seeds, np.ndarray)
         and seeds.dtype == np.int64
-        and greatest == GREATEST_SEED
+        and maximum == GREATEST_SEED
     ):
         numbers = np.atleast_1d(seeds)
         if not (numbers < 0).any():
             return numbers
-    given = np.atleast_1d(np.asarray(seeds, dtype=object)).ravel()
-    for seed in given:
-        whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-        if not (whole and 0 <= seed <= greatest):
-            written = not isinstance(seed, int) or seed.bit_length() < 1000
-            shown = _SHORT.repr(seed) if written else "of very many digits"
+    values = np.atleast_1d(np.asarray(seeds, dtype=object)).ravel()
+    for seed in values:
+        is_integer = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+        if not (is_integer and 0 <= seed <= maximum):
+            is_short = not isinstance(seed, int) or seed.bit_length() < 1000
+            quoted = _SHORT.repr(seed) if is_short else "of very many digits"
             raise ConfigError(
-                f"seed {shown}: must be a whole number from 0 to {greatest}."
+                f"seed {quoted}: must be a whole number from 0 to {maximum}."
             )
-    return np.asarray([int(seed) for seed in given], dtype=np.int64)
+    return np.asarray([int(seed) for seed in values], dtype=np.int64)

@@ -1,11 +1,11 @@
-"""The status line: what takes long is told there, and on a terminal each text replaces the last."""
+"""The status line, which reports long work; on a terminal, each text replaces the last."""
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 UPDATED_S = 0.5  # time between two texts where they replace each other [s]
-REPEATED_S = 20.0  # and where each is a line of its own
+REPEATED_S = 20.0  # time between two texts where each is a line of its own [s]
 CLEAR_LINE = "\r\x1b[K"
 
 
@@ -38,7 +38,7 @@ class StatusLine:
             sys.stderr.write(f"nics_drl_bridge: {text}\n")
 
     def clear(self) -> None:
-        """Removes the text from a terminal, so that the next output has the line for itself."""
+        """Removes the text from a terminal, so that the next output starts on an empty line."""
         if self._is_shown:
             sys.stderr.write(CLEAR_LINE)
             sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""One style of all pictures: type, and colours of Okabe and Ito, which every eye tells apart."""
+"""The style of all pictures: fonts, and the colours of Okabe and Ito for the colour-blind."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -25,15 +25,8 @@ GOAL = ORANGE
 OTHER = "#8d99ae"
 DARK = "#333333"
 EDGE = "#c5cbd3"
-MARKERS = (
-    "o",
-    "s",
-    "^",
-    "D",
-    "v",
-    "P",
-    "X",
-)  # of `SERIES`, as told apart without colours
+# markers of `SERIES`, for pictures without colours
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 RC: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": OTHER,
@@ -77,7 +70,7 @@ class Panel(NamedTuple):
 
 @contextmanager
 def apply_style() -> Iterator[None]:
-    """Gives what is drawn inside the style; of a function as a decorator, too."""
+    """Applies the style to what is drawn in a block, or in a function as its decorator."""
     with mpl.rc_context(RC):
         yield
 
@@ -98,9 +91,9 @@ def make_panels(
 
 def count_legend_columns(labels: Sequence[str], width: float) -> int:
     """Returns the number of columns of a legend that fits into a width [inch]."""
-    room = LETTERS_PER_IN * width
-    each = [len(label) + 5 for label in labels]
-    return len(labels) if sum(each) <= room else max(1, int(room / max(each)))
+    letters = LETTERS_PER_IN * width
+    widths = [len(label) + 5 for label in labels]
+    return len(labels) if sum(widths) <= letters else max(1, int(letters / max(widths)))
 
 
 def count_legend_rows(labels: Sequence[str], width: float) -> int:
@@ -139,11 +132,11 @@ def render_png(
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_axis_off()
-        if (own := axes.get_legend()) is not None:
-            own.set_frame_on(False)
-        if (cell := axes.get_subplotspec()) is not None:
-            share = len(cell.colspan) / cell.get_gridspec().ncols
-            letters = int(LETTERS_PER_IN * share * figure.get_figwidth())
+        if (frame_legend := axes.get_legend()) is not None:
+            frame_legend.set_frame_on(False)
+        if (place_in_grid := axes.get_subplotspec()) is not None:
+            fraction = len(place_in_grid.colspan) / place_in_grid.get_gridspec().ncols
+            letters = int(LETTERS_PER_IN * fraction * figure.get_figwidth())
             title = (fill(line, letters) for line in axes.get_title().splitlines())
             axes.set_title("\n".join(title))
     if legend is not None:

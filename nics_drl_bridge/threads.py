@@ -16,22 +16,23 @@ MOST_THREADS = 1024
 
 @cache
 def _pool(process: int) -> ThreadPoolExecutor:
-    """The waiting threads of a process, started as they are needed: a fork has none."""
+    """Returns the thread pool of a process; a forked process needs one of its own."""
     return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix=f"crew-{process}")
 
 
 def run_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
     """Returns a function's result for each part, in order; threads run all but the first part.
 
-    It helps if the work releases the interpreter lock. Exceptions are raised when all have ended.
+    This is faster if the work releases the interpreter lock. An exception is raised once all parts
+    have ended.
     """
-    others = [_pool(os.getpid()).submit(function, part) for part in parts[1:]]
+    futures = [_pool(os.getpid()).submit(function, part) for part in parts[1:]]
     try:
         first = function(parts[0])
     finally:
-        if others:  # waiting for none takes 8 us
-            wait(others)
-    return [first, *(other.result() for other in others)]
+        if futures:  # waiting for none takes 8 us
+            wait(futures)
+    return [first, *(future.result() for future in futures)]
 
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:

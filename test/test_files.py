@@ -231,10 +231,10 @@ def test_where_folders_can_not_change_places_a_rename_that_fails_leaves_the_old_
 WRITER = """
 import sys
 from pathlib import Path
-from nics_drl_bridge.files import whole_folder
+from nics_drl_bridge.files import write_whole_folder
 while True:
     for word in ("new", "old"):
-        with whole_folder(Path(sys.argv[1]), "model.yaml") as temporary:
+        with write_whole_folder(Path(sys.argv[1]), "model.yaml") as temporary:
             (temporary / "model.yaml").write_text(word)
             (temporary / "extra").write_text(word + " too")
 """
@@ -334,10 +334,10 @@ path = Path(sys.argv[2])
 if sys.argv[1] == "file":
     files.write_parts(path, parts())
 elif sys.argv[1] == "file of a library":
-    with files.whole_file(path) as part:
+    with files.write_whole_file(path) as part:
         part.write_bytes(b"".join(parts()))
 else:
-    with files.whole_folder(path, "model.yaml") as temporary:
+    with files.write_whole_folder(path, "model.yaml") as temporary:
         (temporary / "model.yaml").write_bytes(b"".join(parts()))
 """
 

@@ -27,7 +27,7 @@ from nics_drl_bridge.watch.server import Request
 Env = gymnasium.Env[Any, Any]
 Make = Callable[
     [str, AnyWorld], tuple[Env, Policy]
-]  # for a policy and a world, see `env_of`
+]  # for a policy and a world, see `open_env`
 HELD_S = 0.5  # without a request of the keyboard for so long, the robot stops [s]
 LINGER_S = 1.0  # of simulated time between the end of an episode and the next one [s]
 CAN = frozenset(

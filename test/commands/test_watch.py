@@ -56,7 +56,9 @@ def test_options_that_do_not_fit_are_one_sentence(options, said, tmp_path):
 def test_a_page_without_its_library_is_refused_before_a_robot_is_opened(
     monkeypatch, capsys
 ):
-    monkeypatch.setattr(module.extensions, "lacking", lambda names: next(iter(names)))
+    monkeypatch.setattr(
+        module.extensions, "find_lacking", lambda names: next(iter(names))
+    )
     monkeypatch.setattr(
         module, "_watch_episodes", lambda *given: pytest.fail("a robot was opened")
     )
