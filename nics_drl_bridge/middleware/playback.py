@@ -117,9 +117,7 @@ def read_messages(
         topics = add_gyro_topic(path, topics)
     with open_bag(path) as bag:
         roles = choose_topics(bag, topics)
-        messages = {
-            role: bag.read_messages(topic) for role, topic in roles.items()
-        }
+        messages = {role: bag.read_messages(topic) for role, topic in roles.items()}
     _check_clocks(str(path), roles, messages)
     return messages
 
