@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.recording import topic_roles
-from nics_drl_bridge.recording.mapped import NEAR_DEG, SHORT_OF_EARTH
 from nics_drl_bridge.recording.mapping import NO_COMMANDS
 from nics_drl_bridge.recording.names import split_words, word_set
-from nics_drl_bridge.recording.pose_guess import PoseGuess
+from nics_drl_bridge.recording.pose_guess import PoseGuess, list_used_columns
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
+from nics_drl_bridge.recording.table import Column
 from nics_drl_bridge.robot.spec import find_kind, kind_names
 from nics_drl_bridge.robot.template import list_names
 
@@ -44,9 +44,11 @@ NEVER = word_set("""
     err std stddev sigma var fps latency torque force status axes buttons level
     line
 """)
-NEVER_WORDS = NEVER | NO_COMMANDS
+NOT_COMMANDED = NEVER | NO_COMMANDS | MEASURING
 TICKS = word_set("tick ticks encoder enc encoders count counts")
 WHEEL_WORDS = TICKS | word_set("wheel wheels rpm")
+# Words that say what a column holds.
+EXPLAINED = NOT_COMMANDED | WHEEL_WORDS | word_set("x y z")
 NO_SPEED = word_set("""
     pos position angle current force torque slip distance dist pressure load
     temp effort travel accel acc steer steering
@@ -55,12 +57,13 @@ LEFT = word_set("left l lw wl vl le")
 RIGHT = word_set("right r rw wr vr ri")
 FRONT = word_set("front f")
 REAR = word_set("rear back b")
-CORNERS = {
-    "front_left": {"fl", "lf"},
-    "front_right": {"fr", "rf"},
-    "rear_left": {"rl", "bl", "lr"},
-    "rear_right": {"rr", "br"},
-}
+CORNERS = (
+    ("front_left", word_set("fl lf"), FRONT, LEFT),
+    ("front_right", word_set("fr rf"), FRONT, RIGHT),
+    ("rear_left", word_set("rl bl lr"), REAR, LEFT),
+    ("rear_right", word_set("rr br"), REAR, RIGHT),
+)
+NO_VEHICLE = word_set("motor arm gripper pan tilt head fan")
 STEERING = word_set("steering steer delta servo")
 THROTTLE = word_set("throttle gas accelerator pedal pwm duty")
 TURNING = word_set("angular ang omega yawrate wz w turn rot rotational")
@@ -98,7 +101,7 @@ class Candidate(NamedTuple):
 
     table: TableSurvey
     column: Survey
-    meaning: str | None  # as `speed` or `front_left`; None: its name does not tell
+    meaning: str | None  # as `speed` or `front_left`; None: its name does not say it
     strength: int  # CERTAIN, LIKELY or POSSIBLE
     rank: int = 0  # among those of the same strength
 
@@ -106,6 +109,16 @@ class Candidate(NamedTuple):
     def is_still(self) -> bool:
         """True if it was zero throughout."""
         return self.column.low == self.column.high == 0.0
+
+    @property
+    def merit(self) -> tuple[bool, int, int]:
+        """What decides between columns of one meaning."""
+        return not self.is_still, self.strength, self.rank
+
+    @property
+    def values(self) -> Column:
+        """The values (T,) of the column."""
+        return self.table.data[self.column.name]
 
 
 class CommandGuess(NamedTuple):
@@ -119,14 +132,23 @@ class CommandGuess(NamedTuple):
     # True: no command was recorded, the wheels' own motion stands in
     of_wheels: bool = False
 
+    @property
+    def listed(self) -> dict[str, Candidate]:
+        """The commands, or without them the candidates."""
+        return self.commands or self.candidates
+
 
 def guess_command(
     tables: Sequence[TableSurvey], pose: PoseGuess | None
 ) -> CommandGuess:
-    """Finds the columns that drive a robot of a known kind; else what may be its commands."""
-    found = [each for table in tables for each in _find_candidates(table, tables, pose)]
-    found = _accept_steering(found)
-    certain = [each for each in found if each.strength >= LIKELY]
+    """Finds the columns that drive a robot of a known kind, or what may be its commands."""
+    candidates = [
+        candidate
+        for table in tables
+        for candidate in _find_candidates(table, len(tables) > 1, pose)
+    ]
+    candidates = _accept_steering(candidates)
+    certain = [each for each in candidates if each.strength >= LIKELY]
     kind, commands = _choose_kind(certain)
     if kind is not None:
         return CommandGuess(kind, commands, {})
@@ -134,90 +156,78 @@ def guess_command(
         kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
             return CommandGuess(kind, commands, {}, of_wheels=True)
-    found = found or [
-        each for table in tables for each in _find_unexplained(table, pose)
-    ]
-    kind, candidates = _choose_kind(found)
+    if not candidates:
+        for table in tables:
+            candidates += _find_unexplained(table, pose)
+    kind, named = _choose_kind(candidates)
     if kind is None:
-        some = sorted(found, key=lambda each: -each.strength)[:MOST_CANDIDATES]
-        candidates = {f"command_{k}": each for k, each in enumerate(some)}
-    return CommandGuess(kind, {}, candidates)
+        strongest = sorted(candidates, key=lambda each: -each.strength)
+        named = {
+            f"command_{k}": candidate
+            for k, candidate in enumerate(strongest[:MOST_CANDIDATES])
+        }
+    return CommandGuess(kind, {}, named)
 
 
 def _find_candidates(
-    table: TableSurvey, tables: Sequence[TableSurvey], pose: PoseGuess | None
+    table: TableSurvey, has_others: bool, pose: PoseGuess | None
 ) -> Iterator[Candidate]:
     """Yields the columns of a table that were or may have been sent to the robot."""
     if STANDARD_PACKAGES.match(table.kind) and table.kind not in TWIST_KINDS:
         return
-    of_pose = pose is not None and pose.table is table
-    # The name of a file tells what it holds only beside other files, and if the pose is elsewhere.
-    if table.kind or (len(tables) > 1 and not of_pose):
+    has_pose = pose is not None and pose.table is table
+    # A file's name says what it holds only where there are others, and if the pose is elsewhere.
+    context: set[str] = set()
+    if table.kind or (has_others and not has_pose):
         context = {*split_words(table.name)}
-    else:
-        context = set()
-    if context & (NEVER_WORDS | MEASURING) and not context & COMMANDING:
+    if context & NOT_COMMANDED and not context & COMMANDING:
         return
-    taken = {*pose.columns} if pose is not None and of_pose else set()
+    context_of_topic: set[str] = set()
+    if table.kind:
+        context_of_topic = context & BARE_TWIST
+    used = list_used_columns(table, pose)
     for column in table.numbers:
-        if column.name in taken or column.name in table.stamp_columns:
+        words = {*table.list_words(column.name)}
+        if column.name in used or words & NOT_COMMANDED or column.is_place_on_earth:
             continue
-        words = {*split_unit(column.name)[0]}
-        if words == {"data"}:
-            words = {*split_words(table.name)}
-        if words & (NEVER_WORDS | MEASURING) or _is_place_on_earth(column):
-            continue
-        meaning = guess_meaning(
-            words | (context & {"cmd", "vel"} if table.kind else set())
-        )
+        meaning = guess_meaning(words | context_of_topic)
         strength = _estimate_strength(table, words, context, meaning)
-        known = meaning is not None or strength >= LIKELY
-        if known and not (table.kind in TWIST_KINDS and meaning is None):
-            yield Candidate(
-                table, column, meaning, strength, _rank_topic(table, context)
-            )
+        if meaning is None and (strength < LIKELY or table.kind in TWIST_KINDS):
+            continue
+        yield Candidate(table, column, meaning, strength, _rank_topic(table, context))
 
 
 def _find_unexplained(
     table: TableSurvey, pose: PoseGuess | None
 ) -> Iterator[Candidate]:
-    """Yields the columns of a table of no message whose names tell nothing, as in other languages.
+    """Yields the columns of a file whose names say nothing, as in other languages.
 
     None of them was certainly sent to the robot, but none was certainly measured either.
     """
-    beside = (
-        {*split_words(table.name)}
-        if pose is not None and pose.table is not table
-        else set()
-    )
-    if table.kind or beside & (NEVER_WORDS | MEASURING):
+    if table.kind:
         return
-    taken = {*table.stamp_columns} | (
-        {*pose.columns} if pose and pose.table is table else set()
-    )
+    pose_is_elsewhere = pose is not None and pose.table is not table
+    if pose_is_elsewhere and NOT_COMMANDED.intersection(split_words(table.name)):
+        return
+    used = list_used_columns(table, pose)
     for column in table.numbers:
-        words = {*split_words(column.name)}
-        told = bool(words & (NEVER_WORDS | MEASURING | WHEEL_WORDS | {"x", "y", "z"}))
-        told = (
-            told
-            or column.name in taken
-            or column.name.isdecimal()
-            or _is_place_on_earth(column)
-        )
-        if not told and column.low < column.high:
+        says_something = not EXPLAINED.isdisjoint(split_words(column.name))
+        if says_something or column.name in used or column.name.isdecimal():
+            continue
+        if column.low < column.high and not column.is_place_on_earth:
             yield Candidate(table, column, None, POSSIBLE)
 
 
 def _estimate_strength(
     table: TableSurvey, words: set[str], context: set[str], meaning: str | None
 ) -> int:
-    if table.kind in ACKERMANN_KINDS:
-        return CERTAIN if meaning is not None else POSSIBLE
-    if (words | context) & COMMANDING:
+    if table.kind in ACKERMANN_KINDS and meaning is None:
+        return POSSIBLE
+    if table.kind in ACKERMANN_KINDS or (words | context) & COMMANDING:
         return CERTAIN
-    if words & WISHING and meaning is not None:
+    if meaning == "throttle" or (words & WISHING and meaning is not None):
         return LIKELY
-    return LIKELY if meaning == "throttle" else POSSIBLE
+    return POSSIBLE
 
 
 def _rank_topic(table: TableSurvey, context: set[str]) -> int:
@@ -230,31 +240,34 @@ def _rank_topic(table: TableSurvey, context: set[str]) -> int:
 
 
 def guess_meaning(words: set[str]) -> str | None:
-    """Returns what a command with these words in its name means; None if they do not tell."""
-    moves = words & {"velocity", "vel", "rate", "speed"}
-    left = bool(words & LEFT)
-    right = bool(words & RIGHT)
-    for corner, short in CORNERS.items():
-        ahead, side = corner.split("_")
-        spoken = words & (FRONT if ahead == "front" else REAR)
-        if words & short or (spoken and (left if side == "left" else right)):
+    """Returns what a command with these words in its name means; None if they do not say it."""
+    is_speed = bool(words & {"velocity", "vel", "rate", "speed"})
+    is_left = bool(words & LEFT)
+    is_right = bool(words & RIGHT)
+    for corner, short, lengthwise, sideways in CORNERS:
+        if words & short or (words & lengthwise and words & sideways):
             return corner
-    if words & STEERING and not (left or right):
-        return None if moves else "steering"
-    if left != right:
-        return "left" if left else "right"
-    if left or words & {"motor", "arm", "gripper", "pan", "tilt", "head", "fan"}:
+    if words & STEERING and not (is_left or is_right):
+        if is_speed:
+            return None
+        return "steering"
+    if is_left and is_right:
+        return None
+    if is_left:
+        return "left"
+    if is_right:
+        return "right"
+    if words & NO_VEHICLE:
         return None
     if words & THROTTLE:
         return "throttle"
     if "traction" in words:
         return "traction"
-    if (
-        words & TURNING
-        or {"yaw", "rate"} <= words
-        or (words & {"theta", "th"} and moves)
-    ):
-        return None if words & {"x", "y", "linear"} else "turn"
+    is_angle = bool(words & {"theta", "th"})
+    if words & TURNING or {"yaw", "rate"} <= words or (is_angle and is_speed):
+        if words & {"x", "y", "linear"}:
+            return None
+        return "turn"
     if "vy" in words or (words & SPEED and "y" in words):
         return "side"
     if words & SPEED and not words & {"z", "vz"}:
@@ -262,64 +275,59 @@ def guess_meaning(words: set[str]) -> str | None:
     return None
 
 
-def _accept_steering(found: Sequence[Candidate]) -> list[Candidate]:
+def _accept_steering(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Takes a plain `steering` for a command where a throttle is recorded beside it."""
-    throttle = any(
-        each.meaning == "throttle" and each.strength >= LIKELY for each in found
+    has_throttle = any(
+        each.meaning == "throttle" and each.strength >= LIKELY for each in candidates
     )
-    made = []
-    for each in found:
-        words = split_unit(each.column.name)[0]
-        words = split_words(each.table.name) if words == ["data"] else words
-        if throttle and words in (["steering"], ["steer"]):
-            each = each._replace(strength=max(each.strength, LIKELY))
-        made.append(each)
-    return made
+    accepted = []
+    for candidate in candidates:
+        words = candidate.table.list_words(candidate.column.name)
+        if has_throttle and words in (["steering"], ["steer"]):
+            strength = max(candidate.strength, LIKELY)
+            candidate = candidate._replace(strength=strength)
+        accepted.append(candidate)
+    return accepted
 
 
 def _choose_kind(
-    found: Sequence[Candidate],
+    candidates: Sequence[Candidate],
 ) -> tuple[str | None, dict[str, Candidate]]:
     """Returns the kind of robot that these columns drive best, and its commands by its names."""
-    own = [
+    kinds = [
         (name, kind.template.words)
         for name in kind_names()
         if (kind := find_kind(name))
     ]
-    best: tuple[tuple[int, int, int], str, dict[str, Candidate]] | None = None
-    for order, (kind, names) in enumerate((*own, *KINDS)):
-        commands = _match_commands(names, found) if names else {}
-        if not commands:
-            continue
+    best: tuple[str | None, dict[str, Candidate]] = (None, {})
+    best_merit: tuple[int, int] | None = None
+    for kind, names in (*kinds, *KINDS):
+        commands = _match_commands(names, candidates)
         still = sum(each.is_still for each in commands.values())
         if still == len(commands):
             continue
         strength = min(each.strength for each in commands.values())
-        if best is None or (-strength, still, order) < best[0]:
-            best = (-strength, still, order), kind, commands
-    return (None, {}) if best is None else best[1:]
+        if best_merit is None or (strength, -still) > best_merit:
+            best_merit = strength, -still
+            best = kind, commands
+    return best
 
 
 def _match_commands(
-    names: Mapping[str, str], found: Sequence[Candidate]
+    names: Mapping[str, str], candidates: Sequence[Candidate]
 ) -> dict[str, Candidate]:
-    """Finds a column for each of a kind's commands; none if one is missing or can't be told."""
+    """Finds a column for each of a kind's commands; none if one is missing or ambiguous."""
     commands: dict[str, Candidate] = {}
     for meaning, name in names.items():
-        fitting = [each for each in found if each.meaning == meaning]
+        fitting = [each for each in candidates if each.meaning == meaning]
         if not fitting:
             return {}
-        most = max((not each.is_still, each.strength, each.rank) for each in fitting)
-        best = [e for e in fitting if (not e.is_still, e.strength, e.rank) == most]
-        if any(not _has_same_values(best[0], other) for other in best[1:]):
+        best = max(fitting, key=lambda each: each.merit)
+        rivals = [each for each in fitting if each.merit == best.merit]
+        if not all(np.array_equal(best.values, each.values) for each in rivals):
             return {}
-        commands[name] = best[0]
+        commands[name] = best
     return commands
-
-
-def _has_same_values(one: Candidate, other: Candidate) -> bool:
-    values = [each.table.data[each.column.name] for each in (one, other)]
-    return np.array_equal(values[0], values[1])
 
 
 def _find_wheels(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
@@ -328,37 +336,28 @@ def _find_wheels(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
         if STANDARD_PACKAGES.match(table.kind):
             continue
         for column in table.numbers:
-            words, _ = split_unit(column.name)
-            spoken = {*split_words(column.name)}
-            if (
-                not spoken & WHEEL_WORDS
-                or spoken & NO_SPEED
-                or column.low == column.high
-            ):
+            words = {*split_words(column.name)}
+            is_wheel = words & WHEEL_WORDS and not words & NO_SPEED
+            if not is_wheel or column.low == column.high:
                 continue
-            meaning = guess_meaning({*words} - TICKS - {"speed", "velocity", "vel"})
+            words_of_side = {*split_unit(column.name)[0]} - TICKS
+            meaning = guess_meaning(words_of_side - {"speed", "velocity", "vel"})
             if meaning in ("left", "right", *WHEELS):
-                yield Candidate(
-                    table, column, meaning, LIKELY, int(bool(spoken & TICKS))
-                )
+                rank = int(bool(words & TICKS))
+                yield Candidate(table, column, meaning, LIKELY, rank)
 
 
-def _is_place_on_earth(column: Survey) -> bool:
-    """True for `lat` or `lon` whose values stay within a degree, as those of a drive do."""
-    if not {*split_words(column.name)} & SHORT_OF_EARTH:
-        return False
-    return column.high - column.low < NEAR_DEG <= max(abs(column.low), abs(column.high))
-
-
-def find_look_alikes(kind: str) -> list[str]:
+def find_look_alikes(name: str) -> list[str]:
     """Returns the other kinds of robots that have the same commands."""
-    found = []
-    own = find_kind(kind)
-    ways = [] if own is None else [{*list_names(way)} for way in own.template.commands]
-    for name in kind_names():
-        other = find_kind(name)
-        if name == kind or other is None:
+    kind = find_kind(name)
+    if kind is None:
+        return []
+    commands = [{*list_names(names)} for names in kind.template.commands]
+    look_alikes = []
+    for other_name in kind_names():
+        other = find_kind(other_name)
+        if other_name == name or other is None:
             continue
-        if any({*list_names(way)} in ways for way in other.template.commands):
-            found.append(name)
-    return found
+        if any({*list_names(names)} in commands for names in other.template.commands):
+            look_alikes.append(other_name)
+    return look_alikes

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from nics_drl_bridge.recording.command_guess import (
     find_look_alikes,
     guess_command,
 )
+from nics_drl_bridge.recording.episode_guess import guess_episode
 from nics_drl_bridge.recording.imu_guess import guess_yaw_rate, write_imu_line
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
@@ -23,6 +25,7 @@ from nics_drl_bridge.recording.pose_guess import (
     GLOBE,
     PoseGuess,
     guess_pose,
+    list_used_columns,
     select_apart,
 )
 from nics_drl_bridge.recording.recording import find_clockwise_keys, select_along_path
@@ -51,40 +54,63 @@ MIRRORED = 0.6
 MIRRORED_BETTER = 0.3
 
 
+class _Draft(NamedTuple):
+    """What a draft of a mapping is written from."""
+
+    tables: Sequence[TableSurvey]
+    pose: PoseGuess | None
+    guess: CommandGuess
+    switch: Switch | None
+    gyro: tuple[TableSurvey, Survey] | None
+    episode: tuple[TableSurvey, Survey] | None
+    common_time: str | None  # the stamps of most tables, for the whole mapping
+
+    @property
+    def is_single(self) -> bool:
+        """True if there is one table, which references need not name."""
+        return len(self.tables) == 1
+
+
 def propose_mapping(tables: Sequence[TableSurvey]) -> str:
     """Drafts a mapping in YAML; guesses are marked, and what is not certain is left blank."""
-    alone = len(tables) == 1
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
     times = [table.time for table in tables if table.time is not None]
-    common = max(times, key=times.count) if times else None
-    if pose:
-        pose_lines = _write_pose(pose, alone, common)
-    else:
-        pose_lines = [NO_POSE, "pose:", "  x: ", "  y: "]
-    values = _compute_poses(pose, pose_lines) if pose else None
-    if guess.commands or guess.candidates:
-        switch = guess_switch(tables, values)
-    else:
-        switch = None
-    lines = [f"{DOUBT} {doubt}" for doubt in find_doubts(guess, values)]
-    if not guess.commands and not guess.candidates:
+    common_time = max(times, key=times.count, default=None)
+    pose_lines = [NO_POSE, "pose:", "  x: ", "  y: "]
+    poses = None
+    if pose is not None:
+        pose_lines = _write_pose(pose, len(tables) == 1, common_time)
+        poses = _compute_poses(pose, pose_lines)
+    switch = None
+    if guess.listed:
+        switch = guess_switch(tables, poses)
+    gyro = _find_free_yaw_rate(tables, guess)
+    episode = guess_episode(tables)
+    draft = _Draft(tables, pose, guess, switch, gyro, episode, common_time)
+    lines = [f"{DOUBT} {doubt}" for doubt in find_doubts(guess, poses)]
+    if not guess.listed:
         lines.append(f"{DOUBT} {NO_COMMAND}")
-    lines.append(_write_robot(guess, _guess_radius(values)))
-    if common is not None:
-        lines.append(f"time: {common}  {GUESSED}")
+    lines.append(_write_robot(guess, _guess_radius(poses)))
+    if common_time is not None:
+        lines.append(f"time: {common_time}  {GUESSED}")
     elif any(table.t is None and table.rows for table in tables):
         lines.append(
             f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
         )
+    if episode is not None:
+        table, column = episode
+        lines.append(
+            f"episode: {table.refer_to(column.name, draft.is_single)}  {GUESSED}"
+        )
     lines += pose_lines
-    lines += _write_clock(pose, guess.commands or guess.candidates)
-    backwards = find_reversed_wheels(guess, values)
-    lines += _write_commands(guess, switch, backwards, alone, common)
-    gyro = _find_free_yaw_rate(tables, guess)
+    lines += _write_clock(pose, guess.listed)
+    lines += _write_commands(draft, find_reversed_wheels(guess, poses))
     if gyro is not None:
-        lines.append(f"{write_imu_line(*gyro, alone, common)}  {GUESSED}")
-    lines += _list_unused(tables, pose, guess, switch, gyro)
+        lines.append(
+            f"{write_imu_line(*gyro, draft.is_single, common_time)}  {GUESSED}"
+        )
+    lines += _list_unused(draft)
     return "\n".join(lines) + "\n"
 
 
@@ -92,211 +118,222 @@ def _write_robot(guess: CommandGuess, radius: float) -> str:
     if guess.kind is None:
         example = f"{{kind: differential, footprint_radius: {radius}}}"
         return f"robot:  # which kind is not certain, as in {example}"
-    alike = "".join(f", or {each}" for each in find_look_alikes(guess.kind))
+    look_alikes = "".join(f", or {kind}" for kind in find_look_alikes(guess.kind))
     robot = f"robot: {{kind: {guess.kind}, footprint_radius: {radius}}}"
-    return f"{robot}  {GUESSED}{alike}; radius in m"
+    return f"{robot}  {GUESSED}{look_alikes}; radius in m"
 
 
-def _write_commands(
-    guess: CommandGuess,
-    switch: Switch | None,
-    backwards: Sequence[Candidate],
-    alone: bool,
-    common: str | None,
-) -> Iterator[str]:
+def _write_commands(draft: _Draft, backwards: Sequence[Candidate]) -> Iterator[str]:
     """Yields the commands, or a blank with the candidates as comments."""
-    when = "" if switch is None else f"when: {{{switch.refer_to(alone)}: {switch.on}}}"
+    guess = draft.guess
+    when = ""
+    if draft.switch is not None:
+        flag = draft.switch.refer_to(draft.is_single)
+        when = f"when: {{{flag}: {draft.switch.on}}}"
     if guess.commands:
         wheels = "  # no command was recorded: what the wheels did stands in for it"
         yield "command:" + wheels * guess.of_wheels
-        for name, each in guess.commands.items():
+        for name, candidate in guess.commands.items():
             keys = when
-            if each in backwards:
+            reason = STILL * candidate.is_still
+            if candidate in backwards:
                 keys = "scale: -1"
-            value = _write_value(name, each, keys, alone, common)
-            why = ": else it turns against the other" * (each in backwards)
-            yield f"  {name}: {value}  {GUESSED}{STILL * each.is_still}{why}"
+                reason += ": else it turns against the other"
+            value = _write_value(name, candidate, keys, draft)
+            yield f"  {name}: {value}  {GUESSED}{reason}"
     elif guess.candidates:
         yield "command:  # none is certain: uncomment what was sent to the robot"
-        for name, each in guess.candidates.items():
-            yield f"#  {name}: {_write_value(name, each, when, alone, common)}"
+        for name, candidate in guess.candidates.items():
+            yield f"#  {name}: {_write_value(name, candidate, when, draft)}"
     else:
         yield f"command:  # {NO_COMMAND}"
 
 
-def _write_value(
-    name: str, candidate: Candidate, when: str, alone: bool, common: str | None
-) -> str:
+def _write_value(name: str, candidate: Candidate, when: str, draft: _Draft) -> str:
     """Returns a command as a mapping has it: a column, or a column with more keys."""
     table = candidate.table
     column = candidate.column
-    reference = table.refer_to(column.name, alone)
+    reference = table.refer_to(column.name, draft.is_single)
     keys = [*_write_unit_keys(name, table, column)]
-    if (
-        when and "steer" not in name
-    ):  # a switch cuts the motor; the steering stays as it is
+    # A switch cuts the motor; the steering stays as it is.
+    if when and "steer" not in name:
         keys.append(when)
-    if table.time not in (common, None):
+    if table.time not in (draft.common_time, None):
         keys.append(f"time: {table.time}")
-    return f"{{from: {reference}, {', '.join(keys)}}}" if keys else reference
+    if not keys:
+        return reference
+    return f"{{from: {reference}, {', '.join(keys)}}}"
 
 
 def _write_unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
-    words = {*split_words(column.name)}
     unit = split_unit(column.name)[1]
-    if words & TICKS:
-        counters = [
-            table.data[c.name] for c in table.numbers if {*split_words(c.name)} & TICKS
-        ]
-        step = np.abs(
-            np.concatenate([np.diff(each.astype(np.float64)) for each in counters])
-        )
+    if not TICKS.isdisjoint(split_words(column.name)):
         yield "unit: ticks"
         if "steer" in name:
             yield "differentiate: false"
-        if (t := table.t) is not None and np.ptp(t) > 0.0 and (step > 0.0).any():
-            rate = float(np.median(step[step > 0.0])) * len(t) / float(np.ptp(t))
-            yield f"ticks_per_turn: {2 ** round(np.log2(2.0 * np.pi * rate / USUAL_WHEEL))}"
+        if ticks := _guess_ticks_per_turn(table):
+            yield f"ticks_per_turn: {ticks}"
+    elif unit == "%":
+        yield 'unit: "%"'
     elif unit is not None and UNITS[unit].factor != 1.0:
-        yield f"unit: {unit}" if unit != "%" else 'unit: "%"'
+        yield f"unit: {unit}"
     elif name == "steering_command" and max(-column.low, column.high) > LARGEST_ANGLE:
         yield "unit: deg"
 
 
+def _guess_ticks_per_turn(table: TableSurvey) -> int:
+    """Returns the power of 2 by which the wheels turn at a usual rate; 0 if they stand."""
+    counters = [
+        table.data[column.name].astype(np.float64)
+        for column in table.numbers
+        if not TICKS.isdisjoint(split_words(column.name))
+    ]
+    steps = np.abs(np.concatenate([np.diff(counter) for counter in counters]))
+    steps = steps[steps > 0.0]
+    if table.t is None or not len(steps) or not np.ptp(table.t) > 0.0:
+        return 0
+    ticks_per_s = float(np.median(steps)) * len(table.t) / float(np.ptp(table.t))
+    return int(2 ** round(np.log2(2.0 * np.pi * ticks_per_s / USUAL_WHEEL)))
+
+
 def _write_clock(
     pose: PoseGuess | None, commands: Mapping[str, Candidate]
-) -> list[str]:
-    """Returns the line that gives the pose a clock of its own, if it has one by its stamps."""
-    if pose is None or (t := pose.table.t) is None or not pose.table.stamps:
-        return []
-    tables = [each.table for each in commands.values()]
-    others = [(each.unit, np.sort(each.t)) for each in tables if each.t is not None]
-    if not others:
-        return []
-    if all(u[-1] < min(t) or u[0] > max(t) for _, u in others):
-        why = "shares no time with the commands"
-    elif all(unit != pose.table.unit and 0.0 in (u[0], t[0]) for unit, u in others):
-        why = "one counts from its first row, and in another unit"
-    else:
-        return []
-    return [f"  clock: tracker  {GUESSED}: {why}"]
+) -> Iterator[str]:
+    """Yields the line that gives the pose a clock of its own, if its stamps show one."""
+    if pose is None or pose.table.t is None or not pose.table.stamps:
+        return
+    t = pose.table.t
+    stamps = [
+        (candidate.table.unit, np.sort(candidate.table.t))
+        for candidate in commands.values()
+        if candidate.table.t is not None
+    ]
+    if not stamps:
+        return
+    line = f"  clock: tracker  {GUESSED}"
+    if all(other[-1] < min(t) or other[0] > max(t) for _, other in stamps):
+        yield f"{line}: shares no time with the commands"
+    elif all(
+        unit != pose.table.unit and 0.0 in (other[0], t[0]) for unit, other in stamps
+    ):
+        yield f"{line}: one counts from its first row, and in another unit"
 
 
 def _find_free_yaw_rate(
     tables: Sequence[TableSurvey], guess: CommandGuess
 ) -> tuple[TableSurvey, Survey] | None:
     """Returns the yaw rate of a gyro, unless it may be a command."""
-    found = guess_yaw_rate(tables)
-    if found is None:
+    gyro = guess_yaw_rate(tables)
+    if gyro is None:
         return None
-    table, column = found
-    commands = (*guess.commands.values(), *guess.candidates.values())
-    taken = any(
-        each.table is table and each.column.name == column.name for each in commands
-    )
-    return None if taken else found
+    table, column = gyro
+    for candidate in guess.listed.values():
+        if candidate.table is table and candidate.column.name == column.name:
+            return None
+    return gyro
 
 
-def _list_unused(
-    tables: Sequence[TableSurvey],
-    pose: PoseGuess | None,
-    guess: CommandGuess,
-    switch: Switch | None,
-    gyro: tuple[TableSurvey, Survey] | None,
-) -> Iterator[str]:
+def _list_unused(draft: _Draft) -> Iterator[str]:
     """Yields a comment for each table that names the columns of values that the draft lacks."""
-    taken = {
-        (id(each.table), each.column.name)
-        for each in (*guess.commands.values(), *guess.candidates.values())
+    used = {
+        (id(candidate.table), candidate.column.name)
+        for candidate in draft.guess.listed.values()
     }
-    if pose is not None:
-        taken |= {(id(pose.table), column) for column in pose.columns}
-    if switch is not None:
-        taken.add((id(switch.table), switch.column))
-    if gyro is not None:
-        taken.add((id(gyro[0]), gyro[1].name))
-    for table in tables:
-        rest = []
+    if draft.switch is not None:
+        used.add((id(draft.switch.table), draft.switch.column))
+    for pair in (draft.gyro, draft.episode):
+        if pair is not None:
+            used.add((id(pair[0]), pair[1].name))
+    for table in draft.tables:
+        used_here = list_used_columns(table, draft.pose)
+        unused = []
         for column in table.columns:
-            is_value = not {*split_words(column.name)} & NO_VALUES
-            is_free = (id(table), column.name) not in taken
-            if is_value and is_free and column.name not in table.stamp_columns:
-                rest.append(f"{column.name}{_explain_unused(column)}")
-        place = "" if len(tables) == 1 else f"{table.name}: "
-        more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
-        if rest:
-            yield f"{NOT_USED}: {place}{', '.join(rest[:MOST_LISTED])}{more}"
+            is_value = NO_VALUES.isdisjoint(split_words(column.name))
+            is_used = (id(table), column.name) in used or column.name in used_here
+            if is_value and not is_used:
+                unused.append(f"{column.name}{_explain_unused(column)}")
+        place = f"{table.name}: " * (not draft.is_single)
+        listed = ", ".join(unused[:MOST_LISTED])
+        if len(unused) > MOST_LISTED:
+            listed += f" and {len(unused) - MOST_LISTED} more"
+        if unused:
+            yield f"{NOT_USED}: {place}{listed}"
 
 
 def _explain_unused(column: Survey) -> str:
     if column.low < column.high:
         return ""
-    return " (constant)" if column.low == column.high else " (no numbers)"
+    if column.low == column.high:
+        return " (constant)"
+    return " (no numbers)"
 
 
-def _write_pose(pose: PoseGuess, alone: bool, common: str | None) -> list[str]:
+def _write_pose(pose: PoseGuess, is_single: bool, common_time: str | None) -> list[str]:
     table = pose.table
     if table.stamps is None and pose.x in (form[0].format("x") for form in POSES[:4]):
         return [f"pose: {table.name}  {GUESSED}"]  # a message whose fields are known
     lines = [f"pose:  {GUESSED}"]
-    if not alone:
+    if not is_single:
         lines.append(f"  in: {write_reference(table.name)}")
     lines.append(f"  x: {write_reference(pose.x)}")
     lines.append(f"  y: {write_reference(pose.y)}")
     if pose.heading is not None:
         lines.append(f"  heading: {write_reference(pose.heading)}")
     else:
-        lines.append(
-            f"  quaternion: [{', '.join(map(write_reference, pose.quaternion))}]"
-        )
-    if table.time not in (common, None):
+        columns = ", ".join(map(write_reference, pose.quaternion))
+        lines.append(f"  quaternion: [{columns}]")
+    if table.time not in (common_time, None):
         lines.append(f"  time: {table.time}")
     units = _guess_pose_units(pose)
     return [_correct_heading(line, pose, units) for line in lines] + units
 
 
 def _guess_pose_units(pose: PoseGuess) -> list[str]:
-    """Returns the lines on the units of a pose, by its names, else by what is plausible."""
-    place = "deg" if {*split_words(pose.x)} & {*GLOBE} else split_unit(pose.x)[1]
-    turned = split_unit(pose.heading or "")[1]
-    said = []
-    for key, unit in (("unit", place), ("heading_unit", turned)):
-        if (
-            unit is not None
-            and UNITS[unit].factor != 1.0
-            and UNITS[unit].si in ("m", "rad")
-        ):
-            said.append(f"  {key}: {unit}  {GUESSED}")
-    if place is not None or turned is not None:
-        return said
-    for _ in range(2):
-        values = _compute_poses(pose, said)
-        if values is None:
+    """Returns the lines on the units of a pose, by its names, or by what is plausible."""
+    units = {
+        "unit": split_unit(pose.x)[1],
+        "heading_unit": split_unit(pose.heading or "")[1],
+    }
+    if not {*GLOBE}.isdisjoint(split_words(pose.x)):
+        units["unit"] = "deg"
+    lines = []
+    for key, unit in units.items():
+        if unit is None:
+            continue
+        si, factor = UNITS[unit]
+        if factor != 1.0 and si in ("m", "rad"):
+            lines.append(f"  {key}: {unit}  {GUESSED}")
+    if any(unit is not None for unit in units.values()):
+        return lines
+    for _ in units:
+        poses = _compute_poses(pose, lines)
+        if poses is None:
             break
         fault = recordings.find_implausible_pose(
-            *values, radius=_guess_radius(values, 0.0)
+            *poses, radius=_guess_radius(poses, 0.0)
         )
         if fault is not None and not fault.line.startswith("time"):
-            said.append(f"  {fault.line}  {GUESSED}: else {fault.reason}")
-    return said
+            lines.append(f"  {fault.line}  {GUESSED}: else {fault.reason}")
+    return lines
 
 
 def _correct_heading(line: str, pose: PoseGuess, units: Sequence[str]) -> str:
     """Returns the heading's line as that of a compass, if the path only leads along such a one."""
     if not line.startswith("  heading: "):
         return line
-    values = _compute_poses(pose, units)
-    if values is None:
+    poses = _compute_poses(pose, units)
+    if poses is None:
         return line
-    apart = values[1][select_along_path(values[1], _guess_radius(values))]
-    keys = find_clockwise_keys(apart)
-    keys = keys or find_clockwise_keys(
-        select_apart(values[1]), MIRRORED, MIRRORED_BETTER
+    _, values = poses
+    spaced = values[select_along_path(values, _guess_radius(poses))]
+    keys = find_clockwise_keys(spaced) or find_clockwise_keys(
+        select_apart(values), MIRRORED, MIRRORED_BETTER
     )
     if not keys:
         return line
-    why = "else heading and path turn opposite ways"
-    return f"  heading: {{from: {line.partition(': ')[2]}, {keys}}}  {GUESSED}: {why}"
+    reason = "else heading and path turn opposite ways"
+    column = line.partition(": ")[2]
+    return f"  heading: {{from: {column}, {keys}}}  {GUESSED}: {reason}"
 
 
 def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array] | None:
@@ -305,43 +342,44 @@ def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array]
     if table.t is None:
         return None
     columns = [table.data[name].astype(np.float64) for name in pose.columns]
-    if any(len(each) != len(table.t) for each in columns):  # of several streams
+    if any(len(column) != len(table.t) for column in columns):  # of several streams
         return None
-    x, y, *turned = columns
-    heading = turned[0] if len(turned) == 1 else _compute_heading(*turned)
+    x, y, *orientation = columns
+    heading = orientation[0]
+    if pose.quaternion:
+        heading = recordings.compute_heading(*orientation)
     values = np.stack([x, y, heading], axis=1)
-    whole = np.isfinite(values).all(axis=1)
-    if whole.sum() < 3:
+    is_finite = np.isfinite(values).all(axis=1)
+    if is_finite.sum() < 3:
         return None
     text = "\n".join(lines)
-    units = re.findall(r"^  (unit|heading_unit): (\S+)", text, re.MULTILINE)
-    for key, unit in units:
-        part = np.s_[:, :2] if key == "unit" else np.s_[:, 2]
-        values[part] *= UNITS[unit].factor
-        if key == "unit" and UNITS[unit].si == "rad":
-            values[part] = np.stack(east_and_north(*values[part].T), axis=1)
-    if turned_round := re.search(
-        r"^  heading: .* scale: -1(?:, offset: ([\d.]+))?}", text, re.M
-    ):
-        values[:, 2] = float(turned_round[1] or 0.0) - values[:, 2]
-    return table.t[whole], values[whole]
-
-
-def _compute_heading(x: Array, y: Array, z: Array, w: Array) -> Array:
-    return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    units = dict(re.findall(r"^  (unit|heading_unit): (\S+)", text, re.MULTILINE))
+    if "heading_unit" in units:
+        values[:, 2] *= UNITS[units["heading_unit"]].factor
+    if "unit" in units:
+        si, factor = UNITS[units["unit"]]
+        values[:, :2] *= factor
+        if si == "rad":
+            values[:, :2] = np.stack(east_and_north(*values[:, :2].T), axis=1)
+    clockwise = re.search(
+        r"^  heading: .* scale: -1(?:, offset: ([\d.]+))?}", text, re.MULTILINE
+    )
+    if clockwise:
+        values[:, 2] = float(clockwise[1] or 0.0) - values[:, 2]
+    return table.t[is_finite], values[is_finite]
 
 
 def _guess_radius(
-    values: tuple[Array, Array] | None, fastest: float = FAR_AWAY
+    poses: tuple[Array, Array] | None, fastest: float = FAR_AWAY
 ) -> float:
     """Returns the radius of a robot [m]: of a car if it is as fast, or on a map of the land."""
-    if values is None:
+    if poses is None:
         return NO_RADIUS
-    t, pose = values
-    path = np.hypot(*np.diff(pose[:: max(1, len(t) // 200), :2], axis=0).T).sum()
-    surveyed = (
-        np.abs(pose[:, :2]).min() > FAR_AWAY
-        and np.ptp(pose[:, :2], axis=0).max() < FAR_AWAY
-    )
-    fast = FAST_CAR * float(np.ptp(t)) < path < fastest
-    return CAR_RADIUS if surveyed or fast else NO_RADIUS
+    t, values = poses
+    place = values[:, :2]
+    path = np.hypot(*np.diff(place[:: max(1, len(t) // 200)], axis=0).T).sum()
+    is_far = np.abs(place).min() > FAR_AWAY
+    is_on_map = is_far and np.ptp(place, axis=0).max() < FAR_AWAY
+    if is_on_map or FAST_CAR * float(np.ptp(t)) < path < fastest:
+        return CAR_RADIUS
+    return NO_RADIUS

@@ -22,8 +22,9 @@ from nics_drl_bridge.recording.mapping import (
     Reference,
     Value,
     explain_no_command,
+    is_place_on_earth,
+    may_be_place_on_earth,
 )
-from nics_drl_bridge.recording.names import split_words
 from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.recording import (
     MeasuredBy,
@@ -46,8 +47,6 @@ MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
 MOST_UNTRACKED = 0.05
 NO_LENGTH = 1e-9
 SHORTEST_S = 1.0
-SHORT_OF_EARTH = {"lat", "lon", "lng", "long"}  # short names of latitude and longitude
-NEAR_DEG = 1.0  # a drive is within so much of its latitude and longitude
 MOST_RATIO = 100.0  # of durations of two streams of a drive
 
 
@@ -56,12 +55,12 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     if mapping.episode is None:
         return _read_drive(source, mapping)[0]
     plain = mapping.model_copy(update={"episode": None})
-    single = split_table(source, mapping)
-    if not single:
-        recording, since = _read_drive(source, plain)
-        return split_by_time(source, mapping, recording, since)
+    episodes = split_table(source, mapping)
+    if not episodes:
+        recording, origin_s = _read_drive(source, plain)
+        return split_by_time(source, mapping, recording, origin_s)
     drives = []
-    for episode in single:
+    for episode in episodes:
         try:
             drives.append(replace(_read_drive(episode, plain)[0], source=episode.place))
         except RecordingError as error:
@@ -70,73 +69,66 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
 
 
 def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
-    """Reads a drive, and what was subtracted from the stamps of its pose [s]."""
+    """Reads a drive, and the time that was subtracted from the stamps of its pose [s]."""
     reader = MappedReader(source, mapping)
     _check_commands(reader, mapping.command)
-    found: dict[str, Stream] = {"pose": read_pose(reader, mapping.pose)}
-    groups: Names[str, Names[str, Value]] = {
-        "command": mapping.command,
-        "state": mapping.state,
+    streams = {
+        "pose": read_pose(reader, mapping.pose),
+        "command": _read_values(reader, "command", mapping.command, held=True),
     }
-    for name, values in groups.items():
-        if values:
-            held = name == "command"
-            parts = [
-                reader.read_series(f"{name}.{k}", v, None, held)
-                for k, v in values.items()
-            ]
-            found[name] = combine_series(name, parts, held)
-    if mapping.imu is not None and mapping.imu.heading is not None:
-        found["imu"] = _read_turn_rate(reader, mapping.imu, mapping.imu.heading)
+    if mapping.state:
+        streams["state"] = _read_values(reader, "state", mapping.state, held=False)
     for name in ("wheels", "imu", "odometry"):
-        if name not in found and (stream := getattr(mapping, name)) is not None:
-            found[name] = _read_measured(reader, name, stream)
-    for name, stream in found.items():
-        keep, note = stamping.select_new_rows(stream.t, stream.values, name)
+        measured = getattr(mapping, name)
+        if isinstance(measured, ImuSource) and measured.heading is not None:
+            streams[name] = _read_turn_rate(reader, measured, measured.heading)
+        elif measured is not None:
+            streams[name] = _read_measured(reader, name, measured)
+    for name, stream in streams.items():
+        is_new, note = stamping.select_new_rows(stream.t, stream.values, name)
         reader.add_notes(note)
-        found[name] = stream.rows(keep)
-    names = (*mapping.state, *mapping.command)
-    streams = cast(Any, found)
-    measured_by = mapping.pose.measured_by or _guess_pose_source(source, mapping)
-    made = Recording(
-        **streams,
+        streams[name] = stream.rows(is_new)
+    recording = Recording(
+        **cast(Any, streams),
         source=source.place,
-        variables=names,
+        variables=(*mapping.state, *mapping.command),
         latency=source.latency,
-        measured_by=measured_by,
+        measured_by=mapping.pose.measured_by or _guess_pose_source(source, mapping),
     )
-    check_streams(
-        made,
-        {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2},
-    )
-    shifted: Any = _shift_to_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
-    since = float(found["pose"].t[0] - shifted["pose"].t[0])
-    return replace(made, **shifted, repairs=tuple(reader.notes)), since
+    widths = {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2}
+    check_streams(recording, widths)
+    shifted: Any = _shift_to_zero(streams, mapping.clock or schema.ROBOT_CLOCK, reader)
+    origin_s = float(streams["pose"].t[0] - shifted["pose"].t[0])
+    return replace(recording, **shifted, repairs=tuple(reader.notes)), origin_s
+
+
+def _read_values(
+    reader: MappedReader, name: str, values: Names[str, Value], held: bool
+) -> Stream:
+    parts = [
+        reader.read_series(f"{name}.{key}", value, None, held)
+        for key, value in values.items()
+    ]
+    return combine_series(name, parts, held)
 
 
 def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
-    """Refuses what was measured, by the name of its column, where a command is needed."""
+    """Refuses a column as a command whose name or values say that it was measured."""
     for name, value in commands.items():
-        table, which = reader.locate(value.from_)
-        is_number = isinstance(which, int) or (
-            which not in table.names and which.isdecimal()
-        )
-        known = is_number and int(which) < len(table.names)
-        column = table.names[int(which)] if known else str(which)
-        if why := explain_no_command(column):
-            raise ConfigError(f"{table.place}: command.{name}: {why}.")
-        words = {*split_words(column)}
-        if words & SHORT_OF_EARTH and _is_place_on_earth(read_numbers(table, which)):
-            fault = f"{column!r} looks like a latitude or longitude, and was not sent to the robot"
-            raise ConfigError(
-                f"{table.place}: command.{name}: {fault}; name a column that was."
-            )
-
-
-def _is_place_on_earth(values: Array) -> bool:
-    """True for values that stay within a degree, far from zero, as places on the earth do."""
-    known = values[np.isfinite(values)]
-    return len(known) > 0 and np.ptp(known) < NEAR_DEG <= np.abs(known).max()
+        table, reference = reader.locate(value.from_)
+        column = str(reference)
+        is_number = column.isdecimal() and reference not in table.names
+        if is_number and int(column) < len(table.names):
+            column = table.names[int(column)]
+        fault = explain_no_command(column)
+        if not fault and may_be_place_on_earth(column):
+            values = read_numbers(table, reference)
+            values = values[np.isfinite(values)]
+            if len(values) and is_place_on_earth(column, values.min(), values.max()):
+                fault = f"{column!r} looks like a latitude or longitude"
+                fault += ", and was not sent to the robot; name a column that was"
+        if fault:
+            raise ConfigError(f"{table.place}: command.{name}: {fault}.")
 
 
 def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
@@ -147,7 +139,7 @@ def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
     tables = [pose.in_, *(str(each).partition(":")[0] for each in references)]
     topics = [name for table in tables if table for name in (table, f"/{table}")]
     kinds = [source.get_table(name).kind for name in topics if name in source.names]
-    kind = next((each for each in kinds if each), "")
+    kind = next(filter(None, kinds), "")
     names = [pose.in_, pose.clock, *pose.frames, *references]
     return guess_source_by_names(
         (str(name) for name in names if name is not None), kind
@@ -155,150 +147,136 @@ def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
 
 
 def _read_turn_rate(reader: MappedReader, imu: ImuSource, heading: Value) -> Stream:
-    """Reads a second heading as accelerations of zero and the turn rate that integrates to it."""
+    """Reads a second heading as the turn rate that integrates to it, without accelerations."""
     heading = heading.model_copy(update={"unit": heading.unit or "rad"})
-    unit = get_unit(heading).si
-    if unit != "rad":
-        raise ConfigError(
-            f"imu.heading: is in {unit}, where rad is needed; check its unit."
-        )
+    _check_kind("imu.heading", heading, ("rad",))
     series = reader.read_series("imu.heading", heading, imu, held=False)
-    joined = combine_series("imu", [series], held=False)
-    t = joined.t
-    keep = np.concatenate([[True], np.diff(t) > 0.0])
-    joined = joined.rows(keep)
-    t = t[keep]
-    if len(t) < 2:
-        return replace(joined, values=np.zeros((len(t), 3)))
-    turned = np.unwrap(joined.values[:, 0])
-    rate = np.gradient(turned, t)
-    return replace(
-        joined, values=np.stack([np.zeros_like(t), np.zeros_like(t), rate], axis=1)
-    )
+    stream = combine_series("imu", [series], held=False)
+    stream = stream.rows(np.append(True, np.diff(stream.t) > 0.0))
+    values = np.zeros((len(stream.t), 3))
+    if len(stream.t) > 1:
+        values[:, 2] = np.gradient(np.unwrap(stream.values[:, 0]), stream.t)
+    return replace(stream, values=values)
+
+
+def _check_kind(name: str, value: Value, kinds: Sequence[str]) -> None:
+    """Refuses a value whose unit is of no kind that is needed (ConfigError)."""
+    si = get_unit(value).si
+    if si not in kinds:
+        raise ConfigError(
+            f"{name}: is in {si}, where {' or '.join(kinds)} is needed; check its unit."
+        )
 
 
 def _check_units(reader: MappedReader, pose: Stream) -> None:
     """Refuses poses, as they were recorded, that only a wrong unit explains."""
     mapping = reader.mapping
+    radius = 0.0
     if isinstance(mapping.robot, dict):
-        given = mapping.robot.get("footprint_radius")
-    else:
-        given = None
-    radius = float(given) if isinstance(given, (int, float)) else 0.0
-    if fault := find_implausible_pose(pose.t, pose.values, radius=radius):
-        time = mapping.pose.time or mapping.time
-        line = fault.line.replace("...", str(time.columns[0] if time else "t"))
-        said = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"
-        raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
+        given_radius = mapping.robot.get("footprint_radius")
+        if isinstance(given_radius, (int, float)):
+            radius = float(given_radius)
+    fault = find_implausible_pose(pose.t, pose.values, radius=radius)
+    if fault is None:
+        return
+    column = "t"
+    if time := mapping.pose.time or mapping.time:
+        column = str(time.columns[0])
+    line = fault.line.replace("...", column)
+    said = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"
+    raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
 
 
 def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
     """Reads a stream of measurements; values that it lacks are zero."""
-    parts: list[Series | None] = []
-    for key, kinds in schema.SI[name].items():
+    parts: dict[int, Series] = {}
+    for column, (key, kinds) in enumerate(schema.SI[name].items()):
         value: Value | None = getattr(stream, key)
-        if (
-            value is not None
-            and value.unit is not None
-            and get_unit(value).si not in kinds
-        ):
-            fault = f"{name}.{key}: is in {get_unit(value).si}"
-            raise ConfigError(
-                f"{fault}, where {' or '.join(kinds)} is needed; check its unit."
-            )
-        parts.append(
-            reader.read_series(f"{name}.{key}", value, stream, False) if value else None
-        )
-    joined = combine_series(
-        name, [part for part in parts if part is not None], held=False
-    )
-    columns = iter(joined.values.T)
-    full = [
-        np.zeros(len(joined.t)) if part is None else next(columns) for part in parts
-    ]
-    return replace(joined, values=np.stack(full, axis=1))
+        if value is None:
+            continue
+        if value.unit is not None:
+            _check_kind(f"{name}.{key}", value, kinds)
+        parts[column] = reader.read_series(f"{name}.{key}", value, stream, held=False)
+    measured = combine_series(name, list(parts.values()), held=False)
+    values = np.zeros((len(measured.t), len(schema.SI[name])))
+    values[:, list(parts)] = measured.values
+    return replace(measured, values=values)
 
 
 def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
     """Reads poses, with their deviations where a covariance is mapped."""
     if pose.x is None:
         pose = _complete_pose(reader, pose)
+    values = {"x": pose.x, "y": pose.y, "heading": pose.heading}
+    units = {"x": pose.unit, "y": pose.unit, "heading": pose.heading_unit}
+    kinds = dict(schema.SI["pose"])
     parts = []
     factors = []
-    whole = list[Value]()
-    for key, kinds in schema.SI["pose"].items():
-        value: Value | None = getattr(pose, key)
+    for key, value in values.items():
         if value is None:
             parts.append(_read_heading(reader, pose, pose.quaternion or ""))
             factors.append(schema.UNITS[pose.heading_unit].factor)
             continue
-        unit = value.unit or (pose.heading_unit if key == "heading" else pose.unit)
-        value = value.model_copy(update={"unit": unit})
-        kinds = kinds if key != "y" else (get_unit(whole[0]).si,)
-        whole.append(value)
-        if get_unit(value).si not in kinds:
-            fault = f"pose.{key}: is in {get_unit(value).si}, not in {kinds[0]}"
-            raise ConfigError(f"{fault}; check its unit.")
+        value = value.model_copy(update={"unit": value.unit or units[key]})
+        _check_kind(f"pose.{key}", value, kinds[key])
+        unit = get_unit(value)
+        if key == "x":
+            kinds["y"] = (unit.si,)
         parts.append(reader.read_series(f"pose.{key}", value, pose, held=False))
-        factors.append(abs(get_unit(value).factor * value.scale))
-        if (
-            key == "y" and get_unit(value).si == "rad"
-        ):  # longitude, latitude; covariances are in m
-            ground = east_and_north(parts[0].values, parts[1].values)
-            parts = [
-                each._replace(values=v) for each, v in zip(parts, ground, strict=True)
-            ]
+        factors.append(abs(unit.factor * value.scale))
+        if key == "y" and unit.si == "rad":
+            # Longitude and latitude; covariances are in m.
+            east, north = east_and_north(parts[0].values, parts[1].values)
+            parts = [parts[0]._replace(values=east), parts[1]._replace(values=north)]
             factors = [1.0, 1.0]
     _check_units(reader, combine_series("pose", parts, held=False))
-    heading = parts[2]
-    parts[2] = heading._replace(
-        values=np.unwrap(heading.values)
-    )  # as it may be interpolated
-    made = combine_series("pose", parts, held=False)
-    made.values[:, 2] = wrap_angle(made.values[:, 2])
+    # A heading can be interpolated only without its jumps.
+    parts[2] = parts[2]._replace(values=np.unwrap(parts[2].values))
+    stream = combine_series("pose", parts, held=False)
+    stream.values[:, 2] = wrap_angle(stream.values[:, 2])
     if pose.covariance is None:
-        return made
-    sigma = _read_deviations(reader, pose, pose.covariance, made.t)
-    return made if sigma is None else replace(made, sigma=sigma * np.array(factors))
+        return stream
+    sigma = _read_deviations(reader, pose, pose.covariance, stream.t)
+    if sigma is not None:
+        sigma = sigma * np.array(factors)
+    return replace(stream, sigma=sigma)
 
 
 def _read_heading(
-    reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference]
+    reader: MappedReader, pose: PoseSource, references: str | Sequence[Reference]
 ) -> Series:
     """Returns the heading of quaternions; those of length 0 are left out."""
-    each = [f"{given}.{axis}" for axis in "xyzw"] if isinstance(given, str) else given
+    if isinstance(references, str):
+        references = [f"{references}.{axis}" for axis in "xyzw"]
+    values = [Value.model_validate({"from": reference}) for reference in references]
     parts = [
-        reader.read_series(
-            "pose.quaternion", Value.model_validate({"from": which}), pose, held=False
-        )
-        for which in each
+        reader.read_series("pose.quaternion", value, pose, held=False)
+        for value in values
     ]
-    made = combine_series("pose.quaternion", parts, held=False)
-    norm = np.linalg.norm(made.values, axis=1)
-    lost = norm < NO_LENGTH
-    if lost.any() and lost.mean() <= MOST_UNTRACKED:
-        some = f"{int(lost.sum())} of {len(lost)} rows without orientation"
-        reader.add_notes(f"pose: {some} were left out.")
-        made = made.rows(~lost)
-        norm = norm[~lost]
-    for k in np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)[:1]:
-        where = (
-            f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
-        )
-        fault = f"{where} the quaternion has the length {norm[k]:.3f} and not 1"
-        raise RecordingError(f"{fault}; list its columns in the order x, y, z, w.")
-    if recordings.is_w_first(made.values):
-        raise RecordingError(f"{reader.source.place}: pose: {recordings.W_FIRST}.")
-    x, y, z, w = made.values.T
-    tilt = np.degrees(
-        np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0)))
-    )
+    stream = combine_series("pose.quaternion", parts, held=False)
+    place = f"{reader.source.place}: pose"
+    length = np.linalg.norm(stream.values, axis=1)
+    is_lost = length < NO_LENGTH
+    if is_lost.any() and is_lost.mean() <= MOST_UNTRACKED:
+        lost = f"{int(is_lost.sum())} of {len(is_lost)} rows without orientation"
+        reader.add_notes(f"pose: {lost} were left out.")
+        stream = stream.rows(~is_lost)
+        length = length[~is_lost]
+    for row in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
+        since = f"{stream.t[row] - stream.t[0]:.3f} s from the start"
+        fault = f"{since} the quaternion has the length {length[row]:.3f} and not 1"
+        advice = "list its columns in the order x, y, z, w"
+        raise RecordingError(f"{place}: {fault}; {advice}.")
+    if recordings.is_w_first(stream.values):
+        raise RecordingError(f"{place}: {recordings.W_FIRST}.")
+    x, y, z, w = stream.values.T
+    cosine = np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0)
+    tilt = np.degrees(np.median(np.arccos(cosine)))
     if tilt > MOST_TILT_DEG:
-        fault = f"pose: by its quaternion the body is tilted by {tilt:.0f} deg"
+        fault = f"by its quaternion the body is tilted by {tilt:.0f} deg"
         advice = "list its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]"
-        raise RecordingError(f"{reader.source.place}: {fault}; {advice}.")
-    heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return Series(made.t, heading, made.clock)
+        raise RecordingError(f"{place}: {fault}; {advice}.")
+    return Series(stream.t, recordings.compute_heading(x, y, z, w), stream.clock)
 
 
 POSES = (
@@ -314,48 +292,53 @@ POSES = (
 def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
     """Completes a pose of which only the topic is given."""
     table, _ = reader.locate("", pose.in_)
-    for position, turned, covariance in POSES:
-        x, y = (position.format(axis) for axis in "xy")
-        quaternion = f"{turned}.w" in table.names
-        if x in table.names and (quaternion or turned in table.names):
-            known = {"x": x, "y": y, "quaternion" if quaternion else "heading": turned}
-            given = pose.model_dump(by_alias=True, exclude_none=True)
-            if covariance is not None and "covariance" not in given:
-                known["covariance"] = covariance
-            return PoseSource.model_validate({**given, **known})
+    for position, orientation, covariance in POSES:
+        keys = {"x": position.format("x"), "y": position.format("y")}
+        if f"{orientation}.w" in table.names:
+            keys["quaternion"] = orientation
+        elif orientation in table.names:
+            keys["heading"] = orientation
+        if len(keys) < 3 or keys["x"] not in table.names:
+            continue
+        given = pose.model_dump(by_alias=True, exclude_none=True)
+        if covariance is not None and "covariance" not in given:
+            keys["covariance"] = covariance
+        return PoseSource.model_validate({**given, **keys})
     fault = f"{table.place}: its messages are no poses of a known form"
-    raise RecordingError(
-        f"{fault}; name x, y and heading or quaternion in the mapping."
-    )
+    advice = "name x, y and heading or quaternion in the mapping"
+    raise RecordingError(f"{fault}; {advice}.")
 
 
 def _read_deviations(
-    reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference], t: Array
+    reader: MappedReader,
+    pose: PoseSource,
+    references: str | Sequence[Reference],
+    t: Array,
 ) -> Array | None:
-    """Returns standard deviations (T, 3) from variances or a matrix; None if they say nothing."""
-    if isinstance(given, str):
-        table, which = reader.locate(given, pose.in_)
-        count = sum(name.startswith(f"{which}[") for name in table.names)
+    """Returns standard deviations (T, 3) from variances or a matrix; None if none is known."""
+    if isinstance(references, str):
+        table, field = reader.locate(references, pose.in_)
+        count = sum(name.startswith(f"{field}[") for name in table.names)
         if count not in schema.COVARIANCES:
-            fault = f"{table.place}: {which!r} has {count} numbers"
+            fault = f"{table.place}: {field!r} has {count} numbers"
             raise RecordingError(f"{fault}; a covariance has 3, 9 or 36.")
-        given = [f"{given}[{k}]" for k in range(count)]
+        references = [f"{references}[{k}]" for k in range(count)]
     columns = []
-    for k in schema.COVARIANCES[len(given)]:
-        value = Value.model_validate({"from": given[k]})
-        part = reader.read_series(
-            "pose.covariance", value, pose, held=False, infinite=True
+    for k in schema.COVARIANCES[len(references)]:
+        value = Value.model_validate({"from": references[k]})
+        series = reader.read_series(
+            "pose.covariance", value, pose, held=False, allow_infinite=True
         )
-        positive = part.values > 0.0
-        known = np.interp(t, part.t, positive) == 1.0
-        variance = np.interp(t, part.t, np.where(positive, part.values, 0.0))
-        columns.append(np.sqrt(np.where(known, variance, np.nan)))
+        is_positive = series.values > 0.0
+        is_known = np.interp(t, series.t, is_positive) == 1.0
+        variance = np.interp(t, series.t, np.where(is_positive, series.values, 0.0))
+        columns.append(np.sqrt(np.where(is_known, variance, np.nan)))
     sigma = np.stack(columns, axis=1)
-    unknown = np.isnan(sigma)
-    if unknown.all():
+    is_unknown = np.isnan(sigma)
+    if is_unknown.all():
         return None
-    if unknown.any():
-        rows = int(unknown.any(axis=1).sum())
+    if is_unknown.any():
+        rows = int(is_unknown.any(axis=1).sum())
         reader.add_notes(
             f"pose: {rows} of {len(t)} rows have a variance that is not positive: unknown."
         )
@@ -363,48 +346,60 @@ def _read_deviations(
 
 
 def _shift_to_zero(
-    found: dict[str, Stream], main: str, reader: MappedReader
+    streams: dict[str, Stream], main_clock: str, reader: MappedReader
 ) -> dict[str, Stream]:
     """Shifts stamps to begin near 0: by one origin, but for clocks whose spans do not overlap."""
-    spans: dict[str, list[float]] = {}
-    for name, stream in found.items():
-        first = float(stream.t[0])
-        last = float(stream.t[-1])
-        span = spans.setdefault(stream.clock, [first, last])
-        if first > span[1] or last < span[0]:
-            fault = (
-                f"{reader.source.place}: {name} lasts from {first:.3f} to {last:.3f} s"
-            )
-            other = f"the streams before it from {span[0]:.3f} to {span[1]:.3f} s, on one clock"
-            advice = "check their `time:`, or give one of them a `clock:` of its own"
-            raise RecordingError(f"{fault}, {other}; {advice}.")
-        span[:] = min(first, span[0]), max(last, span[1])
-    pose = found["pose"]
-    for name, stream in found.items():
-        lasts = np.ptp(stream.t)
-        usual = max(np.ptp(pose.t), 1e-9)
-        if name == "pose" and lasts < SHORTEST_S:
-            fault = f"{reader.source.place}: the pose lasts {lasts:.3g} s"
-            raise RecordingError(
-                f"{fault}; give the `unit:` of its `time:`, as s, min or h."
-            )
-        if lasts and not 1.0 / MOST_RATIO < lasts / usual < MOST_RATIO:
-            fault = f"{reader.source.place}: {name} lasts {lasts:.4g} s, the pose {usual:.4g} s"
-            raise RecordingError(
-                f"{fault}; give the `unit:` of the `time:` that is wrong."
-            )
-    base = spans.get(main) or next(iter(spans.values()))
-    origin = {}
-    combine_series = [
-        span for span in spans.values() if span[0] <= base[1] and span[1] >= base[0]
-    ]
-    first = min(span[0] for span in combine_series)
-    for clock, span in spans.items():
-        origin[clock] = first if span in combine_series else span[0]
-        if span not in combine_series:
+    spans = _find_spans(streams, reader.source.place)
+    _check_durations(streams, reader.source.place)
+    start, stop = spans.get(main_clock) or next(iter(spans.values()))
+    overlapping = {
+        clock: first
+        for clock, (first, last) in spans.items()
+        if first <= stop and last >= start
+    }
+    common = min(overlapping.values())
+    origins = dict.fromkeys(spans, common)
+    for clock, (first, _) in spans.items():
+        if clock not in overlapping:
+            origins[clock] = first
             reader.add_notes(
-                f"The clock {clock!r} was set to 0 at its first stamp, {span[0]:.3f} s."
+                f"The clock {clock!r} was set to 0 at its first stamp, {first:.3f} s."
             )
     return {
-        n: replace(each, t=each.t - origin[each.clock]) for n, each in found.items()
+        name: replace(stream, t=stream.t - origins[stream.clock])
+        for name, stream in streams.items()
     }
+
+
+def _find_spans(
+    streams: dict[str, Stream], place: str
+) -> dict[str, tuple[float, float]]:
+    """Returns first and last stamp of each clock [s]; streams of one clock have to overlap."""
+    spans: dict[str, tuple[float, float]] = {}
+    for name, stream in streams.items():
+        first = float(stream.t[0])
+        last = float(stream.t[-1])
+        start, stop = spans.get(stream.clock, (first, last))
+        if first > stop or last < start:
+            fault = f"{place}: {name} lasts from {first:.3f} to {last:.3f} s"
+            others = (
+                f"the streams before it from {start:.3f} to {stop:.3f} s, on one clock"
+            )
+            advice = "check their `time:`, or give one of them a `clock:` of its own"
+            raise RecordingError(f"{fault}, {others}; {advice}.")
+        spans[stream.clock] = min(first, start), max(last, stop)
+    return spans
+
+
+def _check_durations(streams: dict[str, Stream], place: str) -> None:
+    """Refuses streams that last far longer or shorter than the pose, as in a wrong unit."""
+    pose_s = float(np.ptp(streams["pose"].t))
+    if pose_s < SHORTEST_S:
+        advice = "give the `unit:` of its `time:`, as s, min or h"
+        raise RecordingError(f"{place}: the pose lasts {pose_s:.3g} s; {advice}.")
+    for name, stream in streams.items():
+        duration_s = float(np.ptp(stream.t))
+        if duration_s and not 1.0 / MOST_RATIO < duration_s / pose_s < MOST_RATIO:
+            fault = f"{place}: {name} lasts {duration_s:.4g} s, the pose {pose_s:.4g} s"
+            advice = "give the `unit:` of the `time:` that is wrong"
+            raise RecordingError(f"{fault}; {advice}.")

@@ -90,6 +90,8 @@ def to_si(unit: str, ticks_per_turn: float | None = None) -> UnitOfData:
 
 # Words of columns that can't have been sent to a robot: where it is, and how uncertain that is.
 PLACES_ON_EARTH = word_set("latitude longitude altitude")
+SHORT_OF_EARTH = word_set("lat lon lng long")
+NEAR_DEG = 1.0  # a drive is within so much of its latitude and longitude
 NO_COMMANDS = PLACES_ON_EARTH | word_set("covariance covariances cov variance")
 
 NO_COMMAND_NAMED = (
@@ -139,6 +141,17 @@ def explain_no_command(column: str) -> str:
     is_place = found & PLACES_ON_EARTH
     what = "where the robot was" if is_place else "how uncertain a measurement is"
     return f"{column!r} tells {what}, and was not sent to the robot; name a column that was"
+
+
+def may_be_place_on_earth(column: str) -> bool:
+    """True for columns like `lat`, which may hold a latitude or longitude."""
+    return not SHORT_OF_EARTH.isdisjoint(split_words(column))
+
+
+def is_place_on_earth(column: str, low: float, high: float) -> bool:
+    """True for `lat` or `lon` whose values stay within a degree, as those of a drive do."""
+    is_near = high - low < NEAR_DEG <= max(abs(low), abs(high))
+    return is_near and may_be_place_on_earth(column)
 
 
 class Time(Schema):

@@ -78,8 +78,17 @@ class PoseGuess(NamedTuple):
     @property
     def columns(self) -> tuple[str, ...]:
         """All columns that it uses."""
-        heading = () if self.heading is None else (self.heading,)
-        return (self.x, self.y, *heading, *self.quaternion)
+        if self.heading is None:
+            return (self.x, self.y, *self.quaternion)
+        return (self.x, self.y, self.heading)
+
+
+def list_used_columns(table: TableSurvey, pose: PoseGuess | None) -> set[str]:
+    """Returns the columns of a table that are stamps or belong to the pose."""
+    used = {*table.stamp_columns}
+    if pose is not None and pose.table is table:
+        used.update(pose.columns)
+    return used
 
 
 def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:

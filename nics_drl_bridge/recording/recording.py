@@ -528,3 +528,8 @@ def is_w_first(quaternions: ArrayLike) -> bool:
     """True if quaternions (T, 4), read as x, y, z, w, look like w, x, y, z of a level body."""
     size = np.mean(np.square(np.asarray(quaternions).reshape(-1, 4)), axis=0)
     return bool(size[0] + size[1] > TILTED and size[1] + size[2] < LEVEL)
+
+
+def compute_heading(x: Array, y: Array, z: Array, w: Array) -> Array:
+    """Returns the headings (T,) of quaternions [rad]."""
+    return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))

@@ -10,7 +10,7 @@ import numpy as np
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.mapping import UNITS
+from nics_drl_bridge.recording.mapping import UNITS, is_place_on_earth
 from nics_drl_bridge.recording.names import split_words, word_set, write_reference
 from nics_drl_bridge.recording.recording import (
     IRREGULAR,
@@ -119,6 +119,11 @@ class Survey(NamedTuple):
     low: float  # NaN for text
     high: float
 
+    @property
+    def is_place_on_earth(self) -> bool:
+        """True if it seems to be a latitude or longitude."""
+        return is_place_on_earth(self.name, self.low, self.high)
+
 
 @dataclass
 class TableSurvey:
@@ -162,6 +167,13 @@ class TableSurvey:
         if self.t is None or len(self.t) < 2:
             return []
         return list(_describe_regularity(self.t, self.data))
+
+    def list_words(self, column: str) -> list[str]:
+        """Returns the words of a column, of `data` those of the table."""
+        words = split_unit(column)[0]
+        if words == ["data"]:
+            return split_words(self.name)
+        return words
 
     def refer_to(self, column: str, alone: bool) -> str:
         """Returns how a mapping refers to a column."""

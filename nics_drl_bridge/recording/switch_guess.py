@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.names import split_words, word_set
+from nics_drl_bridge.recording.names import word_set
 from nics_drl_bridge.recording.survey import Survey, TableSurvey
+from nics_drl_bridge.recording.table import Column, is_text
+from nics_drl_bridge.recording.values import match_values
 
 ENABLING = word_set("""
     safety enable enabled armed active activated auto autonomous autonomy
@@ -17,6 +18,7 @@ ENABLING = word_set("""
 DISABLING = word_set("estop emergency kill stop stopped disabled manual fault")
 ON_WORDS = word_set("auto autonomous autonomy enabled on armed active offboard run")
 MODES = ENABLING | word_set("mode state status safety switch")
+NO_VALUES = np.zeros(0)
 FASTER = 2.0  # the robot moves so much faster while the switch is on
 FEWEST = 20  # rows of each value of the switch, from which on the motion tells
 
@@ -28,79 +30,76 @@ class Switch(NamedTuple):
     column: str
     on: str  # the value, as a mapping has it
 
-    def refer_to(self, alone: bool) -> str:
-        """Returns how a mapping refers to the column."""
-        text = self.table.refer_to(self.column, alone)
-        return text if text.startswith('"') or ":" not in text else write_key(text)
-
-
-def write_key(text: str) -> str:
-    """Returns a reference with a colon as a key of YAML."""
-    return f'"{text}"'
+    def refer_to(self, is_single: bool) -> str:
+        """Returns how a mapping refers to the column in a key."""
+        text = self.table.refer_to(self.column, is_single)
+        if ":" in text and not text.startswith('"'):
+            return f'"{text}"'
+        return text
 
 
 def guess_switch(
-    tables: Sequence[TableSurvey], pose: tuple[Array, Array] | None
+    tables: Sequence[TableSurvey], poses: tuple[Array, Array] | None
 ) -> Switch | None:
-    """Finds the only switch, by its name; `pose`, stamps (T,) and poses (T, 3), may deny it."""
-    found = []
+    """Finds the only switch, by its name; `poses`, stamps (T,) and poses (T, 3), may deny it."""
+    switches = []
     for table in tables:
         for column in table.columns:
-            words = split_words(column.name)
-            words = split_words(table.name) if words == ["data"] else words
-            on = _find_on_value({*words}, table, column)
-            if on is not None and not _is_denied(table, column, on, pose):
-                found.append(Switch(table, column.name, on))
-    return found[0] if len(found) == 1 else None
+            words = {*table.list_words(column.name)}
+            values = table.data.get(column.name, NO_VALUES)
+            on = _find_on_value(words, values)
+            if on is not None and not _is_denied(table, column, on, poses):
+                switches.append(Switch(table, column.name, on))
+    if len(switches) != 1:
+        return None
+    return switches[0]
 
 
-def _find_on_value(words: set[str], table: TableSurvey, column: Survey) -> str | None:
+def _find_on_value(words: set[str], values: Column) -> str | None:
     """Returns the value at which the commands count, by the names of column and values."""
-    data = table.data.get(column.name)
-    if data is None or not len(data):
+    if is_text(values):
+        texts = {str(value) for value in np.unique(values)}
+        on = [text for text in texts if text.lower() in ON_WORDS]
+        if words & MODES and len(texts) == 2 and len(on) == 1:
+            return on[0]
         return None
-    if data.dtype.kind in "US":
-        texts = {str(each) for each in np.unique(data)}
-        on = [each for each in texts if each.lower() in ON_WORDS]
-        return on[0] if words & MODES and len(texts) == 2 and len(on) == 1 else None
-    if data.dtype.kind not in "fiub":
+    if values.dtype.kind not in "fiub":
         return None
-    values = {
-        float(each) for each in np.unique(data[np.isfinite(data.astype(np.float64))])
-    }
-    if values != {0.0, 1.0}:
+    numbers = np.unique(values.astype(np.float64))
+    if {*numbers[np.isfinite(numbers)].tolist()} != {0.0, 1.0}:
         return None
     if words & DISABLING or {"e", "stop"} <= words:
         return "0"
-    return "1" if words & ENABLING else None
+    if words & ENABLING:
+        return "1"
+    return None
 
 
 def _is_denied(
-    table: TableSurvey, column: Survey, on: str, pose: tuple[Array, Array] | None
+    table: TableSurvey, column: Survey, on: str, poses: tuple[Array, Array] | None
 ) -> bool:
     """True if the robot does not move faster while the switch is on."""
-    data = table.data[column.name]
-    if pose is None or table.t is None or len(table.t) != len(data):
+    values = table.data[column.name]
+    if poses is None or table.t is None or len(table.t) != len(values):
         return False
-    t, place = pose
+    t, pose = poses
     order = np.argsort(table.t, kind="stable")
     row = np.searchsorted(table.t[order], t, side="right") - 1
-    known = (row >= 0) & (t <= table.t[order[-1]])
-    is_on = _match_value(data, on)[order][np.clip(row, 0, None)]
-    step = np.hypot(*np.diff(place[:, :2], axis=0).T)
+    is_known = (row >= 0) & (t <= table.t[order[-1]])
+    is_on = match_values(values, _parse_value(on))[order][np.clip(row, 0, None)]
+    step = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     span = np.diff(t)
-    moved = known[1:] & known[:-1] & (span > 0.0)
-    while_on = moved & is_on[1:] & is_on[:-1]
-    while_off = moved & ~is_on[1:] & ~is_on[:-1]
+    is_usable = is_known[1:] & is_known[:-1] & (span > 0.0)
+    while_on = is_usable & is_on[1:] & is_on[:-1]
+    while_off = is_usable & ~is_on[1:] & ~is_on[:-1]
     if while_on.sum() < FEWEST or while_off.sum() < FEWEST:
         return False
-    speeds = [
-        float(step[rows].sum() / span[rows].sum()) for rows in (while_on, while_off)
-    ]
-    return speeds[0] < FASTER * speeds[1]
+    speed_on = float(step[while_on].sum() / span[while_on].sum())
+    speed_off = float(step[while_off].sum() / span[while_off].sum())
+    return speed_on < FASTER * speed_off
 
 
-def _match_value(data: NDArray[np.generic], value: str) -> NDArray[np.bool_]:
-    if data.dtype.kind in "US":
-        return np.asarray(data.astype(np.str_) == value)
-    return np.asarray(data.astype(np.float64) == float(value))
+def _parse_value(text: str) -> float | str:
+    if text in ("0", "1"):
+        return float(text)
+    return text

@@ -101,6 +101,11 @@ def _find_column(place: str, names: Sequence[str], which: str | int) -> int:
     raise RecordingError(f"{place}: has no column {which!r}; {hint}")
 
 
+def is_text(column: Column) -> bool:
+    """True if a column holds text, and no numbers."""
+    return column.dtype.kind in "US"
+
+
 def read_numbers(table: Table, which: str | int) -> Array:
     """Returns a column of numbers (T,), NaN where there is none; RecordingError for text."""
     column = table.column(which)

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
+from nics_drl_bridge.recording.guess import propose_mapping
 from nics_drl_bridge.recording.joining import APART_S, LEARNT_SHARE, join
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.recording import (
     Recording,
     load_recording,
     save_recording,
 )
+from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -125,6 +128,30 @@ def test_an_episode_column_makes_episodes_whether_its_times_begin_anew_or_go_on(
     sources = [each.source.rpartition("(")[2] for each in joined.episodes]
     assert sources == ["episode 0)", "episode 1)"] * 2
     assert joined.driven_s() == pytest.approx(20.0, abs=0.2)
+
+
+@pytest.mark.parametrize("restarts", [True, False])
+@pytest.mark.parametrize("name", ["episode", "trial_id"])
+def test_a_draft_names_the_column_that_numbers_episodes(tmp_path, name, restarts):
+    columns = drive(1000)
+    if restarts:
+        columns["t"] = np.concatenate([columns["t"][:400], columns["t"][:600]])
+    episode = np.repeat([0, 1], [400, 600])
+    path = write(tmp_path / "log.csv", columns | {name: episode})
+    with open_source(path) as source:
+        draft = parse_yaml(propose_mapping(inspect_tables(source)), "draft")
+    assert draft["episode"] == name
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.repeat([0, 1, 0], [400, 400, 200]), np.arange(1000), np.zeros(1000)],
+)
+def test_a_draft_leaves_out_a_column_that_numbers_no_episodes(tmp_path, values):
+    path = write(tmp_path / "log.csv", drive(1000) | {"episode": values})
+    with open_source(path) as source:
+        draft = propose_mapping(inspect_tables(source))
+    assert "episode:" not in draft
 
 
 def test_episodes_reach_over_the_tables_of_a_folder(tmp_path):

@@ -515,7 +515,7 @@ def test_longitude_and_latitude_are_places_on_the_ground(tmp_path):
     moved = np.stack([columns["x"], columns["y"]], axis=1)
     assert np.allclose(found - found[0], moved - moved[0], rtol=1e-3, atol=1e-4)
     with pytest.raises(
-        ConfigError, match=r"pose.y: is in m, not in rad; check its unit"
+        ConfigError, match=r"pose.y: is in m, where rad is needed; check its unit"
     ):
         read(path, pose=pose | {"y": {"from": "y", "unit": "m"}})
 
