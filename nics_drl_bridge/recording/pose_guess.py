@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,6 +64,7 @@ ALONG = 0.9  # share to which columns without names lead along their heading
 CONFIRMED = 0.7  # share to which a place leads along the quaternion that follows it
 NEARLY_A_TURN = 5.5  # [rad] from one row to the next
 PIECES = 30  # of the extent of a path, in which it is compared with a heading
+MOST_COMPARED = 200  # poses, about
 ELEMENT = re.compile(r"\[\d+\]")
 
 
@@ -92,140 +94,136 @@ def list_used_columns(table: TableSurvey, pose: PoseGuess | None) -> set[str]:
 
 
 def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
-    """Finds x, y and heading, or a quaternion: by their names, else where the motion shows them."""
-    beside = len(tables) > 1  # then the names of tables tell what they hold
-    mine = [
-        table
-        for table in tables
-        if not (beside and {*split_words(table.name)} & OTHERS)
-    ]
-    found = [guess for table in mine for guess in _find_named_poses(table)]
-    if not found:
-        found = [guess for table in mine for guess in _find_unnamed_poses(table)]
-    return max(found, key=_rank_pose, default=None)
+    """Finds x, y and heading, or a quaternion, by their names, or where the motion shows them."""
+    if len(tables) > 1:  # then the names of tables say what they hold
+        tables = [each for each in tables if OTHERS.isdisjoint(split_words(each.name))]
+    poses = [pose for table in tables for pose in _find_named_poses(table)]
+    if not poses:
+        poses = [pose for table in tables for pose in _find_unnamed_poses(table)]
+    return max(poses, key=_rank_pose, default=None)
 
 
 def _rank_pose(pose: PoseGuess) -> float:
     """Returns how far a pose is to be preferred to others, by what its names say."""
     words = {*split_words(pose.x)}
-    if (
-        pose.table.kind or not words & SOURCES
-    ):  # else the column itself says more than its file
+    # A column whose name says its source says more than the name of its file.
+    if pose.table.kind or not words & SOURCES:
         words |= {*split_words(pose.table.name)}
-    trust = 0.0
+    rank = 0.0
     if words & TRACKERS or {"ground", "truth"} <= words:
-        trust += 3.0
+        rank += 3.0
     elif words & LOCALISERS:
-        trust += 2.0
+        rank += 2.0
     if words & SENSORS:
-        trust -= 2.0
+        rank -= 2.0
     if pose.table.kind.endswith("/TFMessage"):
-        trust -= 1.0
-    return trust + 0.5 * bool(pose.quaternion)
+        rank -= 1.0
+    return rank + 0.5 * bool(pose.quaternion)
 
 
 def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
     """Yields the poses whose x, y and heading say so by their names."""
     if OTHER_PLACES.search(table.kind):
         return
-    named: dict[tuple[str, ...], str] = {}
+    names = _name_by_words(table)
+    moving = {column.name for column in table.numbers if column.low < column.high}
+    for words, x in names.items():
+        if {*words} & (NOT_PLACES | TURNS):
+            continue
+        for first, second in ALL_AXES.items():
+            if first not in words:
+                continue
+            words_of_y = [second if word == first else word for word in words]
+            y = names.get(tuple(words_of_y))
+            kinds = ["m"] + ["rad"] * (first in GLOBE)
+            if y is None or not {x, y} & moving or not _is_in(x, kinds):
+                continue
+            if orientation := _find_orientation(words, names):
+                yield PoseGuess(table, x, y, **orientation)
+            elif heading := _find_heading_called_z(table, words, names):
+                yield PoseGuess(table, x, y, heading)
+
+
+def _name_by_words(table: TableSurvey) -> dict[tuple[str, ...], str]:
+    """Returns the names of columns of numbers by their words, without elements of arrays."""
+    names: dict[tuple[str, ...], str] = {}
     for column in table.numbers:
         if not ELEMENT.search(column.name):
-            named.setdefault(tuple(split_unit(column.name)[0]), column.name)
-    moving = {column.name for column in table.numbers if column.low < column.high}
-    for words, x in named.items():
-        for first, second in ALL_AXES.items():
-            y = named.get(tuple(second if word == first else word for word in words))
-            if first not in words or y is None or not {x, y} & moving:
-                continue
-            if {*words} & (NOT_PLACES | TURNS) or not _is_in(
-                x, first in GLOBE, "m", "rad"
-            ):
-                continue
-            turned = _find_heading(table, words, named)
-            if turned is not None:
-                heading, quaternion = turned
-                yield PoseGuess(table, x, y, heading, quaternion)
+            names.setdefault(tuple(split_unit(column.name)[0]), column.name)
+    return names
 
 
-def _is_in(name: str, also_angle: bool, *kinds: str) -> bool:
-    """True if a name has no unit, or one of these kinds; of angles only where they may be."""
+def _is_in(name: str, kinds: Sequence[str]) -> bool:
+    """True if a name has no unit, or one of these kinds."""
     unit = split_unit(name)[1]
-    if unit is None:
-        return True
-    si = UNITS[unit].si
-    return si in kinds and (also_angle or si != "rad")
+    return unit is None or UNITS[unit].si in kinds
 
 
-def _find_heading(
-    table: TableSurvey, place: tuple[str, ...], named: dict[tuple[str, ...], str]
-) -> tuple[str | None, tuple[str, ...]] | None:
-    """Returns the heading, or the quaternion, that shares most words with a place."""
-    best: tuple[float, str | None, tuple[str, ...]] | None = None
-    for words, name in named.items():
+def _find_orientation(
+    place: tuple[str, ...], names: dict[tuple[str, ...], str]
+) -> dict[str, Any]:
+    """Returns the quaternion, or else the heading, that shares most words with a place."""
+    quaternions: list[tuple[int, tuple[str, ...]]] = []
+    headings: list[tuple[float, str]] = []
+    for words, name in names.items():
         if not words or {*words} & SENSORS - {*place}:
             continue  # of another source than the place
-        shared = float(len({*words} & {*place}))
-        if words[-1] in ("w", "qw"):
-            each = [(*words[:-1], words[-1][:-1] + axis) for axis in "xyzw"]
-            if all(one in named for one in each) and each[0] != place:
-                quaternion = tuple(named[one] for one in each)
-                if best is None or 100.0 + shared > best[0]:
-                    best = 100.0 + shared, None, quaternion
-        elif (
-            words[-1] in HEADINGS
-            and not {*words} & NOT_PLACES
-            and _is_in(name, True, "rad")
-        ):
-            rank = shared - 0.1 * HEADINGS.index(words[-1])
-            if best is None or rank > best[0]:
-                best = rank, name, ()
-    if best is not None:
-        return best[1], best[2]
-    if place[-1] == "x" and "position" not in place:
-        z = named.get((*place[:-1], "z"))
-    else:
-        z = None
-    low, high = next(
-        ((c.low, c.high) for c in table.columns if c.name == z), (0.0, 0.0)
-    )
-    if (
-        z is not None
-        and _is_in(z, True, "rad")
-        and -3.3 < low < high < 6.4
-        and high - low > 0.5
-        and _is_heading(table, place, z)
-    ):
-        return z, ()
+        *first, last = words
+        shared = len({*words} & {*place})
+        if last in ("w", "qw"):
+            axes = [(*first, last[:-1] + axis) for axis in "xyzw"]
+            if all(axis in names for axis in axes) and axes[0] != place:
+                quaternions.append((shared, tuple(names[axis] for axis in axes)))
+        elif last in HEADINGS and not {*words} & NOT_PLACES and _is_in(name, ["rad"]):
+            headings.append((shared - 0.1 * HEADINGS.index(last), name))
+    if quaternions:
+        return {"quaternion": max(quaternions, key=itemgetter(0))[1]}
+    if headings:
+        return {"heading": max(headings, key=itemgetter(0))[1]}
+    return {}
+
+
+def _find_heading_called_z(
+    table: TableSurvey, place: tuple[str, ...], names: dict[tuple[str, ...], str]
+) -> str | None:
+    """Returns the column z beside x and y if it is a heading and no height, as the path shows."""
+    if place[-1] != "x" or "position" in place:
+        return None
+    z = names.get((*place[:-1], "z"))
+    if z is None or not _is_in(z, ["rad"]):
+        return None
+    height = next(column for column in table.columns if column.name == z)
+    is_angle = -3.3 < height.low < height.high < 6.4
+    if not is_angle or height.high - height.low <= 0.5:
+        return None
+    x = names[place]
+    y = names[(*place[:-1], "y")]
+    pose = _stack_finite([table.data[name].astype(np.float64) for name in (x, y, z)])
+    if pose is None:
+        return None
+    if (np.abs(np.diff(pose[:, 2])) > NEARLY_A_TURN).any():
+        return z  # it wraps, as only an angle does
+    pose = select_apart(pose)
+    alignment = max(measure_alignment(pose, 1.0), measure_alignment(pose, -1.0))
+    if len(pose) > 2 and alignment > CONFIRMED:
+        return z
     return None
 
 
-def _is_heading(table: TableSurvey, place: tuple[str, ...], z: str) -> bool:
-    """True if a path leads along what is called z, as it is then a heading and no height."""
-    y = (*place[:-1], "y")
-    named = {tuple(split_unit(column.name)[0]): column.name for column in table.numbers}
-    columns = [
-        table.data[name].astype(np.float64) for name in (named[place], named[y], z)
-    ]
-    if len({len(each) for each in columns}) > 1:
-        return False
-    pose = np.stack(columns, axis=1)
-    pose = pose[np.isfinite(pose).all(axis=1)]
-    if (np.abs(np.diff(pose[:, 2])) > NEARLY_A_TURN).any():
-        return True  # it wraps, as only an angle does
-    pose = select_apart(pose)
-    return (
-        len(pose) > 2
-        and max(measure_alignment(pose, 1.0), measure_alignment(pose, -1.0)) > CONFIRMED
-    )
+def _stack_finite(columns: Sequence[Array]) -> Array | None:
+    """Returns the rows of columns without NaN; None for columns of several streams."""
+    if len({len(column) for column in columns}) > 1:
+        return None
+    rows = np.stack(columns, axis=1)
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
 def select_apart(pose: Array) -> Array:
     """Returns the poses (of T, 3) that are a thirtieth of the path's extent from the one before."""
-    apart = np.ptp(pose[:, :2], axis=0).max() / PIECES
+    distance = np.ptp(pose[:, :2], axis=0).max() / PIECES
     kept = [0]
     for k in range(1, len(pose)):
-        if np.hypot(*(pose[k, :2] - pose[kept[-1], :2])) > apart:
+        if np.hypot(*(pose[k, :2] - pose[kept[-1], :2])) > distance:
             kept.append(k)
     return np.asarray(pose[kept])
 
@@ -237,22 +235,20 @@ def _find_unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
     names = [c.name for c in table.numbers if c.name not in table.stamp_columns]
     columns = [table.data[name].astype(np.float64) for name in names]
     for k in range(2, len(names) - 3):
-        guess = _match_quaternion(table, names, columns, k)
-        if guess is not None:
-            yield guess
+        pose = _match_quaternion(table, names, columns, k)
+        if pose is not None:
+            yield pose
     for k in range(len(names) - 2):
         if not all(name.isdecimal() for name in names[k : k + 3]):
             continue
-        if len({len(each) for each in columns[k : k + 3]}) > 1:
+        values = _stack_finite(columns[k : k + 3])
+        if values is None or not len(values) or not np.ptp(values, axis=0).all():
             continue
-        pose = np.stack(columns[k : k + 3], axis=1)
-        pose = pose[np.isfinite(pose).all(axis=1)][:: max(1, len(pose) // 200)]
-        if not len(pose) or not (np.ptp(pose, axis=0) > 0.0).all():
-            continue
-        led = max(measure_alignment(pose, 1.0), measure_alignment(pose, np.pi / 180.0))
-        if led > ALONG > measure_alignment(pose, 0.0):
-            x, y, heading = names[k : k + 3]
-            yield PoseGuess(table, x, y, heading)
+        values = values[:: max(1, len(values) // MOST_COMPARED)]
+        in_radians = measure_alignment(values, 1.0)
+        in_degrees = measure_alignment(values, np.pi / 180.0)
+        if max(in_radians, in_degrees) > ALONG > measure_alignment(values, 0.0):
+            yield PoseGuess(table, *names[k : k + 3])
 
 
 def _match_quaternion(
@@ -260,33 +256,33 @@ def _match_quaternion(
 ) -> PoseGuess | None:
     """Returns the pose whose quaternion stands in four columns from k on, if they are one."""
     turn = list(names[k : k + 4])
-    four = columns[k : k + 4]
     if not all(name.isdecimal() or {*split_words(name)} & TURNS for name in turn):
         return None
-    if len({len(each) for each in four}) > 1:
-        return None  # of several streams
-    turns = any(np.ptp(each) > 0.0 for each in four)
-    if (
-        not turns
-        or not np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH
-    ):
+    parts = list(columns[k : k + 4])
+    if len({len(part) for part in parts}) > 1 or not any(map(np.ptp, parts)):
         return None
-    if recordings.is_w_first(np.stack(four, axis=1)):
+    length = np.linalg.norm(parts, axis=0)
+    if not np.nanmax(np.abs(length - 1.0)) < UNIT_LENGTH:
+        return None
+    if recordings.is_w_first(np.stack(parts, axis=1)):
         turn = [*turn[1:], turn[0]]
-        four = [*four[1:], four[0]]
+        parts = [*parts[1:], parts[0]]
     place = [
-        name for word in ("x", "y") for name in names if split_unit(name)[0] == [word]
+        name
+        for axis in ("x", "y")
+        for name in names
+        if split_unit(name)[0] == [axis] and name not in turn
     ]
-    place = [name for name in place if name not in turn]
-    x, y = place if len(place) == 2 else names[max(k - 3, 0) :][:2]
-    if {*split_words(f"{x} {y}")} & NOT_PLACES or {x, y} & {*turn}:
+    if len(place) != 2:
+        place = list(names[max(k - 3, 0) :][:2])
+    if {*split_words(" ".join(place))} & NOT_PLACES or {*place} & {*turn}:
         return None
-    where = [columns[names.index(name)] for name in (x, y)]
-    if any(len(each) != len(four[0]) for each in where):
+    heading = 2.0 * np.arctan2(parts[2], parts[3])
+    x, y = (columns[names.index(name)] for name in place)
+    pose = _stack_finite([x, y, heading])
+    if pose is None:
         return None
-    heading = 2.0 * np.arctan2(four[2], four[3])
-    pose = np.stack([*where, heading], axis=1)
-    pose = pose[np.isfinite(pose).all(axis=1)][:: max(1, len(pose) // 200)]
+    pose = pose[:: max(1, len(pose) // MOST_COMPARED)]
     if len(pose) < 3 or measure_alignment(pose, 1.0) < CONFIRMED:
         return None
-    return PoseGuess(table, x, y, None, tuple(turn))
+    return PoseGuess(table, *place, quaternion=tuple(turn))
