@@ -195,7 +195,7 @@ def samples_on_one_clock(
 ) -> Samples:
     """Builds Samples of shared stamps [s], a row per regular step, without gaps and repetitions."""
     span = np.diff(t)
-    dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
+    dt = compute_usual_step(t)
     regular = np.abs(span - dt) < IRREGULAR * dt
     length = np.where(np.abs(span - dt) < JITTER * dt + ROUNDING_S, dt, span)[
         regular, None
@@ -508,12 +508,24 @@ def _find_too_fast(
     return Implausible(reason, cause, line)
 
 
+def compute_usual_step(t: Array) -> float:
+    """Returns the median of the steps forward between stamps (T,), 0 if there are none."""
+    step = np.diff(t)
+    forward = step[step > 0.0]
+    if not len(forward):
+        return 0.0
+    return float(np.median(forward))
+
+
 def guess_time_unit(t: Array) -> str | None:
     """Returns the unit of stamps (T,) that can't be seconds; None if they can."""
-    step = np.diff(t)
-    usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
-    fitting = (u for u in UNITS_OF_STEP if usual * UNITS[u].factor < SLOWEST_SAMPLING_S)
-    return next(fitting, None) if usual > SLOWEST_SAMPLING_S else None
+    step = compute_usual_step(t)
+    if step <= SLOWEST_SAMPLING_S:
+        return None
+    for unit in UNITS_OF_STEP:
+        if step * UNITS[unit].factor < SLOWEST_SAMPLING_S:
+            return unit
+    return None
 
 
 def _find_too_slow(t: Array) -> Implausible | None:

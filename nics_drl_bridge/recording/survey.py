@@ -1,7 +1,7 @@
 """Surveys a recording of any form: tables, their stamps and what is odd in them, columns."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,51 +15,53 @@ from nics_drl_bridge.recording.names import split_words, word_set, write_referen
 from nics_drl_bridge.recording.recording import (
     IRREGULAR,
     UNITS_OF_STEP,
+    compute_usual_step,
     guess_time_unit,
 )
-from nics_drl_bridge.recording.table import Column, Source, Table
+from nics_drl_bridge.recording.table import Column, Source, Table, is_text
 from nics_drl_bridge.recording.values import parse_dates
 
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # of a table
 # stamps that would be closer are not in the unit that their name says
 SHORTEST_STEP_S = 1e-4
+LEAST_SCORE = 0.25  # of a column of stamps
 MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
 TIMES = word_set("""
     time times stamp timestamp t s sec secs seconds elapsed ms us ns millis
     micros nanos date datetime
 """)
 # Units as they end a name (`yaw_deg`, `v_m_s`), the longest first.
-ENDINGS: dict[tuple[str, ...], str] = {
-    ("m", "per", "s"): "m/s",
-    ("rad", "per", "s"): "rad/s",
-    ("deg", "per", "s"): "deg/s",
-    ("m", "s"): "m/s",
-    ("rad", "s"): "rad/s",
-    ("deg", "s"): "deg/s",
-    ("mm", "s"): "mm/s",
-    ("cm", "s"): "cm/s",
-    ("km", "h"): "km/h",
-    ("m",): "m",
-    ("cm",): "cm",
-    ("mm",): "mm",
-    ("meters",): "m",
-    ("metres",): "m",
-    ("rad",): "rad",
-    ("radians",): "rad",
-    ("deg",): "deg",
-    ("degrees",): "deg",
-    ("mps",): "m/s",
-    ("kmh",): "km/h",
-    ("kph",): "km/h",
-    ("mph",): "mph",
-    ("rads",): "rad/s",
-    ("radps",): "rad/s",
-    ("degps",): "deg/s",
-    ("dps",): "deg/s",
-    ("rpm",): "rpm",
-    ("pct",): "%",
-    ("percent",): "%",
+ENDINGS = {
+    "m per s": "m/s",
+    "rad per s": "rad/s",
+    "deg per s": "deg/s",
+    "m s": "m/s",
+    "rad s": "rad/s",
+    "deg s": "deg/s",
+    "mm s": "mm/s",
+    "cm s": "cm/s",
+    "km h": "km/h",
+    "m": "m",
+    "cm": "cm",
+    "mm": "mm",
+    "meters": "m",
+    "metres": "m",
+    "rad": "rad",
+    "radians": "rad",
+    "deg": "deg",
+    "degrees": "deg",
+    "mps": "m/s",
+    "kmh": "km/h",
+    "kph": "km/h",
+    "mph": "mph",
+    "rads": "rad/s",
+    "radps": "rad/s",
+    "degps": "deg/s",
+    "dps": "deg/s",
+    "rpm": "rpm",
+    "pct": "%",
+    "percent": "%",
 }
 # Units as they stand in brackets, `x(m)` or `omega [rad s^-1]`, beside those of a mapping.
 IN_BRACKETS = {
@@ -96,19 +98,20 @@ NO_UNIT = ("", "-", "1", "none", "unitless")
 def split_unit(name: str) -> tuple[list[str], str | None]:
     """Returns the words of a name, and the unit that it ends with: `x(m)`, `x [mm]`, `yaw_deg`."""
     if bracket := re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", name):
-        said = bracket[1]
-        unit = said if said in UNITS else IN_BRACKETS.get(said.lower())
-        unitless = said.lower() in NO_UNIT and not said.isdecimal()
-        if unit is not None and said != "1":
-            return split_words(name[: bracket.start()]), unit
-        if unitless:
-            return split_words(name[: bracket.start()]), None
+        text = bracket[1]
+        words = split_words(name[: bracket.start()])
+        if text in UNITS and text != "1":
+            return words, text
+        if text.lower() in IN_BRACKETS:
+            return words, IN_BRACKETS[text.lower()]
+        if text.lower() in NO_UNIT and not text.isdecimal():
+            return words, None
     words = split_words(name) or [""]
     if "rpm" in words:
         return [word for word in words if word != "rpm"], "rpm"
     for ending, unit in ENDINGS.items():
-        if len(words) > len(ending) and tuple(words[-len(ending) :]) == ending:
-            return words[: -len(ending)], unit
+        if " ".join(words).endswith(f" {ending}"):
+            return words[: -len(ending.split())], unit
     return words, None
 
 
@@ -142,11 +145,15 @@ class TableSurvey:
     @property
     def time(self) -> str | None:
         """The stamps for a mapping, as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
-        if self.stamps is None:
-            return None
         columns = [write_reference(column) for column in self.stamp_columns]
-        listed = columns[0] if len(columns) == 1 else f"[{', '.join(columns)}]"
-        return f"{{from: {listed}, unit: {self.unit}}}" if self.unit else listed
+        if not columns:
+            return None
+        text = columns[0]
+        if len(columns) > 1:
+            text = f"[{', '.join(columns)}]"
+        if self.unit:
+            return f"{{from: {text}, unit: {self.unit}}}"
+        return text
 
     @property
     def numbers(self) -> list[Survey]:
@@ -158,15 +165,16 @@ class TableSurvey:
         """The columns of the stamps."""
         if self.stamps is None:
             return []
-        split = re.fullmatch(r"\[(.+), (.+)\]", self.stamps)
-        return [split[1], split[2]] if split else [self.stamps]
+        if split := re.fullmatch(r"\[(.+), (.+)\]", self.stamps):
+            return [split[1], split[2]]
+        return [self.stamps]
 
     @property
     def regularity(self) -> list[str]:
         """Sentences on rate, gaps, stamps that run backwards, repeated rows and missing values."""
         if self.t is None or len(self.t) < 2:
             return []
-        return list(_describe_regularity(self.t, self.data))
+        return list(_describe_regularity(self.t, _select_numbers(self.data)))
 
     def list_words(self, column: str) -> list[str]:
         """Returns the words of a column, of `data` those of the table."""
@@ -175,140 +183,146 @@ class TableSurvey:
             return split_words(self.name)
         return words
 
-    def refer_to(self, column: str, alone: bool) -> str:
-        """Returns how a mapping refers to a column."""
-        return write_reference(column if alone else f"{self.name}:{column}")
+    def refer_to(self, column: str, is_single: bool) -> str:
+        """Returns how a mapping refers to a column, in a single table by its name alone."""
+        if is_single:
+            return write_reference(column)
+        return write_reference(f"{self.name}:{column}")
 
 
 def inspect_tables(source: Source) -> list[TableSurvey]:
     """Surveys every table of a source; RecordingError if none is readable."""
-    found = []
-    unread = None
+    tables = []
+    first_error = None
     for name in source.names:
         try:
-            found.append(_inspect_table(name, source.get_table(name)))
+            tables.append(_inspect_table(name, source.get_table(name)))
         except RecordingError as error:  # one unreadable table leaves the others
-            found.append(TableSurvey(name, 0, [], findings=[str(error)]))
-            unread = unread or error
-    if unread is not None and not any(table.columns for table in found):
-        raise unread
-    # Units of stamps are such that all tables last about as long as those in seconds.
-    lasting = [
-        float(np.ptp(each.t)) for each in found if each.t is not None and not each.unit
+            tables.append(TableSurvey(name, 0, [], findings=[str(error)]))
+            first_error = first_error or error
+    if first_error is not None and not any(table.columns for table in tables):
+        raise first_error
+    _correct_units(tables)
+    return tables
+
+
+def _correct_units(tables: Sequence[TableSurvey]) -> None:
+    """Chooses units of stamps by which all tables last about as long as those in seconds."""
+    durations = [
+        float(np.ptp(table.t))
+        for table in tables
+        if table.t is not None and not table.unit
     ]
-    for table in found:
-        if table.t is None or not table.unit or not lasting:
+    for table in tables:
+        if table.t is None or not table.unit or not durations:
             continue
         raw = table.t / UNITS[table.unit].factor
-        ratio = {
-            u: np.ptp(raw) * UNITS[u].factor / np.median(lasting)
-            for u in ("ms", "us", "ns")
-        }
-        table.unit = min(ratio, key=lambda unit: abs(np.log(max(ratio[unit], 1e-30))))
+        ratio = max(float(np.ptp(raw) / np.median(durations)), 1e-30)
+        table.unit = min(
+            UNITS_OF_STEP, key=lambda unit: abs(np.log(ratio * UNITS[unit].factor))
+        )
         table.t = raw * UNITS[table.unit].factor
-    return found
 
 
 def _inspect_table(name: str, table: Table) -> TableSurvey:
     columns = []
     data = {}
-    for k, title in list(enumerate(table.names))[:MOST_COLUMNS]:
-        which = title if title and table.names.count(title) == 1 else str(k)
-        data[which] = column = table.column(which)
-        columns.append(Survey(which, *_find_range(column)))
+    for k, title in enumerate(table.names[:MOST_COLUMNS]):
+        column_name = title
+        if not title or table.names.count(title) > 1:
+            column_name = str(k)
+        column = table.column(column_name)
+        data[column_name] = column
+        columns.append(Survey(column_name, *_find_range(column)))
     rows = max((len(column) for column in data.values()), default=0)
-    found = TableSurvey(name, rows, columns, findings=list(table.notes), data=data)
-    found.kind = table.kind
-    given = table.stamps("")
-    if given is not None:
-        found.t = given.t
-    else:
-        found.stamps, raw = _guess_stamps(data)
-        if raw is not None:
-            raw = raw[np.isfinite(raw)]
-            found.unit = guess_time_unit(raw) or _guess_unit_by_name(
-                found.stamps or "", raw
-            )
-            found.t = raw * UNITS[found.unit or "s"].factor
-    return found
+    survey = TableSurvey(name, rows, columns, findings=list(table.notes), data=data)
+    survey.kind = table.kind
+    stream = table.stamps("")
+    if stream is not None:
+        survey.t = stream.t
+        return survey
+    survey.stamps, raw = _guess_stamps(data)
+    if survey.stamps is not None and raw is not None:
+        raw = raw[np.isfinite(raw)]
+        survey.unit = guess_time_unit(raw) or _guess_unit_by_name(survey.stamps, raw)
+        survey.t = raw * UNITS[survey.unit or "s"].factor
+    return survey
 
 
 def _guess_unit_by_name(name: str, raw: Array) -> str | None:
     """Returns the unit below a second that a name says of its stamps, as `time_ms`."""
-    said = split_unit(name)[1] or (split_words(name) or [""])[-1]
-    step = np.diff(raw)
-    usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
-    if said not in UNITS_OF_STEP or usual * UNITS[said].factor < SHORTEST_STEP_S:
+    words, unit = split_unit(name)
+    if unit is None:
+        unit = (words or [""])[-1]
+    if unit not in UNITS_OF_STEP:
         return None
-    return said
+    if compute_usual_step(raw) * UNITS[unit].factor < SHORTEST_STEP_S:
+        return None
+    return unit
 
 
 def _find_range(column: Column) -> tuple[float, float]:
-    values = np.zeros(0) if column.dtype.kind in "US" else column.astype(np.float64)
+    if is_text(column):
+        return np.nan, np.nan
+    values = column.astype(np.float64)
     if not np.isfinite(values).any():
         return np.nan, np.nan
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
+def _select_numbers(data: dict[str, Column]) -> dict[str, Array]:
+    return {
+        name: column.astype(np.float64)
+        for name, column in data.items()
+        if not is_text(column)
+    }
+
+
 def _guess_stamps(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     """Guesses the column of stamps: by its name, and by how steadily it rises."""
-    for seconds, rest in stamping.SPLIT:
-        if all(
-            each in data and data[each].dtype.kind not in "US"
-            for each in (seconds, rest)
-        ):
-            return f"[{seconds}, {rest}]", stamping.join_stamps(
-                data[seconds], data[rest]
-            )
-
-    def score_column(name: str) -> float:
-        step = np.diff(values[name][np.isfinite(values[name])])
-        if not len(step) or np.mean(step < 0.0) > MOST_BACK or not (step > 0.0).any():
-            return 0.0
-        named = bool(TIMES & set(split_unit(name)[0]))
-        counts = bool((step == 1.0).all())  # an index, unless its name says otherwise
-        anonymous = name.isdecimal() and not counts
-        return (named + 0.5 * anonymous) * float(np.mean(step > 0.0))
-
-    numbers = {
-        name: c.astype(np.float64)
-        for name, c in data.items()
-        if c.dtype.kind not in "US"
-    }
-    texts = {name: parse_dates(c) for name, c in data.items() if c.dtype.kind in "US"}
-    values = numbers | {
-        name: dates for name, dates in texts.items() if dates is not None
-    }
-    best = max(values, key=score_column, default=None)
-    return (
-        (None, None)
-        if best is None or score_column(best) < 0.25
-        else (best, values[best])
-    )
+    values = _select_numbers(data)
+    for seconds, fraction in stamping.SPLIT:
+        if {seconds, fraction} <= values.keys():
+            stamps = stamping.join_stamps(data[seconds], data[fraction])
+            return f"[{seconds}, {fraction}]", stamps
+    for name, column in data.items():
+        if name not in values and (dates := parse_dates(column)) is not None:
+            values[name] = dates
+    scores = {name: _score_stamps(name, column) for name, column in values.items()}
+    best = max(scores, key=lambda name: scores[name], default=None)
+    if best is None or scores[best] < LEAST_SCORE:
+        return None, None
+    return best, values[best]
 
 
-def _describe_regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:
+def _score_stamps(name: str, values: Array) -> float:
+    step = np.diff(values[np.isfinite(values)])
+    if not len(step) or np.mean(step < 0.0) > MOST_BACK or not (step > 0.0).any():
+        return 0.0
+    has_name_of_time = not TIMES.isdisjoint(split_unit(name)[0])
+    is_index = bool((step == 1.0).all())  # unless its name says otherwise
+    is_nameless = name.isdecimal() and not is_index
+    return (has_name_of_time + 0.5 * is_nameless) * float(np.mean(step > 0.0))
+
+
+def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
     """Yields sentences on rate, gaps, stamps that run backwards, and rows that lack or repeat."""
     step = np.diff(t)
-    usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else np.nan
+    usual = compute_usual_step(t) or np.nan
     yield f"{1.0 / usual:.4g} Hz, {float(np.ptp(t)):.1f} s"
     if gaps := int((step > GAP * usual).sum()):
         where = float(t[int(np.argmax(step))] - t[0])
         yield f"gaps: {gaps}, the longest of {step.max():.3g} s after {where:.1f} s"
-    if back := int((step < 0.0).sum()):
-        yield f"stamps that run backwards: {back}"
-    numbers = {
-        name: c.astype(np.float64)
-        for name, c in data.items()
-        if c.dtype.kind not in "US"
-    }
-    whole = [c for c in numbers.values() if len(c) == len(t)]
-    same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
-    if again := int((step == 0.0).sum()):
-        yield f"stamps like the one before: {again}, in rows that repeat all of it: {same.sum()}"
+    if backward := int((step < 0.0).sum()):
+        yield f"stamps that run backwards: {backward}"
+    whole = [column for column in numbers.values() if len(column) == len(t)]
+    is_same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
+    if repeated := int((step == 0.0).sum()):
+        same = f"in rows that repeat all of it: {is_same.sum()}"
+        yield f"stamps like the one before: {repeated}, {same}"
     if (np.abs(step - usual) > IRREGULAR * usual).mean() > IRREGULAR:
         yield "stamps are uneven: rows arrive in bursts"
-    missing = {name: int(np.isnan(c).sum()) for name, c in numbers.items()}
+    missing = {name: int(np.isnan(column).sum()) for name, column in numbers.items()}
     for count in sorted({*missing.values()} - {0}):
-        names = ", ".join(name for name, each in missing.items() if each == count)
+        names = ", ".join(name for name in missing if missing[name] == count)
         yield f"{count} of {len(t)} rows have no {names}"
