@@ -30,26 +30,25 @@ def find_doubts(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterat
     if motion is None:
         return
     t, speed, turn_rate = motion
-    for name, signal in (("speed", speed), ("turn", turn_rate)):
-        found = {each.meaning: each for each in guess.commands.values()}.get(name)
-        if found is None or signal.std() < 1e-3:
+    commands = {command.meaning: command for command in guess.commands.values()}
+    lags = np.arange(EARLIEST_S, LONGEST_LATENCY_S + STEP_S / 2.0, STEP_S)
+    for meaning, signal in (("speed", speed), ("turn", turn_rate)):
+        command = commands.get(meaning)
+        if command is None or signal.std() < 1e-3:
             continue
-        lags = np.arange(EARLIEST_S, LONGEST_LATENCY_S + STEP_S / 2.0, STEP_S)
-        likeness = _compute_likeness(found, t, signal, lags)
+        likeness = _compute_likeness(command, t, signal, lags)
         if likeness is None:
             continue
         best = int(np.argmax(likeness))
         if likeness[best] < LEAST_CORRELATION:
-            said = f"{_name_candidate(found)} hardly goes with the motion"
+            said = f"{_name_candidate(command)} hardly goes with the motion"
             yield f"{said}; is it what was sent to the robot?"
         elif likeness[best] > CLEAR_CORRELATION and lags[best] > IMPLAUSIBLE_LATENCY_S:
-            late = (
-                f"the motion follows {_name_candidate(found)} after {lags[best]:.1f} s"
-            )
+            late = f"the motion follows {_name_candidate(command)} after {lags[best]:.1f} s"
             yield f"{late}, which no latency explains; check `time:` and the command"
         elif likeness[best] > CLEAR_CORRELATION and lags[best] < PRECEDES_S:
             early = (
-                f"the motion precedes {_name_candidate(found)} by {-lags[best]:.1f} s"
+                f"the motion precedes {_name_candidate(command)} by {-lags[best]:.1f} s"
             )
             yield f"{early}, as a measurement's would; check `time:` and the command"
 
@@ -62,9 +61,11 @@ def find_reversed_wheels(
     Both have to turn the same way when the robot moves, and the right one faster when it turns
     counter-clockwise.
     """
-    motion = _compute_rates(*pose) if pose is not None and guess.of_wheels else None
-    sides = {each.meaning: each for each in guess.commands.values()}
-    if motion is None or sides.keys() != {"left", "right"}:
+    sides = {wheel.meaning: wheel for wheel in guess.commands.values()}
+    if pose is None or not guess.of_wheels or sides.keys() != {"left", "right"}:
+        return []
+    motion = _compute_rates(*pose)
+    if motion is None:
         return []
     t, speed, turn_rate = motion
     left, right = (_compute_wheel_rate(sides[side], t) for side in ("left", "right"))
@@ -74,7 +75,9 @@ def find_reversed_wheels(
     if likeness[0] * likeness[1] > 0.0 or min(map(abs, likeness)) < LEAST_CORRELATION:
         return []
     turned_by_left = float(np.corrcoef(right + left, turn_rate)[0, 1])
-    return [sides["left"] if turned_by_left > 0.0 else sides["right"]]
+    if turned_by_left > 0.0:
+        return [sides["left"]]
+    return [sides["right"]]
 
 
 def _compute_wheel_rate(wheel: Candidate, t: Array) -> Array | None:
@@ -82,11 +85,13 @@ def _compute_wheel_rate(wheel: Candidate, t: Array) -> Array | None:
     values = wheel.table.data[wheel.column.name].astype(np.float64)
     if wheel.table.t is None or len(wheel.table.t) != len(values):
         return None
-    at = np.interp(t, wheel.table.t, values)
-    is_counter = bool({*split_words(wheel.column.name)} & TICKS)
-    rate = np.gradient(at, STEP_S) if is_counter else at
+    rate = np.interp(t, wheel.table.t, values)
+    if not TICKS.isdisjoint(split_words(wheel.column.name)):
+        rate = np.gradient(rate, STEP_S)
     rate = np.convolve(rate, np.ones(SMOOTHED) / SMOOTHED, "same")
-    return np.asarray(rate) if rate.std() > 1e-9 else None
+    if rate.std() <= 1e-9:
+        return None
+    return np.asarray(rate)
 
 
 def _name_candidate(candidate: Candidate) -> str:
@@ -108,12 +113,12 @@ def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
         np.convolve(np.diff(each) / STEP_S, mean, "same") for each in (x, y, turned)
     )
     middle = (turned[1:] + turned[:-1]) / 2.0
-    ahead = dx * np.cos(middle) + dy * np.sin(middle)
-    aside = -dx * np.sin(middle) + dy * np.cos(middle)
-    along = (
-        ahead if np.abs(ahead).sum() >= np.abs(aside).sum() else aside
-    )  # a turned tracker
-    return grid[:-1] + STEP_S / 2.0, along, turn
+    speed = dx * np.cos(middle) + dy * np.sin(middle)
+    sideways = -dx * np.sin(middle) + dy * np.cos(middle)
+    # A tracked body may be mounted across the robot.
+    if np.abs(sideways).sum() > np.abs(speed).sum():
+        speed = sideways
+    return grid[:-1] + STEP_S / 2.0, speed, turn
 
 
 def _compute_likeness(

@@ -23,9 +23,9 @@ FORMAT = "nics_drl_bridge/recording/4"
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
 MeasuredBy = Literal["", "odometry", "tracker", "truth"]
 """What measured a pose: odometry, which drifts; motion capture or a localiser; a simulation."""
-# share of the median by which a step differs if it is a gap or a repetition
+# fraction of the median by which a step differs if it is a gap or a repetition
 IRREGULAR = 0.5
-# steps that differ by less are equally long, but for rounding
+# steps that differ by less are equally long, except for rounding
 JITTER = 1e-4
 ROUNDING_S = 1e-6
 
@@ -42,17 +42,18 @@ SMALL_M = 1.0
 SLOWEST_IN_CM = 300.0
 FASTEST_TURN = 15.0  # a robot that turns faster for long [rad/s] does so in degrees
 FULL_TURN_DEG = 360.0
-# A heading in degrees leads along the path to this share, better by so much than the same in
-# radians, and than none.
+# A heading in degrees leads along the path to this fraction: better than the same in radians, and
+# than a fixed one, by the next two.
 ALONG = 0.9
 LESS_ALONG = 0.2
 ALONG_BY_CHANCE = 0.05
-MIN_DIRECTIONS = 30  # a reversed axis shows in a path of more pieces than this,
-MIN_TURN = 1.0  # that turns by this [rad],
-# and leads along mirrored headings, by so much more than as given
+# A reversed axis shows in a path of so many pieces that turns by so much [rad].
+MIN_DIRECTIONS = 30
+MIN_TURN = 1.0
+# It leads along mirrored headings to this fraction, which is by so much more than unmirrored.
 MIRRORED = 0.9
 BETTER = 0.15
-# Squares of what a level body has none of, x and y, in quaternions in another order than read.
+# Mean squares of x and y, which are 0 in the quaternions of a level body, if read as x, y, z, w.
 TILTED = 0.05
 LEVEL = 0.01
 W_FIRST = "its quaternions look like w, x, y, z of a level body; list them in the order x, y, z, w"
@@ -73,19 +74,23 @@ class Stream:
     @property
     def weights(self) -> Array:
         """Weights (T, D) by the variances, 1 for a usual one or where none is known."""
+        weights = np.ones_like(self.values)
         if self.sigma is None:
-            return np.ones_like(self.values)
-        known = np.isfinite(self.sigma) & (self.sigma > 0.0)
-        columns = zip(self.sigma.T, known.T, strict=True)
-        usual = [
-            np.median(column[own]) if own.any() else 1.0 for column, own in columns
-        ]
-        share = np.where(known, self.sigma, usual) / usual
-        return np.asarray(np.clip(share**-2.0, *WEIGHTS))
+            return weights
+        is_known = np.isfinite(self.sigma) & (self.sigma > 0.0)
+        for column, sigma, rows in zip(
+            weights.T, self.sigma.T, is_known.T, strict=True
+        ):
+            if rows.any():
+                relative = sigma[rows] / np.median(sigma[rows])
+                column[rows] = np.clip(relative**-2.0, *WEIGHTS)
+        return weights
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Stream":
         """Returns the rows selected by a mask (T,), indices or a slice."""
-        sigma = None if self.sigma is None else self.sigma[keep]
+        sigma = self.sigma
+        if sigma is not None:
+            sigma = sigma[keep]
         return replace(self, t=self.t[keep], values=self.values[keep], sigma=sigma)
 
 
@@ -150,11 +155,9 @@ class Recording:
         if not self.episodes or len(t) < 2:
             return t
         step = np.diff(t)
-        across = np.diff(self.episode_at(t)) > 0
-        usual = float(np.median(step[~across])) if not across.all() else 0.0
-        return np.asarray(
-            t[0] + np.append(0.0, np.cumsum(np.where(across, usual, step)))
-        )
+        is_gap = np.diff(self.episode_at(t)) > 0
+        step[is_gap] = np.median(step[~is_gap]) if not is_gap.all() else 0.0
+        return np.asarray(t[0] + np.append(0.0, np.cumsum(step)))
 
     def driven_s(self, until_s: float = np.inf) -> float:
         """Returns how long the robot drove until a time from the first pose on [s], all gaps out.
@@ -196,12 +199,11 @@ def samples_on_one_clock(
     """Builds Samples of shared stamps [s], a row per regular step, without gaps and repetitions."""
     span = np.diff(t)
     dt = compute_usual_step(t)
-    regular = np.abs(span - dt) < IRREGULAR * dt
-    length = np.where(np.abs(span - dt) < JITTER * dt + ROUNDING_S, dt, span)[
-        regular, None
-    ]
-    first = np.flatnonzero(regular)
-    last = np.flatnonzero(regular) + 1
+    is_regular = np.abs(span - dt) < IRREGULAR * dt
+    is_exact = np.abs(span - dt) < JITTER * dt + ROUNDING_S
+    length = np.where(is_exact, dt, span)[is_regular, None]
+    first = np.flatnonzero(is_regular)
+    last = first + 1
     twist = geometry.log(geometry.between(pose[first], pose[last])) / length
     rates = (state[last] - state[first]) / length
     return Samples(
@@ -216,12 +218,12 @@ def samples_on_one_clock(
 def check(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording that a robot can use; else RecordingError names place and fault."""
     names = spec.variable_names
-    known = recording.variables
+    recorded = recording.variables
     if recording.state is None:  # then only the order of the commands matters
         count = len(spec.command)
         names = names[-count:]
-        known = known[-count:]
-    if known and known != names:
+        recorded = recorded[-count:]
+    if recorded and recorded != names:
         problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
         advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
         raise RecordingError(f"{problem}; {advice}: choose the robot that drove.")
@@ -256,10 +258,15 @@ def _find_fault(stream: Stream, width: int) -> str:
         return f"has {len(t)} samples; record a drive of 20 s or more"
     if t[-1] == t[0]:
         return f"all of its stamps are {t[0]:g} s; choose another column as its time"
-    for row in np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(t))[:1]:
-        return f"row {row} holds NaN or inf; remove the row, or find out why it was recorded"
-    for row in np.flatnonzero(np.diff(t) < 0.0)[:1]:
-        reason = f"time runs backwards at row {row + 1} ({t[row]:.6f} s, then {t[row + 1]:.6f} s)"
+    is_finite = np.isfinite(values).all(axis=1) & np.isfinite(t)
+    if not is_finite.all():
+        advice = "remove the row, or find out why it was recorded"
+        return f"row {int(np.argmin(is_finite))} holds NaN or inf; {advice}"
+    backward = np.flatnonzero(np.diff(t) < 0.0)
+    if len(backward):
+        before, after = t[backward[0] : backward[0] + 2]
+        times = f"({before:.6f} s, then {after:.6f} s)"
+        reason = f"time runs backwards at row {backward[0] + 1} {times}"
         return f"{reason}; sort the rows, or cut the file there"
     return ""
 
@@ -309,22 +316,18 @@ def load_recording(path: str | Path) -> Recording:
         streams: Any = {
             n: _read_stream(arrays, n, clock) for n, clock in meta["clocks"].items()
         }
-        latency = Latency.model_validate(meta.get("latency", {}))
-        variables = tuple(meta["variables"])
-        repairs = tuple(meta["repairs"])
-        found = Recording(
-            **streams, source=str(path), variables=variables, latency=latency
-        )
         measured_by = meta.get("measured_by", "")
         if measured_by not in get_args(MeasuredBy):
             raise ValueError(f"measured_by is {measured_by!r}")
-        episodes = tuple(Episode(**each) for each in meta.get("episodes", ()))
-        return replace(
-            found,
-            repairs=repairs,
+        return Recording(
+            **streams,
+            source=str(path),
+            variables=tuple(meta["variables"]),
+            repairs=tuple(meta["repairs"]),
             robot=meta.get("robot"),
+            latency=Latency.model_validate(meta.get("latency", {})),
             measured_by=measured_by,
-            episodes=episodes,
+            episodes=tuple(Episode(**each) for each in meta.get("episodes", ())),
             learn_until_s=meta.get("learn_until_s"),
         )
     except FileNotFoundError:
@@ -348,23 +351,22 @@ def is_recording(path: Path) -> bool:
 
 
 def _read_stream(arrays: dict[str, NDArray[Any]], name: str, clock: str) -> Stream:
-    sigma = arrays.get(f"{name}_sigma")
     t = arrays[f"{name}_t"].astype(float)
     values = arrays[name].astype(float)
-    return Stream(t, values, clock, None if sigma is None else sigma.astype(float))
+    sigma = arrays.get(f"{name}_sigma")
+    if sigma is not None:
+        sigma = sigma.astype(float)
+    return Stream(t, values, clock, sigma)
 
 
 def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` file's content. Raises ValueError if it is damaged or too large."""
+    """Returns the arrays of an `.npz` file; ValueError if it is damaged or too large."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if (
-                sum(member.file_size for member in archive.infolist())
-                > files.MOST_BYTES
-            ):
-                raise ValueError(
-                    f"unpacked it is larger than {files.MOST_BYTES // 2**20} MB"
-                )
+            size = sum(member.file_size for member in archive.infolist())
+        if size > files.MOST_BYTES:
+            limit = f"{files.MOST_BYTES // 2**20} MB"
+            raise ValueError(f"unpacked it is larger than {limit}")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # noqa: BLE001 - damage breaks zipfile and numpy in any way
@@ -389,9 +391,15 @@ def find_implausible_pose(
     """
     if len(t) < 3:
         return None
-    hardest = HARDEST if radius < SMALL_M else HARDEST_OF_CARS
-    degrees = _find_degrees(t, pose) or _find_radians(pose[_select_spaced(t)])
-    return _find_too_slow(t) or degrees or _find_too_fast(t, pose, fastest, hardest)
+    hardest = HARDEST_OF_CARS
+    if radius < SMALL_M:
+        hardest = HARDEST
+    return (
+        _find_too_slow(t)
+        or _find_degrees(t, pose)
+        or _find_radians(pose[_select_spaced(t)])
+        or _find_too_fast(t, pose, fastest, hardest)
+    )
 
 
 def _find_degrees(t: Array, pose: Array) -> Implausible | None:
@@ -403,13 +411,12 @@ def _find_degrees(t: Array, pose: Array) -> Implausible | None:
         return Implausible(reason, cause, "heading_unit: deg")
     if np.abs(heading).max() <= 2.0 * np.pi + 0.1:
         return None
-    around = np.abs(np.abs(np.diff(heading)) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
-    every = _select_spaced(t)
-    rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(
-        t[every]
-    )
-    turns = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
-    if not (around.any() or turns or _is_only_along(pose[every], np.pi / 180.0)):
+    wraps = np.abs(np.abs(np.diff(heading)) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
+    spaced = _select_spaced(t)
+    turned = np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[spaced])
+    rate = np.abs(turned) / np.diff(t[spaced])
+    is_fast = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
+    if not (wraps.any() or is_fast or _is_only_along(pose[spaced], np.pi / 180.0)):
         return None
     reason = f"the heading is up to {np.abs(heading).max():.4g} rad"
     return Implausible(reason, cause, "heading_unit: deg")
@@ -425,8 +432,8 @@ def _find_radians(pose: Array) -> Implausible | None:
 
 def _is_only_along(pose: Array, scale: float) -> bool:
     """True if poses (T, 3) lead along headings x scale, and not along them as they are."""
-    led, as_given, none = (measure_alignment(pose, each) for each in (scale, 1.0, 0.0))
-    return led > max(ALONG, as_given + LESS_ALONG, none + ALONG_BY_CHANCE)
+    scaled, unscaled, fixed = (measure_alignment(pose, k) for k in (scale, 1.0, 0.0))
+    return scaled > max(ALONG, unscaled + LESS_ALONG, fixed + ALONG_BY_CHANCE)
 
 
 def select_along_path(pose: Array, apart: float) -> NDArray[np.intp]:
@@ -437,22 +444,23 @@ def select_along_path(pose: Array, apart: float) -> NDArray[np.intp]:
 
 def has_visible_axes(pose: Array) -> bool:
     """True if poses (T, 3), apart on their path, turn far enough to show a reversed axis."""
-    turned = float(np.ptp(np.unwrap(pose[:, 2]))) if len(pose) else 0.0
-    return len(pose) >= MIN_DIRECTIONS and turned >= MIN_TURN
+    if len(pose) < MIN_DIRECTIONS:
+        return False
+    return float(np.ptp(np.unwrap(pose[:, 2]))) >= MIN_TURN
 
 
 def find_clockwise_keys(
-    pose: Array, least: float = MIRRORED, better: float = BETTER
+    pose: Array, minimum: float = MIRRORED, margin: float = BETTER
 ) -> str:
     """Returns the keys that turn the heading of poses (T, 3), apart on their path, round.
 
-    As in `scale: -1`; empty unless the path leads along the mirrored headings alone: to the share
-    `least`, and by so much `better` than along those given.
+    As in `scale: -1`; empty unless the path leads along the mirrored headings alone: at least to
+    the fraction `minimum`, and by `margin` better than along the recorded ones.
     """
     if not has_visible_axes(pose):
         return ""
     mirrored = _compute_course(pose, -1.0)
-    if abs(mirrored) < max(least, better + measure_alignment(pose, 1.0)):
+    if abs(mirrored) < max(minimum, margin + measure_alignment(pose, 1.0)):
         return ""
     if mirrored.real > 0.0:
         return "scale: -1"
@@ -460,7 +468,7 @@ def find_clockwise_keys(
 
 
 def measure_alignment(pose: Array, scale: float) -> float:
-    """Returns to what share poses (T, 3) lead along their headings x scale, ahead or back."""
+    """Returns the fraction to which poses (T, 3) lead along headings x scale, ahead or back."""
     return abs(_compute_course(pose, scale))
 
 
@@ -483,28 +491,29 @@ def _select_spaced(t: Array) -> NDArray[np.intp]:
 def _find_too_fast(
     t: Array, pose: Array, fastest: float, hardest: float
 ) -> Implausible | None:
-    every = _select_spaced(t)
-    step = np.diff(pose[every, :2], axis=0)
-    took = np.diff(t[every])
-    if not len(took):
+    spaced = _select_spaced(t)
+    span = np.maximum(np.diff(t[spaced]), 1e-9)
+    if not len(span):
         return None
-    velocity = step / np.maximum(took, 1e-9)[:, None]
+    velocity = np.diff(pose[spaced, :2], axis=0) / span[:, None]
     speed = np.percentile(np.hypot(*velocity.T), 90)
     cause = "positions must be in metres and stamps in seconds"
-    line = "unit: mm" if speed > SLOWEST_IN_CM else "unit: cm"
+    line = "unit: cm"
+    if speed > SLOWEST_IN_CM:
+        line = "unit: mm"
     if speed > TOO_FAST * fastest:
         reason = (
             f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
         )
         return Implausible(reason, cause, line)
-    if np.isfinite(fastest) or len(took) < 3:
+    if np.isfinite(fastest) or len(span) < 3:
         return None
-    hard = np.percentile(
-        np.hypot(*np.diff(velocity, axis=0).T) / np.maximum(took[1:], 1e-9), 75
-    )
-    if hard <= hardest:
+    acceleration = np.hypot(*np.diff(velocity, axis=0).T) / span[1:]
+    usual_acceleration = np.percentile(acceleration, 75)
+    if usual_acceleration <= hardest:
         return None
-    reason = f"moves at {speed:.3g} m/s and changes that by {hard:.3g} m/s^2"
+    change = f"changes that by {usual_acceleration:.3g} m/s^2"
+    reason = f"moves at {speed:.3g} m/s and {change}"
     return Implausible(reason, cause, line)
 
 
@@ -529,7 +538,8 @@ def guess_time_unit(t: Array) -> str | None:
 
 
 def _find_too_slow(t: Array) -> Implausible | None:
-    if (unit := guess_time_unit(t)) is None:
+    unit = guess_time_unit(t)
+    if unit is None:
         return None
     reason = f"there are {np.median(np.diff(t)):.3g} s between samples"
     cause = f"stamps must be in seconds ({UNITS_OF_STEP[unit]} look like this)"

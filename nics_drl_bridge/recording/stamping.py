@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -25,11 +25,11 @@ HEADER = "header"
 SAME_CLOCK_S = (-0.001, 1.0)
 # the delay from headers of one clock to their receipt varies by less
 MAX_WANDER_S = 1.0
-# percentage of messages that a stalled recorder may have received even later,
+# A stalled recorder may receive this percentage of messages even later, by so much.
 STALLED = 2.0
-MAX_STALL_S = 30.0  # but by no more than this
-MAX_LATE = 0.01  # share of messages that may arrive after one with a later stamp
-# share that may lack a stamp at the start: a simulation has no time yet
+MAX_STALL_S = 30.0
+MAX_LATE = 0.01  # fraction of messages that may arrive after one with a later stamp
+# fraction that may lack a stamp at the start: a simulation has no time yet
 MAX_UNSTAMPED = 0.05
 ROBOT_STREAMS = (
     "command",
@@ -45,15 +45,18 @@ SPLIT = (
     ("sec", "nsec"),
     ("sec", "nsecs"),
 )
-ROWS_A_SECOND = 5  # from which on stamps in whole seconds lack the rest
-# times the usual step of a counter fit between its overflows, which lose
+ROWS_A_SECOND = (
+    5  # stamps in whole seconds, of so many rows each, have lost their fraction
+)
+# A counter takes more than COUNTING usual steps from one overflow to the next, loses at most LOST
+# steps at each, and reaches all of PARTS parts of its range.
 COUNTING = 16.0
-LOST = 2.0  # no more than this many steps
-PARTS = 10  # its values are in all of so many parts
-# or they go so far, which is this share of all their steps
+LOST = 2.0
+PARTS = 10
+# Or it grows by GROWN counts, which are this fraction of the sum of its steps.
 GROWN = 2000.0
 ONE_WAY = 0.95
-# a speed goes this share of its steps back at once, within so many
+# A speed goes back by this fraction of its steps, in a range of fewer than so many steps.
 BACK = 0.2
 WITHIN = 25.0
 TREMBLING = 4.0  # ticks of a wheel that stands
@@ -62,8 +65,8 @@ STAMP_BITS = (16, 24, 31, 32)
 # rows that come too late do so by less
 LATE_ROWS = 50
 LATE_S = 1.0
-MOST_BACK = 0.9  # share of steps back in rows that begin with the last
-MOST_STRAY = 0.01  # share of stamps that fit none beside them
+MOST_BACK = 0.9  # fraction of steps back in rows that begin with the last
+MOST_STRAY = 0.01  # fraction of stamps that fit none beside them
 LONGEST_PAUSE_S = 86_400.0  # of a drive; a longer one is a clock that was set
 USUAL = 10.0  # an overflow goes on with a step of less than this many usual ones
 
@@ -81,8 +84,12 @@ class TopicData:
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:
         """Returns the messages selected by `keep`, a mask (T,) or indices."""
-        header = None if self.header_ns is None else self.header_ns[keep]
-        return TopicData(self.topic, self.receive_ns[keep], header, self.values[keep])
+        header_ns = self.header_ns
+        if header_ns is not None:
+            header_ns = header_ns[keep]
+        return TopicData(
+            self.topic, self.receive_ns[keep], header_ns, self.values[keep]
+        )
 
 
 def stamp_streams(
@@ -107,32 +114,28 @@ def stamp_streams(
         clocks = dict.fromkeys(data, (HEADER, origin - first))
     else:
         clocks = _assign_clocks(data, headers, place)
-    robot = {clocks[name][0] for name in of_robot if name in data}
-    made = {}
+    robot_clocks = {clocks[name][0] for name in of_robot if name in data}
+    streams = {}
     for name, part in data.items():
-        ns, (clock, shift) = headers[name], clocks[name]
-        if ns is None or (len(robot) > 1 and name in of_robot):
-            made[name] = _stamp_by_receipt(part, origin)
+        ns = headers[name]
+        clock, shift = clocks[name]
+        if ns is None or (len(robot_clocks) > 1 and name in of_robot):
+            streams[name] = _stamp_by_receipt(part, origin)
         else:
-            made[name] = Stream(
-                _convert_to_seconds(ns + shift - origin), part.values, clock
-            )
-    return made
+            t = (ns + shift - origin) * S_PER_NS
+            streams[name] = Stream(t, part.values, clock)
+    return streams
 
 
-def has_continuous_headers(parts: Iterable[TopicData]) -> bool:
-    """True if the headers of all go on without a leap, at whatever rate beside the receipt."""
-    received, stamped = zip(
-        *((part.receive_ns, part.header_ns) for part in parts), strict=True
-    )
-    if any(ns is None or not ns.all() for ns in stamped):
+def has_continuous_headers(parts: Collection[TopicData]) -> bool:
+    """True if the headers of all, in the order of their receipt, go on without a leap."""
+    receive_ns = np.concatenate([part.receive_ns for part in parts])
+    headers = [part.header_ns for part in parts]
+    if any(ns is None or not ns.all() for ns in headers):
         return False
-    order = np.argsort(np.concatenate(received), kind="stable")
-    return bool(
-        (
-            np.abs(np.diff(np.concatenate(stamped)[order])) * S_PER_NS < MAX_WANDER_S
-        ).all()
-    )
+    stamps_ns = np.concatenate(cast(Any, headers))
+    step_ns = np.diff(stamps_ns[np.argsort(receive_ns, kind="stable")])
+    return bool((np.abs(step_ns) * S_PER_NS < MAX_WANDER_S).all())
 
 
 def _assign_clocks(
@@ -147,26 +150,28 @@ def _assign_clocks(
         topic = data[name].topic
         delay = data[name].receive_ns - ns
         median = int(np.median(delay))
-        least = delay.min()
-        most = delay.max()
-        usual = np.percentile(delay, 100.0 - STALLED)
-        wander = max(usual - median, median - least) * S_PER_NS
-        if wander > MAX_WANDER_S or (most - median) * S_PER_NS > MAX_STALL_S:
+        minimum = delay.min()
+        maximum = delay.max()
+        late = np.percentile(delay, 100.0 - STALLED)
+        wander = max(late - median, median - minimum) * S_PER_NS
+        if wander > MAX_WANDER_S or (maximum - median) * S_PER_NS > MAX_STALL_S:
             raise RecordingError(
-                f"{place}: topic {topic!r}: its header stamps lie {least * S_PER_NS:.3f} to "
-                f"{most * S_PER_NS:.3f} s before their receipt, so they are of several clocks or "
-                "of a simulated time at another rate; write `stamps: receive` into the topics "
+                f"{place}: topic {topic!r}: its header stamps lie {minimum * S_PER_NS:.3f} to "
+                f"{maximum * S_PER_NS:.3f} s before their receipt, so they are of several clocks "
+                "or of a simulated time at another rate; write `stamps: receive` into the topics "
                 "file (`time: arrival` into a map), or for a simulation `stamps: header` (`time: "
                 "header`), and record it with `ros2 bag record --use-sim-time`."
             )
-        if not SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
-            alike = (
-                c
-                for c, d in foreign.items()
-                if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1]
-            )
-            clock = next(alike, f"{HEADER} of {topic}" if foreign else HEADER)
-            clocks[name] = (clock, foreign.setdefault(clock, median))
+        if SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
+            continue
+        clock = HEADER
+        if foreign:
+            clock = f"{HEADER} of {topic}"
+        for other, shift in foreign.items():
+            if abs(shift - median) * S_PER_NS < SAME_CLOCK_S[1]:
+                clock = other
+                break
+        clocks[name] = (clock, foreign.setdefault(clock, median))
     return clocks
 
 
@@ -213,15 +218,8 @@ def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
 
 def _stamp_by_receipt(part: TopicData, origin: int) -> Stream:
     order = np.argsort(part.receive_ns, kind="stable")
-    return Stream(
-        _convert_to_seconds(part.receive_ns[order] - origin),
-        part.values[order],
-        RECEIVE,
-    )
-
-
-def _convert_to_seconds(ns: Nanoseconds) -> Array:
-    return np.asarray(ns * S_PER_NS, dtype=np.float64)
+    t = (part.receive_ns[order] - origin) * S_PER_NS
+    return Stream(t, part.values[order], RECEIVE)
 
 
 def join_stamps(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
@@ -264,19 +262,20 @@ def unwrap_counter(values: Array, size: float) -> tuple[Array, int]:
 
 
 def describe_counter(values: Array) -> str:
-    """Returns what whole numbers (T,) do as a counter's alone: they overflow, or go on and on."""
+    """Says what only a counter does, if whole numbers (T,) do it: overflow, or go on and on."""
+    if not (values == np.round(values)).all():
+        return ""
     step = np.abs(np.diff(values))
-    whole = bool((values == np.round(values)).all())
-    gone = float(abs(values[-1] - values[0]))
-    if whole and gone > max(GROWN, ONE_WAY * step.sum()):
-        return f"went on by {gone:.10g}"
-    size = find_overflow(values, (1.0,), BITS) if whole else None
+    growth = float(abs(values[-1] - values[0]))
+    if growth > max(GROWN, ONE_WAY * step.sum()):
+        return f"went on by {growth:.10g}"
+    size = find_overflow(values, (1.0,), BITS)
     if size is None:
         return ""
     usual = float(np.percentile(step, 95))
     lost = size - step[step > size / 2.0]
-    calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
-    if calm and np.histogram(values, PARTS)[0].all():
+    is_calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
+    if is_calm and np.histogram(values, PARTS)[0].all():
         return f"overflows at {size:.10g}"
     return ""
 
@@ -294,27 +293,23 @@ def is_oscillating(values: Array) -> bool:
 def count_rows_a_second(t: Array) -> int:
     """Returns how many stamps (T,) in whole seconds repeat, as if their rest were lost; else 0."""
     seconds = np.unique(t)
-    usual = np.median(np.diff(seconds)) if len(seconds) > 1 else 0.0
-    lost = (
-        usual == 1.0
-        and (t == np.round(t)).all()
-        and len(t) >= ROWS_A_SECOND * len(seconds)
-    )
-    return round(len(t) / len(seconds)) if lost else 0
+    if len(t) < ROWS_A_SECOND * len(seconds) or (t != np.round(t)).any():
+        return 0
+    if len(seconds) < 2 or np.median(np.diff(seconds)) != 1.0:
+        return 0
+    return round(len(t) / len(seconds))
 
 
 def remove_overflow(t: Array, name: str) -> tuple[Array, str]:
     """Continues stamps (T,) of a clock of 32 bits or less that began anew."""
-    if not (np.diff(t) < 0.0).any():
-        return t, ""
-    size = find_overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
+    size = None
+    if (np.diff(t) < 0.0).any():
+        size = find_overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
     if size is None:
         return t, ""
-    made, count = unwrap_counter(t, size)
-    return (
-        made,
-        f"{name}: its clock overflowed at {size:.10g} {format_times(count)}, and was continued.",
-    )
+    continued, count = unwrap_counter(t, size)
+    overflows = f"its clock overflowed at {size:.10g} {format_times(count)}"
+    return continued, f"{name}: {overflows}, and was continued."
 
 
 def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
@@ -336,11 +331,9 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         t = t[~stray]
         rows = rows[~stray]
     late = np.maximum.accumulate(t) - t
-    run = 0
-    longest = 0
-    for each in late:  # rows in a row that are older than one before them
-        run = run + 1 if each > 0.0 else 0
-        longest = max(longest, run)
+    # How many rows in a row are older than one before them.
+    on_time = np.flatnonzero(np.concatenate([[True], late <= 0.0, [True]]))
+    longest = int(np.diff(on_time).max()) - 1
     if 0 < longest <= LATE_ROWS and late.max() <= LATE_S:
         order = np.argsort(t, kind="stable")
         finding = f"{int((late > 0.0).sum())} of {len(t)} rows came after later ones"
@@ -350,14 +343,20 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         t = t[order]
         rows = rows[order]
     step = np.diff(t)
-    if (jump := (step < 0.0) | (step > LONGEST_PAUSE_S)).any() and not jump.all():
-        usual = float(np.median(step[~jump]))
-        k = int(np.argmax(jump))
+    is_jump = (step < 0.0) | (step > LONGEST_PAUSE_S)
+    if is_jump.any() and not is_jump.all():
+        usual = float(np.median(step[~is_jump]))
+        k = int(np.argmax(is_jump))
         first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
-        said = f"{name}: the clock was set {'back' if step[k] < 0.0 else 'ahead'}"
+        direction = "ahead"
+        if step[k] < 0.0:
+            direction = "back"
+        count = format_times(int(is_jump.sum()))
         joining = f"the parts were joined, a usual step of {usual:.3g} s apart"
-        notes.append(f"{said} {format_times(int(jump.sum()))} ({first}); {joining}.")
-        t = t + np.append(0.0, np.cumsum(np.where(jump, usual - step, 0.0)))
+        notes.append(
+            f"{name}: the clock was set {direction} {count} ({first}); {joining}."
+        )
+        t = t + np.append(0.0, np.cumsum(np.where(is_jump, usual - step, 0.0)))
     return t, rows, " ".join(notes)
 
 
@@ -365,26 +364,29 @@ def _find_stray(t: Array) -> NDArray[np.bool_]:
     """Selects few stamps (T,) that break the order and are far from those on both sides."""
     if len(t) < 5:
         return np.zeros(len(t), dtype=np.bool_)
-    back = np.diff(t) < 0.0
-    beside = np.append(back, False) | np.append(False, back)
+    is_backward = np.diff(t) < 0.0
+    is_beside = np.append(is_backward, False) | np.append(False, is_backward)
     middle = np.median(sliding_window_view(np.pad(t, 2, mode="reflect"), 5), axis=1)
-    stray = beside & (np.abs(t - middle) > LATE_S)
-    return np.asarray(stray if stray.mean() <= MOST_STRAY else stray & False)
+    is_stray = is_beside & (np.abs(t - middle) > LATE_S)
+    return np.asarray(is_stray & (is_stray.mean() <= MOST_STRAY))
 
 
 def format_times(count: int) -> str:
-    """Says how often."""
-    return "once" if count == 1 else f"{count} times"
+    """Says how often: once, or so many times."""
+    if count == 1:
+        return "once"
+    return f"{count} times"
 
 
 def select_new_rows(
     t: Array, values: Array, name: str
 ) -> tuple[NDArray[np.bool_], str]:
     """Selects rows (T,) that do not repeat the one before them, stamp and values (T, D)."""
-    again = (np.diff(t) == 0.0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
-    if not again.any():
-        return np.ones(len(t), dtype=np.bool_), ""
-    finding = f"{int(again.sum())} of {len(t)} rows repeat the row before them"
-    return np.append(
-        True, ~again
-    ), f"{name}: {finding}, stamp and all, and were left out."
+    is_repeated = (np.diff(t) == 0.0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
+    note = ""
+    if is_repeated.any():
+        finding = (
+            f"{int(is_repeated.sum())} of {len(t)} rows repeat the row before them"
+        )
+        note = f"{name}: {finding}, stamp and all, and were left out."
+    return np.append(True, ~is_repeated), note
