@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     AnyBag = Reader | Ros1Reader
 
 METADATA = "metadata.yaml"
-ABOUT = "rosbag2_bagfile_information"
+METADATA_KEY = "rosbag2_bagfile_information"
 DATABASE = ".db3"
 SUFFIXES = (".mcap", DATABASE)
 ROS_1 = ".bag"
@@ -59,8 +59,9 @@ def is_bag(path: str | Path) -> bool:
 
 def is_storage(path: Path) -> bool:
     """True if a file has the name of a bag file, compressed or not."""
-    plain = path.with_suffix("") if path.suffix in COMPRESSED else path
-    return plain.suffix in SUFFIXES or path.suffix == ROS_1
+    if path.suffix in COMPRESSED:
+        return path.with_suffix("").suffix in SUFFIXES
+    return path.suffix in (*SUFFIXES, ROS_1)
 
 
 @contextmanager
@@ -70,38 +71,22 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
     check_libraries(path, "reading")
     try:
         if path.suffix == ROS_1:
-            with _open_ros_1(path) as found:
-                yield found
-            return
-        from rosbags.rosbag2 import Reader
-
-        place = _find_place(path)
-        files = [place, *(place.iterdir() if place.is_dir() else ())]
-        # rosbags opens databases by URI, which these characters cut.
-        sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
-        if sign and any(DATABASE in file.suffixes for file in files):
-            fault = f"SQLite can't open what has {sign!r} in its path"
-            raise RecordingError(f"{place}: {fault}; rename the folder.")
-        for file in files:
-            check_no_device(file)
-        with (
-            TemporaryDirectory() as room
-        ):  # before rosbags, which unpacks chunks of any size
-            for file in _list_files(place, Path(room)) if place.is_dir() else [place]:
-                _check_storage(file)
-        with Reader(place) as reader:
-            _check_summary(reader)
-            yield BagFile(reader, str(path))
+            with _open_ros_1(path) as bag:
+                yield bag
+        else:
+            with _open_ros_2(path) as bag:
+                yield bag
     except BridgeError:
         raise
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
-        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        fault = f"can't be read as a bag ({shorten(why, LONGEST_REASON)})"
+        reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        fault = f"can't be read as a bag ({shorten(reason, LONGEST_REASON)})"
         advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record anew"
         if path.suffix == ROS_1:
             advice = "mend it with `rosbag reindex`, or record anew"
-        said = f"{path}: {fault}; it is damaged or was not closed: {advice}."
-        raise RecordingError(said) from None
+        raise RecordingError(
+            f"{path}: {fault}; it is damaged or was not closed: {advice}."
+        ) from None
 
 
 @contextmanager
@@ -114,18 +99,49 @@ def _open_ros_1(path: Path) -> "Iterator[BagFile]":
         yield BagFile(reader, str(path), is_ros_1=True)
 
 
+@contextmanager
+def _open_ros_2(path: Path) -> "Iterator[BagFile]":
+    from rosbags.rosbag2 import Reader
+
+    place = _find_place(path)
+    files = [place]
+    if place.is_dir():
+        files += place.iterdir()
+    # rosbags opens databases by URI, which these characters cut.
+    sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
+    if sign and any(DATABASE in file.suffixes for file in files):
+        fault = f"SQLite can't open what has {sign!r} in its path"
+        raise RecordingError(f"{place}: {fault}; rename the folder.")
+    for file in files:
+        check_no_device(file)
+    # Before rosbags, which unpacks chunks of any size.
+    if place.is_dir():
+        with TemporaryDirectory() as room:
+            for file in _list_files(place, Path(room)):
+                _check_storage(file)
+    else:
+        _check_storage(place)
+    with Reader(place) as reader:
+        _check_summary(reader)
+        yield BagFile(reader, str(path))
+
+
 def _find_place(path: Path) -> Path:
     """Returns what to open: the folder if it has metadata, which give the expected counts."""
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
-    folder = path if path.is_dir() else path.absolute().parent
-    files = [p for p in sorted(folder.iterdir()) if is_storage(p)]
+    folder = path
+    if not path.is_dir():
+        folder = path.absolute().parent
+    files = [file for file in sorted(folder.iterdir()) if is_storage(file)]
     if (folder / METADATA).is_file() and (path.is_dir() or len(files) == 1):
         return folder
-    if path.is_dir() and len(files) != 1:
-        fault = f"holds {len(files)} bag files and no {METADATA}"
-        raise RecordingError(f"{path}: {fault}; write it with `ros2 bag reindex`.")
-    file = files[0] if path.is_dir() else path
+    file = path
+    if path.is_dir():
+        if len(files) != 1:
+            fault = f"holds {len(files)} bag files and no {METADATA}"
+            raise RecordingError(f"{path}: {fault}; write it with `ros2 bag reindex`.")
+        file = files[0]
     if file.suffix in COMPRESSED:
         advice = f"unpack it with `zstd -d`, or give the folder with {METADATA}"
         raise RecordingError(f"{file}: is compressed; {advice}.")
@@ -135,22 +151,21 @@ def _find_place(path: Path) -> Path:
 def read_metadata(folder: Path) -> dict[str, Any]:
     """Returns a bag's metadata within `parse_yaml`'s limits; ValueError if they are not whole."""
     try:
-        about = parse_yaml(read_text(folder / METADATA), METADATA).get(ABOUT)
+        metadata = parse_yaml(read_text(folder / METADATA), METADATA).get(METADATA_KEY)
     except BridgeError as error:
         raise ValueError(str(error)) from None
-    if not isinstance(about, dict):
-        raise ValueError(f"{METADATA}: lacks {ABOUT}")
-    return about
+    if not isinstance(metadata, dict):
+        raise ValueError(f"{METADATA}: lacks {METADATA_KEY}")
+    return metadata
 
 
 def _list_files(folder: Path, room: Path) -> list[Path]:
     """Returns the files of a bag; those compressed as a whole are unpacked to another folder."""
-    about = read_metadata(folder)
-    listed = [
-        folder / Path(str(name)).name for name in about.get("relative_file_paths") or ()
-    ]
-    files = [file for file in listed if file.is_file()]
-    if str(about.get("compression_mode", "")).lower() != "file":
+    metadata = read_metadata(folder)
+    names = metadata.get("relative_file_paths") or ()
+    files = [folder / Path(str(name)).name for name in names]
+    files = [file for file in files if file.is_file()]
+    if str(metadata.get("compression_mode", "")).lower() != "file":
         return files
     from nics_drl_bridge.recording.mcap import unpack_file
 
@@ -182,24 +197,23 @@ def _check_summary(reader: "Reader") -> None:
 
     storages: list[Any] = list(getattr(reader.storage, "storages", [reader.storage]))
     summary = _count_messages(reader)
-    held = sum(map(_count_messages, storages), Counter())
-    told = summary.total()
-    there = sum(each.metadata.message_count for each in storages)
-    if there != told:
+    stored = sum(map(_count_messages, storages), Counter())
+    total = summary.total()
+    stored_total = sum(storage.metadata.message_count for storage in storages)
+    if stored_total != total:
         raise ValueError(
-            f"its summary speaks of {told} messages, its files hold {there}"
+            f"its summary speaks of {total} messages, its files hold {stored_total}"
         )
-    if (whole := reader.message_count) != told:
-        raise ValueError(
-            f"its summary speaks of {whole} messages, its topics add up to {told}"
-        )
+    if reader.message_count != total:
+        fault = f"its summary speaks of {reader.message_count} messages"
+        raise ValueError(f"{fault}, its topics add up to {total}")
     if not all(isinstance(topic, str) and topic for topic, _ in summary):
         raise ValueError("its summary has lost the name of a topic")
-    for topic, kind in sorted(set(summary + held), key=str):
-        if (promised := summary[topic, kind]) != (found := held[topic, kind]):
-            names = (repr(shorten(str(name), LONGEST_NAME)) for name in (topic, kind))
-            fault = f"topic {' of type '.join(names)} has {found} messages in its files"
-            raise ValueError(f"{fault}, {promised} by its summary")
+    for key in sorted(set(summary + stored), key=str):
+        if summary[key] != stored[key]:
+            names = (repr(shorten(str(name), LONGEST_NAME)) for name in key)
+            fault = f"topic {' of type '.join(names)} has {stored[key]} messages in its files"
+            raise ValueError(f"{fault}, {summary[key]} by its summary")
     if reader.compression_mode == "message":
         for storage in storages:
             for _, _, data in storage.messages(storage.connections):
@@ -236,13 +250,15 @@ class BagFile:
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
             self._connections.setdefault(connection.topic, []).append(connection)
-        topics = self._connections.items()
         # Message type of each topic; several are joined by `and`.
         self.types = {
-            t: " and ".join(sorted({c.msgtype for c in some})) for t, some in topics
+            topic: " and ".join(sorted({each.msgtype for each in connections}))
+            for topic, connections in self._connections.items()
         }
         self.empty = frozenset(
-            t for t, some in topics if not sum(c.msgcount for c in some)
+            topic
+            for topic, connections in self._connections.items()
+            if not any(each.msgcount for each in connections)
         )
 
     @property
@@ -252,10 +268,13 @@ class BagFile:
 
     def offers(self, topic: str) -> tuple[Offer, ...]:
         """Returns the offers of a topic's publishers, as far as the bag contains them."""
-        some = (
-            getattr(c.ext, "offered_qos_profiles", ()) for c in self._connections[topic]
+        return tuple(
+            offer
+            for connection in self._connections[topic]
+            for offer in convert_offers(
+                getattr(connection.ext, "offered_qos_profiles", ())
+            )
         )
-        return tuple(offer for profiles in some for offer in convert_offers(profiles))
 
     def can_decode(self, topic: str) -> bool:
         """True if messages of the topic can be decoded."""
@@ -269,20 +288,18 @@ class BagFile:
 
     def read_messages(self, topic: str) -> list[Message]:
         """Returns all messages of a topic."""
-        found = []
+        messages = []
+        decode = self._store.deserialize_cdr
         if self._is_ros_1:
             decode = self._store.deserialize_ros1
-        else:
-            decode = self._store.deserialize_cdr
-        for k, (kind, ns, data) in enumerate(self._read_raw(topic)):
+        for k, (kind, receive_ns, data) in enumerate(self._read_raw(topic)):
             try:
-                found.append(Message(ns, decode(data, kind)))
+                messages.append(Message(receive_ns, decode(data, kind)))
             except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
-                what = (
+                raise ValueError(
                     f"topic {topic!r}: message {k} can't be decoded as {kind} ({error})"
-                )
-                raise ValueError(what) from None
-        return found
+                ) from None
+        return messages
 
     def read_serialized(self, topic: str) -> list[tuple[int, bytes]]:
         """Returns the same messages undecoded, as ROS 2 sends them: receipt [ns] and bytes."""

@@ -29,9 +29,9 @@ from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
 QUATERNION_TOLERANCE = 0.05
 SCAN = "sensor_msgs/msg/LaserScan"
-LEAST_MESSAGES = 20
+FEWEST_MESSAGES = 20
 PERCENTILES = (5.0, 50.0, 95.0)
-SPANNED = 0.9  # share of a uniform distribution between the first and last of these percentiles
+SPANNED = 0.9  # part of a uniform distribution between the first and last of these percentiles
 
 
 def load_bag(
@@ -42,9 +42,10 @@ def load_bag(
         raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
     with open_bag(path) as bag:
         topics = roles.assign(mapping, bag.types, bag.empty, bag.place)
+        pose = topics.get("pose") or topics["odom"]
         data = {
             "command": _read_command(bag, topics["cmd_vel"], spec),
-            "pose": _read_pose(bag, topics.get("pose") or topics["odom"], mapping),
+            "pose": _read_pose(bag, pose, mapping),
         }
         if "pose" in topics and "odom" in topics:
             data["odometry"] = _read_rows(bag, topics["odom"], msgs.read_twist)
@@ -56,14 +57,13 @@ def load_bag(
         if "imu" in topics:
             data["imu"], axis = _read_imu(bag, topics["imu"])
             if not axis.is_usual:
-                told = f"imu: by gravity its axis {axis.name} points up, so that is its yaw axis."
-                repairs = (told,)
+                note = f"imu: by gravity its axis {axis.name} points up, so that is its yaw axis."
+                repairs = (note,)
         latency = measure_latency(bag, topics.get("odom"))
-        pose = topics.get("pose") or topics["odom"]
         measured_by = guess_pose_source(pose, bag.types[pose])
-    made: Any = stamp_streams(data, mapping.stamps, str(path))
+    recorded: Any = stamp_streams(data, mapping.stamps, str(path))
     recording = Recording(
-        **made,
+        **recorded,
         source=str(path),
         variables=spec.variable_names,
         latency=latency,
@@ -77,16 +77,17 @@ def _read_rows(
     bag: BagFile,
     topic: str,
     row: Callable[[Any], msgs.Row],
-    some: Sequence[Message] | None = None,
+    messages: Sequence[Message] | None = None,
 ) -> TopicData:
-    messages = bag.read_messages(topic) if some is None else some
-    receive, header = read_times(messages)
+    if messages is None:
+        messages = bag.read_messages(topic)
+    receive_ns, header_ns = read_times(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
         fault = f"topic {topic!r}: message {k} holds NaN or inf"
         advice = "find out why it was sent, cut the bag there, or choose another topic"
         raise RecordingError(f"{bag.place}: {fault}; {advice}.")
-    return TopicData(topic, receive, header, values)
+    return TopicData(topic, receive_ns, header_ns, values)
 
 
 def _read_imu(bag: BagFile, topic: str) -> tuple[TopicData, UpAxis]:
@@ -147,29 +148,30 @@ def select_transforms(
     child: str | None,
 ) -> list[Message]:
     """Returns the transforms between two frames, or the only two frames; else RecordingError."""
-    single = [
-        (msgs.get_frames(transform), Message(message.receive_ns, transform))
-        for message in messages
-        for transform in getattr(message.content, "transforms", (message.content,))
+    transforms: dict[tuple[str, str], list[Message]] = {}
+    for message in messages:
+        for transform in getattr(message.content, "transforms", (message.content,)):
+            pair = msgs.get_frames(transform)
+            part = Message(message.receive_ns, transform)
+            transforms.setdefault(pair, []).append(part)
+    pairs = [
+        (parent, child_frame)
+        for parent, child_frame in transforms
+        if frame is None or frame.strip("/") == parent
+        if child is None or child.strip("/") == child_frame
     ]
-    wanted = (frame, child)
-    there = {pair for pair, _ in single}
-    pairs = {
-        pair
-        for pair in there
-        if all(
-            w is None or w.strip("/") == f for w, f in zip(wanted, pair, strict=True)
-        )
-    }
     if len(pairs) == 1:
-        return [message for pair, message in single if pair in pairs]
-    problem = "several transforms" if pairs else "no transform"
-    named = " with the given names" if any(wanted) else ""
-    listed = ", ".join(sorted(f"{a} -> {b}" for a, b in there)) or "none"
-    fault = f"{bag.place}: topic {topic!r} holds {problem}{named}"
+        return transforms[pairs[0]]
+    problem = "no transform"
+    if pairs:
+        problem = "several transforms"
+    if frame or child:
+        problem += " with the given names"
+    frames = ", ".join(sorted(" -> ".join(pair) for pair in transforms)) or "none"
+    fault = f"{bag.place}: topic {topic!r} holds {problem}"
     example = "as in `frame: world` and `child_frame: base_link`"
     advice = f"write those of the robot into the topics file or the map, {example}"
-    raise RecordingError(f"{fault}; {advice}; it holds {listed}.")
+    raise RecordingError(f"{fault}; {advice}; it holds {frames}.")
 
 
 def read_joint_streams(
@@ -181,10 +183,11 @@ def read_joint_streams(
 ) -> dict[str, TopicData]:
     """Returns state and wheels, each if the joints show it; for errors see `extract_state`."""
     joints = gather_joints(topic, messages)
-    state = extract_state(joints, spec, mapping, place)
-    wheels = extract_wheels(joints, mapping, place)
-    found = {"state": state, "wheels": wheels}
-    return {name: data for name, data in found.items() if data is not None}
+    streams = {
+        "state": extract_state(joints, spec, mapping, place),
+        "wheels": extract_wheels(joints, mapping, place),
+    }
+    return {name: data for name, data in streams.items() if data is not None}
 
 
 class Joints(NamedTuple):
@@ -205,11 +208,12 @@ def gather_joints(topic: str, messages: Sequence[Message]) -> Joints:
     )
     position, velocity = np.full((2, len(messages), len(names)), np.nan)
     for row, message in enumerate(messages):
-        told = message.content
-        columns = [names.index(name) for name in told.name]
-        for table, values in ((position, told.position), (velocity, told.velocity)):
-            if len(values) == len(columns):
-                table[row, columns] = values
+        joints = message.content
+        columns = [names.index(name) for name in joints.name]
+        if len(joints.position) == len(columns):
+            position[row, columns] = joints.position
+        if len(joints.velocity) == len(columns):
+            velocity[row, columns] = joints.velocity
     return Joints(topic, *read_times(messages), names, position, velocity)
 
 
@@ -217,33 +221,40 @@ def extract_state(
     joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str
 ) -> TopicData | None:
     """Returns the measured state (T, S), or None without joints; RecordingError if it is needed."""
-    known = [v.name for v in spec.state]
-    for name in sorted(mapping.state.keys() - set(known)):
+    names = [variable.name for variable in spec.state]
+    for name in sorted(mapping.state.keys() - set(names)):
         fault = f"robot {spec.name!r} has no state {name!r}"
-        raise RecordingError(f"{place}: topics: {fault}; {suggest(name, known)}")
-    sources = {v.name: _find_joint(joints, v, mapping, place) for v in spec.state}
-    found = [source for source in sources.values() if source is not None]
-    if spec.state and len(found) == len(sources):
-        columns = []
-        for variable, source in zip(spec.state, found, strict=True):
-            usual = "position" if variable.unit in msgs.POSITION_UNITS else "velocity"
-            if (source.field or usual) == "position":
-                table = joints.position
-            else:
-                table = joints.velocity
-            columns.append(source.scale * table[:, joints.names.index(source.joint)])
-        return _select_complete(
-            joints, np.stack(columns, axis=1), [s.joint for s in found], place
-        )
-    if mapping.state or any(v.must_be_measured for v in spec.state):
-        missing = next(name for name, source in sources.items() if source is None)
-        fault = f"no joint is known for the state {missing!r}"
-        listed = (
-            f"the joints of {joints.topic!r} are {', '.join(joints.names) or 'none'}"
-        )
-        advice = f"name it in the topics file, as in state: {{{missing}: JOINT}}"
-        raise RecordingError(f"{place}: {fault}; {listed}: {advice}.")
-    return None
+        raise RecordingError(f"{place}: topics: {fault}; {suggest(name, names)}")
+    columns = []
+    sources = []
+    for variable in spec.state:
+        source = _find_joint(joints, variable, mapping, place)
+        if source is not None:
+            sources.append(source.joint)
+            columns.append(_read_joint(joints, variable, source))
+        elif mapping.state or any(each.must_be_measured for each in spec.state):
+            fault = f"no joint is known for the state {variable.name!r}"
+            others = ", ".join(joints.names) or "none"
+            advice = (
+                f"name it in the topics file, as in state: {{{variable.name}: JOINT}}"
+            )
+            raise RecordingError(
+                f"{place}: {fault}; the joints of {joints.topic!r} are {others}: {advice}."
+            )
+    if not names or len(columns) < len(names):
+        return None
+    return _select_complete(joints, np.stack(columns, axis=1), sources, place)
+
+
+def _read_joint(joints: Joints, variable: StateVariable, source: JointSource) -> Array:
+    """Returns the values (T,) of a state variable."""
+    field = source.field
+    if field is None and variable.unit in msgs.POSITION_UNITS:
+        field = "position"
+    table = joints.velocity
+    if field == "position":
+        table = joints.position
+    return np.asarray(source.scale * table[:, joints.names.index(source.joint)])
 
 
 def extract_wheels(joints: Joints, mapping: TopicRoles, place: str) -> TopicData | None:
@@ -263,11 +274,13 @@ def extract_wheels(joints: Joints, mapping: TopicRoles, place: str) -> TopicData
 def _find_joint(
     joints: Joints, variable: StateVariable, mapping: TopicRoles, place: str
 ) -> JointSource | None:
-    named = mapping.state.get(variable.name)
-    if named is None:
-        guess = _match_joint(joints.names, variable.name)
-        return None if guess is None else JointSource(joint=guess)
-    source = JointSource(joint=named) if isinstance(named, str) else named
+    source = mapping.state.get(variable.name)
+    if source is None:
+        source = _match_joint(joints.names, variable.name)
+        if source is None:
+            return None
+    if isinstance(source, str):
+        source = JointSource(joint=source)
     _get_joint_index(joints, source.joint, place)
     return source
 
@@ -282,11 +295,13 @@ def _get_joint_index(joints: Joints, name: str, place: str) -> int:
 def _match_joint(names: Iterable[str], wanted: str) -> str | None:
     """Returns the only joint whose name has all words of the wanted name, in any order."""
     words = set(wanted.split("_"))
-    found = [name for name in names if words <= set(re.split(r"[^a-z]+", name.lower()))]
-    if wanted in found:
+    fitting = [
+        name for name in names if words <= set(re.split(r"[^a-z]+", name.lower()))
+    ]
+    if wanted in fitting:
         return wanted
-    if len(found) == 1:
-        return found[0]
+    if len(fitting) == 1:
+        return fitting[0]
     return None
 
 
@@ -314,31 +329,33 @@ def measure_latency(bag: BagFile, odom: str | None = None) -> Latency:
 
 def _find_topic(bag: BagFile, kind: str, name: str) -> str | None:
     """Returns the only topic of a type, or the only one of several with the usual name."""
-    of_kind = [
+    topics = [
         topic
-        for topic, one in bag.types.items()
-        if one == kind and topic not in bag.empty
+        for topic, topic_kind in bag.types.items()
+        if topic_kind == kind and topic not in bag.empty
     ]
-    named = [topic for topic in of_kind if re.search(rf"(^|/){name}$", topic)]
-    found = of_kind if len(of_kind) == 1 else named
-    return found[0] if len(found) == 1 else None
+    if len(topics) > 1:
+        topics = [topic for topic in topics if re.search(rf"(^|/){name}$", topic)]
+    if len(topics) != 1:
+        return None
+    return topics[0]
 
 
 def _measure_delay(bag: BagFile, topic: str | None) -> Delay | None:
-    messages = bag.read_messages(topic) if topic else []
-    receive, stamps = read_times(messages)
-    if len(messages) < LEAST_MESSAGES or stamps is None or not stamps.all():
+    if topic is None:
         return None
-    late = (receive - stamps) * S_PER_NS
-    if hasattr(
-        messages[0].content, "ranges"
-    ):  # a scan's stamp is that of beam 0, not of its last
-        scans = [
-            (max(0.0, float(m.content.time_increment)), m.content.ranges)
-            for m in messages
-        ]
-        late -= [increment * max(len(ranges) - 1, 0) for increment, ranges in scans]
-    low, middle, high = np.percentile(late, PERCENTILES)
+    messages = bag.read_messages(topic)
+    receive_ns, stamps_ns = read_times(messages)
+    if len(messages) < FEWEST_MESSAGES or stamps_ns is None or not stamps_ns.all():
+        return None
+    delay = (receive_ns - stamps_ns) * S_PER_NS
+    if hasattr(messages[0].content, "ranges"):
+        # A scan's stamp is that of its first beam.
+        for k, message in enumerate(messages):
+            scan = message.content
+            increment = max(0.0, float(scan.time_increment))
+            delay[k] -= increment * max(len(scan.ranges) - 1, 0)
+    low, middle, high = np.percentile(delay, PERCENTILES)
     if not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
         return None
     jitter = float(high - low) / SPANNED

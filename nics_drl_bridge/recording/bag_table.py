@@ -43,8 +43,9 @@ def list_fields(message: Any, path: str = "") -> Iterator[str]:
     ):
         yield path
     elif isinstance(message, (list, tuple, np.ndarray)):
-        for k in range(len(message) if len(message) <= LONGEST_ARRAY else 0):
-            yield from list_fields(message[k], f"{path}[{k}]")
+        if len(message) <= LONGEST_ARRAY:
+            for k, element in enumerate(message):
+                yield from list_fields(element, f"{path}[{k}]")
     else:
         labels: Any = getattr(message, NAMES, None)
         for name in (each for each in vars(message) if not each.startswith("__")):
@@ -89,9 +90,13 @@ def read_column(
     place: str, names: Sequence[str], messages: Sequence[Message], which: str | int
 ) -> Column:
     """Returns a field of all messages (T,); RecordingError if they have none of that name."""
-    path = names[which] if isinstance(which, int) else which
-    inner = [name for name in names if name.startswith(path)]
-    hint = f"say which, as {inner[0]!r}." if inner else suggest(path, names)
+    if isinstance(which, int):
+        which = names[which]
+    path = which
+    hint = suggest(path, names)
+    inner = next((name for name in names if name.startswith(path)), None)
+    if inner is not None:
+        hint = f"say which, as {inner!r}."
     read = make_field_reader(path)
     try:
         values = [read(message.content) for message in messages]
@@ -112,18 +117,22 @@ class Bag(Source):
     """The topics of an opened bag as tables, of transforms those between two frames."""
 
     def __init__(self, bag: BagFile, mapping: mapped.Mapping | None = None) -> None:
-        known = bag.types.keys() - bag.empty
-        scenes = {topic for topic in known if SCENES.search(bag.types[topic])}
-        super().__init__(
-            bag.place, sorted(t for t in known - scenes if bag.can_decode(t))
-        )
+        topics = [
+            topic
+            for topic, kind in sorted(bag.types.items())
+            if topic not in bag.empty and not SCENES.search(kind)
+        ]
+        super().__init__(bag.place, [t for t in topics if bag.can_decode(t)])
         self._bag = bag
-        self._frames = (None, None) if mapping is None else mapping.pose.frames
+        self._frames: tuple[str | None, str | None] = (None, None)
         # topics that are read, and whether they come from the robot's computer, for common stamps
-        self._used = {} if mapping is None else list_topics_used(mapping, self.names)
+        self._used: dict[str, bool] = {}
+        if mapping is not None:
+            self._frames = mapping.pose.frames
+            self._used = list_topics_used(mapping, self.names)
         self._messages: dict[str, Sequence[Message]] = {}
         self._notes: dict[str, list[str]] = {}  # by topic
-        self._stamps: dict[tuple[str, ...], dict[str, Stream]] = {}
+        self._stamps: dict[tuple[str, ...], Stream] = {}
 
     @property
     def latency(self) -> Latency:
@@ -152,39 +161,37 @@ class Bag(Source):
     def _stamp_rows(self, topic: str, which: str) -> Stream:
         """Stamps a topic with all that are used: only together do they show their clocks."""
         topics = tuple(self._used) or (topic,)
-        bare = [
-            each
-            for each in topics
-            if not np.any(read_times(self._read_messages(each))[1])
-        ]
-        # Beside topics without headers these are compared with the arrival, as if nobody asked.
+        key = (which, topic, *topics)
+        if key not in self._stamps:
+            self._stamps[key] = self._stamp_topics(topic, topics, which)
+        return self._stamps[key]
+
+    def _stamp_topics(self, topic: str, topics: Sequence[str], which: str) -> Stream:
+        data = {}
+        for name in topics:
+            messages = self._read_messages(name)
+            rows = np.arange(len(messages), dtype=np.float64)[:, None]
+            data[name] = TopicData(name, *read_times(messages), rows)
+        # Without headers in other topics, these are compared with the arrival, as if nobody asked.
+        bare = [name for name, part in data.items() if not np.any(part.header_ns)]
         stamps = STAMPS[which]
         if which == mapped.HEADER and bare and topic not in bare:
             stamps = "auto"
-        if (key := (which, stamps, *topics)) not in self._stamps:
-            data = {}
-            for each in topics:
-                messages = self._read_messages(each)
-                rows = np.arange(len(messages), dtype=np.float64)[:, None]
-                data[each] = TopicData(each, *read_times(messages), rows)
-            robot = [each for each, own in self._used.items() if own]
-            try:
-                self._stamps[key] = stamp_streams(data, stamps, self.place, robot)
-            except RecordingError as error:
-                if which:
-                    raise
-                fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
-                stamps = (
-                    "header" if has_continuous_headers(data.values()) else "receive"
-                )
-                if stamps == "header":
-                    by = "headers, which go on together"
-                else:
-                    by = "arrival"
-                note = f"{fault}; all messages were stamped by their {by}."
-                self._notes.setdefault(topic, []).append(note)
-                self._stamps[key] = stamp_streams(data, stamps, self.place, robot)
-        return self._stamps[key][topic]
+        robot = [name for name, is_robots in self._used.items() if is_robots]
+        try:
+            return stamp_streams(data, stamps, self.place, robot)[topic]
+        except RecordingError as error:
+            if which:
+                raise
+            stamps = "receive"
+            origin = "arrival"
+            if has_continuous_headers(data.values()):
+                stamps = "header"
+                origin = "headers, which go on together"
+            fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
+            note = f"{fault}; all messages were stamped by their {origin}."
+            self._notes.setdefault(topic, []).append(note)
+            return stamp_streams(data, stamps, self.place, robot)[topic]
 
 
 def list_topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:

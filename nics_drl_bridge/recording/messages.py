@@ -39,11 +39,12 @@ WHEELS = ("left_wheel", "right_wheel")
 
 def check_libraries(path: Path, what: str, instead: str = "") -> None:
     """Raises RecordingError if a library that `reading` or `writing` a bag needs is missing."""
-    for library in (each for each in LIBRARIES if find_spec(each) is None):
-        advice = f"install it with pip install 'nics_drl_bridge[bags]'{instead}"
-        raise RecordingError(
-            f"{path}: {what} a bag needs the library {library}; {advice}."
-        )
+    for library in LIBRARIES:
+        if find_spec(library) is None:
+            advice = f"install it with pip install 'nics_drl_bridge[bags]'{instead}"
+            raise RecordingError(
+                f"{path}: {what} a bag needs the library {library}; {advice}."
+            )
 
 
 def make_typestore() -> "Typestore":
@@ -73,7 +74,7 @@ def collect_types(
         get_typestore,
     )
 
-    own: dict[str, Any] = {}
+    defined: dict[str, Any] = {}
     store = make_typestore()
     for connection in connections:
         form, text = connection.msgdef
@@ -81,19 +82,23 @@ def collect_types(
             Exception
         ):  # a definition that can't be parsed leaves its type unknown
             if form == MessageDefinitionFormat.MSG:
-                own |= get_types_from_msg(text, connection.msgtype)
+                defined |= get_types_from_msg(text, connection.msgtype)
             elif form == MessageDefinitionFormat.IDL:
                 for part in re.split(r"^=+\nIDL: .*\n", text, flags=re.MULTILINE):
-                    own |= get_types_from_idl(part) if part.strip() else {}
+                    if part.strip():
+                        defined |= get_types_from_idl(part)
     if not header:
-        own.pop(HEADER, None)
+        defined.pop(HEADER, None)
     new = {
-        name: each for name, each in own.items() if store.fielddefs.get(name) != each
+        name: fields
+        for name, fields in defined.items()
+        if store.fielddefs.get(name) != fields
     }
     if new.keys() & store.fielddefs.keys():  # of another release, or of ROS 1
         new = {**store.fielddefs, **new}
         store = get_typestore(Stores.EMPTY)
-        new = {name: each for name, each in new.items() if name not in store.fielddefs}
+        for name in store.fielddefs:
+            new.pop(name, None)
     store.register(new)
     return store
 
@@ -121,8 +126,9 @@ def read_command(message: Any) -> Row:
 def read_robot_command(message: Any, spec: RobotSpec) -> Array:
     """Returns the command (C,) of a message for a robot; see `read_command`."""
     row = np.array(read_command(message))
-    of_angles = hasattr(getattr(message, "drive", message), "steering_angle")
-    return spec.from_fields(row) if of_angles else spec.from_cmd_vel(row)
+    if hasattr(getattr(message, "drive", message), "steering_angle"):
+        return spec.from_fields(row)
+    return spec.from_cmd_vel(row)
 
 
 def _get_place(message: Any) -> tuple[Any, Any]:
@@ -170,7 +176,9 @@ def read_twist(message: Any) -> Row:
 def read_turn_variance(message: Any) -> float | None:
     """Returns the variance of an Odometry's yaw rate [rad^2/s^2]; None if it says nothing."""
     variance = float(message.twist.covariance[35])
-    return variance if math.isfinite(variance) and variance > 0.0 else None
+    if not math.isfinite(variance) or variance <= 0.0:
+        return None
+    return variance
 
 
 def read_imu(message: Any) -> Row:

@@ -248,7 +248,8 @@ def _find_unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
         in_radians = measure_alignment(values, 1.0)
         in_degrees = measure_alignment(values, np.pi / 180.0)
         if max(in_radians, in_degrees) > ALONG > measure_alignment(values, 0.0):
-            yield PoseGuess(table, *names[k : k + 3])
+            x, y, heading = names[k : k + 3]
+            yield PoseGuess(table, x, y, heading)
 
 
 def _match_quaternion(
@@ -278,11 +279,12 @@ def _match_quaternion(
     if {*split_words(" ".join(place))} & NOT_PLACES or {*place} & {*turn}:
         return None
     heading = 2.0 * np.arctan2(parts[2], parts[3])
-    x, y = (columns[names.index(name)] for name in place)
-    pose = _stack_finite([x, y, heading])
+    x, y = place
+    path = [columns[names.index(name)] for name in (x, y)]
+    pose = _stack_finite([*path, heading])
     if pose is None:
         return None
     pose = pose[:: max(1, len(pose) // MOST_COMPARED)]
     if len(pose) < 3 or measure_alignment(pose, 1.0) < CONFIRMED:
         return None
-    return PoseGuess(table, *place, quaternion=tuple(turn))
+    return PoseGuess(table, x, y, quaternion=tuple(turn))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -122,13 +122,14 @@ def stamp_streams(
         if ns is None or (len(robot_clocks) > 1 and name in of_robot):
             streams[name] = _stamp_by_receipt(part, origin)
         else:
-            t = (ns + shift - origin) * S_PER_NS
+            t = np.asarray((ns + shift - origin) * S_PER_NS, dtype=np.float64)
             streams[name] = Stream(t, part.values, clock)
     return streams
 
 
-def has_continuous_headers(parts: Collection[TopicData]) -> bool:
+def has_continuous_headers(parts: Iterable[TopicData]) -> bool:
     """True if the headers of all, in the order of their receipt, go on without a leap."""
+    parts = list(parts)
     receive_ns = np.concatenate([part.receive_ns for part in parts])
     headers = [part.header_ns for part in parts]
     if any(ns is None or not ns.all() for ns in headers):
@@ -218,7 +219,7 @@ def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
 
 def _stamp_by_receipt(part: TopicData, origin: int) -> Stream:
     order = np.argsort(part.receive_ns, kind="stable")
-    t = (part.receive_ns[order] - origin) * S_PER_NS
+    t = np.asarray((part.receive_ns[order] - origin) * S_PER_NS, dtype=np.float64)
     return Stream(t, part.values[order], RECEIVE)
 
 

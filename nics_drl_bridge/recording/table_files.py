@@ -46,30 +46,28 @@ def read_text_table(path: Path) -> Table:
     """Reads a table; RecordingError names the file, the line and the fix."""
     lines, comments = _read_lines(path)
     separator = _find_separator([text for _, text in lines[:TRIED]])
-    at = np.array([line for line, _ in lines], dtype=np.intp)
+    line_numbers = np.array([line for line, _ in lines], dtype=np.intp)
     rows = [_split(text, separator) for _, text in lines]
     first, width = _find_first_row(path, rows)
     above = rows[:first]
-    rows, at, notes = _keep_one_width(path, rows[first:], at[first:], above, width)
+    rows, line_numbers, notes = _keep_one_width(
+        path, rows[first:], line_numbers[first:], above, width
+    )
     columns = [list(column) for column in zip(*rows, strict=True)]
     # The last title that has most names: one of units, below it, repeats some.
     titles = [row for row in above if len(row) > 1 or width == 1]
     head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
     if head is None and comments:
         head = _find_title(comments[-1], separator, width)
-    if (
-        head is None
-        and width == len(TUM)
-        and (separator is None or path.suffix == TUM_SUFFIX)
-    ):
-        head = list(TUM) if _is_tum(columns) else None
-    if head is None and (named := _split_labels(columns)):
-        columns, head = named
+    may_be_tum = separator is None or path.suffix == TUM_SUFFIX
+    if head is None and may_be_tum and _is_tum(columns):
+        head = list(TUM)
+    if head is None and (labelled := _split_labels(columns)):
+        columns, head = labelled
     columns = [_replace_commas(column) for column in columns]
     names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
-    return make_table(
-        str(path), names, tuple(map(_convert_column, columns)), at, tuple(notes)
-    )
+    data = [_convert_column(column) for column in columns]
+    return make_table(str(path), names, data, line_numbers, tuple(notes))
 
 
 def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
@@ -82,12 +80,14 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
         data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: can't be read ({error.strerror}).") from None
+    encoding = "utf-8-sig"
+    if data[:2] in UTF_16:
+        encoding = "utf-16"
     try:
-        text = data.decode("utf-16" if data[:2] in UTF_16 else "utf-8-sig")
+        text = data.decode(encoding)
     except UnicodeDecodeError:
-        text = data.decode(
-            "latin-1"
-        )  # as written by old tools: a degree sign in a header
+        # As old tools write it: a degree sign in a header.
+        text = data.decode("latin-1")
     if "\0" in text:
         raise RecordingError(f"{path}: is not text; save it as CSV in UTF-8.")
     text = text.replace("\r\n", "\n").replace("\r", "\n")
@@ -103,9 +103,8 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     comments = [
         line.lstrip("#/% ") for _, line in lines if line.lstrip().startswith(COMMENTS)
     ]
-    return [
-        each for each in lines if not each[1].lstrip().startswith(COMMENTS)
-    ], comments
+    rows = [(k, line) for k, line in lines if not line.lstrip().startswith(COMMENTS)]
+    return rows, comments
 
 
 def _split(line: str, separator: str | None) -> list[str]:
@@ -142,11 +141,13 @@ def _find_separator(lines: Sequence[str]) -> str | None:
 
     def score(separator: str | None) -> int:
         fields = [field for line in lines for field in _split(line, separator) if field]
-        return sum(1 if _is_value(field) else -1 for field in fields)
+        return 2 * sum(map(_is_value, fields)) - len(fields)
 
     best = max(SEPARATORS, key=score)
     others = sorted(set(NO_SEPARATOR.sub("", "".join(lines))))
-    return best if score(best) > 0 or not others else max(others, key=score)
+    if score(best) <= 0 and others:
+        return max(others, key=score)
+    return best
 
 
 def _find_first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
@@ -171,39 +172,38 @@ def _find_first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
 def _keep_one_width(
     path: Path,
     rows: list[list[str]],
-    at: NDArray[np.intp],
+    line_numbers: NDArray[np.intp],
     above: list[list[str]],
     width: int,
 ) -> tuple[list[list[str]], NDArray[np.intp], list[str]]:
     """Leaves out headers that are repeated, and the few rows that were cut short."""
-    file = path.name
     notes = []
-    new = np.array([row not in above for row in rows], dtype=np.bool_)
-    if not new.all():
-        notes.append(
-            f"{file}: {(~new).sum()} lines repeat the header, and were left out."
-        )
-    fits = np.array([len(row) == width for row in rows], dtype=np.bool_)
-    broken = np.flatnonzero(new & ~fits)
-    if len(broken) > max(1.0, MOST_BROKEN * new.sum()):
-        fault = f"line {at[broken[0]]} has {len(rows[broken[0]])} fields"
+    is_data = np.array([row not in above for row in rows], dtype=np.bool_)
+    if not is_data.all():
+        headers = f"{(~is_data).sum()} lines repeat the header"
+        notes.append(f"{path.name}: {headers}, and were left out.")
+    is_whole = np.array([len(row) == width for row in rows], dtype=np.bool_)
+    broken = np.flatnonzero(is_data & ~is_whole)
+    if len(broken) > max(1.0, MOST_BROKEN * is_data.sum()):
+        fault = f"line {line_numbers[broken[0]]} has {len(rows[broken[0]])} fields"
         advice = f"where most lines have {width}; mend or remove it and those like it"
         raise RecordingError(f"{path}: {fault} {advice}.")
     if len(broken):
-        where = ", ".join(map(str, at[broken[:5]]))
-        notes.append(
-            f"{file}: {len(broken)} lines of another length (line {where}) were left out."
-        )
-    kept = np.flatnonzero(new & fits)
-    whole = [rows[k] for k in kept]
-    while width > 1 and not any(row[width - 1] for row in whole):
+        where = ", ".join(map(str, line_numbers[broken[:5]]))
+        left_out = f"{len(broken)} lines of another length (line {where})"
+        notes.append(f"{path.name}: {left_out} were left out.")
+    kept = np.flatnonzero(is_data & is_whole)
+    kept_rows = [rows[k] for k in kept]
+    while width > 1 and not any(row[width - 1] for row in kept_rows):
         width -= 1  # after a separator at the end of each line
-        whole = [row[:width] for row in whole]
-    return whole, at[kept], notes
+        kept_rows = [row[:width] for row in kept_rows]
+    return kept_rows, line_numbers[kept], notes
 
 
 def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
     """True for stamps that rise, and unit quaternions at the end."""
+    if len(columns) != len(TUM):
+        return False
     try:
         values = np.array(columns, dtype=np.float64)
     except ValueError:
@@ -218,29 +218,34 @@ def _split_labels(
     columns: Sequence[list[str]],
 ) -> tuple[list[list[str]], list[str]] | None:
     """Names columns by labels that stand in each row, as in `time: 1.2 ticks: 3 4`."""
-    found: dict[str, list[list[str]]] = {}
+    labelled: dict[str, list[list[str]]] = {}
+    label = None
     for column in columns:
         first = column[0]
         if first.endswith((":", "=")) and set(column) == {first}:
-            found[label := first.rstrip(":=")] = []
-        elif not found:
+            label = first.rstrip(":=")
+            labelled[label] = []
+        elif label is None:
             return None
         else:
-            found[label].append(column)
-    names = [
-        name if len(some) == 1 else f"{name}[{k}]"
-        for name, some in found.items()
-        for k in range(len(some))
-    ]
-    return list(chain.from_iterable(found.values())), names
+            labelled[label].append(column)
+    names = []
+    for label, values in labelled.items():
+        if len(values) == 1:
+            names.append(label)
+        else:
+            names += [f"{label}[{k}]" for k in range(len(values))]
+    return list(chain.from_iterable(labelled.values())), names
 
 
 def _replace_commas(column: list[str]) -> list[str]:
     """Writes decimal commas as points."""
     if not any("," in field for field in column):
         return column
-    changed = [field.replace(",", ".") for field in column]
-    return changed if all(map(_is_value, changed)) else column
+    with_points = [field.replace(",", ".") for field in column]
+    if all(map(_is_value, with_points)):
+        return with_points
+    return column
 
 
 def _convert_column(column: Sequence[str]) -> Column:
@@ -258,7 +263,9 @@ def read_arrays(path: Path) -> Table:
     try:
         with check_no_device(path).open("rb") as file:
             loaded = np.load(file, allow_pickle=False)
-            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+            if isinstance(loaded, np.ndarray):
+                loaded = {"": loaded}
+            arrays = dict(loaded)
     except Exception as error:  # noqa: BLE001 - damage breaks numpy in any way
         advice = "write numbers with numpy.save or numpy.savez, without pickle"
         why = " ".join(str(error).split())[:200]
@@ -286,14 +293,12 @@ def read_parquet(path: Path) -> Table:
     except Exception as error:  # noqa: BLE001 - damage breaks the reader in any way
         why = " ".join(str(error).split())[:200]
         raise RecordingError(f"{path}: can't be read as Parquet ({why}).") from None
-    stamps = [
-        c.astype("datetime64[ns]").astype(str) if c.dtype.kind == "M" else c
-        for c in columns
-    ]
-    texts = [
-        np.array([*map(str, c)], np.str_) if c.dtype.kind == "O" else c for c in stamps
-    ]
-    return make_table(str(path), tuple(table.column_names), tuple(texts))
+    for k, column in enumerate(columns):
+        if column.dtype.kind == "M":
+            columns[k] = column.astype("datetime64[ns]").astype(str)
+        elif column.dtype.kind == "O":
+            columns[k] = np.array([str(value) for value in column], np.str_)
+    return make_table(str(path), tuple(table.column_names), columns)
 
 
 READERS: dict[str, Callable[[Path], Table]] = {
@@ -308,17 +313,21 @@ class Files(Source):
     """A file, or the files of a folder; RecordingError if it holds none of a known format."""
 
     def __init__(self, path: Path) -> None:
-        known = (*TEXTS, *READERS)
-        inside = [path] if path.is_file() else sorted(path.rglob("*"))
-        some = [file for file in inside if file.suffix.lower() in known or file == path]
-        if not some:
-            raise RecordingError(
-                f"{path}: holds no file of a known format ({', '.join(known)})."
-            )
-        root = path.parent if path.is_file() else path
-        self._files = {
-            file.relative_to(root).as_posix(): file for file in some[:MOST_FILES]
-        }
+        self._files = {path.name: path}
+        if not path.is_file():
+            suffixes = (*TEXTS, *READERS)
+            files = [
+                file
+                for file in sorted(path.rglob("*"))
+                if file.suffix.lower() in suffixes
+            ]
+            if not files:
+                raise RecordingError(
+                    f"{path}: holds no file of a known format ({', '.join(suffixes)})."
+                )
+            self._files = {
+                file.relative_to(path).as_posix(): file for file in files[:MOST_FILES]
+            }
         super().__init__(str(path), tuple(self._files))
 
     def read(self, name: str) -> Table:

@@ -86,16 +86,20 @@ def list_imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
 
     `auto` is none unless `by_default`, as for a model that was made with a gyro; so is `none`.
     """
+    if wanted in (NONE, "") or (wanted == "auto" and not by_default):
+        return ()
     if wanted == "auto":
-        return IMU_NAMES if by_default else ()
-    return () if wanted in (NONE, "") else (wanted,)
+        return IMU_NAMES
+    return (wanted,)
 
 
 def load_topic_roles(
     file: str | Path | None = None, options: Iterable[str] = ()
 ) -> TopicRoles:
     """Reads roles from a YAML file and options `ROLE=TOPIC`, which override it (ConfigError)."""
-    roles = load_yaml(file, TopicRoles) if file else TopicRoles()
+    roles = TopicRoles()
+    if file:
+        roles = load_yaml(file, TopicRoles)
     given: dict[str, str] = {}
     for option in options:
         role, equals, topic = (part.strip() for part in option.partition("="))
@@ -122,17 +126,17 @@ def assign(
 ) -> dict[str, str]:
     """Assigns topics to roles, named or guessed; RecordingError lists them if that is unclear."""
     table = _Topics(types, empty, place)
-    found = {}
+    assigned = {}
     for role in ROLES:
-        if role == "odom" and "pose" in found and roles.odom is None:
+        if role == "odom" and "pose" in assigned and roles.odom is None:
             continue
         topic = table.choose(role, getattr(roles, role))
         if topic is not None:
-            found[role] = topic
+            assigned[role] = topic
     for needed, words in ((("cmd_vel",), "commands"), (("pose", "odom"), "poses")):
-        if not found.keys() & set(needed):
+        if assigned.keys().isdisjoint(needed):
             raise RecordingError(f"{place}: {table.describe_missing(needed, words)}")
-    return found
+    return assigned
 
 
 @dataclass(frozen=True)
@@ -147,12 +151,16 @@ class _Topics:
             return None
         if wanted is None:
             return self._guess(role)
-        topic = wanted if wanted.startswith("/") else f"/{wanted}"
-        if topic not in self.types or topic in self.empty:
-            lack = "holds no messages of the" if topic in self.empty else "has no"
-            listed = self._list_topics((role,))
+        topic = f"/{wanted.removeprefix('/')}"
+        fault = None
+        if topic in self.empty:
+            fault = "holds no messages of the"
+        elif topic not in self.types:
+            fault = "has no"
+        if fault is not None:
+            topics = self._list_topics((role,))
             raise RecordingError(
-                f"{self.place}: {lack} topic {topic!r} ({role}); {listed}"
+                f"{self.place}: {fault} topic {topic!r} ({role}); {topics}"
             )
         if self.types[topic] not in TYPES[role]:
             fault = f"{self.place}: the topic {topic!r} is of type {self.types[topic]}"
@@ -169,23 +177,26 @@ class _Topics:
             never: tuple[str, ...] = (TRANSFORMS,)
             if pattern != GROUND_TRUTH:
                 never = NEVER_GUESSED.get(role, ())
-            full = [topic for topic in fitting if self.types[topic] not in never]
-            found = [topic for topic in full if re.search(pattern, topic)]
-            if len(found) > 1:
-                without = "" if role == "cmd_vel" else f", or {role}={NONE} for none"
-                several = ", ".join(f"{t} ({self.types[t]})" for t in found)
-                fault = (
-                    f"{self.place}: each of several topics could be {role}: {several}"
+            topics = [
+                topic
+                for topic in fitting
+                if self.types[topic] not in never and re.search(pattern, topic)
+            ]
+            if len(topics) == 1:
+                return topics[0]
+            if topics:
+                several = ", ".join(
+                    f"{topic} ({self.types[topic]})" for topic in topics
                 )
-                raise RecordingError(
-                    f"{fault}; say which with --topic {role}={found[0]}{without}."
-                )
-            if found:
-                return found[0]
+                fault = f"each of several topics could be {role}: {several}"
+                advice = f"say which with --topic {role}={topics[0]}"
+                if role != "cmd_vel":
+                    advice += f", or {role}={NONE} for none"
+                raise RecordingError(f"{self.place}: {fault}; {advice}.")
         return None
 
     def describe_missing(self, roles: Sequence[str], words: str) -> str:
-        """Tells that no topic has any of the roles, with the fix."""
+        """Says that no topic has any of the roles, with the fix."""
         kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
         advice = f"record one of type {', '.join(kinds)}"
         if roles == ("cmd_vel",):
@@ -210,9 +221,11 @@ class _Topics:
     def _list_topics(self, roles: Sequence[str]) -> str:
         fitting = self._find_fitting(*roles)
         topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
-        told = [
-            f"{topic} ({self.types[topic]}{', empty' if topic in self.empty else ''})"
-            for topic in topics[:MOST_LISTED]
-        ]
-        more = len(topics) - len(told)
-        return f"its topics are {', '.join(told)}{f' and {more} more' if more else ''}."
+        listed = []
+        for topic in topics[:MOST_LISTED]:
+            empty = ", empty" * (topic in self.empty)
+            listed.append(f"{topic} ({self.types[topic]}{empty})")
+        text = ", ".join(listed)
+        if len(topics) > MOST_LISTED:
+            text += f" and {len(topics) - MOST_LISTED} more"
+        return f"its topics are {text}."
