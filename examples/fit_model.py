@@ -15,9 +15,8 @@ from nics_drl_bridge.robot.spec import load_robot
 
 def main() -> None:
     robot = load_robot("differential")
-    recording = textbook.record(
-        robot, np.random.default_rng(0)
-    )  # or read_recording(path)
+    # or read_recording(path)
+    recording = textbook.record(robot, np.random.default_rng(0))
     found = identify(recording, robot)
     print("\n".join(found.model.equations()))
     Path("fit_model.png").write_bytes(draw_held_out_paths(found.trial))

@@ -13,9 +13,8 @@ from nics_drl_bridge.report.pictures import panels, png
 def main() -> None:
     robot = load_robot("differential")
     world = load_world("arena")
-    recording = textbook.record(
-        robot, np.random.default_rng(0)
-    )  # or read_recording(path)
+    # or read_recording(path)
+    recording = textbook.record(robot, np.random.default_rng(0))
     model, _ = generate(recording, robot, load_lidar("paper"), world.shapes)
     print(model.report)
     save_model(model, "my_robot")

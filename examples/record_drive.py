@@ -12,15 +12,13 @@ from nics_drl_bridge.report.pictures import drive_picture
 
 def main() -> None:
     robot = load_robot("ackermann")
-    pattern = DrivePlan(
-        robot, bound=2.0, duration=60.0
-    ).preview()  # as `nics record --preview`
+    # as `nics record --preview`
+    pattern = DrivePlan(robot, bound=2.0, duration=60.0).preview()
     print("\n".join(pattern.describe()))
     Path("record_drive.png").write_bytes(drive_picture(pattern, robot))
 
-    recording = textbook.record(
-        robot, np.random.default_rng(0)
-    )  # `nics record` asks a real one
+    # `nics record` asks a real one
+    recording = textbook.record(robot, np.random.default_rng(0))
     save_recording(recording, "drive.npz")
     print(f"drive.npz holds {len(recording.pose.t)} poses")
 

@@ -15,18 +15,16 @@ SHAPES = [
     Rectangle(size=(0.6, 0.4)),
     Polygon(points=((0.0, 0.0), (0.5, 0.0), (0.1, 0.1), (0.0, 0.5))),
 ]
-AROUND = np.array(
-    [(0.8, 0.3, 0.4), (-0.5, 0.9, 1.0), (0.2, -1.0, 2.0)]
-)  # x, y, heading
+# x, y, heading
+AROUND = np.array([(0.8, 0.3, 0.4), (-0.5, 0.9, 1.0), (0.2, -1.0, 2.0)])
 
 
 def main() -> None:
     lidar = load_lidar("rplidar_a2")
     room = load_map("room")
     robots = room.cell_to_world(np.argwhere(room.distance_field > 0.5)[::400])
-    robots += np.array(
-        [0.013, 0.007]
-    )  # from a cell's centre a beam may just touch a corner
+    # from a cell's centre a beam may just touch a corner
+    robots += np.array([0.013, 0.007])
     poses = np.concatenate([robots, np.zeros((len(robots), 1))], axis=1)
     scans = {}
     for renderer in ("auto", "exact"):

@@ -12,9 +12,8 @@ OUT = Path("runs/example")
 
 def main() -> None:
     changes = {"steps": STEPS, "worlds": {"arena": 128}}
-    settings = chosen_settings(
-        "navigation", "demo", changes
-    )  # config/training/demo.yaml
+    # config/training/demo.yaml
+    settings = chosen_settings("navigation", "demo", changes)
     curve = []
 
     def tell(progress: train.checkpoints.Progress) -> None:

@@ -16,9 +16,8 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
 
 TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a share of the radius
-COARSE = np.radians(
-    2.0
-)  # between grid rotations, steps are of at most half of this [rad]
+# between grid rotations, steps are of at most half of this [rad]
+COARSE = np.radians(2.0)
 MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)  # least first beam of a row, relative to the bearing
 # an edge that two corners miss by more [beams] is found by climbing the hull

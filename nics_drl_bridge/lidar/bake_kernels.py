@@ -79,9 +79,8 @@ def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore
         first += 1
     while last > first and not np.isfinite(fine[last]):
         last -= 1
-    if not np.isfinite(
-        fine[first]
-    ):  # thinner than the spacing of the points: hit by none
+    # thinner than the spacing of the points: hit by none
+    if not np.isfinite(fine[first]):
         fine[:] = along((edge[0] + edge[1]) / 2.0, corners, radius, distance, cos, sin)
         return
     inside = EDGE * (edge[1] - edge[0])

@@ -58,9 +58,8 @@ class TableArrays(NamedTuple):
     # to the bearing, and its width; the other and the first corner of the hull that may be its
     # right silhouette; those of the left one. Pairs are 16 bits each
     cells: NDArray[np.int32]
-    rows: NDArray[
-        np.float32
-    ]  # (R,) ranges [m], one phase of the points after the other
+    # (R,) ranges [m], one phase of the points after the other
+    rows: NDArray[np.float32]
     shift: int  # log2 of the phases
     hulls: NDArray[np.float64]  # (sum V, 2) corners, see `shapes.Outlines`
 

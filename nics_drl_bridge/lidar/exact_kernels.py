@@ -52,9 +52,8 @@ class Beams(NamedTuple):
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
-    turns: NDArray[
-        np.float32
-    ]  # (4 Q,) cosines, sines of turns by up to Q beams either way
+    # (4 Q,) cosines, sines of turns by up to Q beams either way
+    turns: NDArray[np.float32]
     # (2, 2) unit vectors: what lies farther along both than its radius is behind all beams
     behind: NDArray[np.float64]
 
@@ -226,9 +225,8 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
         gx = bx - ax
         gy = by - ay
         cross = ax * by - ay * bx
-        if (
-            ex * gy - ey * gx < 0.0 or cross == 0.0
-        ):  # the lidar may lie on a side towards it
+        # the lidar may lie on a side towards it
+        if ex * gy - ey * gx < 0.0 or cross == 0.0:
             return False
         if (ay <= 0.0) != (by <= 0.0):  # it crosses the ray ahead, or the one behind
             rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
@@ -319,9 +317,8 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         other = arctan2(ay + ends * ey, ax + ends * ex)
         low = one if cross > 0.0 else other
         wide = other - one if cross > 0.0 else one - other
-        wide = (
-            wide + TWO_PI if wide < -1.0 else max(wide, 0.0)
-        )  # a whole turn, or rounding
+        # a whole turn, or rounding
+        wide = wide + TWO_PI if wide < -1.0 else max(wide, 0.0)
         low = (low - beams.first) * per_beam
         low -= np.floor(low * per_turn) * turn
         high = low + wide * per_beam
@@ -340,9 +337,8 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
 def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-def]
     count = whole.shape[0]
     few = BLOCK <= whole.shape[0] < MANY
-    most = min(
-        beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count
-    )  # a quarter turn
+    # a quarter turn
+    most = min(beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count)
     for begin in range(first, end, most):
         until = min(begin + most, end)
         width = min((until - begin + UNIT - 1) // UNIT * UNIT, count)

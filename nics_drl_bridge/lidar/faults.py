@@ -38,18 +38,14 @@ class LidarFaults(Schema):
     skew: Skew = "none"
     # what it reports for a return nearer than range_min
     too_close: TooClose = "minus_inf"
-    noise_proportional: float = Field(
-        default=0.0, ge=0.0, le=10.0
-    )  # added to noise_std, per metre
-    quantisation: float = Field(
-        default=0.0, ge=0.0, le=1e4
-    )  # returns are multiples of it [m]
-    dropout: float = Field(
-        default=0.0, ge=0.0, le=1.0
-    )  # probability that a return is lost
-    dropout_far: float = Field(
-        default=0.0, ge=0.0, le=1.0
-    )  # added to dropout in full at range_max
+    # added to noise_std, per metre
+    noise_proportional: float = Field(default=0.0, ge=0.0, le=10.0)
+    # returns are multiples of it [m]
+    quantisation: float = Field(default=0.0, ge=0.0, le=1e4)
+    # probability that a return is lost
+    dropout: float = Field(default=0.0, ge=0.0, le=1.0)
+    # added to dropout in full at range_max
+    dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
     def _probable(self) -> "LidarFaults":

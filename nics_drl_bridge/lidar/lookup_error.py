@@ -18,9 +18,8 @@ SEED = 0
 TOUCHING = 1e-3
 OUTLIER = 0.3  # greatest allowed error of any beam [m]
 DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
-SLANT = np.radians(
-    1.5
-)  # between line of sight and edge at most, in the search for outliers [rad]
+# between line of sight and edge at most, in the search for outliers [rad]
+SLANT = np.radians(1.5)
 # least interval of looked-up distances, as a share of the lidar's range
 NARROWEST = 0.1
 
@@ -96,9 +95,8 @@ def _scans(
 ) -> tuple[Array, Array]:
     mount = exact.mount
     directions = exact.beams.directions
-    robots = np.tile(
-        [-mount[0], -mount[1], 0.0], (PLACES, 1, 1)
-    )  # the lidar is at the origin
+    # the lidar is at the origin
+    robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))
     scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
     worlds = np.arange(PLACES)
     lanes = scan_kernels.scan_lanes()

@@ -24,9 +24,8 @@ distance [cells]; column and row relative to the lidar, index increments of one 
 the quadrant's bit shift, and the side of the free square."""
 LONGEST = 255  # side of the largest square that fits in a byte [cells]
 PARALLEL = np.float32(1e-12)  # least component of a direction: its inverse stays finite
-SLACK = (
-    1.0 + 1e-6
-)  # a return at exactly range_max must not be lost to rounding; `finish` decides
+# a return at exactly range_max must not be lost to rounding; `finish` decides
+SLACK = 1.0 + 1e-6
 
 
 class GridArrays(NamedTuple):
@@ -34,9 +33,8 @@ class GridArrays(NamedTuple):
 
     # (rows + 2, columns + 2), a byte per quadrant: 0 in solid cells and the border around the map
     squares: NDArray[np.uint32]
-    frame: NDArray[
-        np.float64
-    ]  # (5,) x, y [m], cosine, sine of its origin, resolution [m]
+    # (5,) x, y [m], cosine, sine of its origin, resolution [m]
+    frame: NDArray[np.float64]
 
 
 @kernel(allocates=True)
@@ -208,9 +206,8 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
     """Moves each lane to the end of its free square; True if any moved."""
     singles = lanes.single
     wholes = lanes.whole
-    for j in range(
-        LANES
-    ):  # apart from the loop below, so that LLVM can vectorise that one
+    # apart from the loop below, so that LLVM can vectorise that one
+    for j in range(LANES):
         k = np.uintp(j)
         cell = (
             here
@@ -258,6 +255,5 @@ def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped
         )
         t = singles[k + T]
         value = np.float32(resolution) * t if hit & (t < limit) else np.float32(np.inf)
-        ranges[j] = min(
-            ranges[j], np.float32(value).view(np.int32)
-        )  # see `exact_kernels._cross`
+        # see `exact_kernels._cross`
+        ranges[j] = min(ranges[j], np.float32(value).view(np.int32))

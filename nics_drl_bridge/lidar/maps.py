@@ -26,9 +26,8 @@ from nics_drl_bridge.lidar.shapes import Coordinate
 FREE = 0
 OCCUPIED = 100
 UNKNOWN = -1
-NO_MAP = map_kernels.GridArrays(
-    np.zeros((0, 0), np.uint32), np.zeros(0)
-)  # for the kernels
+# for the kernels
+NO_MAP = map_kernels.GridArrays(np.zeros((0, 0), np.uint32), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +109,8 @@ MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not open
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
 PIXELS_AT_ONCE = 2**20  # of an image whose brightness is computed
 BRIGHTEST_16 = 65535.0  # of a pixel with 16 bits
-LUMA = np.array(
-    [0.212656, 0.715158, 0.072186]
-)  # of R, G, B (Rec. 709), as ImageMagick for Nav2
+# of R, G, B (Rec. 709), as ImageMagick for Nav2
+LUMA = np.array([0.212656, 0.715158, 0.072186])
 
 
 class MapFile(Schema):
@@ -122,15 +120,13 @@ class MapFile(Schema):
     become 0 to 100 %. `raw`: pixels from 0 to 100 are the percentage itself.
     """
 
-    image: str = Field(
-        min_length=1
-    )  # path, absolute or relative to the folder of the YAML file
+    # path, absolute or relative to the folder of the YAML file
+    image: str = Field(min_length=1)
     resolution: float = Field(ge=1e-4, le=100.0)  # side of a pixel [m]
     origin: tuple[Coordinate, Coordinate, Heading]  # of the image's lower left corner
     negate: bool  # 0 or 1; True if white is occupied, rather than black
-    occupied_thresh: float = Field(
-        ge=0.0, le=1.0
-    )  # from this darkness on pixels are occupied
+    # from this darkness on pixels are occupied
+    occupied_thresh: float = Field(ge=0.0, le=1.0)
     free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
     # how pixels become cells, see above
     mode: Literal["trinary", "scale", "raw"] = "trinary"
@@ -244,9 +240,8 @@ def read_image(
         )
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", Image.DecompressionBombWarning
-            )  # MAX_CELLS is less
+            # MAX_CELLS is less
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             if path.stat().st_size > MAX_BYTES:
                 raise Image.DecompressionBombError
             with Image.open(path, formats=tuple(FORMATS)) as image:

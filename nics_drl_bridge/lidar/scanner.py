@@ -28,9 +28,8 @@ RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
 NO_WALLS = np.zeros((0, 4))
 # `auto` looks up at distances where the ranges' RMSE is at most this [m]
 GREATEST_ERROR = 0.01
-_MEASURED: dict[
-    tuple[Any, ...], tuple[float, float]
-] = {}  # cache of `lookup_distances`
+# cache of `lookup_distances`
+_MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}
 # `auto` scans beams farther apart exactly: rows of few points err [rad]
 WIDEST_BEAMS = 0.2
 

@@ -19,13 +19,11 @@ class SectorPlan(NamedTuple):
     """Assignment of the beams of one lidar to the sectors of one layout."""
 
     first: NDArray[np.int32]  # (S,) first beam of each sector
-    hits: NDArray[
-        np.int32
-    ]  # (S,) number of its beams, which continue with beam 0 after the last
+    # (S,) number of its beams, which continue with beam 0 after the last
+    hits: NDArray[np.int32]
     directions: NDArray[np.float64]  # (B, 2) of the beams in `base_link`
-    shift: NDArray[
-        np.float64
-    ]  # (2,) of the lidar from the viewpoint [m]; zero: filled by beam
+    # (2,) of the lidar from the viewpoint [m]; zero: filled by beam
+    shift: NDArray[np.float64]
     angle_min: float  # begin of sector 0 [rad]
     width: float  # of the sectors [rad]
     range_min: float  # of the lidar [m]
@@ -129,9 +127,8 @@ def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
     x = plan.shift[0] + reach * direction[0]
     y = plan.shift[1] + reach * direction[1]
     angle = (math.atan2(y, x) - plan.angle_min) % TURN
-    s = (
-        int(angle / plan.width) if angle < TURN else 0
-    )  # a tiny negative angle is rounded to TURN
+    # a tiny negative angle is rounded to TURN
+    s = int(angle / plan.width) if angle < TURN else 0
     return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
 
 

@@ -37,9 +37,8 @@ class ScanLayout(Schema):
     """The scan that a policy sees: the nearest return in each sector, seen from the viewpoint."""
 
     sectors: int = Field(ge=4, le=1440)  # S
-    angle_min: float = (
-        -np.pi
-    )  # begin of the first, counter-clockwise, in `base_link` [rad]
+    # begin of the first, counter-clockwise, in `base_link` [rad]
+    angle_min: float = -np.pi
     angle_max: float = np.pi  # end of the last sector [rad]
     range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns count as none [m]
     viewpoint: tuple[Place, Place] = (0.0, 0.0)  # x, y in `base_link` [m]
@@ -264,9 +263,8 @@ def reader_beside(
     near = np.allclose(limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4)
     same = near and found.lidar.beams == like.beams
     turned = found.lidar.angles - like.angles if same else np.ones(1)
-    whole = (
-        2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))
-    )  # the same beams, off by full turns
+    # the same beams, off by full turns
+    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))
     if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
         return Reader(like, found.backwards)
     return found

@@ -53,14 +53,12 @@ class Sensor(Schema, ABC):
     of a class that `add_sensor_kind` imported. A reading is S numbers, float32; NaN is unknown.
     """
 
-    message: ClassVar[
-        str
-    ]  # type of its message, as sensor_msgs/msg/LaserScan, with a header
+    # type of its message, as sensor_msgs/msg/LaserScan, with a header
+    message: ClassVar[str]
 
     kind: str
-    name: str = Field(
-        pattern="^[a-z][a-z0-9_]*$"
-    )  # also its topic, below the robot's namespace
+    # also its topic, below the robot's namespace
+    name: str = Field(pattern="^[a-z][a-z0-9_]*$")
 
     @property
     @abstractmethod
@@ -190,6 +188,5 @@ def _validated(given: Any) -> Sensor:
 _dumped = PlainSerializer(
     lambda sensor: sensor.model_dump(mode="json"), return_type=dict
 )
-AnySensor = Annotated[
-    Sensor, PlainValidator(_validated), _dumped
-]  # a field of a schema
+# a field of a schema
+AnySensor = Annotated[Sensor, PlainValidator(_validated), _dumped]

@@ -108,9 +108,8 @@ class Segment(Outlined):
     """A straight wall without thickness."""
 
     kind: Literal["segment"] = "segment"  # which kind of shape this is
-    ends: tuple[
-        tuple[Place, Place], tuple[Place, Place]
-    ]  # in the shape's own frame [m]
+    # in the shape's own frame [m]
+    ends: tuple[tuple[Place, Place], tuple[Place, Place]]
 
     @model_validator(mode="after")
     def _extended(self) -> "Segment":
@@ -143,9 +142,8 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses
-    with np.errstate(
-        invalid="ignore"
-    ):  # a body with an infinite heading is NaN, and not visible
+    # a body with an infinite heading is NaN, and not visible
+    with np.errstate(invalid="ignore"):
         bodies[..., COS], bodies[..., SIN] = (
             np.cos(poses[..., 2]),
             np.sin(poses[..., 2]),
@@ -205,9 +203,8 @@ class Outlines:
 
     shapes: tuple[Shape, ...]  # H
     corners: Array  # (sum V, 2) of all outlines, one after the other [m]
-    corner: NDArray[
-        np.int64
-    ]  # (H + 1,) first corner of each outline; a circle has none
+    # (H + 1,) first corner of each outline; a circle has none
+    corner: NDArray[np.int64]
     hulls: (
         Array  # (sum 2 V, 2) corners of all convex hulls [m]; a circle's is its centre
     )

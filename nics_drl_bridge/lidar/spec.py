@@ -68,9 +68,8 @@ class LidarSpec(Schema):
     angle_min: float  # of the first beam, in the frame of the lidar [rad]
     angle_max: float  # of the last beam, or of the end of the circle [rad]
     range_min: float = Field(ge=0.0)  # nearer returns are reported as `-inf` [m]
-    range_max: float = Field(
-        ge=1e-3, le=LARGEST
-    )  # farther returns are reported as `inf` [m]
+    # farther returns are reported as `inf` [m]
+    range_max: float = Field(ge=1e-3, le=LARGEST)
     rate: float = Field(ge=1e-3, le=1e5)  # scans per second [Hz]
     mount: Mount = (0.0, 0.0, 0.0)  # of `laser` in `base_link`
     noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)  # of a range [m]

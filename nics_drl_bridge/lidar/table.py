@@ -40,9 +40,8 @@ MOST_WIDE = 0xFFFF  # greatest number of beams in a row
 class Density(Schema):
     """Sampling density of a table; a shape with rotational symmetry is baked for one period."""
 
-    distances: int = Field(
-        default=100, ge=3, le=10_000
-    )  # from the shape's radius to out of range
+    # from the shape's radius to out of range
+    distances: int = Field(default=100, ge=3, le=10_000)
     rotations: int = Field(default=240, ge=1, le=100_000)  # in a full turn
     phases: Literal[1, 2, 4, 8] = 1  # points per beam, see `for_beams`
 
@@ -89,9 +88,8 @@ class LidarTable:
     shapes: tuple[Shape, ...]  # H
     density: Density
     beam_angle: float  # between the beams that it was baked for [rad]
-    grid: NDArray[
-        np.float64
-    ]  # (H, 3) greatest distance [m], rotations in a period, first cell
+    # (H, 3) greatest distance [m], rotations in a period, first cell
+    grid: NDArray[np.float64]
     start: NDArray[np.int32]  # (cells,) begin of each row in `rows`
     cell: NDArray[np.int16]  # (cells, 6) see above
     rows: NDArray[np.float32]  # (R,) ranges [m], padded by what one look-up can read

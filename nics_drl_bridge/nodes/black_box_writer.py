@@ -96,9 +96,8 @@ class Disk:
         self._orders: SimpleQueue[tuple[str, Sequence[str], list[bytes]] | None] = (
             SimpleQueue()
         )
-        self._room = threading.Semaphore(
-            MOST_AT_WORK
-        )  # for files that are not written yet
+        # for files that are not written yet
+        self._room = threading.Semaphore(MOST_AT_WORK)
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -183,9 +182,8 @@ def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
 
 def main() -> None:
     """Serves the gate until it ends; SIGTERM lets it give up the files that are not written yet."""
-    with contextlib.suppress(
-        OSError
-    ):  # the gate's real-time priority is not for its files
+    # the gate's real-time priority is not for its files
+    with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(NICENESS)
     disk = Disk(answer)

@@ -103,9 +103,8 @@ class CommandListener:
     def look(self) -> None:
         """Follows the type that is published now."""
         if self._subscription is None:
-            with contextlib.suppress(
-                RuntimeError
-            ):  # the old one is not gone yet: at the next look
+            # the old one is not gone yet: at the next look
+            with contextlib.suppress(RuntimeError):
                 self._subscribe()
             return
         ends = self._node.get_publishers_info_by_topic(

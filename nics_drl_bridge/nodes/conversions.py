@@ -28,15 +28,13 @@ from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import RobotSpec
 
-PLANAR = np.ix_(
-    [0, 1, 5], [0, 1, 5]
-)  # x, y and heading in the 6 x 6 covariance of a message
+# x, y and heading in the 6 x 6 covariance of a message
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
 # variance of z, roll and pitch, which a planar robot does not measure
 UNUSED_VARIANCE = 1e6
-FIELD = re.compile(
-    r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)"
-)  # type, in a `.msg` file
+# type, in a `.msg` file
+FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 
 
 def stamp_to_ros(time_ns: int) -> Time:
@@ -121,9 +119,8 @@ def odometry_to_ros(
     twist: ArrayLike,
     time_ns: int,
     frames: Sequence[str],
-    variance: tuple[
-        float, float, float, float
-    ],  # of position, heading, linear, angular [SI]
+    # of position, heading, linear, angular [SI]
+    variance: tuple[float, float, float, float],
 ) -> Odometry:
     """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
@@ -316,9 +313,8 @@ def _message_file(kind: str) -> Path | None:
 
     package, _, name = kind.split("/")
     prefixes = [sys.prefix]
-    with contextlib.suppress(
-        OSError
-    ):  # if ROS 2 comes from wheels, the variable is not set
+    # if ROS 2 comes from wheels, the variable is not set
+    with contextlib.suppress(OSError):
         prefixes = [*get_search_paths(), sys.prefix]
     files = (
         Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes

@@ -27,9 +27,8 @@ GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 # a step may be early by this share of it, because timers are no more precise
 SLACK = 0.1
-PATIENCE_NS = (
-    NS_PER_S // 2
-)  # steps missed for longer than this are not made up for [ns]
+# steps missed for longer than this are not made up for [ns]
+PATIENCE_NS = NS_PER_S // 2
 
 
 class DeviceTiming(NamedTuple):
@@ -40,9 +39,8 @@ class DeviceTiming(NamedTuple):
     step_ns: int  # of the world
     odom_ns: int  # between two odometries
     scan_ns: int  # between two scans
-    scan_late_ns: tuple[
-        int, int
-    ]  # least delay to publication, and greatest additional one
+    # least delay to publication, and greatest additional one
+    scan_late_ns: tuple[int, int]
     odom_late_ns: tuple[int, int]
 
     @property

@@ -16,9 +16,8 @@ class EStopQueue:
     """Measures the rate of `e_stop`, and judges each sleep of the gate by it."""
 
     def __init__(self) -> None:
-        self._heard: deque[tuple[float, int]] = (
-            deque()
-        )  # times [s], and messages read at each
+        # times [s], and messages read at each
+        self._heard: deque[tuple[float, int]] = deque()
         self._ticked_s: float | None = None  # last tick of the gate
         self._ever_heard = False
         self._since_tick = 0  # messages
@@ -37,9 +36,8 @@ class EStopQueue:
         self._ticked_s = now
         waiting = self._since_tick
         self._since_tick = 0
-        if (
-            waiting > QUEUE_MESSAGES
-        ):  # a publisher that began in a sleep has no rate from before
+        # a publisher that began in a sleep has no rate from before
+        if waiting > QUEUE_MESSAGES:
             return (
                 f"{waiting} messages came at once, and a press among more may be lost"
             )

@@ -23,10 +23,8 @@ from rclpy.waitable import NumberOfEntities
 from nics_drl_bridge.interface import NS_PER_S
 
 InvalidHandle = rclpy_implementation.InvalidHandle
-PARTS_MISSING = (
-    AttributeError,
-    TypeError,
-)  # raised if rclpy differs from what is known here
+# raised if rclpy differs from what is known here
+PARTS_MISSING = (AttributeError, TypeError)
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
 """Returned by a callback that has woken another thread of this process. The executor then keeps out
@@ -63,14 +61,12 @@ class StandingExecutor(SingleThreadedExecutor):
         asked = list[Callable[[], object]]()
         left = False
         try:
-            if (
-                self._entities is not None and self.context.ok()
-            ):  # a callback may have shut it down
+            # a callback may have shut it down
+            if self._entities is not None and self.context.ok():
                 asked = self._entities.asked()
                 woken, others = self._entities.others_ready(self._guard)
-                self._changed |= (
-                    woken or others
-                )  # adding an entity to a node wakes the executor
+                # adding an entity to a node wakes the executor
+                self._changed |= woken or others
                 # So does rclpy itself, after each callback; then there is nothing to handle.
                 due, left = (
                     self._entities.due(),
@@ -93,9 +89,8 @@ class StandingExecutor(SingleThreadedExecutor):
         try:
             entities = self._gathered()
             entities.wait(-1 if timeout_sec is None else int(timeout_sec * NS_PER_S))
-        except (
-            RuntimeError
-        ):  # of the library: another thread may have shut down the context
+        except RuntimeError:
+            # of the library: another thread may have shut down the context
             if self.context.ok():
                 raise
         if not self.context.ok():
@@ -103,9 +98,8 @@ class StandingExecutor(SingleThreadedExecutor):
         return entities.taken()
 
     def _come(self) -> list[Received]:
-        if (
-            self._entities is None or not self.context.ok()
-        ):  # a callback may have ended it
+        # a callback may have ended it
+        if self._entities is None or not self.context.ok():
             return []
         return self._entities.come()
 

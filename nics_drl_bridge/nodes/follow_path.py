@@ -257,9 +257,8 @@ class PathActions:
         try:
             run = self._run = begin(goal)
             if before is not None and before.frame == run.frame:
-                run.valid_s = (
-                    before.valid_s
-                )  # a way that is planned again is no way got on
+                # a way that is planned again is no way got on
+                run.valid_s = before.valid_s
                 if before.progress.check == run.progress.check:
                     run.progress = before.progress
             if before is None or not np.array_equal(before.path.end, run.path.end):
@@ -430,9 +429,8 @@ class PathActions:
         drive = self._drive(ahead[:2])
         if drive.touched:
             patience = number(self._node, "failure_tolerance")
-            if (
-                0.0 <= patience < time.monotonic() - run.valid_s
-            ):  # it has waited for long enough
+            # it has waited for long enough
+            if 0.0 <= patience < time.monotonic() - run.valid_s:
                 code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
                 raise Refusal(
                     code, "the robot touches something, so that no command is valid."

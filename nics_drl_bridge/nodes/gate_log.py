@@ -32,9 +32,8 @@ LONGEST_LINE_S = 64.0
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
 GRACE_S = 0.5  # in which the writer may clean up what it gives up [s]
 POLL_S = 0.005
-OVERDUE_S = (
-    PATIENCE_S + 5.0
-)  # after which a file that is not answered counts as not written [s]
+# after which a file that is not answered counts as not written [s]
+OVERDUE_S = PATIENCE_S + 5.0
 RESTART_S = 5.0  # shortest time between two starts of the writer [s]
 STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states
@@ -58,17 +57,15 @@ class GateLog:
         self._now = self._since = float("-inf")
         # that stops the robot; "" while commands pass, None at first
         self._rule: str | None = None
-        self._burst: set[str] = (
-            set()
-        )  # with a written stop since commands last passed for long
+        # with a written stop since commands last passed for long
+        self._burst: set[str] = set()
         # Of each kind: time of the last line, and least time until the next [s].
         self._said: dict[str, tuple[float, float]] = {}
         self._kept: Counter[str] = Counter()  # events of a kind since then
         self._owed = False
         self._writer = BoxWriter()
-        self._state_s = float(
-            "-inf"
-        )  # time of the last state that the writer was sent [s]
+        # time of the last state that the writer was sent [s]
+        self._state_s = float("-inf")
         self._entries = 0  # that it was sent since
         self._names: list[str] = []
 
@@ -86,12 +83,10 @@ class GateLog:
         if rule != self._rule:
             self._changed(rule)
         self._cause = cause
-        lasts = (
-            entry.now - self._since >= LINE_S
-        )  # what does not alternate is told in any case
-        if (
-            self._owed and (more := self._due(rule, lasts)) is not None
-        ):  # else it is told later
+        # what does not alternate is told in any case
+        lasts = entry.now - self._since >= LINE_S
+        # else it is told later
+        if self._owed and (more := self._due(rule, lasts)) is not None:
             self._owed = False
             if cause is None:
                 self._logger.info(f"commands pass{more}")
@@ -195,9 +190,8 @@ class BoxWriter:
     def __init__(self) -> None:
         self.needs_state = True  # before the next entry
         self._backlog = bytearray()  # that the pipe has not taken yet
-        self._orders: dict[
-            str, float
-        ] = {}  # times [s] of files that are not answered yet, by path
+        # times [s] of files that are not answered yet, by path
+        self._orders: dict[str, float] = {}
         self._answers = b""  # the beginning of a line
         self._failed: list[str] = []
         self._entrance = self._exit = -1  # our ends of its pipes
@@ -242,9 +236,8 @@ class BoxWriter:
             self._process.terminate()
             self._finish(GRACE_S)
         reason = f"its writer ended with {self._process.poll()}"
-        if (
-            self._process.poll() is None
-        ):  # blocked by the disk; it ends when that releases it
+        # blocked by the disk; it ends when that releases it
+        if self._process.poll() is None:
             self._process.kill()
             reason = "the disk does not answer"
         self._hear()

@@ -25,9 +25,8 @@ class GoalFrames:
     def __init__(self, node: Node, topics: RobotTopics) -> None:
         self._node = node
         self._topics = topics
-        self._mounted: dict[
-            str, tuple[str, Array]
-        ] = {}  # frame: its parent, and its pose there
+        # frame: its parent, and its pose there
+        self._mounted: dict[str, tuple[str, Array]] = {}
         self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
         self._transforms = conversions.message_type("tf2_msgs/msg/TFMessage")
         self._heard = []
@@ -81,9 +80,8 @@ class GoalFrames:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:
             raise ConfigError(f"goal_pose: {error}") from None
-        if (
-            frame == self._map
-        ):  # of a localiser, if there is one; else that of the estimate
+        # of a localiser, if there is one; else that of the estimate
+        if frame == self._map:
             robot = None if self._odom is None else self.robot_in(self._map)
             if robot is None:
                 return place[:2]

@@ -290,9 +290,8 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
 
 
 def _shut_down(opened: Resources) -> None:
-    with (
-        uninterrupted()
-    ):  # else Python may exit with a thread inside the middleware's library
+    # else Python may exit with a thread inside the middleware's library
+    with uninterrupted():
         if opened.thread is None:  # it never began, so that nothing was commanded
             if opened.node is not None:
                 opened.node.destroy_node()

@@ -24,9 +24,8 @@ NAME = "nics_doctor"
 SPIN_S = 0.1
 LOOK_S = 0.5
 DISCOVERY_S = 10.0
-ANY_PUBLISHER = profile_of(
-    Offer(100, reliable=False)
-)  # matches any offer, so hears every topic
+# matches any offer, so hears every topic
+ANY_PUBLISHER = profile_of(Offer(100, reliable=False))
 
 
 def listen(

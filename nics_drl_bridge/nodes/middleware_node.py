@@ -52,9 +52,8 @@ class MiddlewareNode(ManagedNode):
         if self.state != ACTIVE:
             return
         estimator = self._topics.middleware.estimator
-        stamp_ns = max(
-            stamp_ns, estimator.time_ns
-        )  # a pose or a yaw rate may have been newer
+        # a pose or a yaw rate may have been newer
+        stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
         frames = [
             str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")

@@ -144,8 +144,7 @@ def _start_forwarder(
 def _lead_into(entrance: int, descriptor: int) -> None:
     """Replaces an output by the entrance of a pipe."""
     os.set_blocking(entrance, False)
-    with contextlib.suppress(
-        AttributeError, OSError
-    ):  # not on every system; the usual size will do
+    # not on every system; the usual size will do
+    with contextlib.suppress(AttributeError, OSError):
         fcntl.fcntl(entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
     os.dup2(entrance, descriptor)

@@ -15,11 +15,8 @@ NO_POSE = "none"
 POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
 OWN = -1.0  # of a delay: as in the model
 HIGHEST_PRIORITY = 99
-PLAIN_TWISTS = (
-    "humble",
-    "iron",
-    "jazzy",
-)  # distributions whose robots are driven by a Twist
+# distributions whose robots are driven by a Twist
+PLAIN_TWISTS = ("humble", "iron", "jazzy")
 STAMPED = "enable_stamped_cmd_vel"
 FRAME = re.compile(r"[^\s/]\S{0,254}")
 MAY_BE_EMPTY = ("footprint_frame",)

@@ -77,9 +77,8 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
-        self._covariance = self._topics.middleware.estimator.covariance[
-            :3, :3
-        ]  # at a new goal
+        # at a new goal
+        self._covariance = self._topics.middleware.estimator.covariance[:3, :3]
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)

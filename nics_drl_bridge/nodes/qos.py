@@ -62,9 +62,8 @@ SENSOR = profile_of(Offer(5, reliable=False))
 link a reliable scan arrives half a second late and looks fresh. It matches every publisher. Also in
 lock-step: acknowledging each datum takes a tenth of a step, and lost data are requested again."""
 
-SENSOR_RELIABLE = profile_of(
-    Offer(10)
-)  # publishers of the same: subscribers of both kinds match
+# publishers of the same: subscribers of both kinds match
+SENSOR_RELIABLE = profile_of(Offer(10))
 
 EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
@@ -78,21 +77,17 @@ E_STOP = QoSProfile(
 """Subscriptions to `e_stop`. A press lasts for a single message, and the heartbeats that follow it,
 also those of another publisher, must not push it out of the queue while nobody reads it."""
 
-COMMAND = profile_of(
-    Offer(1)
-)  # commands and goals: only the newest counts, and it has to arrive
+# commands and goals: only the newest counts, and it has to arrive
+COMMAND = profile_of(Offer(1))
 # Commands of which the gate looks at the publisher, too: the one that a second publisher sends
 # at the same moment must not replace the first one's unnoticed.
 EVERY_POLICY = profile_of(Offer(10))
-TRANSFORMS = profile_of(
-    Offer(100)
-)  # `/tf`: like tf2's own, whose listeners request reliable
-LATCHED = profile_of(
-    Offer(1, transient_local=True)
-)  # `/tf_static`, `map`: for late joiners too
-DIAGNOSTICS = profile_of(
-    Offer(10)
-)  # as the diagnostic aggregator expects `/diagnostics`
+# `/tf`: like tf2's own, whose listeners request reliable
+TRANSFORMS = profile_of(Offer(100))
+# `/tf_static`, `map`: for late joiners too
+LATCHED = profile_of(Offer(1, transient_local=True))
+# as the diagnostic aggregator expects `/diagnostics`
+DIAGNOSTICS = profile_of(Offer(10))
 
 MOMENT_S = 0.5
 UNKNOWN = "_UNKNOWN_"

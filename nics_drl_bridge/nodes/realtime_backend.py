@@ -48,10 +48,8 @@ class RealtimeOptions(Schema):
     start: Literal["wait", "present"] = "wait"
     # The place where it stands counts as the start: `map` is laid so. Not with a pose sensor.
     lays_map: bool = False
-    tolerance: tuple[PositiveFloat, PositiveFloat] = (
-        0.1,
-        0.1,
-    )  # of the start's pose [m, rad]
+    # of the start's pose [m, rad]
+    tolerance: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.1)
     start_timeout_s: PositiveFloat = 300.0  # longest wait for that
     # told what is missing; the node's logger by default
     say: Callable[[str], None] | None = None

@@ -52,10 +52,8 @@ HALT_S = 0.5
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 PLACE = "recording"
 FEWEST = 2
-SAME_PACE = (
-    0.8,
-    1.25,
-)  # of stamps relative to receipt; beyond it, it is another kind of time
+# of stamps relative to receipt; beyond it, it is another kind of time
+SAME_PACE = (0.8, 1.25)
 
 
 @dataclass(frozen=True)
@@ -151,10 +149,8 @@ class DriveLog:
         """Returns all streams on their clocks. Raises RecordingError if too little was received."""
         topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
         if len(self.rows["pose"]) >= FEWEST:
-            topics |= {
-                "pose": "pose",
-                "odometry": "odom twist",
-            }  # which determines its noise
+            # which determines its noise
+            topics |= {"pose": "pose", "odometry": "odom twist"}
         data: dict[str, TopicData] = {}
         for name, topic in topics.items():
             if len(self.rows[topic]) >= FEWEST:

@@ -189,9 +189,8 @@ class RobotTopics:
             pose = initial_pose(
                 message, str(self._node.get_parameter("map_frame").value)
             )
-            spread = START_STD**2 * np.eye(
-                3
-            )  # where nothing corrects it, it defines the map
+            # where nothing corrects it, it defines the map
+            spread = START_STD**2 * np.eye(3)
             if self._posed:
                 covariance = conversions.pose_from_ros(message)[1]
                 given = measurement.check_covariance(covariance, 3, START_STD)

@@ -69,9 +69,8 @@ def open_context(
         asked = os.environ.get("ROS_DOMAIN_ID", "0")
     else:
         asked = str(domain_id)
-    if (
-        asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID
-    ):  # DDS would end the process
+    # DDS would end the process
+    if asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID:
         raise BackendError(
             f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}."
         )
@@ -263,9 +262,8 @@ def declare(
     read_only: bool = False,
 ) -> Any:
     """Declares a parameter of the default's type, and returns its value, which lies in a span."""
-    if read_only and hasattr(
-        node, "fixed"
-    ):  # a managed node: from configure to cleanup
+    # a managed node: from configure to cleanup
+    if read_only and hasattr(node, "fixed"):
         node.fixed.add(name)
         read_only = False
     descriptor = ParameterDescriptor(description=description, read_only=read_only)

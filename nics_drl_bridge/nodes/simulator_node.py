@@ -316,9 +316,8 @@ class DeviceNode(qos.QosWatch):
         self.now_ns = self._first_ns
         self._open_topics()
         self._start_time()
-        self.standard = open_services(
-            self
-        )  # its entities are those of the first episode, too
+        # its entities are those of the first episode, too
+        self.standard = open_services(self)
         self.begin()
 
     def use_world(self, world: AnyWorld) -> None:
@@ -343,9 +342,8 @@ class DeviceNode(qos.QosWatch):
         command_ns_before = self._command_ns
         heard_before = self._heard
         self._command_ns = np.zeros(count, np.int64)
-        self._heard = np.zeros(
-            count, np.bool_
-        )  # in lock-step: those that have their command
+        # in lock-step: those that have their command
+        self._heard = np.zeros(count, np.bool_)
         known = [k for k in kept if k < len(command_ns_before)]
         self._command_ns[: len(known)] = command_ns_before[known]
         self._heard[: len(known)] = heard_before[known]
@@ -565,9 +563,8 @@ class DeviceNode(qos.QosWatch):
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
-        self.device.begin(
-            seed, start if given else None
-        )  # may raise, so that all goes on
+        # may raise, so that all goes on
+        self.device.begin(seed, start if given else None)
         if rewind:
             self.now_ns = self._first_ns
         self._outbox.clear()
@@ -580,9 +577,8 @@ class DeviceNode(qos.QosWatch):
 
     def rewind(self) -> None:
         """Puts the time back to its start, while everything stays where it is."""
-        self._command_ns += (
-            self._first_ns - self.now_ns
-        )  # commands stay as old as they are
+        # commands stay as old as they are
+        self._command_ns += self._first_ns - self.now_ns
         self.now_ns = self._first_ns
         self._outbox.clear()
         self._odom_pace.begin(self.now_ns)

@@ -334,9 +334,8 @@ def description(setup: Setup) -> Iterator[NodeStart]:
             yield setup.node(STATE_PUBLISHER, STATE_PUBLISHER, robot, parameters)
     if setup.flag("rviz"):
         first = setup.robots[0]
-        topics = [
-            ("/map", f"/{first.transforms}/map".replace("//", "/"))
-        ]  # of all robots
+        # of all robots
+        topics = [("/map", f"/{first.transforms}/map".replace("//", "/"))]
         topics += [(f"/{topic}", topic) for topic in SHOWN]
         yield setup.node(RVIZ, RVIZ, first, timed, ("-d", setup["rviz_config"]), topics)
 

@@ -27,12 +27,8 @@ RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOCAL = "LOCALHOST"
 ONLY_LOCAL = "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
-OTHER_RANGES = (
-    "SUBNET",
-    "OFF",
-    SELF_MADE,
-    "",
-)  # rcl treats any other value as LOCALHOST
+# rcl treats any other value as LOCALHOST
+OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")
 OLDEST_DISTRIBUTION = "humble"  # it has no discovery ranges
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 UDP = "UDPv4"
@@ -42,10 +38,8 @@ PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 PROFILES_HERE = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 FAST_DDS_2 = b"libfastrtps.so"
 FAST_DDS_2_DISTRIBUTIONS = (OLDEST_DISTRIBUTION, "iron", "jazzy")
-PEERS = (
-    "ROS_DISCOVERY_SERVER",
-    "ROS_STATIC_PEERS",
-)  # discovery that the profile does not do
+# discovery that the profile does not do
+PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
 TABLE = Path("/proc/net/udp")
 # RTPS: a domain's first is that of its multicast

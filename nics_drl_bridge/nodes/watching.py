@@ -49,9 +49,8 @@ class RosSource:
         self._world = world or World(
             name="map", bounds=bounds, goal_distance=(0.0, 1.0)
         )
-        self._within = (
-            None if world is None else world.members[0]
-        )  # the one that is shown
+        # the one that is shown
+        self._within = None if world is None else world.members[0]
         self._model = model
         self.period_s = PERIOD_S
         self._title = namespace or "live topics"

@@ -18,10 +18,8 @@ HEAD = 4  # bytes of the header, not counted for alignment; the second one gives
 # offsets of stamp and frame of a message's header
 STAMP = 4
 FRAME = 12
-UNREADABLE = (
-    ValueError,
-    struct.error,
-)  # raised by all readers for bytes of another type
+# raised by all readers for bytes of another type
+UNREADABLE = (ValueError, struct.error)
 PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
 # Numbers of an odometry before each: pose, its covariance, twist, its covariance.
@@ -128,9 +126,8 @@ class OdometryWriter:
     def __init__(self, message: Odometry) -> None:
         self._content = bytearray(serialize_message(message))
         self._stamp = struct.Struct(f"{_order(self._content)}iI")
-        self._numbers = numbers_of(
-            self._content
-        )  # writable, because it is a view of a bytearray
+        # writable, because it is a view of a bytearray
+        self._numbers = numbers_of(self._content)
         self._covariance = self._numbers[POSE_COVARIANCE:TWIST].reshape(6, 6)
 
     def write(
@@ -154,9 +151,8 @@ class ScanWriter:
     def __init__(self, message: LaserScan) -> None:
         self._content = bytearray(serialize_message(message))
         self._stamp = struct.Struct(f"{_order(self._content)}iI")
-        self._ranges = ranges_of(
-            self._content
-        )  # writable, because it is a view of a bytearray
+        # writable, because it is a view of a bytearray
+        self._ranges = ranges_of(self._content)
 
     def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
         """Returns a message with ranges (B,), as the device reports them."""

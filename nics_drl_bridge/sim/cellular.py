@@ -31,25 +31,19 @@ class Cellular(Schema):
 
     kind: Literal["cellular"] = "cellular"  # which kind of generator this is
     worlds: int = Field(ge=1, le=10_000)  # how many of them are made
-    seed: int = Field(
-        default=0, ge=0
-    )  # of the generator; another one makes other worlds
+    # of the generator; another one makes other worlds
+    seed: int = Field(default=0, ge=0)
     columns: int = Field(default=30, ge=4)  # of cells across the field
     rows: int = Field(default=30, ge=4)  # along it
-    cell: float = Field(
-        default=0.15, ge=0.01, le=10.0
-    )  # side, and diameter of a cylinder [m]
-    fill: tuple[float, float] = (
-        0.1,
-        0.35,
-    )  # share of the cells that are filled at first
+    # side, and diameter of a cylinder [m]
+    cell: float = Field(default=0.15, ge=0.01, le=10.0)
+    # share of the cells that are filled at first
+    fill: tuple[float, float] = (0.1, 0.35)
     smoothing: tuple[int, int] = (2, 4)  # passes of the automaton
-    margin: float = Field(
-        default=4.0, ge=0.5, le=100.0
-    )  # free space before and behind [m]
-    passage: float = Field(
-        default=0.5, ge=0.0, le=100.0
-    )  # width that the way through has [m]
+    # free space before and behind [m]
+    margin: float = Field(default=4.0, ge=0.5, le=100.0)
+    # width that the way through has [m]
+    passage: float = Field(default=0.5, ge=0.0, le=100.0)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Cellular":
@@ -98,9 +92,8 @@ def _field(given: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
 
 def _has_way(filled: NDArray[np.bool_], given: Cellular) -> bool:
     """True if a disc of the passage's width gets from before the field to behind it."""
-    ahead = FINE * (
-        1 + math.ceil(given.passage / 2.0 / given.cell)
-    )  # beyond, all is free
+    # beyond, all is free
+    ahead = FINE * (1 + math.ceil(given.passage / 2.0 / given.cell))
     free = np.ones((FINE * given.rows + 2 * ahead, FINE * given.columns + 2), np.bool_)
     free[:, [0, -1]] = False  # the walls at both sides
     free[ahead:-ahead, 1:-1] = ~np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)

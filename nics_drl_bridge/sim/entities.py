@@ -46,9 +46,8 @@ class Entity:
     name: str
     robot: int = -1  # index of the robot; -1 for shapes
     slots: tuple[int, ...] = ()  # indices of the bodies of its shapes
-    parts: tuple[
-        Placed, ...
-    ] = ()  # its shapes and their poses in the entity's own frame
+    # its shapes and their poses in the entity's own frame
+    parts: tuple[Placed, ...] = ()
     # (3,) where it was spawned; None for what the world came with
     start: Array | None = None
     motion: Motion | None = None
@@ -73,9 +72,8 @@ class Entities:
         self._own = self.device.simulator.sampler.count
         self._launched = list(self.robots)
         self._spare = list[Shape]()
-        self._table: Array = np.zeros(
-            (self._own, 7)
-        )  # the bodies, in the order of slots
+        # the bodies, in the order of slots
+        self._table: Array = np.zeros((self._own, 7))
         self.device.arrange = self._arrange
 
     @property
@@ -89,9 +87,8 @@ class Entities:
         bodies[sorted(self.removed), RADIUS] = 0.0
         found = scenes.starts.copy()
         if starts is not None:
-            own = [
-                self.robots.index(name) for name in self._launched
-            ]  # that are still there
+            # that are still there
+            own = [self.robots.index(name) for name in self._launched]
             found[:, : len(own)] = starts[:, own]
         for entity in self.spawned.values():
             if entity.robot >= 0:

@@ -28,9 +28,8 @@ class ModelFile(Schema):
     description: str = ""
     tags: tuple[str, ...] = ()
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_PARTS)
-    at: tuple[
-        Pose, ...
-    ] = ()  # of each shape in the entity [m, m, rad]; at its origin by default
+    # of each shape in the entity [m, m, rad]; at its origin by default
+    at: tuple[Pose, ...] = ()
 
     @model_validator(mode="after")
     def _one_each(self) -> "ModelFile":

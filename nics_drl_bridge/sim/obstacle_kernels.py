@@ -77,9 +77,8 @@ def steer(
         bodies, count, speeds, plans, scene.walls, movers.field, scene.grid, period
     )
     draws = (step + 1) * MOST
-    for k in range(
-        count
-    ):  # walkers first: they react to the velocities of the last period
+    # walkers first: they react to the velocities of the last period
+    for k in range(count):
         velocity[k, :] = 0.0
         if plans[k, at.KIND] == at.PEDESTRIAN and bodies[k, RADIUS] > 0.0:
             velocity[k, 0], velocity[k, 1] = _walk(

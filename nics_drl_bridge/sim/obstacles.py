@@ -64,25 +64,20 @@ class Pedestrian(Schema):
     """
 
     kind: Literal["pedestrian"] = "pedestrian"  # which kind of motion this is
-    speed: Speed = (
-        1.08,
-        1.6,
-    )  # range of the desired one, per episode; its end is a limit [m/s]
-    relaxation: float = Field(
-        default=0.5, ge=0.1, le=10.0
-    )  # tau, to the desired velocity [s]
+    # range of the desired one, per episode; its end is a limit [m/s]
+    speed: Speed = (1.08, 1.6)
+    # tau, to the desired velocity [s]
+    relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
     repulsion: Strength = 2.1  # V0 [m^2/s^2] of walkers, obstacles and robots
     range: Distance = 0.3  # sigma [m]
     wall_repulsion: Strength = 10.0  # U0 [m^2/s^2]
     wall_range: Distance = 0.2  # R [m]
     # delta t, the time by which the others' motion is extrapolated [s]
     foresight: Strength = 1.0
-    view: float = Field(
-        default=math.radians(200.0), ge=0.0, le=2.0 * math.pi
-    )  # 2 phi [rad]
-    behind: float = Field(
-        default=0.5, ge=0.0, le=1.0
-    )  # c, weight of forces from out of sight
+    # 2 phi [rad]
+    view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
+    # c, weight of forces from out of sight
+    behind: float = Field(default=0.5, ge=0.0, le=1.0)
     fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
 
 

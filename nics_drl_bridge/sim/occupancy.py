@@ -26,9 +26,8 @@ ROUNDING = 1e-6  # share of a cell by which a field may exceed whole cells
 def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
     """Returns the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
     own = sampler.samplers[member].motions
-    both = zip_longest(
-        bodies, own[: len(bodies)]
-    )  # what is no part of the world stands
+    # what is no part of the world stands
+    both = zip_longest(bodies, own[: len(bodies)])
     return [
         (sampler.shapes[int(body[SHAPE])], body[:3])
         for body, motion in both

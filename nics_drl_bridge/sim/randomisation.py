@@ -44,18 +44,16 @@ FAULT_COLUMNS = (  # see `lidar.fault_kernels`
     "quantisation",
     "skew",
 )
-CHOICES: dict[
-    str, tuple[int, Mapping[Any, int]]
-] = {  # faults drawn from words: column, values
+# faults drawn from words: column, values
+CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {
     "skew": (fault_kernels.SKEW, SKEW),
     "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE),
 }
 KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP = range(4)
 CHOICES_GROUP, SCENE_GROUP, RESPONSE_GROUP = range(4, 7)
 GROUPS = 8
-PLACES = (
-    1 << 20
-)  # More than a group has columns; the counters of two groups never collide
+# More than a group has columns; the counters of two groups never collide
+PLACES = 1 << 20
 UNIT = (np.zeros(1), np.ones(1))
 
 
@@ -80,9 +78,8 @@ class KinematicRanges(Schema):
     scale: Factor = AS_IT_IS  # for every coefficient
     # on all time constants of the state alike, one for each robot
     response: Factor = AS_IT_IS
-    dofs: dict[str, Factor] = Field(
-        default_factory=dict
-    )  # overrides it, by name of a rate (`wz`)
+    # overrides it, by name of a rate (`wz`)
+    dofs: dict[str, Factor] = Field(default_factory=dict)
     # overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`
     terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
 
@@ -120,12 +117,10 @@ class LidarRanges(Schema):
     quantisation: Level | None = None  # returns are multiples of it [m]
     dropout: Level | None = None  # probability that a return is lost
     dropout_far: Level | None = None  # added to it at range_max
-    skew: tuple[Skew, ...] | None = Field(
-        default=None, min_length=1
-    )  # words to draw from
-    too_close: tuple[TooClose, ...] | None = Field(
-        default=None, min_length=1
-    )  # words to draw from
+    # words to draw from
+    skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)
+    # words to draw from
+    too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
 
     @model_validator(mode="after")
     def _probable(self) -> "LidarRanges":
@@ -142,9 +137,8 @@ class ObstacleRanges(Schema):
 
     count: tuple[int, int] | None = None  # [least, greatest], instead of the world's
     size: Factor = AS_IT_IS  # factor on the size of every obstacle, one per episode
-    rungs: int = Field(
-        default=5, ge=2, le=100
-    )  # number of sizes, evenly spaced: each is baked
+    # number of sizes, evenly spaced: each is baked
+    rungs: int = Field(default=5, ge=2, le=100)
 
     @model_validator(mode="after")
     def _countable(self) -> "ObstacleRanges":
@@ -159,14 +153,11 @@ class Randomisation(Schema):
     """Ranges that are drawn from in every episode; all else stays as in model and world."""
 
     name: str  # used in messages
-    kinematics: KinematicRanges = (
-        KinematicRanges()
-    )  # factors on the motion of the model
+    # factors on the motion of the model
+    kinematics: KinematicRanges = KinematicRanges()
     action_latency: Latency = (0.0, 0.0)  # in addition to the model's [control periods]
-    observation_latency: Latency = (
-        0.0,
-        0.0,
-    )  # age of scan and odometry [control periods]
+    # age of scan and odometry [control periods]
+    observation_latency: Latency = (0.0, 0.0)
     odometry: OdometryRanges = OdometryRanges()  # errors of odometry and of motion
     lidar: LidarRanges = LidarRanges()  # noise and faults of the lidar
     obstacles: ObstacleRanges = ObstacleRanges()  # number and size of the obstacles
@@ -215,14 +206,12 @@ class Draws:
     noise: Array  # (n, M, 2 + 3 + S) see `State.noise`
     faults: Array  # (n, M, P) of each lidar, columns as in `lidar.fault_kernels`
     count: Integers | None  # (n,) obstacles in the scene; None leaves it to the world
-    size: (
-        Integers | None
-    )  # (n,) index into `Randomisation.sizes`; None where there is only one
+    # (n,) index into `Randomisation.sizes`; None where there is only one
+    size: Integers | None
     scale: Array | None  # (n,) that size
     latency: Array  # (n, M, 2) `delay` and `age` in seconds
-    labels: tuple[
-        Label, ...
-    ]  # of the drawn numbers that may differ from episode to episode
+    # of the drawn numbers that may differ from episode to episode
+    labels: tuple[Label, ...]
 
     def named(self) -> dict[str, NDArray[np.generic]]:
         """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
@@ -246,9 +235,8 @@ class Sampler:
         )
         fastest, slowest = randomisation.kinematics.response
         self._response = np.array([fastest]), np.array([slowest])
-        self._rates = (
-            np.nonzero(model.kinematics.coefficients)[0] >= 3
-        )  # (T,) terms of the state's
+        # (T,) terms of the state's
+        self._rates = np.nonzero(model.kinematics.coefficients)[0] >= 3
         self._timing = _latencies(randomisation, model)
         self._step = model.timing[0]
         self._noise = _levels(randomisation, model, where)

@@ -29,9 +29,8 @@ MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
 DRAWN = 0
 NO_OBSTACLES = 1
 NO_ROBOTS = 2
-LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(
-    8
-)  # columns of a group
+# columns of a group
+LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)
 X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
 """Columns of a place: a region [m], headings [rad], cumulative share of the places up to it."""
 
@@ -40,9 +39,8 @@ class FreeSpace(NamedTuple):
     """All that stands in every scene, and where robots fit between it."""
 
     cells: MapField  # distances to the nearest wall or solid cell of the map
-    area: NDArray[
-        np.int32
-    ]  # (rows, columns) number of the connected free space; 0 for none
+    # (rows, columns) number of the connected free space; 0 for none
+    area: NDArray[np.int32]
     bounds: Array  # (4,) least x, y and greatest x, y of the field [m]
     walls: Array  # (W, 4)
     grid: MapField  # the static map
@@ -275,9 +273,8 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
 def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
     """Draws a point in one of the chosen cells, given by row-major indices; takes 3 counters."""
     cell = int(uniform_of(source, counter) * chosen.shape[0])
-    if (
-        chosen.shape[0] < cells.distances.size
-    ):  # of all cells, a look-up would only miss the cache
+    # of all cells, a look-up would only miss the cache
+    if chosen.shape[0] < cells.distances.size:
         cell = chosen[cell]
     i = cell // cells.distances.shape[1]
     j = cell % cells.distances.shape[1]
@@ -501,9 +498,8 @@ def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: 
     count = plan.group.shape[0]
     s = scratch
     cells = scratch.cells
-    found = cells.found[
-        :count
-    ]  # the scratch may be for the most obstacles of several worlds
+    # the scratch may be for the most obstacles of several worlds
+    found = cells.found[:count]
     cells = BodyCells(cells.first, cells.then, cells.ordered, cells.frame, found)
     scratch = SceneScratch(
         s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.spare, cells

@@ -172,9 +172,8 @@ class _Scope:
             self.pose = include.find("pose")
             self.placement = _text(include, "placement_frame")
         self.models: list[_Scope] = []
-        self.strange: list[
-            tuple[str, str]
-        ] = []  # name of a model, and why it can't be read
+        # name of a model, and why it can't be read
+        self.strange: list[tuple[str, str]] = []
         states = element.iterfind("state/model")
         self._state = {one.get("name", ""): one.find("pose") for one in states}
         self._named: dict[str, Element | _Scope] = {}

@@ -264,9 +264,8 @@ def _scan_alone(
         fault_kernels.slice_poses(
             scans.slices, spot[0, 0], drive, lidar.sweep_time, skew
         )
-    for g in range(
-        groups
-    ):  # large functions are called below: compiling them once is enough
+    # large functions are called below: compiling them once is enough
+    for g in range(groups):
         out = scan if groups == 1 else scans.part
         for i in range(3 if groups > 1 else 0):
             spot[0, 0, i] = scans.slices[g, i]
@@ -298,9 +297,8 @@ def _gather(
     spot = scans.spot[0, 0]
     first = velocity.shape[1]
     several = bodies.shape[1]
-    in_cells = members.standing or (
-        members.crowded and lag == 0
-    )  # those of a crowd are of now
+    # those of a crowd are of now
+    in_cells = members.standing or (members.crowded and lag == 0)
     if in_cells:
         several = around(n, spot[0], spot[1], reach, cells)
     count = 0

@@ -38,9 +38,8 @@ R = TypeVar("R")
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
 # Greatest number of robots in one world; each is tested against every other
 MOST_ROBOTS = 1_000
-MOST_NUMBERS = (
-    2**30
-)  # Most values in all worlds, some GB: beams of robots, states of obstacles
+# Most values in all worlds, some GB: beams of robots, states of obstacles
+MOST_NUMBERS = 2**30
 PER_BODY = 64
 # Beyond the range of commands that was recorded, as a share of their limits
 TOLERANCE = 0.05
@@ -242,9 +241,8 @@ class FastSimulator:
         self.data = allocation.allocate(model, self._sizes)
         # Name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
         self.readings = unread(model.sensors, worlds, robots)
-        self.parts = allocation.split(
-            worlds, threads
-        )  # the worlds that each thread steps
+        # the worlds that each thread steps
+        self.parts = allocation.split(worlds, threads)
         known = model.kinematics, model.robot, tell
         self._boxes = {part.start: CommandBox(*known) for part in self.parts}
 

@@ -33,15 +33,13 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 class Obstacles(Schema):
     """A group of obstacles with common properties."""
 
-    shapes: tuple[Shape, ...] = Field(
-        min_length=1, max_length=MOST_SHAPES
-    )  # each takes any
+    # each takes any
+    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
     # or [least, greatest], drawn per episode
     count: int | tuple[int, int] | None = None
     gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
-    at: tuple[
-        Pose, ...
-    ] = ()  # fixed poses, x, y [m], heading [rad], instead of `count` at random
+    # fixed poses, x, y [m], heading [rad], instead of `count` at random
+    at: tuple[Pose, ...] = ()
     # their motion, see `sim.obstacles`; by default they stand still
     motion: Motion | None = None
 
@@ -74,9 +72,8 @@ class Obstacles(Schema):
 class Places(Schema):
     """Places in regions, x1, y1, x2, y2 of opposite corners [m], or at poses or points."""
 
-    regions: tuple[Region, ...] = Field(
-        default=(), max_length=MOST_PLACES
-    )  # x1, y1, x2, y2 [m]
+    # x1, y1, x2, y2 [m]
+    regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
@@ -89,9 +86,8 @@ class Places(Schema):
 class Starts(Places):
     """Places where robots start: any point of the regions, or one of the poses."""
 
-    at: tuple[Pose, ...] = Field(
-        default=(), max_length=MOST_PLACES
-    )  # x, y [m], heading [rad]
+    # x, y [m], heading [rad]
+    at: tuple[Pose, ...] = Field(default=(), max_length=MOST_PLACES)
 
 
 class Goals(Places):
@@ -114,9 +110,8 @@ class World(Schema):
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
     # around the footprint at start, goal, and on a path between [m]
     clearance: Distance = 0.3
-    goal_distance: tuple[
-        Distance, Distance
-    ]  # least and greatest, from start straight to goal [m]
+    # least and greatest, from start straight to goal [m]
+    goal_distance: tuple[Distance, Distance]
     starts: Starts | None = None  # where robots start; None: anywhere with room
     goals: Goals | None = None  # where goals lie; None: anywhere with room
     _file: str | None = PrivateAttr(default=None)
