@@ -1,4 +1,4 @@
-"""`--help` of the nodes, and what is wrong with their arguments; without ROS 2."""
+"""Help texts of the nodes and a check of their arguments, without ROS 2."""
 
 import textwrap
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ INDENT = 4
 
 
 def help_of(node: str) -> str:
-    """Returns the help of a node by the name of its executable."""
+    """Return the help of a node by the name of its executable."""
     if node not in NODES:
         return f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO ...]\n"
     facts = NODES[node]()
@@ -33,7 +33,7 @@ def help_of(node: str) -> str:
         "\n".join(topics),
         "parameters, with their defaults:",
         "\n".join(map(_line, facts.parameters)),
-        "and `use_sim_time`, as every node of ROS 2. `ros2 param describe` tells the ranges, too.",
+        "and `use_sim_time`, like every ROS 2 node. `ros2 param describe` also shows the ranges.",
         f"example:\n    ros2 run nics_drl_bridge {node} {ROS} {facts.example}",
     ]
     return "\n\n".join(parts) + "\n"
@@ -46,7 +46,7 @@ def _line(row: Row) -> str:
 
 
 def _words(value: Any) -> str:
-    """Returns a value as it is written after `:=`."""
+    """Return a value as it is written after `:=`."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
@@ -60,14 +60,14 @@ def _hanging(text: str, indent: int) -> str:
 
 
 def wrong_with(node: str, words: Sequence[str]) -> str:
-    """Returns a sentence about the first word that is no argument of a node, or ""."""
-    ours = True  # not for ROS 2, which tells what is wrong with its own
+    """Return a sentence about the first word that is not an argument of a node, or ""."""
+    ours = True  # False for the words that ROS 2 itself checks
     for word in words:
         if word in (ROS, END):
             ours = word == END
         elif ours:
             given = f"-p {word}" if ":=" in word else "-p NAME:=VALUE"
-            fix = f"write parameters and remappings behind {ROS}, as in `{node} {ROS} {given}`"
+            fix = f"write parameters and remappings after {ROS}, as in `{node} {ROS} {given}`"
             return (
                 f"{node}: there is no argument {word!r}; {fix}, or see `{node} --help`."
             )

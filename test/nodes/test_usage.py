@@ -56,7 +56,7 @@ def test_a_parameter_without_ros_args_is_one_sentence():
     done = run("policy_node", "policy:=mppi")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
-        "policy_node: there is no argument 'policy:=mppi'; write parameters and remappings behind "
+        "policy_node: there is no argument 'policy:=mppi'; write parameters and remappings after "
         "--ros-args, as in `policy_node --ros-args -p policy:=mppi`, or see `policy_node --help`.\n"
     )
 
