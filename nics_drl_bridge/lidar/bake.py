@@ -39,7 +39,7 @@ def bake(
     shapes: Sequence[Shape],
     density: Density | None = None,
 ) -> LidarTable:
-    """Scans shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
+    """Scan shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
 
     Equal shapes are baked once, by default at `Density.for_beams`. Raises ConfigError if the table
     would be too large, or a shape covers too many beams.
@@ -77,7 +77,7 @@ def bake(
 def with_shapes(
     spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]
 ) -> LidarTable:
-    """Returns the table if it contains all of these shapes, or else one of equal density."""
+    """Return the table if it contains all of these shapes, or else one of equal density."""
     if set(shapes) <= set(table.shapes):
         return table
     if not table.has_rows:
@@ -86,7 +86,7 @@ def with_shapes(
 
 
 def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
-    """Computes the cells of a shape and the widths of their rows."""
+    """Compute the cells of a shape and the widths of their rows."""
     shape = outlines.shapes[h]
     radius = outlines.radii[h]
     order = outlines.orders[h]
@@ -150,7 +150,7 @@ def _reach_of(edge: Array, parts: int, outer: np.ufunc) -> Array:
 
 
 def _wound(hull: Array, hints: NDArray[np.int64], along: Array) -> NDArray[np.int64]:
-    """Unwraps corners at an edge (...), which points `along` in the shape's frame [rad]."""
+    """Unwrap corners at an edge (...), which points `along` in the shape's frame [rad]."""
     x, y = (np.roll(hull, -1, axis=0) - hull).T
     after = np.arctan2(y, x)
     middle = after - np.mod(after - np.roll(after, 1), 2.0 * np.pi) / 2.0
@@ -202,7 +202,7 @@ def _miss(
 
 
 def _fill(table: LidarTable, grids: Sequence[Grid]) -> None:
-    """Writes the rows of all cells into the table."""
+    """Write the rows of all cells into the table."""
     outlines = table.outlines
     distances = table.density.distances
     done = 0

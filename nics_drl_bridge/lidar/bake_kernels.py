@@ -12,7 +12,7 @@ EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a share of the
 
 @kernel(allocates=True)
 def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
-    """Writes the right and left edge [rad] of a shape straight ahead, and the corners there.
+    """Write the right and left edge [rad] of a shape straight ahead, and the corners there.
 
     Both results are (T, D, 2), for rotations (T,) [rad] and distances (D,) [m] of its origin. The
     convex hull is (V, 2) [m], unused for a circle; `radius` [m] is 0 for any other shape.
@@ -66,7 +66,7 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
 
 @kernel(allocates=True)
 def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
-    """Writes ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad]."""
+    """Write ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad]."""
     fine[:] = np.inf
     if corners.shape[0] == 0:
         exact_kernels.circle(fine, beams, distance, 0.0, radius, np.inf)
@@ -90,7 +90,7 @@ def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore
 
 @kernel(allocates=True)
 def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
-    """Sorts points (width * phases,) so that those of one phase are contiguous."""
+    """Sort points (width * phases,) so that those of one phase are contiguous."""
     for phase in range(phases):
         for k in range(width):
             rows[phase * width + k] = fine[k * phases + phase]
@@ -98,7 +98,7 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """Writes the rows of one rotation [rad] into the table's ranges (R,) float32 [m].
+    """Write the rows of one rotation [rad] into the table's ranges (R,) float32 [m].
 
     The layout (3, D) is the begin of the row of each distance, its first beam relative to the
     bearing, and its width in beams. `shape` are corners and radius, see `row`; edges are (D, 2),

@@ -80,7 +80,7 @@ class LidarArrays(NamedTuple):
 
 @kernel(inline=True)
 def sensor_pose(pose, mount):  # type: ignore[no-untyped-def]
-    """Returns x, y, heading of a lidar in its world, from the pose (3,) of its robot."""
+    """Return x, y, heading of a lidar in its world, from the pose (3,) of its robot."""
     x = pose[0]
     y = pose[1]
     heading = pose[2]
@@ -94,7 +94,7 @@ def sensor_pose(pose, mount):  # type: ignore[no-untyped-def]
 
 @kernel
 def compute(out, here, bodies, me, near, walls, lidar, found):  # type: ignore[no-untyped-def]
-    """Fuses walls, and of the bodies `near` those that are not looked up."""
+    """Fuse walls, and of the bodies `near` those that are not looked up."""
     computed = False
     for k in near:
         if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
@@ -127,7 +127,7 @@ def way_of(body, x, y, lidar):  # type: ignore[no-untyped-def]
 
 @kernel(contracts=True, inline=True)
 def polar(dx, dy):  # type: ignore[no-untyped-def]
-    """Returns distance [m] and bearing [rad] of a place, in single precision."""
+    """Return distance [m] and bearing [rad] of a place, in single precision."""
     distance = math.sqrt(np.float32(dx * dx + dy * dy))
     return distance, arctan2_single(np.float32(dy), np.float32(dx))
 
@@ -164,7 +164,7 @@ class Seen(NamedTuple):
 
 @kernel(contracts=True, inline=True)
 def seen_at(dx, dy, c, s):  # type: ignore[no-untyped-def]
-    """Returns a shape at (dx, dy) from the lidar, turned by (c, s), as seen from there."""
+    """Return a shape at (dx, dy) from the lidar, turned by (c, s), as seen from there."""
     return Seen(dx * dx + dy * dy, c * dx + s * dy, s * dx - c * dy)
 
 
@@ -202,13 +202,13 @@ def tangent(seen, x1, y1, x2, y2, radius, side):  # type: ignore[no-untyped-def]
 
 @kernel(contracts=True, inline=True)
 def seen_from(seen, x, y):  # type: ignore[no-untyped-def]
-    """Returns a corner (x, y) of a hull along and across the bearing, times the distance."""
+    """Return a corner (x, y) of a hull along and across the bearing, times the distance."""
     return seen.d2 + seen.cos * x - seen.sin * y, seen.sin * x + seen.cos * y
 
 
 @kernel(contracts=True, inline=True)
 def in_beams(right, left, bearing, heading, beams):  # type: ignore[no-untyped-def]
-    """Returns a bearing and both silhouettes in beams, the right one in the first turn."""
+    """Return a bearing and both silhouettes in beams, the right one in the first turn."""
     per_beam = 1.0 / beams.step
     turn = 2.0 * math.pi * per_beam
     per_turn = 1.0 / turn
@@ -267,7 +267,7 @@ def blended(rows, one, two, other, other2, share, blend, least, most):  # type: 
 
 @kernel(contracts=True)
 def outermost(hulls, hull, corners, first, stride, seen, side):  # type: ignore[no-untyped-def]
-    """Climbs along a hull to a silhouette, see `silhouette`, from the corner `first`.
+    """Climb along a hull to a silhouette, see `silhouette`, from the corner `first`.
 
     Seen from outside, the direction of the corners rises and falls once around the hull, so that a
     local optimum is the global one. Only shapes with many corners need it, at short distances.

@@ -39,7 +39,7 @@ class BodyCells(NamedTuple):
 
 
 def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
-    """Allocates cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
+    """Allocate cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
     rows = min(worlds, 1) if ordered else worlds
     side = max(int(math.sqrt(PER_BODY * bodies)), 1)
     cells = BodyCells(
@@ -60,7 +60,7 @@ def _place(way, cells_per_metre, side):  # type: ignore[no-untyped-def]
 
 @kernel
 def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
-    """Lays the cells of a world, which are empty then, over a square from (low_x, low_y) on."""
+    """Lay the cells of a world, which are empty then, over a square from (low_x, low_y) on."""
     if cells.first.shape[0] > 0:
         frame = cells.frame[n]
         frame[LEFT] = low_x
@@ -71,7 +71,7 @@ def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def clear(n, cells):  # type: ignore[no-untyped-def]
-    """Empties the cells of a world."""
+    """Empty the cells of a world."""
     if cells.first.shape[0] > 0:
         cells.first[n, :] = -1
         cells.frame[n, LARGEST] = cells.frame[n, MOVED] = 0.0
@@ -89,7 +89,7 @@ def _cell(body, stands, frame):  # type: ignore[no-untyped-def]
 
 @kernel
 def add(n, k, body, cells):  # type: ignore[no-untyped-def]
-    """Adds a body (7,) to the chain of its cell."""
+    """Add a body (7,) to the chain of its cell."""
     if cells.first.shape[0] > 0:
         cell = _cell(body, True, cells.frame[n])
         cells.then[n, k] = cells.first[n, cell]
@@ -98,7 +98,7 @@ def add(n, k, body, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
-    """Sorts the bodies (K, 7) of a world, the first `standing` of them by cells."""
+    """Sort the bodies (K, 7) of a world, the first `standing` of them by cells."""
     low_x = np.inf
     low_y = np.inf
     high_x = -np.inf
@@ -139,7 +139,7 @@ def _copy(body, to):  # type: ignore[no-untyped-def]
 
 @kernel
 def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-def]
-    """Sorts the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
+    """Sort the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
 
     Of neighbours in the same lines of memory, few miss the cache; `spare` (K, 7) is scratch.
     """
@@ -161,7 +161,7 @@ def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-
 
 @kernel(inline=True)
 def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
-    """Returns the least and the greatest row, and column, of the cells around a place."""
+    """Return the least and the greatest row, and column, of the cells around a place."""
     frame = cells.frame[n]
     per_metre = cells.frame[n, PER_METRE]
     side = cells.frame[n, SIDE]
@@ -175,7 +175,7 @@ def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
-    """Writes to `found` the sorted bodies that may be within `reach` [m] of a place; how many."""
+    """Write to `found` the sorted bodies that may be within `reach` [m] of a place; how many."""
     first = cells.first
     then = cells.then
     found = cells.found

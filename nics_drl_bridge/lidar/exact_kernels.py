@@ -76,7 +76,7 @@ class OutlineArrays(NamedTuple):
 
 @kernel(allocates=True)
 def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
-    """Returns the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
+    """Return the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
     most = max(min(int(HALF_PI / step), directions.shape[1]), 1) + BLOCK
     angles = step * np.arange(-most, most)
     turns = np.concatenate((np.cos(angles), np.sin(angles))).astype(np.float32)
@@ -120,7 +120,7 @@ def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
 
 @kernel
 def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
-    """Fuses the exact ranges to a circle at (x, y)."""
+    """Fuse the exact ranges to a circle at (x, y)."""
     d2 = x * x + y * y
     r2 = radius * radius
     d = math.sqrt(d2)
@@ -156,7 +156,7 @@ def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
 
 @kernel
 def segment(out, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
-    """Fuses the exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
+    """Fuse the exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
     edge(out, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
 
 
@@ -197,7 +197,7 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
 
 @kernel
 def polygon(out, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
-    """Fuses the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
+    """Fuse the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
     last = corners.shape[0] - 1
     cull = beside_convex(x, y, c, s, corners)
     ax, ay = turned(x, y, c, s, corners[last])
@@ -245,7 +245,7 @@ def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
 
 @kernel
 def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
-    """Applies the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
+    """Apply the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
     low = np.float32(range_min)
     high = np.float32(range_max)
     for i in range(out.shape[0]):
@@ -256,7 +256,7 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
 
 @kernel
 def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-untyped-def]
-    """Fuses walls (W, 4) into a scan from a `LidarPose`, as `finish` would leave them.
+    """Fuse walls (W, 4) into a scan from a `LidarPose`, as `finish` would leave them.
 
     Limits are range_min and range_max [m]; `found` (11 TOGETHER,) is scratch memory.
     """
@@ -280,7 +280,7 @@ def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-unty
 
 @kernel(inline=True)
 def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: ignore[no-untyped-def]
-    """Finds the beams that meet some walls in range, none for the others; without branches."""
+    """Find the beams that meet some walls in range, none for the others; without branches."""
     c = lidar.c
     s = lidar.s
     per_beam = 1.0 / beams.step
@@ -368,7 +368,7 @@ def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-de
 
 @kernel(contracts=True, inline=True)
 def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: ignore[no-untyped-def]
-    """Fuses a wall into those of the beams from a place on that are in [begin, end).
+    """Fuse a wall into those of the beams from a place on that are in [begin, end).
 
     They are turned in single precision from the first, or from the last if they meet it ever
     flatter: up to a quarter turn, nothing cancels out. Ranges are whole numbers, in the same order
@@ -407,7 +407,7 @@ def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: 
 
 @kernel
 def body_into(out, beams, lidar, body, outlines, range_max):  # type: ignore[no-untyped-def]
-    """Fuses one body (7,) into a scan from a `LidarPose`."""
+    """Fuse one body (7,) into a scan from a `LidarPose`."""
     c = lidar.c
     s = lidar.s
     dx = body[X] - lidar.x

@@ -46,7 +46,7 @@ class Distortion(NamedTuple):
 
 @kernel(allocates=True)
 def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
-    """Applies faults (P,) of the device to one exact scan (B,) float32, REP-117, in place [m].
+    """Apply faults (P,) of the device to one exact scan (B,) float32, REP-117, in place [m].
 
     A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
     """
@@ -145,14 +145,14 @@ def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped
 
 @kernel(inline=True)
 def _told(value, measured, device):  # type: ignore[no-untyped-def]
-    """Returns what was measured of a return, else what is told of what is too close or none."""
+    """Return what was measured of a return, else what is told of what is too close or none."""
     other = device.close if value < device.close else value
     return measured if np.float32(value).view(np.uint32) < np.uint32(INF) else other
 
 
 @kernel(contracts=True, inline=True)
 def _coarse(value, device):  # type: ignore[no-untyped-def]
-    """Returns the nearest multiple of the step that is within the limits."""
+    """Return the nearest multiple of the step that is within the limits."""
     count = np.floor(value * device.per_step + np.float32(0.5))
     count = device.first if count < device.first else count
     count = device.last if count > device.last else count
@@ -183,7 +183,7 @@ def _drop(ranges, share, far, by):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
-    """Writes the pose (3,) `ago` [s] before, along the arc of a twist (3,); heading unwrapped."""
+    """Write the pose (3,) `ago` [s] before, along the arc of a twist (3,); heading unwrapped."""
     turn = -twist[2] * ago
     half = 0.5 * turn
     # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
@@ -199,7 +199,7 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
-    """Writes the poses (G, 3) of the robot at which G equal groups of beams were measured.
+    """Write the poses (G, 3) of the robot at which G equal groups of beams were measured.
 
     Group g has the beams from `g * B // G` to `(g + 1) * B // G`, and the pose of its interval's
     middle, heading unwrapped. The `sweep` [s] ends at `pose`: the newest beam is the last, or beam
@@ -216,7 +216,7 @@ def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-
 
 @kernel(allocates=True)
 def distort_worlds(ranges, chosen, limits, faults, seeds, steps):  # type: ignore[no-untyped-def]
-    """Applies the same faults to the scans (N, M, B) of some worlds (n,), see `distort`."""
+    """Apply the same faults to the scans (N, M, B) of some worlds (n,), see `distort`."""
     robots = ranges.shape[1]
     for n in chosen:
         for m in range(robots):

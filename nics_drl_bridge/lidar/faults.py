@@ -54,7 +54,7 @@ class LidarFaults(Schema):
         return self
 
     def parameters(self, noise_std: float) -> NDArray[np.float64]:
-        """Returns the kernels' row (P,), in the order of the columns in `fault_kernels`."""
+        """Return the kernels' row (P,), in the order of the columns in `fault_kernels`."""
         too_close = TOO_CLOSE[self.too_close]
         skew = SKEW[self.skew]
         return np.array(

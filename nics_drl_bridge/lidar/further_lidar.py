@@ -41,7 +41,7 @@ class FurtherLidar(Sensor):
         return self.lidar.mount
 
     def renderer(self, around: SensedWorlds) -> Render:
-        """Scans bodies, walls and map like the first lidar, with this one's faults."""
+        """Scan bodies, walls and map like the first lidar, with this one's faults."""
         scanner = make_scanner(self.lidar, around.shapes, around.renderer)
         state, lidar, salt = around.state, scanner.arguments, crc32(self.name.encode())
         limits = self.lidar.range_min, self.lidar.range_max
@@ -69,13 +69,13 @@ class FurtherLidar(Sensor):
         return render
 
     def write(self, message: Any, reading: Readings) -> None:
-        """Fills a LaserScan as the device would."""
+        """Fill a LaserScan as the device would."""
         for field, value in self.lidar.header._asdict().items():
             setattr(message, field, value)
         message.ranges = array.array("f", to_device(reading, self.lidar).tobytes())
 
     def read(self, message: Any) -> Readings:
-        """Returns the scan (B,) of a LaserScan."""
+        """Return the scan (B,) of a LaserScan."""
         header = self.lidar.header
         beams = self.lidar.beams
         off = abs(message.angle_min - header.angle_min)
@@ -91,7 +91,7 @@ class FurtherLidar(Sensor):
         return shares.astype(np.float32)
 
     def points(self, reading: Readings) -> NDArray[np.float64]:
-        """Ends of the beams that hit something (Q, 2); what is too close counts as at range_min."""
+        """End of the beams that hit something (Q, 2); what is too close counts as at range_min."""
         x, y, heading = self.mount
         near = np.where(
             np.isneginf(reading), self.lidar.range_min, reading.astype(np.float64)

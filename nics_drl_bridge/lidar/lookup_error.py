@@ -27,7 +27,7 @@ NARROWEST = 0.1
 def lookup_distances(
     exact: LidarArrays, baked: LidarArrays, shape: int, radius: float, greatest: float
 ) -> tuple[float, float]:
-    """Finds the distances between which looking up a shape has an RMSE of at most `greatest` [m].
+    """Find the distances between which looking up a shape has an RMSE of at most `greatest` [m].
 
     So it must be in each ring of distances and each band of ranges over all rings, and no beam off
     by more than `OUTLIER`: long thin shapes err when near and seen at a slant, distant ones where a
@@ -124,7 +124,7 @@ def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
 
 
 def _slanted(poses: Array, outline: Array, seed: int) -> Array:
-    """Draws poses with the lidar nearly on the line of an edge: rare, and off by its length."""
+    """Draw poses with the lidar nearly on the line of an edge: rare, and off by its length."""
     rng = np.random.default_rng(seed)
     along = np.roll(outline, -1, axis=0) - outline
     length = np.hypot(*along.T)

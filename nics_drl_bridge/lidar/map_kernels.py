@@ -39,7 +39,7 @@ class GridArrays(NamedTuple):
 
 @kernel(allocates=True)
 def free_squares(blocked):  # type: ignore[no-untyped-def]
-    """Bakes the squares (rows + 2, columns + 2) of a map (rows, columns), see `GridArrays`."""
+    """Bake the squares (rows + 2, columns + 2) of a map (rows, columns), see `GridArrays`."""
     rows, columns = blocked.shape
     side = np.zeros((rows + 2, columns + 2), np.int32)
     squares = np.zeros((rows + 2, columns + 2), np.uint32)
@@ -123,7 +123,7 @@ def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
 
 @kernel
 def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[no-untyped-def]
-    """Fuses a map (`GridArrays`) into a scan (B,) float32 [m]: walks if `exact`, else jumps."""
+    """Fuse a map (`GridArrays`) into a scan (B,) float32 [m]: walks if `exact`, else jumps."""
     squares = grid.squares
     frame = grid.frame
     if squares.size == 0:
@@ -166,7 +166,7 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
 
 @kernel
 def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-untyped-def]
-    """Puts the beams from `first` on into lanes, each mirrored so that it points right and up."""
+    """Put the beams from `first` on into lanes, each mirrored so that it points right and up."""
     c = np.float32(c)
     s = np.float32(s)
     u = np.float32(u)
@@ -203,7 +203,7 @@ def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-un
 
 @kernel
 def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
-    """Moves each lane to the end of its free square; True if any moved."""
+    """Move each lane to the end of its free square; True if any moved."""
     singles = lanes.single
     wholes = lanes.whole
     # apart from the loop below, so that LLVM can vectorise that one
@@ -242,7 +242,7 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped-def]
-    """Fuses the lanes that ended at a solid cell, not in the border around the map."""
+    """Fuse the lanes that ended at a solid cell, not in the border around the map."""
     singles = lanes.single
     wholes = lanes.whole
     ranges = out.view(np.int32)

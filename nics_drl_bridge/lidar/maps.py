@@ -67,14 +67,14 @@ class GridMap:
         return map_kernels.GridArrays(map_kernels.free_squares(self.blocked), frame)
 
     def world_to_cell(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Returns row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
+        """Return row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
         place = rotate(
             np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2]
         )
         return np.floor(place[..., ::-1] / self.resolution).astype(np.int64)
 
     def cell_to_world(self, cells: ArrayLike) -> NDArray[np.float64]:
-        """Returns the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
+        """Return the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
         x, y, heading = self.origin
         place = (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution
         c = np.cos(heading)
@@ -141,7 +141,7 @@ class MapFile(Schema):
 def load_map(
     name: str | Path, unknown_stops: bool = False, occupied_from: int = OCCUPIED
 ) -> GridMap:
-    """Loads a shipped map by name (`room`), or any other by the path of its YAML file.
+    """Load a shipped map by name (`room`), or any other by the path of its YAML file.
 
     Cells equal those of Nav2's map_server: pixels exactly on a threshold are occupied or free,
     colours count by brightness (Rec. 709) in 256 steps, and pixels that are not opaque are unknown
@@ -161,7 +161,7 @@ def files_of(name: str | Path) -> tuple[Path, Path]:
 
 
 def map_files(grid: GridMap, path: Path) -> None:
-    """Writes a map as files of Nav2's map_server: YAML, and a PGM of the same name beside it.
+    """Write a map as files of Nav2's map_server: YAML, and a PGM of the same name beside it.
 
     `load_map` gives the same cells. They are trinary, or raw if some are neither free nor occupied.
     """
@@ -219,7 +219,7 @@ def _cells_by_brightness(file: MapFile) -> NDArray[np.int8]:
 def read_image(
     path: Path, source: str
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Reads brightness (rows, columns), and opacity if any, of a PGM (8, 16 bit), PNG or BMP.
+    """Read brightness (rows, columns), and opacity if any, of a PGM (8, 16 bit), PNG or BMP.
 
     Raises ConfigError, with the `source` that names it, if it is missing, damaged or too large.
     """
@@ -293,7 +293,7 @@ def stack_fixtures(
     grids: Sequence[GridMap | None],
     member: NDArray[np.int64],
 ) -> Fixtures:
-    """Stacks the fixtures of P worlds: walls (W, 4) and the map of each."""
+    """Stack the fixtures of P worlds: walls (W, 4) and the map of each."""
     maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
     squares, places = joined([each.squares for each in maps])
     frames = np.zeros((len(maps), 5))

@@ -78,7 +78,7 @@ class ScanLanes(NamedTuple):
 
 
 def scan_lanes() -> ScanLanes:
-    """Allocates the memory that one thread needs to scan."""
+    """Allocate the memory that one thread needs to scan."""
     return ScanLanes(
         np.zeros(20 * LANES),
         np.zeros(4 * LANES, np.float32),
@@ -89,7 +89,7 @@ def scan_lanes() -> ScanLanes:
 
 @kernel
 def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, lanes):  # type: ignore[no-untyped-def]
-    """Scans from the robots of the worlds `chosen` (n,), at poses (N, M, 3), into ranges (N, M, B).
+    """Scan from the robots of the worlds `chosen` (n,), at poses (N, M, 3), into ranges (N, M, B).
 
     The bodies (N, K, 7) from index `first` on are the robots', or none where `first` is -1.
     `fixtures` are walls and maps, `cells` (`BodyCells`) says which bodies are near. Bodies wait in

@@ -51,7 +51,7 @@ class Scanner:
     grid: GridMap | None = None  # a static map of every world that `scan` sees
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for an unknown renderer, ModelError for another lidar's table."""
+        """Raise ConfigError for an unknown renderer, ModelError for another lidar's table."""
         table = self.table
         spec = self.spec
         if self.renderer not in RENDERERS:
@@ -136,7 +136,7 @@ class Scanner:
         walls: ArrayLike = NO_WALLS,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Scans (N, B) [m], REP-117, from poses (N, 3) of robots, each in a separate world.
+        """Scan (N, B) [m], REP-117, from poses (N, 3) of robots, each in a separate world.
 
         The bodies (N, K, 7) are from `place`; walls (W, 4) x1, y1, x2, y2 [m] are the same in every
         world; the ranges are written to `out` if it is given. Raises ConfigError for an array of a
@@ -208,7 +208,7 @@ def make_scanner(
     renderer: Renderer = "auto",
     grid: GridMap | None = None,
 ) -> Scanner:
-    """Returns a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""
+    """Return a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""
     if renderer == "exact":
         table = LidarTable.without_rows(spec, shapes)
     else:

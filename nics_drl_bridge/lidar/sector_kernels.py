@@ -33,7 +33,7 @@ class SectorPlan(NamedTuple):
 
 @kernel(allocates=True)
 def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """Writes the nearest return in each sector (S,) of one scan (B,) [m], REP-117; NaN is unknown.
+    """Write the nearest return in each sector (S,) of one scan (B,) [m], REP-117; NaN is unknown.
 
     A sector without a beam takes the nearer return of the two adjacent beams.
     """
@@ -45,7 +45,7 @@ def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
-    """Fills each sector from its own beams, by a sparse table (Bender, Farach-Colton 2000).
+    """Fill each sector from its own beams, by a sparse table (Bender, Farach-Colton 2000).
 
     Row k has the least of each 2**k beams in a row. As whole numbers, ranges have the same order,
     NaN is the greatest, and LLVM vectorises.
@@ -89,7 +89,7 @@ def _nearest(least, begin, end):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _by_place(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """Fills each sector from its returns, or the nearer of the neighbouring beams around it."""
+    """Fill each sector from its returns, or the nearer of the neighbouring beams around it."""
     sectors = out.shape[0]
     beams = ranges.shape[0]
     where = np.empty(beams, np.int32)

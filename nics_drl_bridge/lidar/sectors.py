@@ -68,7 +68,7 @@ LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars c
 
 
 def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
-    """Returns the layout for a user's setting; ConfigError if it is none.
+    """Return the layout for a user's setting; ConfigError if it is none.
 
     None, a ScanLayout, a name in `LAYOUTS`, fields, or a number of sectors over the lidar's view.
     """
@@ -126,7 +126,7 @@ NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
 
 
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
-    """Returns the plan by which a lidar fills a layout; ConfigError if it sees too little."""
+    """Return the plan by which a lidar fills a layout; ConfigError if it sees too little."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     _check(lidar, layout, angles)
@@ -210,14 +210,14 @@ class Reader:
     backwards: bool  # True if its beams are in clockwise order
 
     def ordered(self, values: Ranges) -> Ranges:
-        """Returns ranges (..., B) in counter-clockwise order."""
+        """Return ranges (..., B) in counter-clockwise order."""
         return values[..., ::-1] if self.backwards else values
 
 
 def reader_of(
     header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
 ) -> Reader:
-    """Returns the reader for scans of B beams with the header of a LaserScan.
+    """Return the reader for scans of B beams with the header of a LaserScan.
 
     A negative `angle_increment` means clockwise beams, and so does `upside_down`. `like` gives
     mount, frame and value for no return. Raises ConfigError if the header describes no lidar.

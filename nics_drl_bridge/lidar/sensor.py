@@ -82,22 +82,22 @@ class Sensor(Schema, ABC):
 
     @abstractmethod
     def renderer(self, around: SensedWorlds) -> Render:
-        """Prepares to render readings; equal seeds and steps must give equal bits in any batch."""
+        """Prepare to render readings; equal seeds and steps must give equal bits in any batch."""
 
     @abstractmethod
     def write(self, message: Any, reading: Readings) -> None:
-        """Fills a message with a reading (S,); its header is filled in already."""
+        """Fill a message with a reading (S,); its header is filled in already."""
 
     @abstractmethod
     def read(self, message: Any) -> Readings:
-        """Returns the reading (S,) of a message. Raises ValueError if it is not of this sensor."""
+        """Return the reading (S,) of a message. Raises ValueError if it is not of this sensor."""
 
     @abstractmethod
     def shares(self, readings: Readings) -> Readings:
-        """Returns the part of an observation (..., P), in [0, 1], of readings (..., S)."""
+        """Return the part of an observation (..., P), in [0, 1], of readings (..., S)."""
 
     def points(self, reading: Readings) -> Array:
-        """Returns where a reading (S,) shows something in `base_link` (Q, 2) [m]; none here."""
+        """Return where a reading (S,) shows something in `base_link` (Q, 2) [m]; none here."""
         return np.zeros((0, 2))
 
 
@@ -109,7 +109,7 @@ CODE_IN_DATA = (
 
 
 def add_sensor_kind(place: str) -> type[Sensor]:
-    """Imports a kind of sensor from `path/to/file.py:ClassName`, which files then name `ClassName`.
+    """Import a kind of sensor from `path/to/file.py:ClassName`, which files then name `ClassName`.
 
     It runs the file: call it with a path of your own, never with one that a file of data names.
     """
@@ -117,7 +117,7 @@ def add_sensor_kind(place: str) -> type[Sensor]:
 
 
 def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
-    """Returns a sensor of a caller's own entries, whose `kind` may be `path/to/file.py:ClassName`.
+    """Return a sensor of a caller's own entries, whose `kind` may be `path/to/file.py:ClassName`.
 
     Entries that were read from a file go through `sensor_of_data`. Raises ConfigError.
     """
@@ -129,7 +129,7 @@ def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
 
 
 def sensor_of_data(given: Sensor | Mapping[str, Any]) -> Sensor:
-    """Returns a sensor of the entries of a file, which name a known kind and never code.
+    """Return a sensor of the entries of a file, which name a known kind and never code.
 
     Raises ConfigError if they describe none.
     """
@@ -149,7 +149,7 @@ def sensor_of_data(given: Sensor | Mapping[str, Any]) -> Sensor:
 
 
 def load_sensor(file: Path) -> Sensor:
-    """Reads a sensor from a YAML file. Raises ConfigError for what is wrong with it."""
+    """Read a sensor from a YAML file. Raises ConfigError for what is wrong with it."""
     try:
         return sensor_of_data(parse_yaml(read_text(file), str(file)))
     except ConfigError as error:
@@ -158,14 +158,14 @@ def load_sensor(file: Path) -> Sensor:
 
 
 def unread(sensors: Sequence[Sensor], *lead: int) -> dict[str, Readings]:
-    """Returns unknown readings (*lead, S) by the sensors' names."""
+    """Return unknown readings (*lead, S) by the sensors' names."""
     return {
         each.name: np.full((*lead, each.size), np.nan, np.float32) for each in sensors
     }
 
 
 def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
-    """Raises ConfigError if two sensors, or one and the robot's own topics or frames, collide."""
+    """Raise ConfigError if two sensors, or one and the robot's own topics or frames, collide."""
     names = list(TAKEN)
     used = list(frames)
     for sensor in sensors:

@@ -214,7 +214,7 @@ class Outlines:
 
     @classmethod
     def of(cls, shapes: Sequence[Shape]) -> "Outlines":
-        """Creates the arrays of some shapes."""
+        """Create the arrays of some shapes."""
         outlines = [shape.outline for shape in shapes]
         hulls = [convex_hull(o) if len(o) else np.zeros((1, 2)) for o in outlines]
         orders = [rotational_order(o, h) for o, h in zip(outlines, hulls, strict=True)]
@@ -237,7 +237,7 @@ class Outlines:
         return OutlineArrays(self.corners, self.corner)
 
     def index_of(self, shape: Shape) -> int:
-        """Returns the index of a shape. Raises ModelError if it is not among them."""
+        """Return the index of a shape. Raises ModelError if it is not among them."""
         try:
             return self.shapes.index(shape)
         except ValueError:
@@ -247,7 +247,7 @@ class Outlines:
 
 
 def describe(shape: Shape) -> str:
-    """Describes a shape in a few words."""
+    """Describe a shape in a few words."""
     if isinstance(shape, Circle):
         return f"circle of radius {shape.radius:g} m"
     if isinstance(shape, Rectangle):

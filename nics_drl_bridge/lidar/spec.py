@@ -37,7 +37,7 @@ class ScanHeader(NamedTuple):
 
 
 def check_angles(angle_min: float, angle_max: float) -> None:
-    """Raises ValueError unless the limits span at most a full circle within two turns."""
+    """Raise ValueError unless the limits span at most a full circle within two turns."""
     if not 0.0 < angle_max - angle_min <= 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
         raise ValueError(
             "angle_max must exceed angle_min by at most a full circle, in radians"
@@ -47,7 +47,7 @@ def check_angles(angle_min: float, angle_max: float) -> None:
 
 
 def without_sensor_model(data: Any) -> Any:
-    """Takes an empty `sensor_model` of an earlier version out of a file's content."""
+    """Take an empty `sensor_model` of an earlier version out of a file's content."""
     if not isinstance(data, dict) or "sensor_model" not in data:
         return data
     if data["sensor_model"]:
@@ -151,7 +151,7 @@ class LidarSpec(Schema):
 
 
 def load_lidar(name: str | Path) -> LidarSpec:
-    """Loads a shipped lidar by name (`paper`), or any other by the path of its YAML file."""
+    """Load a shipped lidar by name (`paper`), or any other by the path of its YAML file."""
     return load_yaml(find_config(name, "lidars"), LidarSpec)
 
 
@@ -159,7 +159,7 @@ Ranges = NDArray[np.float32]
 
 
 def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
-    """Converts ranges (..., B) to the device's convention; only `inf` is replaced."""
+    """Convert ranges (..., B) to the device's convention; only `inf` is replaced."""
     out = np.array(ranges, dtype=np.float32)
     if spec.no_return != "inf":
         out[out == np.inf] = _no_return(spec)
@@ -167,7 +167,7 @@ def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
 
 
 def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
-    """Converts ranges (..., B) of a device to those of the package.
+    """Convert ranges (..., B) of a device to those of the package.
 
     A finite value below range_min is too close, unless it means no return: that is not free space.
     """

@@ -47,7 +47,7 @@ class Density(Schema):
 
     @classmethod
     def for_beams(cls, beam_angle: float) -> "Density":
-        """Returns the default for an angle between beams [rad]; wide ones need several points."""
+        """Return the default for an angle between beams [rad]; wide ones need several points."""
         wanted = math.ceil(math.log2(max(beam_angle / POINT_ANGLE, 1.0)))
         return cls.model_validate({"phases": min(2**wanted, MOST_PHASES)})
 
@@ -96,7 +96,7 @@ class LidarTable:
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> "LidarTable":
-        """Creates a table of shapes that are only scanned exactly: without limits or baking."""
+        """Create a table of shapes that are only scanned exactly: without limits or baking."""
         shapes = tuple(dict.fromkeys(shapes))
         grid = np.ones((len(shapes), 3))
         grid[:, 0] = [spec.range_max + 2.0 * shape.radius for shape in shapes]
@@ -184,7 +184,7 @@ class LidarTable:
         return digest.hexdigest()
 
     def save(self, folder: str | Path) -> None:
-        """Writes the table as a folder, whole or not at all; ConfigError if not of its kind."""
+        """Write the table as a folder, whole or not at all; ConfigError if not of its kind."""
         own = {*TABLE_FILES, SUMS}
         with write_whole_folder(folder, ABOUT_FILE, own.__contains__) as temporary:
             write_text(temporary / ABOUT_FILE, self._about)
@@ -194,7 +194,7 @@ class LidarTable:
 
     @classmethod
     def load(cls, folder: str | Path, checked: bool = False) -> "LidarTable":
-        """Memory-maps a table that `save` wrote, `checked` if its checksums were compared already.
+        """Memory-map a table that `save` wrote, `checked` if its checksums were compared already.
 
         Raises ConfigError, ModelError if a file is missing, damaged or of another format.
         """
@@ -265,7 +265,7 @@ class LidarTable:
 
 
 def _mapped(path: Path) -> NDArray[Any]:
-    """Maps a `.npy` file into memory; what is written to the array never reaches the file."""
+    """Map a `.npy` file into memory; what is written to the array never reaches the file."""
     try:
         with np.errstate(over="raise"):  # of a shape whose size is no number
             array = np.load(path, mmap_mode="c", allow_pickle=False)

@@ -258,7 +258,7 @@ class DdsBackend:
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
-        """Begins the episode of a seed in the simulator; see `interface.Backend`."""
+        """Begin the episode of a seed in the simulator; see `interface.Backend`."""
         return self.first(self.begin(start), start.pose)
 
     def begin(self, start: Start) -> int:
@@ -349,15 +349,15 @@ class DdsBackend:
                 self._episodes.repeat()
 
     def facts(self) -> BackendFacts:
-        """Returns the newest true pose, if it was asked for."""
+        """Return the newest true pose, if it was asked for."""
         return self._facts
 
     def halt(self) -> None:
-        """Publishes a zero command; the episode is over."""
+        """Publish a zero command; the episode is over."""
         self._link.halt()
 
     def close(self) -> None:
-        """Publishes a zero command and ends the node."""
+        """Publish a zero command and end the node."""
         self._link.close()
 
 
@@ -398,7 +398,7 @@ class FleetBackend:
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
-        """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
+        """Begin one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         stamp_ns = self._robots[0].begin(start)
         both = zip(self._robots, start.pose, strict=True)
         return interface.stack_views(
@@ -407,31 +407,31 @@ class FleetBackend:
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes all commands (M, C) and waits for all data after them."""
+        """Publish all commands (M, C) and wait for all data after them."""
         for robot, robot_command in zip(self._robots, command, strict=True):
             robot.send(robot_command)
         views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
         return interface.stack_views(views), together(facts)
 
     def facts(self) -> BackendFacts:
-        """Returns what is known of all robots, stacked."""
+        """Return what is known of all robots, stacked."""
         return cast("BackendFacts", together([robot.facts() for robot in self._robots]))
 
     def halt(self) -> None:
-        """Publishes a zero command for each robot, even if one of them raises."""
+        """Publish a zero command for each robot, even if one of them raises."""
         with ExitStack() as each:
             for robot in self._robots:
                 each.callback(robot.halt)
 
     def close(self) -> None:
-        """Publishes a zero command for each robot and ends the nodes, even if one raises."""
+        """Publish a zero command for each robot and end the nodes, even if one raises."""
         with ExitStack() as each:
             for robot in self._robots:
                 each.callback(robot.close)
 
 
 def together(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Merges the facts of M robots: equal values stay as they are, others become (M, ...)."""
+    """Merge the facts of M robots: equal values stay as they are, others become (M, ...)."""
     values = {name: [each[name] for each in facts] for name in facts[0]}
     return {
         name: every[0]
@@ -453,7 +453,7 @@ def dds_backend(
     randomisation: str | Randomisation | None = None,
     **options: Any,
 ) -> interface.Backend:
-    """Returns the backend for the options; ConfigError if they do not go together, BackendError."""
+    """Return the backend for the options; ConfigError if they do not go together, BackendError."""
     if not estimator:
         raise ConfigError("backend 'dds' always estimates; leave out `estimator`.")
     if randomisation is not None:

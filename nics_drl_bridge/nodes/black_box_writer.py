@@ -44,7 +44,7 @@ class Segment:
     size: int = 0  # of the lines [bytes]
 
     def add(self, line: bytes) -> None:
-        """Adds a line."""
+        """Add a line."""
         self.lines.append(line)
         self.size += len(line)
 
@@ -58,7 +58,7 @@ class Ring:
         self._segments: deque[Segment] = deque()
 
     def begin(self, now: float, state: bytes) -> None:
-        """Begins a segment with a state at a time [s], and drops segments that are too old."""
+        """Begin a segment with a state at a time [s], and drop segments that are too old."""
         self._segments.append(Segment(now))
         self._segments[-1].add(state)
         while (
@@ -67,7 +67,7 @@ class Ring:
             self._segments.popleft()
 
     def add(self, entry: bytes) -> None:
-        """Adds an entry to the newest segment, and drops old ones if there is too much."""
+        """Add an entry to the newest segment, and drop old ones if there is too much."""
         self._segments[-1].add(entry)
         while len(self._segments) > 1 and self._is_full():
             self._segments.popleft()
@@ -78,7 +78,7 @@ class Ring:
         return lines > self._most_lines or size > MOST_BYTES
 
     def lines(self) -> list[bytes]:
-        """Returns what a file holds now: the oldest state, and all entries since."""
+        """Return what a file holds now: the oldest state, and all entries since."""
         kept = [line for each in self._segments for line in each.lines[1:]]
         return [self._segments[0].lines[0], *kept] if self._segments else []
 
@@ -103,18 +103,18 @@ class Disk:
         self._thread.start()
 
     def write(self, path: str, own: Sequence[str], lines: list[bytes]) -> None:
-        """Lets a file be written; `own` are the names of this gate's files, oldest first."""
+        """Let a file be written; `own` are the names of this gate's files, oldest first."""
         if not self._room.acquire(blocking=False):
             self._answer(path, "the files before it are still being written")
             return
         self._orders.put((path, own, lines))
 
     def give_up(self) -> None:
-        """Stops what is being written, and leaves nothing of it behind."""
+        """Stop what is being written, and leave nothing of it behind."""
         self._given_up.set()
 
     def finish(self, seconds: float) -> bool:
-        """Waits until all is written, or gives up after some time; False if the disk hangs."""
+        """Wait until all is written, or give up after some time; False if the disk hangs."""
         self._orders.put(None)
         self._thread.join(seconds)
         if self._thread.is_alive():
@@ -142,7 +142,7 @@ class Disk:
 
 
 def prune(folder: Path, own: Sequence[str]) -> None:
-    """Removes the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
+    """Remove the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(
         folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name)
@@ -152,7 +152,7 @@ def prune(folder: Path, own: Sequence[str]) -> None:
 
 
 def read_messages(descriptor: int) -> Iterator[tuple[bytes, bytes]]:
-    """Yields the kind and the content of each message, until the gate has ended."""
+    """Yield the kind and the content of each message, until the gate has ended."""
     rest = b""
     while chunk := os.read(descriptor, CHUNK_BYTES):
         *lines, rest = (rest + chunk).split(b"\n")
@@ -161,13 +161,13 @@ def read_messages(descriptor: int) -> Iterator[tuple[bytes, bytes]]:
 
 
 def answer(path: str, failed: str) -> None:
-    """Tells the gate that a file is written, or why not."""
+    """Tell the gate that a file is written, or why not."""
     with contextlib.suppress(OSError):  # the gate has ended
         os.write(1, json.dumps({"path": path, "failed": failed}).encode() + b"\n")
 
 
 def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
-    """Keeps what the gate sends, and writes it whenever the gate says so."""
+    """Keep what the gate sends, and write it whenever the gate says so."""
     ring = Ring()
     for kind, content in messages:
         if kind == STATE:
@@ -181,7 +181,7 @@ def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
 
 
 def main() -> None:
-    """Serves the gate until it ends; SIGTERM lets it give up the files that are not written yet."""
+    """Serve the gate until it ends; SIGTERM lets it give up the files that are not written yet."""
     # the gate's real-time priority is not for its files
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -4,7 +4,7 @@ import sys
 
 
 def module_command(module: str) -> list[str]:
-    """Returns the command that runs a module; its arguments may follow.
+    """Return the command that runs a module; its arguments may follow.
 
     `python -m` looks for modules in the working folder first, which may hold somebody's data, such
     as a model with a file `json.py`. PYTHONSAFEPATH prevents that from Python 3.11 on only.

@@ -75,7 +75,7 @@ REFUSED = (
 
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
-    """Declares and reads a gate's parameters, logs doubts; ConfigError if one can't be used."""
+    """Declare and read a gate's parameters, log doubts; ConfigError if one can't be used."""
     for name in sorted(parameters.SPLIT.keys() & runner.given_values(node).keys()):
         raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
     file = str(runner.declare_row(node, parameters.LIMITS))
@@ -95,7 +95,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
 
 
 def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersResult:
-    """Refuses another clock: the rules were derived for the one that the gate was started with."""
+    """Refuse another clock: the rules were derived for the one that the gate was started with."""
     for parameter in parameters:
         if parameter.name == SIM_TIME and parameter.value != simulated:
             fix = f"start it anew with `-p {SIM_TIME}:={str(not simulated).lower()}`."
@@ -118,7 +118,7 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
 
 
 def declare_black_box(node: Node) -> Path:
-    """Declares the folder of the recordings of stops, and returns that of the node's namespace."""
+    """Declare the folder of the recordings of stops, and return that of the node's namespace."""
     given = str(runner.declare_row(node, parameters.BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
@@ -146,19 +146,19 @@ def _declare_shield(
 
 
 def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
-    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the other readers."""
+    """Read a serialised LaserScan; raises `wire.UNREADABLE`, as the other readers."""
     ranges = from_device(wire.ranges_of(content), lidar)
     return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
 
 
 def reading(sensor: Sensor, content: bytes) -> inputs.SensorReading:
-    """Reads a serialised message of a further sensor."""
+    """Read a serialised message of a further sensor."""
     points = sensor.points(sensor_from_ros(sensor, content))
     return inputs.SensorReading(wire.stamp_of(content), sensor.name, points)
 
 
 def odometry(content: bytes) -> inputs.Odometry:
-    """Reads a serialised Odometry; without a rotation its pose is NaN."""
+    """Read a serialised Odometry; without a rotation its pose is NaN."""
     pose, twist = wire.odometry_of(content)
     if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
         pose = np.full(3, np.nan)
@@ -166,7 +166,7 @@ def odometry(content: bytes) -> inputs.Odometry:
 
 
 def estimate(content: bytes) -> inputs.Estimate:
-    """Reads a serialised Odometry of an estimator."""
+    """Read a serialised Odometry of an estimator."""
     pose, twist = wire.odometry_of(content)
     covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
         6, 6
@@ -175,7 +175,7 @@ def estimate(content: bytes) -> inputs.Estimate:
 
 
 def command(content: bytes) -> inputs.Command:
-    """Reads a serialised TwistStamped."""
+    """Read a serialised TwistStamped."""
     return inputs.Command(
         wire.stamp_of(content), np.array(wire.stamped_twist_of(content))
     )
@@ -184,7 +184,7 @@ def command(content: bytes) -> inputs.Command:
 def foreign_command(
     kind: str, oldest_ns: int, newest: inputs.Scan | None, content: bytes
 ) -> inputs.Command:
-    """Reads a command of another controller, which counts as computed from the newest scan.
+    """Read a command of another controller, which counts as computed from the newest scan.
 
     A stamp, if it has one, must not be older than `oldest_ns`. Raises `wire.UNREADABLE`.
     """
@@ -200,12 +200,12 @@ def foreign_command(
 
 
 def e_stop(content: bytes) -> inputs.EStop:
-    """Reads a serialised Bool."""
+    """Read a serialised Bool."""
     return inputs.EStop(wire.truth_of(content))
 
 
 def take_priority(priority: int) -> str:
-    """Gives all present threads SCHED_FIFO, if not 0; returns reason and fix if refused, or ""."""
+    """Give all present threads SCHED_FIFO, if not 0; return reason and fix if refused, or ""."""
     if priority == 0:
         return ""
     try:
@@ -312,7 +312,7 @@ class CommandGate(qos.QosWatch):
         self._take("cmd_vel_raw", read_with_source, content)
 
     def _take_e_stop(self, content: bytes) -> None:
-        """Decides on all messages that wait, on a press first, so that none waits for the rest."""
+        """Decide on all messages that wait, on a press first, so that none waits for the rest."""
         contents = [content, *qos.take_waiting(self._button)]
         self._queue.hear(time.monotonic(), len(contents))
         messages = []
@@ -404,7 +404,7 @@ class CommandGate(qos.QosWatch):
         return found._replace(message=f"{found.message}; {warning}", warns=True)
 
     def stop(self) -> None:
-        """Leaves a zero command behind."""
+        """Leave a zero command behind."""
         runner.last_word(self._out, self._message(np.zeros(3)))
         self._log.close()
 

@@ -22,7 +22,7 @@ LOOK_S = 0.5  # between two looks at who publishes
 
 
 def name_of(stamped: bool) -> str:
-    """Returns the name of the type of commands."""
+    """Return the name of the type of commands."""
     return TWIST_STAMPED if stamped else TWIST
 
 
@@ -34,7 +34,7 @@ def heard_stamped(node: Node, topic: str) -> bool | None:
 
 
 def deaf_subscribers(node: Node, topic: str, stamped: bool) -> str:
-    """Returns a clause about who subscribes to another type than is published; empty for nobody."""
+    """Return a clause about who subscribes to another type than is published; empty for nobody."""
     ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     kinds = sorted({end.topic_type for end in ends} - {name_of(stamped)})
     if not kinds:
@@ -60,7 +60,7 @@ class TypeWatch:
         self._warned: set[tuple[str, str]] = set()
 
     def look(self, heard: str) -> None:
-        """Looks for publishers of another type than the one that is heard."""
+        """Look for publishers of another type than the one that is heard."""
         for end in self._node.get_publishers_info_by_topic(self._topic):
             kind = end.topic_type
             who = qos.owner(end)
@@ -101,7 +101,7 @@ class CommandListener:
         self._subscription = made
 
     def look(self) -> None:
-        """Follows the type that is published now."""
+        """Follow the type that is published now."""
         if self._subscription is None:
             # the old one is not gone yet: at the next look
             with contextlib.suppress(RuntimeError):
@@ -134,6 +134,6 @@ class CommandListener:
             self._subscription = None
 
     def close(self) -> None:
-        """Listens no more."""
+        """Listen no more."""
         self._node.destroy_timer(self._timer)
         self._unsubscribe()

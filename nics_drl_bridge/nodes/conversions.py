@@ -38,27 +38,27 @@ FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 
 
 def stamp_to_ros(time_ns: int) -> Time:
-    """Returns nanoseconds as a stamp."""
+    """Return nanoseconds as a stamp."""
     return Time(sec=time_ns // NS_PER_S, nanosec=time_ns % NS_PER_S)
 
 
 def stamp_from_ros(stamp: Time) -> int:
-    """Returns a stamp as nanoseconds."""
+    """Return a stamp as nanoseconds."""
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def heading_to_ros(heading: float) -> geometry.Quaternion:
-    """Returns a heading [rad] as a quaternion."""
+    """Return a heading [rad] as a quaternion."""
     return geometry.Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
 
 
 def heading_of(x: float, y: float, z: float, w: float) -> float:
-    """Returns the heading [rad] of a quaternion given by its components."""
+    """Return the heading [rad] of a quaternion given by its components."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion:
-    """Returns an orientation turned about the vertical to a heading [rad]; it stays tilted."""
+    """Return an orientation turned about the vertical to a heading [rad]; it stays tilted."""
     x = stood.x
     y = stood.y
     z = stood.z
@@ -74,7 +74,7 @@ def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion
 
 
 def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
-    """Returns linear.x, linear.y, angular.z (3,) as a Twist."""
+    """Return linear.x, linear.y, angular.z (3,) as a Twist."""
     message = geometry.Twist()
     message.linear.x, message.linear.y, message.angular.z = np.asarray(
         twist, np.float64
@@ -83,21 +83,21 @@ def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
 
 
 def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> geometry.TwistStamped:
-    """Returns linear.x, linear.y, angular.z (3,) as a TwistStamped."""
+    """Return linear.x, linear.y, angular.z (3,) as a TwistStamped."""
     message = geometry.TwistStamped(twist=twist_to_ros(twist))
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     return message
 
 
 def twist_from_ros(message: geometry.Twist | geometry.TwistStamped) -> Array:
-    """Returns linear.x, linear.y, angular.z (3,) of a Twist, stamped or not."""
+    """Return linear.x, linear.y, angular.z (3,) of a Twist, stamped or not."""
     return np.array(messages.read_command(message))
 
 
 def scan_to_ros(
     spec: LidarSpec, ranges: NDArray[np.float32], now_ns: int, frame: str
 ) -> LaserScan:
-    """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec."""
+    """Return ranges (B,) as the device's LaserScan; every header field follows from the spec."""
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(now_ns), frame
     for field, value in spec.header._asdict().items():
@@ -109,7 +109,7 @@ def scan_to_ros(
 def reader_from_ros(
     message: LaserScan, like: LidarSpec, upside_down: bool = False
 ) -> Reader:
-    """Returns the reader of the lidar that a header describes. Raises ConfigError."""
+    """Return the reader of the lidar that a header describes. Raises ConfigError."""
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
     return reader_beside(header, len(message.ranges), like, upside_down)
 
@@ -122,7 +122,7 @@ def odometry_to_ros(
     # of position, heading, linear, angular [SI]
     variance: tuple[float, float, float, float],
 ) -> Odometry:
-    """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry."""
+    """Return pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = Odometry(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
@@ -138,14 +138,14 @@ def odometry_to_ros(
 
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
-    """Returns pose (3,) and body twist (3,) of an Odometry message."""
+    """Return pose (3,) and body twist (3,) of an Odometry message."""
     return np.array(messages.read_whole_pose(message)), np.array(
         messages.read_twist(message)
     )
 
 
 def covariance_to_ros(planar: Array) -> Array:
-    """Returns a covariance (3, 3) of x, y, heading, or of their rates, as a message's (36,)."""
+    """Return a covariance (3, 3) of x, y, heading, or of their rates, as a message's (36,)."""
     whole = np.diag(np.full(6, UNUSED_VARIANCE))
     whole[PLANAR] = planar
     return whole.ravel()
@@ -154,14 +154,14 @@ def covariance_to_ros(planar: Array) -> Array:
 def pose_from_ros(
     message: geometry.PoseStamped | geometry.PoseWithCovarianceStamped,
 ) -> tuple[Array, Array | None]:
-    """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
+    """Return the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
     known = isinstance(message, geometry.PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
     return np.array(messages.read_whole_pose(message)), covariance
 
 
 def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) -> Array:
-    """Returns the pose (3,) in the map of `initialpose`. Raises ConfigError if it can't be used."""
+    """Return the pose (3,) in the map of `initialpose`. Raises ConfigError if it can't be used."""
     frame = message.header.frame_id.strip("/")
     pose = pose_from_ros(message)[0]
     if frame not in ("", map_frame):
@@ -176,7 +176,7 @@ def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) ->
 
 
 def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamped:
-    """Returns a pose (3,) in a frame as a PoseStamped."""
+    """Return a pose (3,) in a frame as a PoseStamped."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = geometry.PoseStamped()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
@@ -186,7 +186,7 @@ def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamp
 
 
 def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
-    """Returns a map as an OccupancyGrid, measured at a time [ns] and in force since."""
+    """Return a map as an OccupancyGrid, measured at a time [ns] and in force since."""
     message = OccupancyGrid(data=array.array("b", grid.cells.tobytes()))
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     info, (x, y, heading) = message.info, grid.origin
@@ -199,7 +199,7 @@ def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
 
 
 def map_from_ros(message: OccupancyGrid) -> GridMap:
-    """Returns the map of an OccupancyGrid. Raises ConfigError if sizes do not fit."""
+    """Return the map of an OccupancyGrid. Raises ConfigError if sizes do not fit."""
     info = message.info
     cells = np.array(message.data, np.int8)
     if (
@@ -220,7 +220,7 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
 
 
 def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:
-    """Returns a state (S,) as a JointState: angles and lengths as positions, all else as rates."""
+    """Return a state (S,) as a JointState: angles and lengths as positions, all else as rates."""
     message = JointState()
     message.header.stamp = stamp_to_ros(time_ns)
     for variable, value in zip(
@@ -234,7 +234,7 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
 
 
 def message_type(kind: str) -> Any | None:
-    """Returns the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed.
+    """Return the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed.
 
     Types come from other programs on the network: only a package that has messages is imported.
     """
@@ -260,7 +260,7 @@ def _has_interfaces(package: str, interface: str) -> bool:
 
 
 def sensor_type(sensor: Sensor) -> Any:
-    """Returns the class of a further sensor's message. Raises ConfigError if it is missing."""
+    """Return the class of a further sensor's message. Raises ConfigError if it is missing."""
     kind = message_type(sensor.message)
     if kind is None:
         missing = f"the message {sensor.message} is not installed; install its package"
@@ -273,7 +273,7 @@ def sensor_type(sensor: Sensor) -> Any:
 def sensor_to_ros(
     sensor: Sensor, reading: NDArray[np.float32], time_ns: int, frame: str
 ) -> Any:
-    """Returns a reading (S,) of a further sensor as its message."""
+    """Return a reading (S,) of a further sensor as its message."""
     message = sensor_type(sensor)()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     sensor.write(message, reading)
@@ -281,7 +281,7 @@ def sensor_to_ros(
 
 
 def sensor_from_ros(sensor: Sensor, content: bytes) -> NDArray[np.float32]:
-    """Returns the reading (S,) of a serialised message. Raises ValueError if it is none."""
+    """Return the reading (S,) of a serialised message. Raises ValueError if it is none."""
     kind = sensor_type(sensor)
     try:
         message = deserialize_message(content, kind)
@@ -291,7 +291,7 @@ def sensor_from_ros(sensor: Sensor, content: bytes) -> NDArray[np.float32]:
 
 
 def message_texts(kind: str) -> dict[str, str]:
-    """Returns the `.msg` texts of a type and of all types in it, as far as they are installed."""
+    """Return the `.msg` texts of a type and of all types in it, as far as they are installed."""
     texts: dict[str, str] = {}
     waiting = [kind]
     while waiting:

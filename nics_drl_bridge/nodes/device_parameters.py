@@ -61,7 +61,7 @@ class Frames(NamedTuple):
 
 
 def declare_device(node: Node, laser_frame: str) -> None:
-    """Declares, and checks, all but the parameters of one kind of simulator. ConfigError."""
+    """Declare, and check, all but the parameters of one kind of simulator. ConfigError."""
     # First, so that it also checks the values that the node is started with.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
     fleet = ParameterDescriptor(
@@ -77,18 +77,18 @@ def declare_device(node: Node, laser_frame: str) -> None:
 
 
 def number(node: Node, name: str) -> float:
-    """Returns the value of a numeric parameter."""
+    """Return the value of a numeric parameter."""
     return float(node.get_parameter(name).value or 0.0)
 
 
 def randomisation(node: Node) -> Randomisation | None:
-    """Returns what is drawn in each episode, if anything. Raises ConfigError."""
+    """Return what is drawn in each episode, if anything. Raises ConfigError."""
     name = str(node.get_parameter("randomisation").value)
     return load_randomisation(name) if name else None
 
 
 def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
-    """Returns the timing given by the parameters; in lock-step, by the model alone."""
+    """Return the timing given by the parameters; in lock-step, by the model alone."""
     mode = choice(node, "mode", MODES)
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
@@ -117,7 +117,7 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
 def timed_model(
     node: Node, model: SimulatorModel, time: DeviceTiming
 ) -> SimulatorModel:
-    """Returns the model with the step of the world and the requested latency."""
+    """Return the model with the step of the world and the requested latency."""
     if time.lockstep:
         return model
     if (latency := number(node, "command_latency")) >= 0.0:
@@ -132,7 +132,7 @@ def timed_model(
 
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
-    """Returns a parameter that must be one of some words. Raises ConfigError with the nearest."""
+    """Return a parameter that must be one of some words. Raises ConfigError with the nearest."""
     value = str(node.get_parameter(name).value)
     if value not in valid:
         raise ConfigError(
@@ -142,7 +142,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
 
 
 def namespaces(node: Node) -> tuple[str, ...]:
-    """Returns each robot's namespace, below the node's own and empty for one. ConfigError."""
+    """Return each robot's namespace, below the node's own and empty for one. ConfigError."""
     value: Any = node.get_parameter("robots").value
     if (
         isinstance(value, int)
@@ -169,12 +169,12 @@ def namespaces(node: Node) -> tuple[str, ...]:
 
 
 def default_namespaces(robots: int) -> tuple[str, ...]:
-    """Returns the default namespaces of several robots: robot1, robot2, ..."""
+    """Return the default namespaces of several robots: robot1, robot2, ..."""
     return tuple(f"robot{k + 1}" for k in range(robots))
 
 
 def frames(node: Node, namespace: str) -> Frames:
-    """Returns the frames of a robot; those of a fleet begin with its namespace, except the map."""
+    """Return the frames of a robot; those of a fleet begin with its namespace, except the map."""
     prefix = str(node.get_parameter("frame_prefix").value) + (
         f"{namespace}/" if namespace else ""
     )
@@ -219,7 +219,7 @@ class TopicPace:
         self._next_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Starts anew: the next message is due now."""
+        """Start anew: the next message is due now."""
         self._next_ns = now_ns
 
     def due(self, now_ns: int) -> bool:
@@ -231,7 +231,7 @@ class TopicPace:
 
 
 def common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """Returns the longest step, in steps of the model [s], that suits all periods [s] best."""
+    """Return the longest step, in steps of the model [s], that suits all periods [s] best."""
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 
 
@@ -244,16 +244,16 @@ class RealTime:
         self._began_ns = self._then_ns = 0
 
     def begin(self, steady_ns: int, now_ns: int) -> None:
-        """Aligns a time of the steady clock with a simulated time."""
+        """Align a time of the steady clock with a simulated time."""
         self._began_ns = steady_ns
         self._then_ns = now_ns
 
     def time_at(self, steady_ns: int) -> int:
-        """Returns the simulated time [ns] at a time of the steady clock."""
+        """Return the simulated time [ns] at a time of the steady clock."""
         return self._then_ns + int((steady_ns - self._began_ns) * self._rate)
 
     def behind(self, steady_ns: int, now_ns: int) -> int:
-        """Returns the steps due at a time of the steady clock, for a world at `now_ns`."""
+        """Return the steps due at a time of the steady clock, for a world at `now_ns`."""
         missing_ns = self.time_at(steady_ns) - now_ns
         return max(0, int((missing_ns + SLACK * self._step_ns) // self._step_ns))
 

@@ -23,7 +23,7 @@ class EStopQueue:
         self._since_tick = 0  # messages
 
     def hear(self, now: float, messages: int) -> None:
-        """Accounts for messages that were read at a steady time [s]."""
+        """Account for messages that were read at a steady time [s]."""
         self._ever_heard = True
         self._since_tick += messages
         self._heard.append((now, messages))
@@ -31,7 +31,7 @@ class EStopQueue:
             self._heard.popleft()
 
     def tick(self, now: float) -> str:
-        """Returns why the sleep since the last tick may have lost a press; else ""."""
+        """Return why the sleep since the last tick may have lost a press; else ""."""
         before = self._ticked_s
         self._ticked_s = now
         waiting = self._since_tick

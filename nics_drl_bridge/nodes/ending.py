@@ -39,7 +39,7 @@ _within = False  # `at_once`
 
 
 def leave(code: int) -> NoReturn:
-    """Ends the process; call it when all is closed."""
+    """End the process; call it when all is closed."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # whoever read it has gone
             stream.flush()
@@ -48,7 +48,7 @@ def leave(code: int) -> NoReturn:
 
 
 def ending_signals() -> list[int]:
-    """Returns the signals at which this process ends in order.
+    """Return the signals at which this process ends in order.
 
     If it was started to outlive its terminal, as by `nohup`, SIGHUP is not one of them.
     """
@@ -57,14 +57,14 @@ def ending_signals() -> list[int]:
 
 
 def own_process() -> None:
-    """Lets `at_once` take effect: this process is one node and nothing else."""
+    """Let `at_once` take effect: this process is one node and nothing else."""
     global _own_process
     _own_process = True
 
 
 @contextlib.contextmanager
 def at_once() -> Iterator[None]:
-    """Lets the signals that end it end the process at once, whatever it is doing."""
+    """Let the signals that end it end the process at once, whatever it is doing."""
     global _within
     if not _own_process or _within:
         yield

@@ -44,7 +44,7 @@ class StandingExecutor(SingleThreadedExecutor):
         self._handed_over_s = 0.0
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Waits for an event and handles it; raises ExternalShutdownException, see rclpy."""
+        """Wait for an event and handle it; raises ExternalShutdownException, see rclpy."""
         received: list[Received] = []
         try:
             received = self._wait(timeout_sec) if self.stands else []
@@ -158,7 +158,7 @@ class StandingExecutor(SingleThreadedExecutor):
             self._entities = None
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Releases all entities; see rclpy."""
+        """Release all entities; see rclpy."""
         self._release()
         return bool(super().shutdown(timeout_sec))
 
@@ -224,7 +224,7 @@ class _Entities:
         return _take(self._subscriptions)
 
     def asked(self) -> list[Callable[[], object]]:
-        """Takes requests to services and answers to clients; returns how each is handled."""
+        """Take requests to services and answers to clients; return how each is handled."""
         ready = self._wait_set.get_ready_entities
         found = list[Callable[[], object]]()
         for service in _known(self._services, ready("service")):

@@ -93,11 +93,11 @@ class HeldActionServer(ActionServer):
         )
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
-        """Holds an accepted goal, which counts as executing from now on; see rclpy."""
+        """Hold an accepted goal, which counts as executing from now on; see rclpy."""
         self._begin(goal_handle)
 
     def finish(self, goal_handle: Any, end: str, result: Any) -> None:
-        """Ends a goal, by the name of a method of it, with a result."""
+        """End a goal, by the name of a method of it, with a result."""
         getattr(goal_handle, end)()
         super().notify_execute(goal_handle, lambda _: result)
 
@@ -193,7 +193,7 @@ class PathActions:
         self._servers[name] = HeldActionServer(self._node, kind, name, self._open, take)
 
     def close(self) -> None:
-        """Ends all goals and topics."""
+        """End all goals and topics."""
         self.stop("the node is being cleaned up")
         while self._undo:
             self._undo.pop()()
@@ -308,7 +308,7 @@ class PathActions:
         return self._begin(goal, frame, way, checks)
 
     def _way(self, frame: str, robot: Array, end: Array) -> Array:
-        """Returns the way (P, 3) on the map, if there is one; else straight."""
+        """Return the way (P, 3) on the map, if there is one; else straight."""
         points = np.stack([robot[:2], end[:2]])
         if self._map is not None and frame in ("", self._map[0]):
             points = route(
@@ -373,7 +373,7 @@ class PathActions:
     # A goal is driven to.
 
     def tick(self) -> bool:
-        """Ends a goal that was cancelled, or whose data are silent; True if one was ended."""
+        """End a goal that was cancelled, or whose data are silent; True if one was ended."""
         run = self._run
         if run is None:
             return False
@@ -399,7 +399,7 @@ class PathActions:
         return False
 
     def twist(self) -> Array:
-        """Returns the twist (3,) towards the end of the path, and reports; ends the goal there."""
+        """Return the twist (3,) towards the end of the path, and report; end the goal there."""
         run = self._run
         assert run is not None  # noqa: S101
         try:
@@ -476,7 +476,7 @@ class PathActions:
         run.goal.handle.publish_feedback(feedback)
 
     def stop(self, why: str) -> None:
-        """Aborts the goal, if there is one."""
+        """Abort the goal, if there is one."""
         run = self._run
         self._run = None
         if run is not None:
@@ -495,13 +495,13 @@ class PathActions:
 
 
 def duration_to_ros(seconds: float) -> Duration:
-    """Returns seconds as a Duration."""
+    """Return seconds as a Duration."""
     whole = int(seconds)
     return Duration(sec=whole, nanosec=int((seconds - whole) * NS_PER_S))
 
 
 def result_of(kind: Any, code: str, sentence: str = "") -> Any:
-    """Returns an action's result; distributions differ in what it tells: nothing, code, or both."""
+    """Return an action's result; distributions differ in what it tells: nothing, code, or both."""
     result = kind.Result()
     if hasattr(result, "error_code"):
         result.error_code = getattr(

@@ -70,7 +70,7 @@ class GateLog:
         self._names: list[str] = []
 
     def note(self, entry: Entry) -> None:
-        """Accounts for a decision."""
+        """Account for a decision."""
         self._record(entry)
         decision = entry.decision
         cause = entry.decision.cause
@@ -96,7 +96,7 @@ class GateLog:
             self._burst.clear()
 
     def _record(self, entry: Entry) -> None:
-        """Sends an entry to the writer, and now and then the state from which it follows."""
+        """Send an entry to the writer, and now and then the state from which it follows."""
         passed = entry.now - self._state_s
         if (
             self._writer.needs_state
@@ -110,12 +110,12 @@ class GateLog:
         self._entries += 1
 
     def refuse(self, reason: str) -> None:
-        """Counts an unused input, by the part of the reason before the colon, and logs it."""
+        """Count an unused input, by the part of the reason before the colon, and log it."""
         if (more := self._counted(f"refused, {reason.partition(':')[0]}")) is not None:
             self._logger.warning(f"refused: {reason}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
-        """Counts and logs a decision that is not finite, which must never happen."""
+        """Count and log a decision that is not finite, which must never happen."""
         if (more := self._counted("not finite, sent as zero")) is not None:
             then = f"zero is sent, and the e-stop is pressed{more}"
             self._logger.error(f"decided on {list(twist)}, which is not finite: {then}")
@@ -126,7 +126,7 @@ class GateLog:
         return self._due(kind)
 
     def _due(self, kind: str, certainly: bool = False) -> str | None:
-        """Returns what to append to a line; None if one of its kind was logged a moment ago."""
+        """Return what to append to a line; None if one of its kind was logged a moment ago."""
         said, wait_s = self._said.get(kind, (float("-inf"), LINE_S))
         if not certainly and self._now - said < wait_s:
             return None
@@ -164,7 +164,7 @@ class GateLog:
         self._logger.error(f"the black box could not be written: {reason}")
 
     def finding(self, state: GateState) -> Condition:
-        """Returns the finding for `/diagnostics`."""
+        """Return the finding for `/diagnostics`."""
         for failure in self._writer.failures():
             self._failed(failure)
         facts: dict[str, object] = {
@@ -176,7 +176,7 @@ class GateLog:
         return Condition(message, self._cause is not None, facts, self._hardware)
 
     def close(self) -> None:
-        """Waits briefly for files that are being written; none is left incomplete."""
+        """Wait briefly for files that are being written; none is left incomplete."""
         for failure in self._writer.close(CLOSING_S):
             self._failed(failure)
 
@@ -201,22 +201,22 @@ class BoxWriter:
         self._close_pipes()  # it ends when they are closed
 
     def state(self, now: float, line: bytes) -> None:
-        """Sends the gate's state at a time [s], from which the next entries follow."""
+        """Send the gate's state at a time [s], from which the next entries follow."""
         self.needs_state = False
         self._send(STATE, f"{now} ".encode() + line)
 
     def entry(self, line: bytes) -> None:
-        """Sends an entry."""
+        """Send an entry."""
         self._send(ENTRY, line)
 
     def write(self, path: Path, own: Sequence[str]) -> None:
-        """Lets what was sent last be written; `own` are the names of this gate's files."""
+        """Let what was sent last be written; `own` are the names of this gate's files."""
         self._orders[str(path)] = time.monotonic()
         order = {"path": str(path), "own": list(own)}
         self._send(WRITE, json.dumps(order).encode() + b"\n")
 
     def failures(self) -> list[str]:
-        """Returns the failures since the last call; starts a new writer if there is none."""
+        """Return the failures since the last call; start a new writer if there is none."""
         self._flush()
         self._hear()
         now = time.monotonic()
@@ -230,7 +230,7 @@ class BoxWriter:
         return failed
 
     def close(self, seconds: float) -> list[str]:
-        """Waits for files that are being written, then lets the writer give up; see `failures`."""
+        """Wait for files that are being written, then let the writer give up; see `failures`."""
         self._finish(seconds)
         if self._process.poll() is None:
             self._process.terminate()
@@ -289,7 +289,7 @@ class BoxWriter:
             self._failed.append(f"its writer can't be started ({error.strerror})")
 
     def _start(self) -> None:
-        """Starts the writer; it is executed, not forked, as DDS has threads in this process."""
+        """Start the writer; it is executed, not forked, as DDS has threads in this process."""
         self._close_pipes()
         self._backlog = bytearray()
         self._answers = b""

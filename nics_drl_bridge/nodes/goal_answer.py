@@ -17,12 +17,12 @@ class GoalAnswer:
     told: str  # where the goal is, or why it was refused
 
     def to_facts(self) -> dict[str, object]:
-        """Returns the answer as facts of a node's diagnostics."""
+        """Return the answer as facts of a node's diagnostics."""
         return {STAMP: self.stamp_ns, TAKEN: self.taken, TOLD: self.told}
 
 
 def answer_from_values(values: Mapping[str, str]) -> GoalAnswer | None:
-    """Returns the answer among the values of a node's diagnostics, or None."""
+    """Return the answer among the values of a node's diagnostics, or None."""
     stamp = values.get(STAMP, "")
     if not stamp.isdecimal():
         return None

@@ -40,7 +40,7 @@ class GoalFrames:
                 )
 
     def close(self) -> None:
-        """Ends the subscriptions."""
+        """End the subscriptions."""
         while self._heard:
             self._node.destroy_subscription(self._heard.pop())
 
@@ -60,7 +60,7 @@ class GoalFrames:
         return str(self._node.get_parameter("map_frame").value)
 
     def robot_in(self, frame: str) -> Array | None:
-        """Returns the robot's pose (3,) in the map or `odom`; None while it is unknown."""
+        """Return the robot's pose (3,) in the map or `odom`; None while it is unknown."""
         reported = self._topics.in_odom()
         if reported is None or frame == self._topics.frames[0].strip("/"):
             return reported
@@ -71,7 +71,7 @@ class GoalFrames:
         return self._topics.view().pose if self._topics.located else None
 
     def in_map(self, goal: PoseStamped) -> Array:
-        """Returns x, y (2,) of a goal in the map, as the robot stands now. Raises ConfigError."""
+        """Return x, y (2,) of a goal in the map, as the robot stands now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
         if not np.isfinite(place).all():
             told = f"({place[0]:g}, {place[1]:g})"
@@ -95,7 +95,7 @@ class GoalFrames:
         return there[:2]
 
     def fixed(self, frame: str, places: Array) -> tuple[str, Array]:
-        """Returns poses (..., 3) of a frame in the map or `odom`, and which of them it is.
+        """Return poses (..., 3) of a frame in the map or `odom`, and which of them it is.
 
         Those of the robot, or of what is mounted on it, are in `odom`, as the robot stands now.
         Raises ConfigError for a frame that is not known, or as long as the robot's place is not.

@@ -48,7 +48,7 @@ __all__ = [
 
 
 def describe(launch: Launch) -> Any:
-    """Returns the launch description of arguments and of the nodes that they ask for."""
+    """Return the launch description of arguments and of the nodes that they ask for."""
 
     def start(context: Any) -> list[Any]:
         names = [argument.name for argument in launch.arguments]
@@ -60,7 +60,7 @@ def describe(launch: Launch) -> Any:
 
 
 def declaration_of(argument: Argument) -> DeclareLaunchArgument:
-    """Returns an argument as `launch` declares it."""
+    """Return an argument as `launch` declares it."""
     default: Any = argument.default
     if argument.same_as:
         default = LaunchConfiguration(argument.same_as)
@@ -73,7 +73,7 @@ def declaration_of(argument: Argument) -> DeclareLaunchArgument:
 
 
 def action_of(node: NodeStart) -> Node:
-    """Returns a node as `launch` starts it."""
+    """Return a node as `launch` starts it."""
     files = [node.params_file] if node.params_file else []
     parameters = {name: parameter_of(value) for name, value in node.parameters.items()}
     return Node(
@@ -89,7 +89,7 @@ def action_of(node: NodeStart) -> Node:
 
 
 def parameter_of(value: Any) -> Any:
-    """Returns a parameter; a string stays a string, even if it looks like a number."""
+    """Return a parameter; a string stays a string, even if it looks like a number."""
     if isinstance(value, str):
         return ParameterValue(TextSubstitution(text=value), value_type=str)
     if isinstance(value, list) and all(isinstance(each, str) for each in value):

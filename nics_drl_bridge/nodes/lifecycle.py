@@ -41,7 +41,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.add_on_set_parameters_callback(self._check_fixed)
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
-        """Creates a publisher that is silent unless the node is active, until clean-up."""
+        """Create a publisher that is silent unless the node is active, until clean-up."""
         profile = copied(qos)
         options = self.publisher_options(topic, profile)
         made = super().create_lifecycle_publisher(kind, topic, profile, **options)
@@ -49,16 +49,16 @@ class ManagedNode(QosWatch, LifecycleNode):
         return made
 
     def configure(self) -> None:
-        """Makes what the parameters request. Raises BridgeError if one can't be used."""
+        """Make what the parameters request. Raises BridgeError if one can't be used."""
 
     def activate(self) -> None:
-        """Begins to act."""
+        """Begin to act."""
 
     def deactivate(self) -> None:
-        """Leaves the robot at rest; publishes nothing afterwards."""
+        """Leave the robot at rest; publish nothing afterwards."""
 
     def start(self) -> None:
-        """Configures and activates the node, if `autostart` is set. Raises BridgeError."""
+        """Configure and activate the node, if `autostart` is set. Raises BridgeError."""
         if not self._autostart:
             self.get_logger().info(
                 "unconfigured: waits for `ros2 lifecycle set` (autostart false)"
@@ -73,7 +73,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         self._starting = False
 
     def stop(self) -> None:
-        """Leaves the robot at rest, from any state."""
+        """Leave the robot at rest, from any state."""
         if self.state == ACTIVE:
             self.deactivate()
 
@@ -87,7 +87,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         return SetParametersResult(successful=not reason, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Configures; a failure leaves it unconfigured."""
+        """Configure; a failure leaves it unconfigured."""
         with at_once():  # to open a policy may compile; nothing has been commanded yet
             done = self._attempt(self.configure, INACTIVE)
         if done == FAILURE:
@@ -110,7 +110,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Leaves the robot at rest, from any state; it can be configured again after an error."""
+        """Leave the robot at rest, from any state; it can be configured again after an error."""
         self.stop()
         return self._attempt(self.undo.close, UNCONFIGURED)
 
@@ -124,7 +124,7 @@ class ManagedNode(QosWatch, LifecycleNode):
     def _attempt(
         self, do: Callable[[], None], reached: str
     ) -> TransitionCallbackReturn:
-        """Does the work of a transition; rclpy itself would not report why one failed."""
+        """Do the work of a transition; rclpy itself would not report why one failed."""
         self._failure = None
         try:
             do()

@@ -50,7 +50,7 @@ LOST_S = 1.0
 
 
 def _exit_at_signals() -> None:
-    """Lets signals end Python like an exception, unless the program handles them itself."""
+    """Let signals end Python like an exception, unless the program handles them itself."""
     for number in ENDING:
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, lambda number, _: sys.exit(128 + number))
@@ -107,14 +107,14 @@ class Link:
             raise
 
     def hears_stamped(self, topic: str, patience_s: float) -> bool:
-        """Waits for who hears commands on a topic; True if stamped ones, or by default."""
+        """Wait for who hears commands on a topic; True if stamped ones, or by default."""
         name = self.node.resolve_topic_name(topic)
         holds(lambda: self.node.count_subscribers(name) > 0, patience_s, POLL_S)
         heard = heard_stamped(self.node, topic)
         return stamped_by_default() if heard is None else heard
 
     def begin(self) -> None:
-        """Starts the executor's thread; call it once all subscriptions exist."""
+        """Start the executor's thread; call it once all subscriptions exist."""
         gc.collect()  # now, as the next one may take a tenth of a second while the robot moves
         given = (self._context, self.node, self._timeout)
         thread = threading.Thread(
@@ -124,7 +124,7 @@ class Link:
         self._resources.thread = thread
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
-        """Publishes linear.x, linear.y, angular.z (3,); BackendError and a zero for NaN or inf."""
+        """Publish linear.x, linear.y, angular.z (3,); BackendError and a zero for NaN or inf."""
         if not all(map(math.isfinite, twist)):
             self.halt()
             fix = "finite, a zero was sent instead; look at what the task's `command` returns."
@@ -136,23 +136,23 @@ class Link:
             self.commands.publish(stamped_twist_to_bytes(twist, stamp_ns, self.frame))
 
     def halt(self) -> None:
-        """Publishes a zero command."""
+        """Publish a zero command."""
         if self._context.ok():
             self._timeout.begin(moving=False)
             self.commands.publish(self._kind())
 
     def halt_if_moving(self) -> None:
-        """Publishes a zero command unless the last one was zero."""
+        """Publish a zero command unless the last one was zero."""
         if self._timeout.moving:
             self.halt()
 
     def check_open(self) -> None:
-        """Raises BackendError if the link is closed."""
+        """Raise BackendError if the link is closed."""
         if not self._closing.alive or not self._context.ok():
             raise BackendError("this backend is closed; make another one.")
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
-        """Calls a service; the executor's thread completes the future. Raises BackendError."""
+        """Call a service; the executor's thread completes the future. Raises BackendError."""
         deadline = time.monotonic() + timeout_s
         # A server that hung for long was dropped, and has to be discovered again.
         holds(client.service_is_ready, timeout_s, POLL_S)
@@ -171,7 +171,7 @@ class Link:
             return bool(self.node.handle.get_count_publishers(self._topic) > 1)
 
     def check_alone(self) -> None:
-        """Raises BackendError with the names of any other publishers of commands."""
+        """Raise BackendError with the names of any other publishers of commands."""
         if not self.others_command():
             return
         topic = self._topic
@@ -190,7 +190,7 @@ class Link:
         patience_s: float,
         advice: str,
     ) -> None:
-        """Waits until all peers are matched. Raises BackendError with what is missing."""
+        """Wait until all peers are matched. Raises BackendError with what is missing."""
         node = self.node
         commands = self.commands
         needed = dict[str, Callable[[], Any]]()
@@ -218,7 +218,7 @@ class Link:
         self.check_alone()
 
     def close(self) -> None:
-        """Publishes a zero command and ends the node."""
+        """Publish a zero command and end the node."""
         self._closing()
         INTERRUPTS.forget(self)
 
@@ -235,7 +235,7 @@ class Interrupts:
         self._before: Any = None
 
     def watch(self, link: Link) -> None:
-        """Halts a link at Ctrl-C from now on, unless the process ignores or handles it itself."""
+        """Halt a link at Ctrl-C from now on, unless the process ignores or handles it itself."""
         self._links.add(link)
         handler = signal.getsignal(signal.SIGINT)
         in_main = threading.current_thread() is threading.main_thread()
@@ -244,7 +244,7 @@ class Interrupts:
             signal.signal(signal.SIGINT, self._interrupt)
 
     def forget(self, link: Link) -> None:
-        """Leaves a link alone, which is closed."""
+        """Leave a link alone, which is closed."""
         self._links.discard(link)
         last = not self._links and signal.getsignal(signal.SIGINT) == self._interrupt
         if last and threading.current_thread() is threading.main_thread():
@@ -318,26 +318,26 @@ class CommandTimeout:
         self.moving = False  # the last command that was sent is none of zero
 
     def begin(self, moving: bool) -> None:
-        """Restarts the timeout; call it before a command is published, zero or not."""
+        """Restart the timeout; call it before a command is published, zero or not."""
         self.moving = moving
         self._due_s = time.monotonic() + self._limit_s if moving else math.inf
 
     def look(self) -> None:
-        """Publishes one zero when the time is over; call it often, from another thread."""
+        """Publish one zero when the time is over; call it often, from another thread."""
         due_s = self._due_s
         if due_s != self._answered_s and time.monotonic() >= due_s:
             self._answered_s = due_s
             self._publisher.publish(self._kind())
 
     def end(self) -> None:
-        """Publishes the last zero, and waits for its delivery."""
+        """Publish the last zero, and wait for its delivery."""
         last_word(self._publisher, self._kind())
 
 
 def identity(
     model: SimulatorModel, world: AnyWorld, randomisation: Randomisation | None
 ) -> dict[str, str]:
-    """Returns the fingerprints of what a simulator simulates; by `none` of no randomisation."""
+    """Return the fingerprints of what a simulator simulates; by `none` of no randomisation."""
     drawn = NO_RANDOMISATION if randomisation is None else randomisation.fingerprint
     return {
         "model": model.fingerprint,
@@ -369,10 +369,10 @@ class EpisodeServices:
         self.clients = [self._reset, self._parameters]
 
     def open(self, timeout_s: float) -> None:
-        """Does nothing: what a simulator runs is checked when an episode begins."""
+        """Do nothing: what a simulator runs is checked when an episode begins."""
 
     def advance(self) -> None:
-        """Does nothing: the world moves when it has a command."""
+        """Do nothing: the world moves when it has a command."""
 
     @property
     def there(self) -> bool:
@@ -380,7 +380,7 @@ class EpisodeServices:
         return all(client.service_is_ready() for client in self.clients)
 
     def repeat(self) -> None:
-        """Requests the present data again, without waiting, unless such a request is pending."""
+        """Request the present data again, without waiting, unless such a request is pending."""
         now = time.monotonic()
         asked = self._repeating
         if asked is not None and not asked.done():
@@ -392,7 +392,7 @@ class EpisodeServices:
             self._asked_s = now
 
     def begin(self, start: Start, timeout_s: float) -> int:
-        """Begins an episode; returns the stamp of its first data [ns]. Raises BridgeError."""
+        """Begin an episode; return the stamp of its first data [ns]. Raises BridgeError."""
         seed = int(start.seed)
         pose = start.pose.ravel().tolist()
         chosen = {

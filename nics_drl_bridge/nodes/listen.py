@@ -31,7 +31,7 @@ ANY_PUBLISHER = profile_of(Offer(100, reliable=False))
 def listen(
     seconds: float, namespace: str = "", domain_id: int | None = None, imu: str = "auto"
 ) -> Facts:
-    """Listens so long [s] from the first message on, awaited for at most 10 s; sends nothing."""
+    """Listen so long [s] from the first message on, awaited for at most 10 s; send nothing."""
     context = open_context([], domain_id)
     node = Node(NAME, context=context, start_parameter_services=False)
     executor = SingleThreadedExecutor(context=context)

@@ -23,7 +23,7 @@ KEPT = 100  # own transforms that are known again when they are heard
 def transform_to_ros(
     parent: str, child: str, pose: ArrayLike, stamp: Any
 ) -> TransformStamped:
-    """Returns a pose (3,) of a child frame in its parent as a transform."""
+    """Return a pose (3,) of a child frame in its parent as a transform."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id, message.header.stamp = parent, stamp
@@ -33,12 +33,12 @@ def transform_to_ros(
 
 
 def transform_from_ros(message: TransformStamped) -> tuple[str, str, Array]:
-    """Returns parent and child of a transform, without slashes, and the child's pose (3,) there."""
+    """Return parent and child of a transform, without slashes, and the child's pose (3,) there."""
     return *messages.get_frames(message), np.array(messages.read_pose(message))
 
 
 def odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
-    """Returns the pose (3,) of `odom` in `map`, from a robot's poses (3,) in both."""
+    """Return the pose (3,) of `odom` in `map`, from a robot's poses (3,) in both."""
     return geometry.compose(in_map, geometry.between(in_odom, np.zeros(3)))
 
 
@@ -64,13 +64,13 @@ class MapToOdom:
         self._subscription = node.create_subscription(*given)
 
     def close(self) -> None:
-        """Ends its topics."""
+        """End its topics."""
         if self._kind is not None:
             self._node.destroy_subscription(self._subscription)
             self._node.destroy_publisher(self._publisher)
 
     def publish(self, odom: Array, stamp_ns: int, frames: tuple[str, str]) -> None:
-        """Publishes the pose (3,) of odom in map at a time [ns], with the frames of both."""
+        """Publish the pose (3,) of odom in map at a time [ns], with the frames of both."""
         self._frames = frames
         if (
             self._kind is None

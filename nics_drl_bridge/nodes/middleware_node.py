@@ -31,7 +31,7 @@ class MiddlewareNode(ManagedNode):
         runner.diagnose(self, "topics", self._look)
 
     def configure(self) -> None:
-        """Opens the model and subscribes."""
+        """Open the model and subscribe."""
         model = open_model(str(self.get_parameter("model").value))
         self._hardware = model.robot.name
         rehearse(model)
@@ -105,7 +105,7 @@ class MiddlewareNode(ManagedNode):
 
 
 def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) -> str:
-    """Returns a sentence about expected topics without usable data; empty if all have some.
+    """Return a sentence about expected topics without usable data; empty if all have some.
 
     `before` are earlier counts of `health.rejected`: what has grown since is refused, not silent.
     """
@@ -131,7 +131,7 @@ def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) 
 
 
 def facts(health: Health) -> dict[str, str]:
-    """Returns the health as keys and values for people."""
+    """Return the health as keys and values for people."""
     found = {}
     for topic, each in health.topics.items():
         found[f"{topic} received"] = str(each.received)

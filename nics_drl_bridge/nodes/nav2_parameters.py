@@ -50,7 +50,7 @@ class ControllerParameters:
             declare_row(node, row)
 
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
-        """Returns the checks of two names, as Nav2's checkers of these plugins make them."""
+        """Return the checks of two names, as Nav2's checkers of these plugins make them."""
         arrives = self._filled(GoalCheck, goal)
         gets_on = self._filled(ProgressCheck, progress)
         kinds = [
@@ -76,7 +76,7 @@ class ControllerParameters:
 
 
 def chosen(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
-    """Returns a plugin by its name, the only one by none; and what is wrong, if it is unknown."""
+    """Return a plugin by its name, the only one by none; and what is wrong, if it is unknown."""
     if not asked and len(known) == 1:
         return known[0], ""
     if asked in known:

@@ -19,7 +19,7 @@ PATIENCE_S = 5.0  # for which a process may take to end
 
 
 def interruptible() -> None:
-    """Lets SIGINT end a process that is about to begin, also below a shell that ignores it.
+    """Let SIGINT end a process that is about to begin, also below a shell that ignores it.
 
     Shells start background jobs so, as in `make test &`, and children inherit it.
     """
@@ -27,7 +27,7 @@ def interruptible() -> None:
 
 
 def _prepared() -> Callable[[], None]:
-    """Returns what a node's process does before it begins: it ends with its parent, on Linux."""
+    """Return what a node's process does before it begins: it ends with its parent, on Linux."""
     if sys.platform != "linux":
         return interruptible
     prctl = ctypes.CDLL(None).prctl
@@ -43,7 +43,7 @@ def _prepared() -> Callable[[], None]:
 
 
 def command_of(node: NodeStart, folder: Path) -> list[str]:
-    """Returns the command line of a node, and writes its parameters to a file in a folder."""
+    """Return the command line of a node, and write its parameters to a file in a folder."""
     place = f"/{node.namespace}/{node.executable}".replace("//", "/")
     # The values of a file for just this node take precedence over those for many.
     nodes = place if node.params_file else "/**"
@@ -68,7 +68,7 @@ def command_of(node: NodeStart, folder: Path) -> list[str]:
 
 
 def program_of(node: NodeStart) -> list[str]:
-    """Returns the words that start a node's program. Raises ConfigError if it is missing."""
+    """Return the words that start a node's program. Raises ConfigError if it is missing."""
     if node.own:
         return [*module_command(f"{PACKAGE}.nodes.start"), node.executable]
     prefix = prefix_of(node.package)
@@ -93,7 +93,7 @@ class ChildProcess:
         environment: Mapping[str, str] | None = None,
         log: Path | None = None,
     ) -> None:
-        """Starts it; its output goes to a file, or where that of this process goes."""
+        """Start it; its output goes to a file, or where that of this process goes."""
         self.name = name
         chosen = dict(environment or {})
         # no modules of the working folder, which may be a model
@@ -116,16 +116,16 @@ class ChildProcess:
         self.pid = self._process.pid
 
     def poll(self) -> int | None:
-        """Returns its exit code, or None while it runs."""
+        """Return its exit code, or None while it runs."""
         return self._process.poll()
 
     def interrupt(self) -> None:
-        """Asks it to end, as Ctrl-C does."""
+        """Ask it to end, as Ctrl-C does."""
         if self.poll() is None:
             self._process.send_signal(signal.SIGINT)
 
     def close(self) -> int:
-        """Ends it: SIGINT, then SIGKILL if it does not react. Returns its exit code."""
+        """End it: SIGINT, then SIGKILL if it does not react. Returns its exit code."""
         self.interrupt()
         try:
             return self._process.wait(PATIENCE_S)

@@ -53,7 +53,7 @@ class _DroppingFile(io.RawIOBase):
 
 
 def ros_arguments(words: Sequence[str]) -> list[str]:
-    """Returns arguments of ROS 2 with which it writes no log file, where the forwarder does.
+    """Return arguments of ROS 2 with which it writes no log file, where the forwarder does.
 
     It leaves that to ROS 2 if the words of the user choose something themselves.
     """
@@ -63,7 +63,7 @@ def ros_arguments(words: Sequence[str]) -> list[str]:
 
 
 def log_file(node: str, words: Sequence[str]) -> str:
-    """Returns the log file of a node, where ROS 2 would write it; empty if the words choose it."""
+    """Return the log file of a node, where ROS 2 would write it; empty if the words choose it."""
     if any(word in FILE_CHOICES for word in words):
         return ""
     home = os.environ.get("ROS_HOME") or os.path.join("~", ".ros")
@@ -73,7 +73,7 @@ def log_file(node: str, words: Sequence[str]) -> str:
 
 
 def forward_output(log: str = "") -> None:
-    """Lets a process of its own write the output of this one, also to a file if it is named.
+    """Let a process of its own write the output of this one, also to a file if it is named.
 
     Call it before threads exist.
     """
@@ -107,7 +107,7 @@ def forward_output(log: str = "") -> None:
 
 
 def finish_output(seconds: float) -> None:
-    """Waits until all output is written, or for some time; nothing can be written afterwards."""
+    """Wait until all output is written, or for some time; nothing can be written afterwards."""
     if _forwarder is None:
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -118,7 +118,7 @@ def finish_output(seconds: float) -> None:
 
 
 def _different_outputs() -> list[int]:
-    """Returns the descriptors of the outputs, once if both are the same, so that order is kept."""
+    """Return the descriptors of the outputs, once if both are the same, so that order is kept."""
     for descriptor in (0, STDOUT, STDERR):
         try:
             os.fstat(descriptor)
@@ -142,7 +142,7 @@ def _start_forwarder(
 
 
 def _lead_into(entrance: int, descriptor: int) -> None:
-    """Replaces an output by the entrance of a pipe."""
+    """Replace an output by the entrance of a pipe."""
     os.set_blocking(entrance, False)
     # not on every system; the usual size will do
     with contextlib.suppress(AttributeError, OSError):

@@ -37,7 +37,7 @@ class Output:
         self._thread.start()
 
     def put(self, line: bytes) -> None:
-        """Adds a line, and drops the oldest ones if too much waits."""
+        """Add a line, and drop the oldest ones if too much waits."""
         with self._changed:
             self._lines.append(line)
             self._bytes += len(line)
@@ -47,13 +47,13 @@ class Output:
             self._changed.notify()
 
     def end(self) -> None:
-        """Tells that no line follows."""
+        """Tell that no line follows."""
         with self._changed:
             self._ended = True
             self._changed.notify()
 
     def join(self, seconds: float) -> None:
-        """Waits until all lines are written, or for some time."""
+        """Wait until all lines are written, or for some time."""
         self._thread.join(seconds)
 
     def _write_lines(self) -> None:
@@ -87,19 +87,19 @@ class Output:
 
 
 def told_of(dropped: int) -> bytes:
-    """Returns the line that tells how many were dropped."""
+    """Return the line that tells how many were dropped."""
     lines = "line was" if dropped == 1 else "lines were"
     return f"({dropped} {lines} dropped here: nobody read this output)\n".encode()
 
 
 def open_log(path: str) -> int:
-    """Opens a file for the log, in a folder that is made if it is missing."""
+    """Open a file for the log, in a folder that is made if it is missing."""
     os.makedirs(os.path.dirname(path), exist_ok=True)
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
 
 
 def copy_lines(source: int, outputs: Sequence[Output]) -> None:
-    """Copies lines from a file descriptor to outputs until its end."""
+    """Copy lines from a file descriptor to outputs until its end."""
     rest = b""
     while chunk := os.read(source, CHUNK_BYTES):
         *lines, rest = (rest + chunk).split(b"\n")
@@ -113,7 +113,7 @@ def copy_lines(source: int, outputs: Sequence[Output]) -> None:
 
 
 def put_line(line: bytes, outputs: Sequence[Output]) -> None:
-    """Adds a line to outputs, of which the first may show colours."""
+    """Add a line to outputs, of which the first may show colours."""
     shown, *others = outputs
     shown.put(line)
     for output in others:
@@ -121,7 +121,7 @@ def put_line(line: bytes, outputs: Sequence[Output]) -> None:
 
 
 def main(log: str, pairs: Sequence[str]) -> None:
-    """Copies between pairs of descriptors, given as `FROM:TO`, until all sources have ended."""
+    """Copy between pairs of descriptors, given as `FROM:TO`, until all sources have ended."""
     logs = [Output(partial(open_log, log))] if log else []
     outputs = [*logs]
     readers = []

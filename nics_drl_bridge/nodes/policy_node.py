@@ -45,7 +45,7 @@ class PolicyNode(ManagedNode):
         runner.diagnose(self, "policy", self._look)
 
     def configure(self) -> None:
-        """Opens model and policy, and subscribes."""
+        """Open model and policy, and subscribe."""
         model = self._model = open_model(str(self.get_parameter("model").value))
         self._open_policy(model)
         self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
@@ -91,11 +91,11 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_timer, timer)
 
     def activate(self) -> None:
-        """Begins with a fresh state of the policy."""
+        """Begin with a fresh state of the policy."""
         begin(self._policy)
 
     def deactivate(self) -> None:
-        """Leaves a zero command behind."""
+        """Leave a zero command behind."""
         self._actions.stop("the node is deactivated")
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 

@@ -32,7 +32,7 @@ POLL_S = 0.005
 
 
 def free_domain_id() -> int:
-    """Returns the environment's domain id (ConfigError if it is none), or a random unused one."""
+    """Return the environment's domain id (ConfigError if it is none), or a random unused one."""
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
         every = range(1, LAST_DOMAIN_ID + 1)
@@ -72,7 +72,7 @@ class NodeProcess(ChildProcess):
         super().__init__(node, command_of(start, folder), chosen, self.log)
 
     def check(self) -> None:
-        """Raises BackendError with the end of its log if the node has ended by itself."""
+        """Raise BackendError with the end of its log if the node has ended by itself."""
         code = self.poll()
         if code is not None:
             lines = (
@@ -113,11 +113,11 @@ class Witness(AbstractContextManager["Witness", None]):
         return np.array(self._poses).reshape(-1, 3)
 
     def sees(self, timeout_s: float) -> bool:
-        """Waits for a first pose; False after the time [s]."""
+        """Wait for a first pose; False after the time [s]."""
         return holds(lambda: self._poses, timeout_s, POLL_S)
 
     def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
-        """Waits until the robot is within `radius` of a goal (2,); False after the time [s]."""
+        """Wait until the robot is within `radius` of a goal (2,); False after the time [s]."""
 
         def there() -> bool:
             newest = self._poses[-1:]
@@ -128,7 +128,7 @@ class Witness(AbstractContextManager["Witness", None]):
         return holds(there, timeout_s, POLL_S)
 
     def arms(self, gate: str, timeout_s: float) -> str:
-        """Arms a gate, asking until it agrees; returns its last reason to refuse, or ''."""
+        """Arm a gate, asking until it agrees; return its last reason to refuse, or ''."""
         answer = self._asked(f"{gate}/arm", timeout_s)
         return "" if answer.success else str(answer.message)
 

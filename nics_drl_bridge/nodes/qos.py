@@ -35,7 +35,7 @@ except ModuleNotFoundError:  # Humble
 
 
 def profile_of(offer: Offer) -> QoSProfile:
-    """Returns an offer, or a request, as a profile."""
+    """Return an offer, or a request, as a profile."""
     reliability = rclpy_qos.ReliabilityPolicy
     durability = rclpy_qos.DurabilityPolicy
     return QoSProfile(
@@ -49,7 +49,7 @@ def profile_of(offer: Offer) -> QoSProfile:
 
 
 def offer_of(profile: QoSProfile) -> Offer:
-    """Returns what a publisher offers, or a subscriber requests."""
+    """Return what a publisher offers, or a subscriber requests."""
     return Offer(
         max(profile.depth, 1),
         profile.reliability != rclpy_qos.ReliabilityPolicy.BEST_EFFORT,
@@ -107,7 +107,7 @@ FLAG = "avoid_ros_namespace_conventions"
 
 
 def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]:
-    """Returns the policies that a user's parameters set for the `end` of a topic, if any.
+    """Return the policies that a user's parameters set for the `end` of a topic, if any.
 
     `end` is `publisher` or `subscription`. Raises ConfigError for a topic whose quality of service
     is fixed, and for a policy or value that does not exist.
@@ -161,13 +161,13 @@ class QosWatch(Node):
     def create_publisher(
         self, kind: Any, topic: str, qos: Any, **options: Any
     ) -> Publisher:
-        """Creates a publisher; see rclpy."""
+        """Create a publisher; see rclpy."""
         profile = copied(qos)
         chosen = self.publisher_options(topic, profile)
         return super().create_publisher(kind, topic, profile, **chosen | options)
 
     def publisher_options(self, topic: str, profile: QoSProfile) -> dict[str, Any]:
-        """Returns the options for a publisher that rclpy makes without `create_publisher`.
+        """Return the options for a publisher that rclpy makes without `create_publisher`.
 
         The profile is changed where a user has overridden it. Raises ConfigError.
         """
@@ -182,7 +182,7 @@ class QosWatch(Node):
     def create_subscription(
         self, kind: Any, topic: str, callback: Any, qos: Any, **options: Any
     ) -> Subscription:
-        """Creates a subscription; see rclpy."""
+        """Create a subscription; see rclpy."""
         profile = copied(qos)
         chosen: dict[str, Any] = {
             "event_callbacks": self._subscription_events(topic, profile)
@@ -201,7 +201,7 @@ class QosWatch(Node):
         qos: Any,
         lost: Callable[[int], None],
     ) -> Subscription:
-        """Creates a raw subscription that reports how many messages the middleware has lost."""
+        """Create a raw subscription that reports how many messages the middleware has lost."""
         events = self._subscription_events(topic, qos)
         events.message_lost = lambda event: lost(event.total_count_change)
         options = {"event_callbacks": events, "raw": True}
@@ -218,7 +218,7 @@ class QosWatch(Node):
         return SubscriptionEventCallbacks(incompatible_qos=warn)
 
     def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
-        """Warns after a moment: a peer's name is known later than its quality of service."""
+        """Warn after a moment: a peer's name is known later than its quality of service."""
         policy = rclpy_qos.qos_policy_name_from_kind(event.last_policy_kind)
         resolved = self.resolve_topic_name(topic)
 
@@ -257,7 +257,7 @@ class QosWatch(Node):
 
 
 def take_waiting(subscription: Subscription) -> list[bytes]:
-    """Takes the messages that wait in the queue of a raw subscription, oldest first."""
+    """Take the messages that wait in the queue of a raw subscription, oldest first."""
     contents: list[bytes] = []
     with subscription.handle:
         while len(contents) < MOST_WAITING:
@@ -269,7 +269,7 @@ def take_waiting(subscription: Subscription) -> list[bytes]:
 
 
 def copied(qos: Any) -> QoSProfile:
-    """Returns a profile of its own: rclpy writes overridden policies into the one it is given."""
+    """Return a profile of its own: rclpy writes overridden policies into the one it is given."""
     return copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
 
 
@@ -279,6 +279,6 @@ def _value(profile: Any, policy: str) -> str:
 
 
 def owner(end: Any) -> str | None:
-    """Returns the full name of an endpoint's node; None until it is discovered."""
+    """Return the full name of an endpoint's node; None until it is discovered."""
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name

@@ -120,7 +120,7 @@ class RealtimeBackend:
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
-        """Begins an episode: by a simulator's service, or when a vehicle stands at the start."""
+        """Begin an episode: by a simulator's service, or when a vehicle stands at the start."""
         self._link.check_open()
         self._link.halt()
         if self._is_vehicle():
@@ -140,7 +140,7 @@ class RealtimeBackend:
         return self._fresh_view()[0]
 
     def present_pose(self) -> Array:
-        """Waits until the robot stands, and returns its pose (3,) in `map`."""
+        """Wait until the robot stands, and return its pose (3,) in `map`."""
         self._link.check_open()
         self._await_start(None)
         with self._topics.lock:
@@ -174,7 +174,7 @@ class RealtimeBackend:
             time.sleep(POLL_S)
 
     def _missing(self, start: Start | None) -> str:
-        """Returns what is missing for an episode, at a start or anywhere; empty for nothing."""
+        """Return what is missing for an episode, at a start or anywhere; empty for nothing."""
         topic, silence_s = self._oldest()
         if math.isinf(silence_s):
             return f"no {topic} yet"
@@ -201,7 +201,7 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
-        """Returns the topic that has been silent for longest, and for how long [s]; inf: for ever.
+        """Return the topic that has been silent for longest, and for how long [s]; inf: for ever.
 
         After a clock jump no datum is left, but when the last one arrived is still known.
         """
@@ -224,7 +224,7 @@ class RealtimeBackend:
         return oldest, silences[oldest]
 
     def _missing_topic(self) -> str | None:
-        """Returns a topic without a datum on the present clock, or None."""
+        """Return a topic without a datum on the present clock, or None."""
         with self._topics.lock:
             there = self._topics.middleware.cache.newest.keys()
             return next(
@@ -233,7 +233,7 @@ class RealtimeBackend:
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command, waits for the end of the period; see `interface.Backend`."""
+        """Publish a command, wait for the end of the period; see `interface.Backend`."""
         self._link.check_open()
         # A command answers the scan of the view that it was computed from, whatever came since.
         self._link.send(self._robot.to_cmd_vel(command), self._scan_ns)
@@ -248,7 +248,7 @@ class RealtimeBackend:
         return self._fresh_view()
 
     def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
-        """Returns the present view; after a clock jump, once all topics have come again."""
+        """Return the present view; after a clock jump, once all topics have come again."""
         limit_s = self._options.stale_after_s
         holds(lambda: self._missing_topic() is None, limit_s, POLL_S)
         with self._topics.lock:
@@ -267,13 +267,13 @@ class RealtimeBackend:
         raise StaleDataError(topic, age_s, limit_s)
 
     def facts(self) -> BackendFacts:
-        """Returns nothing: topics tell all that is known."""
+        """Return nothing: topics tell all that is known."""
         return {}
 
     def halt(self) -> None:
-        """Publishes a zero command."""
+        """Publish a zero command."""
         self._link.halt()
 
     def close(self) -> None:
-        """Publishes a zero command and ends the node."""
+        """Publish a zero command and end the node."""
         self._link.close()

@@ -69,7 +69,7 @@ class DriveParameters:
 
 
 def declare_drive(node: Node) -> DriveParameters:
-    """Declares the parameters of a drive, and reads them. Raises ConfigError."""
+    """Declare the parameters of a drive, and read them. Raises ConfigError."""
     get = {row.name: partial(runner.declare_row, node, row) for row in drive()}
     robot = load_robot(get["robot"]())
     robot.require_cmd_vel()
@@ -103,7 +103,7 @@ class DriveLog:
         return (self.rows["cmd_vel"][-1][0] - self.rows["cmd_vel"][0][0]) / NS_PER_S
 
     def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
-        """Adds a message; returns False if it is not finite, or not newer than the last."""
+        """Add a message; return False if it is not finite, or not newer than the last."""
         rows = self.rows[topic]
         values = np.asarray(values, np.float64)
         if (rows and 0 != header_ns <= rows[-1][1]) or not np.isfinite(values).all():
@@ -112,7 +112,7 @@ class DriveLog:
         return True
 
     def odometry(self, message: Odometry) -> Array | None:
-        """Records an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
+        """Record an odometry; return its pose (3,), or None if it is old, NaN or inf."""
         header = get_stamp(message)
         pose = np.array(read_pose(message))
         if not self.add("odom", header, pose):
@@ -121,11 +121,11 @@ class DriveLog:
         return pose
 
     def joints(self, message: JointState) -> None:
-        """Records the data of the joints."""
+        """Record the data of the joints."""
         self._joints.append(Message(self._now(), message))
 
     def check(self) -> None:
-        """Raises BridgeError if a state is not measured, or stamps run at another rate."""
+        """Raise BridgeError if a state is not measured, or stamps run at another rate."""
         measured = [v.name for v in self._spec.state if v.must_be_measured]
         if self._joints:
             read_joint_streams(
@@ -146,7 +146,7 @@ class DriveLog:
             raise BackendError(f"topic 'odom': {off}; {fix}")
 
     def recording(self) -> Recording:
-        """Returns all streams on their clocks. Raises RecordingError if too little was received."""
+        """Return all streams on their clocks. Raises RecordingError if too little was received."""
         topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
         if len(self.rows["pose"]) >= FEWEST:
             # which determines its noise
@@ -177,7 +177,7 @@ class DriveLog:
 
 
 def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
-    """Returns seconds by stamp per second of receipt, by the least delayed of each half."""
+    """Return seconds by stamp per second of receipt, by the least delayed of each half."""
     heard = receive[-1] - receive[0]
     stamped = header[-1] - header[0]
     if heard <= 0 or stamped <= 0:
@@ -363,7 +363,7 @@ class RecordNode(qos.QosWatch):
         return stamped if self._stamped else stamped.twist
 
     def stop(self) -> None:
-        """Leaves the robot at rest, and saves what was recorded."""
+        """Leave the robot at rest, and save what was recorded."""
         if self.outcome is None:
             self._end(None)
 
@@ -401,7 +401,7 @@ class RecordNode(qos.QosWatch):
 def record(
     given: dict[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
-    """Drives and records until the end, an error or a signal, with parameters beside `args`."""
+    """Drive and record until the end, an error or a signal, with parameters beside `args`."""
     node: RecordNode = runner.run_node(
         partial(RecordNode, given=given), args, "record_node"
     )

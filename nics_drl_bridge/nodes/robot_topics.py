@@ -48,7 +48,7 @@ KINDS_OF_POSE = {
 
 
 def declare_sensors(node: Node, stamped: bool | None = None) -> None:
-    """Declares a robot's sensors but scan and odometry, and the type of its commands, if known."""
+    """Declare a robot's sensors but scan and odometry, and the type of its commands, if known."""
     for row in sensors():
         if row.name == STAMPED and stamped is not None:
             row = row._replace(default=stamped)
@@ -140,7 +140,7 @@ class RobotTopics:
         return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
 
     def _hear_imu(self) -> None:
-        """Subscribes to the gyro, if one is named or the model was made with one."""
+        """Subscribe to the gyro, if one is named or the model was made with one."""
         wanted = str(self._node.get_parameter(IMU).value)
         topics = list_imu_topics(wanted, self._model.gyro)
         self._imu_topic = ""  # the first that speaks
@@ -155,13 +155,13 @@ class RobotTopics:
             self.expected_topics = (*self.expected_topics, wanted)
 
     def close(self) -> None:
-        """Ends the subscriptions."""
+        """End the subscriptions."""
         self._commands.close()
         while self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop())
 
     def restart(self) -> None:
-        """Clears all state; the next odometry starts anew."""
+        """Clear all state; the next odometry starts anew."""
         self._started = False
         self._since_ns = 0
         self._placed = None
@@ -169,17 +169,17 @@ class RobotTopics:
         self.middleware.reset(0, np.zeros(3))
 
     def begin(self, stamp_ns: int, pose: Array) -> None:
-        """Clears all state before a stamp [ns], at which the robot stands at a pose (3,)."""
+        """Clear all state before a stamp [ns], at which the robot stands at a pose (3,)."""
         self._started = True
         self._since_ns = stamp_ns
         self.middleware.reset(stamp_ns, pose)
 
     def place(self, pose: Array) -> None:
-        """Takes the robot to stand at a pose (3,), which thereby defines `map`."""
+        """Take the robot to stand at a pose (3,), which thereby defines `map`."""
         self.middleware.place(pose, START_STD**2 * np.eye(3))
 
     def hear_initial_pose(self) -> None:
-        """Subscribes to `initialpose`, which says where in the map the robot is."""
+        """Subscribe to `initialpose`, which says where in the map the robot is."""
         kind = PoseWithCovarianceStamped
         self._subscribe(INITIAL_POSE, kind, self._take_initial_pose, qos.COMMAND)
 
@@ -208,7 +208,7 @@ class RobotTopics:
         )
 
     def in_odom(self) -> Array | None:
-        """Returns the robot's pose (3,) by odometry at the newest datum; None before any."""
+        """Return the robot's pose (3,) by odometry at the newest datum; None before any."""
         newest = self.middleware.cache.newest.get(measurement.ODOM)
         if newest is None:
             return None
@@ -228,7 +228,7 @@ class RobotTopics:
         return known or measurement.POSE in self.middleware.cache.newest
 
     def view(self) -> RobotView:
-        """Returns the view at the stamp of the newest datum."""
+        """Return the view at the stamp of the newest datum."""
         return self.middleware.view(self.newest_ns)
 
     def _take_scan(self, message: LaserScan) -> None:
@@ -326,7 +326,7 @@ class RobotTopics:
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
-    """Returns facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum.
+    """Return facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum.
 
     And the covariance (3, 3) of the estimated pose.
     """

@@ -58,7 +58,7 @@ SHARED = "model"  # a file sets it for nodes that have no model, too
 def open_context(
     args: Sequence[str] | None = None, domain_id: int | None = None
 ) -> Context:
-    """Returns a new context, local unless the environment sets a range. Raises BackendError."""
+    """Return a new context, local unless the environment sets a range. Raises BackendError."""
 
     def make() -> Context:
         context = Context()
@@ -88,7 +88,7 @@ def open_context(
 
 
 def last_word(publisher: Publisher, message: Any) -> None:
-    """Publishes what has to arrive although the publisher is destroyed next."""
+    """Publish what has to arrive although the publisher is destroyed next."""
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=DELIVERY_S))
 
@@ -98,7 +98,7 @@ def run_node(
     args: Sequence[str] | None = None,
     sole_name: str = "",
 ) -> Any:
-    """Runs a node until a signal (`ENDING`), then stops and destroys it in order; returns it."""
+    """Run a node until a signal (`ENDING`), then stop and destroy it in order; return it."""
     stopping, started = threading.Event(), threading.Event()
 
     def end(*_: Any) -> None:
@@ -151,7 +151,7 @@ def _sentence(error: Exception) -> str:
 
 
 def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
-    """Waits until a condition holds; False if it does not within the time."""
+    """Wait until a condition holds; False if it does not within the time."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
@@ -161,7 +161,7 @@ def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
 
 
 def spin(node: Node, stopping: threading.Event) -> None:
-    """Spins a node until it is to stop, or its context has been shut down."""
+    """Spin a node until it is to stop, or its context has been shut down."""
     executor = StandingExecutor(node.context)
     executor.add_node(node)
     with contextlib.suppress(ExternalShutdownException):
@@ -172,7 +172,7 @@ def spin(node: Node, stopping: threading.Event) -> None:
 
 @contextlib.contextmanager
 def sole(context: Context, name: str) -> Iterator[None]:
-    """Ensures a single instance while a node runs; BackendError if another is running."""
+    """Ensure a single instance while a node runs; BackendError if another is running."""
     # The probe resolves its name as the node will.
     probe = Node(
         name, context=context, start_parameter_services=False, enable_rosout=False
@@ -223,14 +223,14 @@ def _lives(probe: Node, whole: str) -> bool:
 
 
 def steadily(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
-    """Calls at a period of the steady clock, also while the time of the robot stands still."""
+    """Call at a period of the steady clock, also while the time of the robot stands still."""
     return node.create_timer(
         period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME)
     )
 
 
 def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
-    """Offers a Trigger service whose answer is success and message."""
+    """Offer a Trigger service whose answer is success and message."""
 
     def reply(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = answer()
@@ -240,14 +240,14 @@ def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None
 
 
 def declare_model(node: Node) -> SimulatorModel:
-    """Declares the parameter `model`, and opens it; ConfigError if `cmd_vel` can't drive it."""
+    """Declare the parameter `model`, and open it; ConfigError if `cmd_vel` can't drive it."""
     model = open_model(str(declare_row(node, MODEL)))
     model.robot.require_cmd_vel()
     return model
 
 
 def declare_row(node: Node, row: Row) -> Any:
-    """Declares a parameter unless the node has it, and returns its value."""
+    """Declare a parameter unless the node has it, and return its value."""
     if node.has_parameter(row.name):
         return node.get_parameter(row.name).value
     return declare(node, row.name, row.default, row.about, row.span, row.fixed)
@@ -261,7 +261,7 @@ def declare(
     span: tuple[float, float] | None = None,
     read_only: bool = False,
 ) -> Any:
-    """Declares a parameter of the default's type, and returns its value, which lies in a span."""
+    """Declare a parameter of the default's type, and return its value, which lies in a span."""
     # a managed node: from configure to cleanup
     if read_only and hasattr(node, "fixed"):
         node.fixed.add(name)
@@ -285,13 +285,13 @@ def declare(
 
 
 def given_values(node: Node) -> dict[str, Parameter]:
-    """Returns the node's own dictionary of initial values, to which rclpy has no public access."""
+    """Return the node's own dictionary of initial values, to which rclpy has no public access."""
     found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
     return found
 
 
 def unknown(node: Node) -> list[str]:
-    """Returns a sentence for each value whose parameter the node does not have."""
+    """Return a sentence for each value whose parameter the node does not have."""
     known = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
     ignores = getattr(node, "ignores", lambda _: False)
     sentences = [
@@ -305,7 +305,7 @@ def unknown(node: Node) -> list[str]:
 
 
 def unused_overrides(node: Node) -> list[str]:
-    """Returns a sentence for each quality of service that is given for a topic without such an end.
+    """Return a sentence for each quality of service that is given for a topic without such an end.
 
     A managed node that is not configured has no topics yet.
     """
@@ -333,7 +333,7 @@ class Condition(NamedTuple):
 
 
 def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
-    """Publishes a node's finding about itself, which `look` returns, once a second."""
+    """Publish a node's finding about itself, which `look` returns, once a second."""
     topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
     name = f"{node.get_fully_qualified_name()}: {part}"
 

@@ -72,7 +72,7 @@ class Outbox:
     def send(
         self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]
     ) -> None:
-        """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
+        """Publish a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
         delay, jitter = late
         if jitter:
             delay += int(self._random.integers(jitter + 1))
@@ -85,13 +85,13 @@ class Outbox:
         heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
 
     def flush(self, now_ns: int) -> None:
-        """Publishes what is due."""
+        """Publish what is due."""
         while self._waiting and self._waiting[0][0] <= now_ns:
             _, _, publisher, content = heapq.heappop(self._waiting)
             publisher.publish(content)
 
     def drop(self, publishers: Collection[Publisher]) -> None:
-        """Drops what waits for publishers that are about to end."""
+        """Drop what waits for publishers that are about to end."""
         self._waiting = [
             waiting for waiting in self._waiting if waiting[2] not in publishers
         ]
@@ -100,7 +100,7 @@ class Outbox:
             self._latest.pop(publisher, None)
 
     def clear(self) -> None:
-        """Drops the waiting messages: they are from an episode that is over."""
+        """Drop the waiting messages: they are from an episode that is over."""
         self._waiting.clear()
         self._latest.clear()
 
@@ -156,13 +156,13 @@ class RobotPort:
         self._locates = bool(node.get_parameter("publish_map_to_odom").value)
 
     def close(self) -> None:
-        """Ends its topics."""
+        """End its topics."""
         self._outbox.drop(self._publishers)
         for each in self._publishers:
             self._node.destroy_publisher(each)
 
     def mounts(self) -> list[TransformStamped]:
-        """Returns the transforms base_link -> laser, to each further sensor, and footprint."""
+        """Return the transforms base_link -> laser, to each further sensor, and footprint."""
         mounted = [(self.frames.laser, self._model.lidar.mount)]
         mounted += [(frame, sensor.mount) for sensor, frame, _ in self._sensors]
         if self.frames.footprint:
@@ -173,7 +173,7 @@ class RobotPort:
         ]
 
     def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
-        """Returns the transforms odom -> base_link, and map -> odom if requested."""
+        """Return the transforms odom -> base_link, and map -> odom if requested."""
         frames = self.frames
         moving = [transform_to_ros(frames.odom, frames.base, sensed.odom, now)]
         if self._locates:
@@ -182,7 +182,7 @@ class RobotPort:
         return moving
 
     def publish_odometry(self, sensed: Sensed, now_ns: int) -> None:
-        """Publishes odometry, and joints and true pose if they have subscribers."""
+        """Publish odometry, and joints and true pose if they have subscribers."""
         odometry = self._odom.write(
             now_ns, sensed.odom, sensed.twist, sensed.covariance
         )
@@ -196,7 +196,7 @@ class RobotPort:
             )
 
     def publish_scan(self, sensed: Sensed, now_ns: int) -> None:
-        """Publishes the scan, stamped with the time of beam 0, and readings of further sensors."""
+        """Publish the scan, stamped with the time of beam 0, and readings of further sensors."""
         ranges = to_device(sensed.ranges, self._model.lidar)
         self._send_scan(
             self._scans, self._scan.write(now_ns - self._sweep_ns, ranges), now_ns
@@ -238,7 +238,7 @@ class CommandInlet:
             self.heard.append(node.create_subscription(*given))
 
     def close(self) -> None:
-        """Listens no more."""
+        """Listen no more."""
         for each in self.heard:
             self._node.destroy_subscription(each)
 
@@ -283,7 +283,7 @@ class CommandInlet:
         )
 
     def watch(self) -> None:
-        """Warns once of each node that publishes the other type, which is never received."""
+        """Warn once of each node that publishes the other type, which is never received."""
         self._types.look(self._kind)
 
 
@@ -321,7 +321,7 @@ class DeviceNode(qos.QosWatch):
         self.begin()
 
     def use_world(self, world: AnyWorld) -> None:
-        """Simulates a world with the robots that it was started with; `begin` an episode next."""
+        """Simulate a world with the robots that it was started with; `begin` an episode next."""
         simulator = self.make_simulator(world, len(self._names))
         self.world, self.device = (
             world,
@@ -333,11 +333,11 @@ class DeviceNode(qos.QosWatch):
         self._size(range(len(self._names)))
 
     def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:
-        """Makes a simulator of a world for M robots. Raises ConfigError."""
+        """Make a simulator of a world for M robots. Raises ConfigError."""
         return self._make(self, self.model, world, robots)
 
     def _size(self, kept: Sequence[int]) -> None:
-        """Keeps what was heard by some robots, and makes room for those beyond them."""
+        """Keep what was heard by some robots, and make room for those beyond them."""
         count = self.device.robots
         command_ns_before = self._command_ns
         heard_before = self._heard
@@ -398,13 +398,13 @@ class DeviceNode(qos.QosWatch):
         self._ports.append(port)
 
     def add_robot(self, namespace: str) -> None:
-        """Opens the topics of a robot that the device has now, its last one."""
+        """Open the topics of a robot that the device has now, its last one."""
         self._open_robot(namespace)
         self._size(range(self.device.robots - 1))
         self._publish_mounts()
 
     def reopen_robots(self) -> None:
-        """Opens the topics of the robots that it was started with, and of no other."""
+        """Open the topics of the robots that it was started with, and of no other."""
         self.remove_robots(range(len(self._ports)))
         for name in self._names:
             self._open_robot(name)
@@ -412,7 +412,7 @@ class DeviceNode(qos.QosWatch):
         self._publish_mounts()
 
     def remove_robots(self, gone: Sequence[int]) -> None:
-        """Closes the topics of robots that the device has no more."""
+        """Close the topics of robots that the device has no more."""
         kept = [k for k in range(len(self._ports)) if k not in gone]
         for k in gone:
             self._ports[k].close()
@@ -529,7 +529,7 @@ class DeviceNode(qos.QosWatch):
         self._outbox.flush(max(self.now_ns, self._real_time.time_at(steady_ns)))
 
     def _on_clock(self) -> None:
-        """Tells the time between two steps, which may be too far apart for timers by `/clock`."""
+        """Tell the time between two steps, which may be too far apart for timers by `/clock`."""
         if self.paused:
             return
         time_ns = self._real_time.time_at(time.monotonic_ns())
@@ -548,7 +548,7 @@ class DeviceNode(qos.QosWatch):
             self.step()
 
     def advance(self) -> None:
-        """Moves the world by one step, and publishes what is due."""
+        """Move the world by one step, and publish what is due."""
         if not self._time.lockstep:  # those that have been silent stop
             self.device.commands[
                 self.now_ns - self._command_ns > self._timeout_ns()
@@ -559,7 +559,7 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def begin(self, rewind: bool = False) -> None:
-        """Begins the episode of the parameters, with time at its start if it is to be rewound."""
+        """Begin the episode of the parameters, with time at its start if it is to be rewound."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
@@ -576,7 +576,7 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def rewind(self) -> None:
-        """Puts the time back to its start, while everything stays where it is."""
+        """Put the time back to its start, while everything stays where it is."""
         # commands stay as old as they are
         self._command_ns += self._first_ns - self.now_ns
         self.now_ns = self._first_ns
@@ -587,12 +587,12 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def step(self) -> None:
-        """Moves the world by one step, and publishes all that is due; also while it is paused."""
+        """Move the world by one step, and publish all that is due; also while it is paused."""
         self.advance()
         self._outbox.flush(self.now_ns)
 
     def pause(self, paused: bool) -> None:
-        """Holds time, or lets it go on."""
+        """Hold time, or let it go on."""
         self.paused = paused
         if not paused:
             self._go_on()
@@ -659,7 +659,7 @@ class DeviceNode(qos.QosWatch):
 
 
 def declare_renderer(node: Node, default: Renderer) -> Renderer:
-    """Declares the parameter `renderer`, and returns its value."""
+    """Declare the parameter `renderer`, and return its value."""
     runner.declare_row(node, parameters.renderer(default))
     return cast(Renderer, device_parameters.choice(node, "renderer", RENDERERS))
 
@@ -667,7 +667,7 @@ def declare_renderer(node: Node, default: Renderer) -> Renderer:
 def fast_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> FastSimulator:
-    """Makes the fast simulator, with the lidar that the parameter `renderer` names."""
+    """Make the fast simulator, with the lidar that the parameter `renderer` names."""
     renderer = declare_renderer(node, "baked")
     tell = node.get_logger().warning
     drawn = device_parameters.randomisation(node)
@@ -676,7 +676,7 @@ def fast_simulator(
 
 
 def simulator_node(context: Context) -> DeviceNode:
-    """Makes the node `simulator_node`; see `DeviceNode`."""
+    """Make the node `simulator_node`; see `DeviceNode`."""
     return DeviceNode("simulator_node", context, fast_simulator)
 
 

@@ -20,7 +20,7 @@ class Sources:
         self._tells_publisher = True
 
     def name_of(self, info: Mapping[str, Any]) -> str:
-        """Returns the publisher of a message in words; empty if the middleware does not tell it."""
+        """Return the publisher of a message in words; empty if the middleware does not tell it."""
         publisher = info.get("publisher_gid")
         if not publisher:
             self._tells_publisher = False
@@ -31,7 +31,7 @@ class Sources:
         return self._names[gid]
 
     def count_publishers(self) -> None:
-        """Looks at the graph for the number of publishers, where messages do not tell theirs."""
+        """Look at the graph for the number of publishers, where messages do not tell theirs."""
         if not self._tells_publisher:
             self.publishers = max(1, self._node.count_publishers(self._topic))
 

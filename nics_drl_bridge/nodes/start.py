@@ -13,7 +13,7 @@ EXIT_BAD_INPUT = 2
 
 
 def start(node: str, args: list[str] | None = None) -> None:
-    """Runs a node by its name and ends the process; what can't be used is one sentence, and 2."""
+    """Run a node by its name and end the process; what can't be used is one sentence, and 2."""
     from nics_drl_bridge.nodes import ending, output, usage
 
     for number in ending.ending_signals():  # to import the node takes seconds

@@ -111,19 +111,19 @@ class Setup:
             ]
 
     def __getitem__(self, name: str) -> str:
-        """Returns an argument; empty if it was left so, or is none of this launch."""
+        """Return an argument; empty if it was left so, or is none of this launch."""
         return self.values.get(name, "")
 
     def text(self, name: str) -> str | None:
-        """Returns an argument, or None if it was left empty."""
+        """Return an argument, or None if it was left empty."""
         return self[name] or None
 
     def flag(self, name: str) -> bool | None:
-        """Returns an argument that is true or false, or None if it was left empty."""
+        """Return an argument that is true or false, or None if it was left empty."""
         return self[name] == "true" if self[name] else None
 
     def _of_file(self, name: str, node: str) -> Any:
-        """Returns what the file of parameters says of one, for a node in any namespace."""
+        """Return what the file of parameters says of one, for a node in any namespace."""
         found = None
         for key in ("/**", f"/**/{node}", node, f"/{node}") if node else ("/**",):
             found = (
@@ -132,7 +132,7 @@ class Setup:
         return found
 
     def limits(self) -> str:
-        """Returns the gate's limits; if empty and a model was given, its shipped ones, if any."""
+        """Return the gate's limits; if empty and a model was given, its shipped ones, if any."""
         if self["limits"] or not self["model"]:
             return self["limits"]
         robot = self.model if self._opened is None else self._opened.robot.name
@@ -143,12 +143,12 @@ class Setup:
         )
 
     def frame(self, node: str, robot: Robot) -> str | None:
-        """Returns the frame of a robot of a fleet; None for one robot, whose file names it."""
+        """Return the frame of a robot of a fleet; None for one robot, whose file names it."""
         base = self._of_file(BASE_FRAME.name, node) or BASE_FRAME.default
         return f"{robot.frames}{base}" if robot.frames else None
 
     def description(self) -> str:
-        """Returns the URDF of the robot, with the frames that the file of parameters names."""
+        """Return the URDF of the robot, with the frames that the file of parameters names."""
         base = str(self._of_file(BASE_FRAME.name, self.simulator) or BASE_FRAME.default)
         laser = str(self._of_file("laser_frame", self.simulator) or "")
         shipped = base == BASE_FRAME.default and laser in ("", SHIPPED_LASER)
@@ -171,7 +171,7 @@ class Setup:
         arguments: Sequence[str] = (),
         remappings: Sequence[tuple[str, str]] = (),
     ) -> NodeStart:
-        """Returns a node with the parameters that are given; those that are None are left out."""
+        """Return a node with the parameters that are given; those that are None are left out."""
         # As in Nav2, transforms stay in a namespace; those of a fleet, and its map, in that of all.
         alone = robot.transforms == robot.namespace
         place = "" if alone else f"/{robot.transforms}/".replace("//", "/")
@@ -206,13 +206,13 @@ class Launch:
     simulated: bool = False
 
     def nodes(self, given: Values) -> list[NodeStart]:
-        """Returns the nodes for the arguments that are given. Raises BridgeError."""
+        """Return the nodes for the arguments that are given. Raises BridgeError."""
         setup = Setup(complete(self.arguments, given))
         return [node for part in self.parts for node in part(setup)]
 
 
 def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
-    """Returns the values of all arguments. Raises ConfigError for an unknown name or choice."""
+    """Return the values of all arguments. Raises ConfigError for an unknown name or choice."""
     known = {argument.name for argument in arguments}
     for name in given:
         if name not in known:
@@ -229,21 +229,21 @@ def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
 
 
 def opened(model: str) -> Any:
-    """Returns an opened model; it takes seconds, so only what is not shipped is opened."""
+    """Return an opened model; it takes seconds, so only what is not shipped is opened."""
     from nics_drl_bridge.generator import open_model
 
     return open_model(model)
 
 
 def flag_of(name: str, given: str) -> str:
-    """Returns `true` or `false` of an argument, or nothing if it was left empty. ConfigError."""
+    """Return `true` or `false` of an argument, or nothing if it was left empty. ConfigError."""
     if given.lower() not in FLAG_WORDS:  # refused here, before any node is started
         raise ConfigError(f"launch argument {name!r} is {given!r}; give true or false.")
     return FLAG_WORDS[given.lower()]
 
 
 def names_of(robots: Any) -> tuple[str, ...]:
-    """Returns the namespaces of a fleet by a count or their list; none for one robot."""
+    """Return the namespaces of a fleet by a count or their list; none for one robot."""
     if isinstance(robots, list):
         words = [str(each) for each in robots]
     else:
@@ -263,7 +263,7 @@ def names_of(robots: Any) -> tuple[str, ...]:
 
 
 def numbers_of(start: str) -> list[float] | None:
-    """Returns the numbers x, y, heading of each robot; None if it was left empty. ConfigError."""
+    """Return the numbers x, y, heading of each robot; None if it was left empty. ConfigError."""
     words = re.findall(r"[^\s,\[\]]+", start)
     try:
         found = [float(word) for word in words]
@@ -278,7 +278,7 @@ def numbers_of(start: str) -> list[float] | None:
 
 
 def simulator(setup: Setup) -> Iterator[NodeStart]:
-    """Yields the simulator of all robots."""
+    """Yield the simulator of all robots."""
     robots: Any = None
     if setup.fleet:
         robots = list(setup.fleet)
@@ -296,7 +296,7 @@ def simulator(setup: Setup) -> Iterator[NodeStart]:
 
 
 def bridge(setup: Setup) -> Iterator[NodeStart]:
-    """Yields gate, middleware and policy of each robot."""
+    """Yield gate, middleware and policy of each robot."""
     shared = {
         "model": setup.text("model"),
         STAMPED: setup.flag("stamped"),
@@ -321,7 +321,7 @@ def bridge(setup: Setup) -> Iterator[NodeStart]:
 
 
 def description(setup: Setup) -> Iterator[NodeStart]:
-    """Yields robot_state_publisher of each robot, and RViz, where they are wanted."""
+    """Yield robot_state_publisher of each robot, and RViz, where they are wanted."""
     timed = {"use_sim_time": setup.flag("use_sim_time")}
     drawn = setup.description()
     if setup.flag("use_robot_state_pub"):
@@ -341,7 +341,7 @@ def description(setup: Setup) -> Iterator[NodeStart]:
 
 
 def common(use_sim_time: str) -> list[Argument]:
-    """Returns the arguments of every launch."""
+    """Return the arguments of every launch."""
     return [
         Argument(
             "model", "", "Shipped robot, or folder of a model; empty: of params_file"
@@ -353,7 +353,7 @@ def common(use_sim_time: str) -> list[Argument]:
 
 
 def of_nodes() -> list[Argument]:
-    """Returns the arguments of every launch that starts nodes of this package."""
+    """Return the arguments of every launch that starts nodes of this package."""
     file = str(find_config("bridge", "nodes"))
     stamped = (
         "Use TwistStamped for cmd_vel; "
@@ -366,7 +366,7 @@ def of_nodes() -> list[Argument]:
 
 
 def of_simulator(robots: str = "") -> list[Argument]:
-    """Returns the arguments of a simulator."""
+    """Return the arguments of a simulator."""
     kinds = ("simulator", "mujoco")
     start = "x, y, heading [m, rad] of each robot; empty: drawn"
     return [
@@ -378,7 +378,7 @@ def of_simulator(robots: str = "") -> list[Argument]:
 
 
 def of_bridge() -> list[Argument]:
-    """Returns the arguments of gate, middleware and policy, but for the emergency stop."""
+    """Return the arguments of gate, middleware and policy, but for the emergency stop."""
     limits = "Of the gate; empty: of the model, if given, or of params_file"
     return [
         Argument(
@@ -393,7 +393,7 @@ def of_bridge() -> list[Argument]:
 
 
 def e_stop_required(default: str) -> Argument:
-    """Returns the argument for the emergency stop."""
+    """Return the argument for the emergency stop."""
     return Argument(
         "e_stop_required",
         default,
@@ -402,7 +402,7 @@ def e_stop_required(default: str) -> Argument:
 
 
 def of_description() -> list[Argument]:
-    """Returns the arguments of the description, which draws a robot in RViz."""
+    """Return the arguments of the description, which draws a robot in RViz."""
     installed = "true" if prefix_of(STATE_PUBLISHER) else "false"
     view = str(share_folder() / "config" / "rviz" / "bridge.rviz")
     return [
@@ -415,7 +415,7 @@ def of_description() -> list[Argument]:
 
 
 def prefix_of(package: str) -> Path | None:
-    """Returns the folder that a ROS 2 package is installed in, or None."""
+    """Return the folder that a ROS 2 package is installed in, or None."""
     folders = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     for folder in map(Path, filter(None, folders)):
         if (
@@ -426,7 +426,7 @@ def prefix_of(package: str) -> Path | None:
 
 
 def whole_simulation(robots: str = "") -> Launch:
-    """Returns a simulator, and on its topics all that runs on a vehicle."""
+    """Return a simulator, and on its topics all that runs on a vehicle."""
     arguments = [*common("true"), *of_nodes(), *of_simulator(robots), *of_bridge()]
     return Launch(
         "Several robots in one simulator, each with gate, middleware and policy."
@@ -439,12 +439,12 @@ def whole_simulation(robots: str = "") -> Launch:
 
 
 def fleet() -> Launch:
-    """Returns several robots in one simulator, each with a bridge in its namespace."""
+    """Return several robots in one simulator, each with a bridge in its namespace."""
     return whole_simulation(robots="2")
 
 
 def vehicle() -> Launch:
-    """Returns all that runs on a vehicle; an emergency stop that was never heard stops it."""
+    """Return all that runs on a vehicle; an emergency stop that was never heard stops it."""
     return Launch(
         "Gate, middleware and policy of a vehicle, beside the drivers of its lidar and its base.",
         [bridge, description],
@@ -453,7 +453,7 @@ def vehicle() -> Launch:
 
 
 def simulator_alone() -> Launch:
-    """Returns a simulator and the description of its robots, to drive by `cmd_vel`."""
+    """Return a simulator and the description of its robots, to drive by `cmd_vel`."""
     return Launch(
         "A simulator alone, to drive from elsewhere by cmd_vel.",
         [simulator, description],
@@ -463,7 +463,7 @@ def simulator_alone() -> Launch:
 
 
 def bridge_alone() -> Launch:
-    """Returns middleware, policy and gate on a robot's topics."""
+    """Return middleware, policy and gate on a robot's topics."""
     return Launch(
         "Gate, middleware and policy on a robot's topics.",
         [bridge],
@@ -472,7 +472,7 @@ def bridge_alone() -> Launch:
 
 
 def description_alone() -> Launch:
-    """Returns what a robot looks like: its URDF to robot_state_publisher, and RViz."""
+    """Return what a robot looks like: its URDF to robot_state_publisher, and RViz."""
     return Launch(
         "The URDF of a robot to robot_state_publisher, and RViz.",
         [description],

@@ -66,7 +66,7 @@ def chosen(environment: Mapping[str, str]) -> bool:
 
 
 def stay_on_this_machine(environment: MutableMapping[str, str]) -> None:
-    """Limits discovery to this machine in an environment that does not set its range."""
+    """Limit discovery to this machine in an environment that does not set its range."""
     environment.setdefault(RANGE, LOCAL)
     if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:
         environment.setdefault(ONLY_LOCAL, "1")
@@ -80,7 +80,7 @@ class Transport:
         self._in_force: bool | None = None  # the profile; None: not tried yet
 
     def open(self, make: Callable[[], Context]) -> Context:
-        """Returns a context over UDP, or ROS 2's default. Raises BackendError."""
+        """Return a context over UDP, or ROS 2's default. Raises BackendError."""
         with self._lock:
             stay_on_this_machine(os.environ)
             here = stays_here(os.environ)
@@ -172,12 +172,12 @@ OF_THIS_PROCESS = Transport()
 
 
 def multicast_port(domain_id: int) -> int:
-    """Returns the port that participants bind to discover others beyond this machine."""
+    """Return the port that participants bind to discover others beyond this machine."""
     return FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id
 
 
 def ports_of(process: int | str = "self") -> set[int]:
-    """Returns the UDP ports over IPv4 that a process has bound, on Linux."""
+    """Return the UDP ports over IPv4 that a process has bound, on Linux."""
     names = set()
     for file in Path(f"/proc/{process}/fd").iterdir():
         with contextlib.suppress(OSError):  # another thread has closed it
@@ -186,7 +186,7 @@ def ports_of(process: int | str = "self") -> set[int]:
 
 
 def domains_in_use() -> set[int]:
-    """Returns the DDS domains with a participant on this machine."""
+    """Return the DDS domains with a participant on this machine."""
     ports = {port for _, port in _sockets() if port >= FIRST_PORT}
     return {(port - FIRST_PORT) // PORTS_OF_A_DOMAIN for port in ports}
 

@@ -136,7 +136,7 @@ class RosSource:
         )
 
     def advance(self) -> bool:
-        """Follows the robot's way where there is news; True after scans of another lidar."""
+        """Follow the robot's way where there is news; True after scans of another lidar."""
         with self._topics.lock:
             lidar = self._new_lidar
             self._new_lidar = None
@@ -150,7 +150,7 @@ class RosSource:
         return lidar is not None
 
     def take(self, request: Request) -> bool:
-        """Sends a goal; ignores all else. Raises ConfigError for one off the field."""
+        """Send a goal; ignore all else. Raises ConfigError for one off the field."""
         if request.kind == "goal":
             if self._within is not None:
                 check_place("goal", self._within, request.x, request.y)
@@ -163,7 +163,7 @@ class RosSource:
         return False
 
     def close(self) -> None:
-        """Leaves the domain."""
+        """Leave the domain."""
         self._context.try_shutdown()
         self._thread.join()
         self._node.destroy_node()

@@ -58,20 +58,20 @@ def _floats(content: Bytes, order: str) -> int:
 
 
 def stamp_of(content: Bytes) -> int:
-    """Returns the stamp of a message that begins with a header [ns]."""
+    """Return the stamp of a message that begins with a header [ns]."""
     seconds, nanoseconds = struct.unpack_from(f"{_order(content)}iI", content, STAMP)
     return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
 def numbers_of(content: Bytes) -> Array:
-    """Returns all numbers (85,) of a serialised Odometry, in order."""
+    """Return all numbers (85,) of a serialised Odometry, in order."""
     order = _order(content)
     names_end = _after_text(content, _after_text(content, FRAME, order), order)
     return np.frombuffer(content, f"{order}f8", DOUBLES, _aligned(names_end, 8))
 
 
 def frames_of(content: Bytes) -> tuple[str, str]:
-    """Returns the frame of the header and the child frame of a serialised Odometry."""
+    """Return the frame of the header and the child frame of a serialised Odometry."""
     order = _order(content)
     return _text(content, FRAME, order), _text(
         content, _after_text(content, FRAME, order), order
@@ -79,7 +79,7 @@ def frames_of(content: Bytes) -> tuple[str, str]:
 
 
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
-    """Returns pose (3,) and body twist (3,) of a serialised Odometry."""
+    """Return pose (3,) and body twist (3,) of a serialised Odometry."""
     values = numbers_of(content)
     x, y, _, qx, qy, qz, qw = values[:7].tolist()
     vx = values[TWIST]
@@ -89,7 +89,7 @@ def odometry_of(content: Bytes) -> tuple[Array, Array]:
 
 
 def ranges_of(content: Bytes) -> NDArray[np.float32]:
-    """Returns the device's ranges (B,) of a serialised LaserScan."""
+    """Return the device's ranges (B,) of a serialised LaserScan."""
     order = _order(content)
     place = _floats(content, order) + 4 * SCAN_FIELDS
     (beams,) = struct.unpack_from(f"{order}I", content, place)
@@ -97,25 +97,25 @@ def ranges_of(content: Bytes) -> NDArray[np.float32]:
 
 
 def angles_of(content: Bytes) -> tuple[float, float]:
-    """Returns angle_min, angle_increment [rad] of a serialised LaserScan."""
+    """Return angle_min, angle_increment [rad] of a serialised LaserScan."""
     order = _order(content)
     first, _, step = struct.unpack_from(f"{order}3f", content, _floats(content, order))
     return first, step
 
 
 def twist_of(content: Bytes, place: int = HEAD) -> tuple[float, float, float]:
-    """Returns linear.x, linear.y, angular.z of a serialised Twist, which begins at an offset."""
+    """Return linear.x, linear.y, angular.z of a serialised Twist, which begins at an offset."""
     x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, place)
     return x, y, w
 
 
 def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
-    """Returns linear.x, linear.y, angular.z of a serialised TwistStamped."""
+    """Return linear.x, linear.y, angular.z of a serialised TwistStamped."""
     return twist_of(content, _aligned(_after_text(content, FRAME, _order(content)), 8))
 
 
 def truth_of(content: Bytes) -> bool:
-    """Returns the value of a serialised Bool."""
+    """Return the value of a serialised Bool."""
     _order(content)
     return bool(struct.unpack_from("B", content, HEAD)[0])
 
@@ -133,7 +133,7 @@ class OdometryWriter:
     def write(
         self, stamp_ns: int, pose: Array, twist: Array, covariance: Array | None = None
     ) -> bytes:
-        """Returns a message with pose (3,), body twist (3,), and covariance (3, 3) of the pose."""
+        """Return a message with pose (3,), body twist (3,), and covariance (3, 3) of the pose."""
         numbers = self._numbers
         heading = float(pose[2])
         self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NS_PER_S))
@@ -155,14 +155,14 @@ class ScanWriter:
         self._ranges = ranges_of(self._content)
 
     def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
-        """Returns a message with ranges (B,), as the device reports them."""
+        """Return a message with ranges (B,), as the device reports them."""
         self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NS_PER_S))
         self._ranges[:] = ranges
         return bytes(self._content)
 
 
 def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int, frame: str) -> bytes:
-    """Serialises linear.x, linear.y, angular.z (3,) as a TwistStamped in a robot's frame."""
+    """Serialise linear.x, linear.y, angular.z (3,) as a TwistStamped in a robot's frame."""
     x, y, w = np.asarray(twist, np.float64).tolist()
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     text = frame.encode() + b"\0"
@@ -174,6 +174,6 @@ def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int, frame: str) -> bytes
 
 
 def twist_to_bytes(twist: ArrayLike) -> bytes:
-    """Serialises linear.x, linear.y, angular.z (3,) as a Twist."""
+    """Serialise linear.x, linear.y, angular.z (3,) as a Twist."""
     x, y, w = np.asarray(twist, np.float64).tolist()
     return NATIVE + struct.pack("=6d", x, y, 0.0, 0.0, 0.0, w)

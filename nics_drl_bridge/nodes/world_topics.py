@@ -34,7 +34,7 @@ class WorldTopics:
         runner.steadily(node, LOOK_S, self._look)
 
     def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
-        """Listens for a robot, whose number is looked up at each message."""
+        """Listen for a robot, whose number is looked up at each message."""
         kind = PoseWithCovarianceStamped
         topic = f"{namespace}{INITIAL_POSE}"
         return self._node.create_subscription(

@@ -52,7 +52,7 @@ class Sizes:
 
 
 def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
-    """Allocates the arrays of worlds before their first reset, with the model's parameters."""
+    """Allocate the arrays of worlds before their first reset, with the model's parameters."""
     _, substeps, delay = model.timing
     shape = (sizes.worlds, sizes.robots)
     bodies = sizes.obstacles + sizes.robots
@@ -85,7 +85,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
 
 
 def split(worlds: int, threads: int) -> tuple[slice, ...]:
-    """Splits N worlds into contiguous parts of nearly equal size, one per thread."""
+    """Split N worlds into contiguous parts of nearly equal size, one per thread."""
     edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
     return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
 
@@ -97,7 +97,7 @@ def members_of(
     sizes: Sizes,
     member: NDArray[np.int64],
 ) -> arrays.Members:
-    """Stacks P worlds, of up to K obstacles that move by `motions` (P, K), for N copies.
+    """Stack P worlds, of up to K obstacles that move by `motions` (P, K), for N copies.
 
     `member` (N,) is read as the kernels run.
     """
@@ -140,7 +140,7 @@ def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
 
 
 def map_field(grid: GridMap | None) -> arrays.MapField:
-    """Returns a static map as the kernels take it."""
+    """Return a static map as the kernels take it."""
     if grid is None:
         return arrays.NO_FIELD
     return arrays.MapField(
@@ -149,7 +149,7 @@ def map_field(grid: GridMap | None) -> arrays.MapField:
 
 
 def cells_of(sizes: Sizes, members: arrays.Members) -> BodyCells:
-    """Allocates the cells of all worlds, none where looking at all bodies takes less time."""
+    """Allocate the cells of all worlds, none where looking at all bodies takes less time."""
     worlds = sizes.worlds if members.crowded or members.standing else 0
     return body_cells(worlds, sizes.robots + sizes.obstacles, members.standing)
 
@@ -176,7 +176,7 @@ def part_of(
     cells: BodyCells,
     part: slice,
 ) -> arrays.Part:
-    """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
+    """Return the arguments of the kernels for one part of the worlds, with scratch of its own."""
     dt, substeps, _ = model.timing
     motion = arrays.Dynamics(
         make_terms(model.kinematics), SERIES, float(dt), int(substeps)

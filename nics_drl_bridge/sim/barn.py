@@ -37,7 +37,7 @@ def barn_numbers() -> tuple[int, ...]:
 
 
 def barn_world(number: int) -> World:
-    """Returns a world by its number, in the frame of its Gazebo world. ConfigError for no such."""
+    """Return a world by its number, in the frame of its Gazebo world. ConfigError for no such."""
     packed = _arrays()["cylinders"][_index(number)]
     cells = np.unpackbits(packed, count=ROWS * COLUMNS).reshape(ROWS, COLUMNS)
     poses = [(x, y, 0.0) for x, y in _centres(np.argwhere(cells), CORNER).tolist()]
@@ -53,13 +53,13 @@ def barn_world(number: int) -> World:
 
 
 def barn_path(number: int) -> NDArray[np.float64]:
-    """Returns (P, 2) the benchmark's own shortest path in a world, from cell to cell [m]."""
+    """Return (P, 2) the benchmark's own shortest path in a world, from cell to cell [m]."""
     paths = _arrays()["paths"]
     return _centres(paths[paths[:, 0] == _index(number), 1:], PATH_CORNER)
 
 
 def _centres(cells: NDArray[Any], corner: tuple[float, float]) -> NDArray[np.float64]:
-    """Returns x, y (n, 2) [m] of cells (n, 2), row and column."""
+    """Return x, y (n, 2) [m] of cells (n, 2), row and column."""
     return np.asarray(np.round(cells[:, ::-1] * CELL + corner, 6))
 
 

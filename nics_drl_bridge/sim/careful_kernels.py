@@ -45,7 +45,7 @@ MOST_MOVES = 1000
 def rates_at(
     n: int, m: int, j: int, state: State, motion: Dynamics, single: Single
 ) -> None:
-    """Writes to `single.dq` the rates of robot m in substep j, by the command then in effect."""
+    """Write to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     size = state.state.shape[2]
     sent = state.history.shape[2]
     for s in range(size):
@@ -167,7 +167,7 @@ def _hold(
     events: Array,
     moving: Moving,
 ) -> None:
-    """Lets robot m, whose point (px, py) approaches something against n, come no nearer."""
+    """Let robot m, whose point (px, py) approaches something against n, come no nearer."""
     flight = moving.flights[moving.first + m]
     event = events[m]
     slides = (
@@ -190,7 +190,7 @@ def _settle(
     touched: Array,
     moving: Moving,
 ) -> None:
-    """Stops bodies at their contacts within a substep, in order of time; marks `touched` (M,)."""
+    """Stop bodies at their contacts within a substep, in order of time; mark `touched` (M,)."""
     flights = moving.flights
     first = moving.first
     meets = nearby.meets
@@ -284,7 +284,7 @@ def move_carefully(
     nearby: Nearby,
     single: Single,
 ) -> None:
-    """Moves the robots of one world that may meet something by one period, up to their contacts.
+    """Move the robots of one world that may meet something by one period, up to their contacts.
 
     A robot in contact is marked and stops for the rest of the substep. In the next ones it slides
     along what it touches, and turns, as far as that lets it. One that already overlaps something
@@ -393,7 +393,7 @@ def drift_carefully(
     nearby: Nearby,
     single: Single,
 ) -> None:
-    """Lets the robots of one world drift, one after the other, up to their contacts."""
+    """Let the robots of one world drift, one after the other, up to their contacts."""
     pose = state.pose
     collided = state.collided
     meets = nearby.meets

@@ -62,7 +62,7 @@ class Cellular(Schema):
 
 @lru_cache(2048)  # a training opens each of them several times
 def grow(given: Cellular, number: int) -> World:
-    """Returns one of the worlds; the same for the same parameters. ConfigError if none has a way.
+    """Return one of the worlds; the same for the same parameters. ConfigError if none has a way.
 
     The robot starts before the field, between two walls, and its goal lies beyond.
     """

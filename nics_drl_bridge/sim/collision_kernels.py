@@ -32,7 +32,7 @@ class Outline(NamedTuple):
 
 @kernel
 def outline_of(body, outlines):  # type: ignore[no-untyped-def]
-    """Returns the outline of a body's shape, in the body's frame."""
+    """Return the outline of a body's shape, in the body's frame."""
     shape = int(body[SHAPE])
     return Outline(outlines.corners, outlines.first[shape], outlines.first[shape + 1])
 
@@ -46,7 +46,7 @@ def is_round(body, outlines):  # type: ignore[no-untyped-def]
 
 @kernel
 def from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
-    """Returns the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
+    """Return the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
     ex = bx - ax
     ey = by - ay
     dx = x - ax
@@ -282,7 +282,7 @@ def _along(x, y, wall):  # type: ignore[no-untyped-def]
 
 @kernel
 def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
-    """Returns the point of a straight wall nearest to a point."""
+    """Return the point of a straight wall nearest to a point."""
     share = _along(x, y, wall)
     return wall[0] + share * (wall[2] - wall[0]), wall[1] + share * (wall[3] - wall[1])
 
@@ -303,7 +303,7 @@ def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
 
 @kernel
 def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
-    """Returns a point of the map frame in the frame of a grid [m]."""
+    """Return a point of the map frame in the frame of a grid [m]."""
     dx = x - grid.x
     dy = y - grid.y
     return grid.cos * dx + grid.sin * dy, grid.cos * dy - grid.sin * dx
@@ -311,7 +311,7 @@ def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
 
 @kernel
 def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
-    """Returns first and last + 1 row and column of the cells up to `far` [m] from a point."""
+    """Return first and last + 1 row and column of the cells up to `far` [m] from a point."""
     rows, columns = grid.distances.shape
     low_i = math.floor((y - far) / grid.cell)
     high_i = math.floor((y + far) / grid.cell)
@@ -327,7 +327,7 @@ def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
 
 @kernel
 def _bounds(x, y, grid):  # type: ignore[no-untyped-def]
-    """Bounds on the distance from (x, y) to a solid cell, from that of the nearest cell [m]."""
+    """Bound on the distance from (x, y) to a solid cell, from that of the nearest cell [m]."""
     rows, columns = grid.distances.shape
     size = grid.cell
     i = min(max(math.floor(y / size), 0), rows - 1)

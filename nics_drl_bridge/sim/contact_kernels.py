@@ -27,7 +27,7 @@ SEVERAL = 32
 def reaches(
     n: int, state: State, scene: Surroundings, nearby: Nearby, period: float
 ) -> tuple[float, bool]:
-    """Writes how far what may move reaches in a period [s]; longest path, if an obstacle moves."""
+    """Write how far what may move reaches in a period [s]; longest path, if an obstacle moves."""
     reach = nearby.reach
     way = nearby.way
     bodies = state.bodies
@@ -54,7 +54,7 @@ def reaches(
 def find_near(
     n: int, m: int, bodies: Array, scene: Surroundings, nearby: Nearby, cells: BodyCells
 ) -> int:
-    """Returns flags of what robot m of world n may meet; writes row m of `nearby.near`."""
+    """Return flags of what robot m of world n may meet; write row m of `nearby.near`."""
     near = nearby.near
     reach = nearby.reach
     walls = scene.walls
@@ -132,7 +132,7 @@ def contact(
 def move_obstacles(
     bodies: Array, start: Array, velocity: Array, n: int, time: float
 ) -> None:
-    """Moves the obstacles of world n to `time` [s] after their poses `start` (K, 3)."""
+    """Move the obstacles of world n to `time` [s] after their poses `start` (K, 3)."""
     for k in range(velocity.shape[1]):
         bodies[n, k, X] = start[k, 0] + velocity[n, k, 0] * time
         bodies[n, k, Y] = start[k, 1] + velocity[n, k, 1] * time
@@ -144,6 +144,6 @@ def move_obstacles(
 
 @kernel
 def put_body(bodies: Array, n: int, k: int, pose: Array) -> None:
-    """Places body k of world n at a pose (3,)."""
+    """Place body k of world n at a pose (3,)."""
     bodies[n, k, X], bodies[n, k, Y], bodies[n, k, HEADING] = pose[0], pose[1], pose[2]
     bodies[n, k, COS], bodies[n, k, SIN] = math.cos(pose[2]), math.sin(pose[2])

@@ -65,7 +65,7 @@ class DeviceWorld:
         return [bool(one) for one in self.simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
-        """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
+        """Begin the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
         given = self._given
         if starts is not None and starts.size != 3 * given:
             needed = f"{given} robots need {3 * given}: x, y, heading of each."
@@ -88,7 +88,7 @@ class DeviceWorld:
         self._before[:] = self.simulator.data.pose[0]
 
     def exchange(self, simulator: FastSimulator, kept: NDArray[np.int64]) -> None:
-        """Goes on in another simulator, whose first robots are those of these numbers here."""
+        """Go on in another simulator, whose first robots are those of these numbers here."""
 
         def moved(old: Array, new: Array) -> Array:
             new[: len(kept)] = old[kept]
@@ -101,11 +101,11 @@ class DeviceWorld:
         self._before = simulator.data.pose[0].copy()
 
     def put(self, robot: int) -> None:
-        """Takes note that a robot was put elsewhere, which is no motion."""
+        """Take note that a robot was put elsewhere, which is no motion."""
         self._before[robot] = self.simulator.data.pose[0, robot]
 
     def advance(self) -> None:
-        """Moves all robots by one step."""
+        """Move all robots by one step."""
         data = self.simulator.data
         self._before[:] = data.pose[0]
         odom = data.odom[0].copy()
@@ -114,7 +114,7 @@ class DeviceWorld:
         self._covariance = propagate(self._covariance, odom, data.odom[0], self._added)
 
     def sensed(self, robot: int) -> Sensed:
-        """Returns the present values of one robot; the next step may overwrite them."""
+        """Return the present values of one robot; the next step may overwrite them."""
         data = self.simulator.data
         readings = {
             name: each[0, robot] for name, each in self.simulator.readings.items()
@@ -150,7 +150,7 @@ def step_covariance(std: tuple[float, float], period: float) -> Array:
 def propagate(
     covariance: Array, before: ArrayLike, after: ArrayLike, added: Array
 ) -> Array:
-    """Propagates the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
+    """Propagate the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
     A heading error rotates the motion that follows: P' = F P F^T + Q, F the new pose's derivative
     to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q `added`.
@@ -173,13 +173,13 @@ class DrivenSimulator(FastSimulator):
     def reset(
         self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
     ) -> Scenes:
-        """Begins an episode, see `FastSimulator.reset`."""
+        """Begin an episode, see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
         self.wheels: Array = self.data.pose[0].copy()
         return scenes
 
     def begin_period(self, commands: Array) -> None:
-        """Takes the commands (M, C) of the period that begins, and steers the obstacles in it."""
+        """Take the commands (M, C) of the period that begins, and steer the obstacles in it."""
         history = self.data.history[0]
         history[:, 1:] = history[:, :-1].copy()
         history[:, 0] = commands
@@ -196,7 +196,7 @@ class DrivenSimulator(FastSimulator):
         return np.asarray(self.data.history[0, np.arange(len(rows)), rows])
 
     def move_obstacles(self, time: float) -> Array:
-        """Moves the obstacles (K, 7) to their poses `time` [s] after the period's beginning."""
+        """Move the obstacles (K, 7) to their poses `time` [s] after the period's beginning."""
         data = self.data
         contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
         return data.bodies[0, : data.velocity.shape[1]]
@@ -210,7 +210,7 @@ class DrivenSimulator(FastSimulator):
         counted: Array,
         touched: NDArray[np.bool_],
     ) -> None:
-        """Takes over the motion of the robots in the period, and measures what they sense.
+        """Take over the motion of the robots in the period, and measure what they sense.
 
         True poses, body twists and states (M, ...) at its end; pose and body twist (M, 3) there by
         wheel odometry, without noise; and (M,) true for robots that touched anything.

@@ -82,7 +82,7 @@ class Entities:
         return self.device.simulator
 
     def _arrange(self, scenes: Scenes, starts: Array | None) -> Array:
-        """Completes the scene of an episode; returns the starts (1, M, 3) of all robots."""
+        """Complete the scene of an episode; return the starts (1, M, 3) of all robots."""
         bodies = scenes.bodies[0]
         bodies[sorted(self.removed), RADIUS] = 0.0
         found = scenes.starts.copy()
@@ -109,7 +109,7 @@ class Entities:
             bodies[slot] = place(at, shape.radius, index)
 
     def bodies(self) -> Array:
-        """Returns (K, 7) all obstacles as they stand, by their slots."""
+        """Return (K, 7) all obstacles as they stand, by their slots."""
         if self.simulator.moves:  # in the order of the slots
             self._table = self.simulator.obstacles[0]
         return self._table
@@ -125,7 +125,7 @@ class Entities:
         yield from self.spawned.values()
 
     def find(self, name: str) -> Entity:
-        """Returns the entity of a name. Raises UnknownEntityError."""
+        """Return the entity of a name. Raises UnknownEntityError."""
         known = {entity.name: entity for entity in self}
         if name not in known:
             raise UnknownEntityError(
@@ -134,7 +134,7 @@ class Entities:
         return known[name]
 
     def pose(self, entity: Entity) -> Array:
-        """Returns x, y, heading (3,) of an entity in `map`."""
+        """Return x, y, heading (3,) of an entity in `map`."""
         if entity.robot >= 0:
             own: Array = self.simulator.data.pose[0, entity.robot].copy()
             return own
@@ -143,7 +143,7 @@ class Entities:
         return geometry.compose(body, geometry.between(part, np.zeros(3)))
 
     def twist(self, entity: Entity) -> Array:
-        """Returns vx, vy [m/s], wz [rad/s] (3,) of an entity along the axes of `map`."""
+        """Return vx, vy [m/s], wz [rad/s] (3,) of an entity along the axes of `map`."""
         if entity.robot >= 0:
             sensed = self.device.sensed(entity.robot)
             body = textbook(self.simulator.model.robot).twist(sensed.state)
@@ -154,7 +154,7 @@ class Entities:
         return moving
 
     def outlines(self, entity: Entity) -> list[Array]:
-        """Returns the convex hulls (V, 2) of an entity's shapes in its own frame [m]."""
+        """Return the convex hulls (V, 2) of an entity's shapes in its own frame [m]."""
         if entity.robot >= 0:
             return [hull_of(self.simulator.footprint)]
         return [
@@ -163,7 +163,7 @@ class Entities:
         ]
 
     def require_inside(self, pose: Array) -> None:
-        """Raises OutsideError for a pose (3,) outside the world."""
+        """Raise OutsideError for a pose (3,) outside the world."""
         x1, y1, x2, y2 = self.world.members[int(self.simulator.data.member[0])].extent
         if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
             held = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
@@ -171,7 +171,7 @@ class Entities:
             raise OutsideError(f"{told}, which has {held}; move it.")
 
     def move(self, entity: Entity, pose: Array | None, twist: Array | None) -> None:
-        """Puts an entity at a pose (3,), or gives it a twist (3,) along the axes of `map`.
+        """Put an entity at a pose (3,), or give it a twist (3,) along the axes of `map`.
 
         Raises StillError for a twist of what stands still, ConfigError for one beyond a robot's
         reach, OutsideError for a pose outside.
@@ -220,7 +220,7 @@ class Entities:
         self.simulator.put_bodies(bodies)
 
     def free_name(self, name: str) -> str:
-        """Returns a name that no entity has: the given one, or that and a number."""
+        """Return a name that no entity has: the given one, or that and a number."""
         taken = {entity.name for entity in self}
         # A name of the world's own obstacles may come back with the next episode.
         taken |= {f"{OBSTACLE}{k}" for k in range(self._own)}
@@ -232,7 +232,7 @@ class Entities:
         return free
 
     def spawn(self, name: str, parts: Sequence[Placed], pose: Array) -> Entity:
-        """Adds shapes, at poses (3,) in the frame of an entity that is put at a pose (3,).
+        """Add shapes, at poses (3,) in the frame of an entity that is put at a pose (3,).
 
         Raises OutsideError, and ConfigError for what the simulator can't hold.
         """
@@ -263,7 +263,7 @@ class Entities:
         return entity
 
     def spawn_robot(self, name: str, pose: Array) -> Entity:
-        """Adds a robot of the simulator's kind at a pose (3,). Raises OutsideError, ConfigError."""
+        """Add a robot of the simulator's kind at a pose (3,). Raises OutsideError, ConfigError."""
         self.require_inside(pose)
         count = len(self.robot_names)
         entity = Entity(name, robot=count, start=np.array(pose))
@@ -281,7 +281,7 @@ class Entities:
         return [*self._launched, *(found[m] for m in sorted(found))]
 
     def delete(self, entity: Entity) -> None:
-        """Removes an entity. Raises ConfigError for the last robot."""
+        """Remove an entity. Raises ConfigError for the last robot."""
         kept = [m for m in range(self.device.robots) if m != entity.robot]
         if not kept:
             raise ConfigError(
@@ -301,7 +301,7 @@ class Entities:
         self._remake(self._spare, kept)
 
     def restore(self) -> None:
-        """Removes all that was spawned; from the next episode on all that was removed is back."""
+        """Remove all that was spawned; from the next episode on all that was removed is back."""
         if self._spare or self.spawned or self._launched != list(self.robots):
             kept = list(range(len(self._launched)))
             self.spawned.clear()
@@ -312,7 +312,7 @@ class Entities:
     def _remake(
         self, spare: Sequence[Shape], robots: Sequence[int], count: int = 0
     ) -> None:
-        """Makes a simulator for robots of these numbers here, and so many in all; goes on in it."""
+        """Make a simulator for robots of these numbers here, and so many in all; go on in it."""
         old = self.simulator
         bodies = self.bodies().copy()
         # An own world, as the simulator of the present one goes on if this one can't be made.
@@ -330,7 +330,7 @@ class Entities:
 
 
 def hull_of(shape: Shape) -> Array:
-    """Returns the convex hull (V, 2) of a shape [m], counter-clockwise; a circle has 32 corners."""
+    """Return the convex hull (V, 2) of a shape [m], counter-clockwise; a circle has 32 corners."""
     if len(shape.outline):
         return convex_hull(shape.outline)
     angles = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)

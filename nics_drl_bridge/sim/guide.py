@@ -64,7 +64,7 @@ class Guide:
         self.fields = np.zeros((worlds, sampler.robots, *walls.shape[1:]), np.float32)
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
-        """Finds the ways in the scenes of episodes that begin in some worlds (n,)."""
+        """Find the ways in the scenes of episodes that begin in some worlds (n,)."""
         given = worlds, np.asarray(scenes.member, np.int64), scenes.bodies, scenes.goals
         kernels.guide(self.fields, *given, self._grid)
 

@@ -40,7 +40,7 @@ class GuideGrid(NamedTuple):
 
 @kernel(allocates=True)
 def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
-    """Writes the distances (rows, columns) to walls and map, which `cells` have, of coarser cells.
+    """Write the distances (rows, columns) to walls and map, which `cells` have, of coarser cells.
 
     The field is `extent` (4,), beyond which nothing is free.
     """
@@ -58,7 +58,7 @@ def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-def]
-    """Writes lengths of ways [m] from each cell to out[world, m] (rows, columns) float32.
+    """Write lengths of ways [m] from each cell to out[world, m] (rows, columns) float32.
 
     Of the worlds (n,) given: member (n,), bodies (n, K, 7), goals (n, M, 2).
     """
@@ -88,7 +88,7 @@ def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-
 
 @kernel
 def _approach(space, body, x, y, cell, grid):  # type: ignore[no-untyped-def]
-    """Lowers the space (rows, columns) around cells to that beside a body [m]."""
+    """Lower the space (rows, columns) around cells to that beside a body [m]."""
     far = body[RADIUS] + grid.outer + COMFORT
     first = max(int((body[Y] - far - y) / cell), 0)
     last = min(int((body[Y] + far - y) / cell), space.shape[0] - 1)
@@ -147,7 +147,7 @@ def _spread(field, cost, u, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
-    """Updates the ways row by row, from one of the corners; returns the greatest change [m].
+    """Update the ways row by row, from one of the corners; return the greatest change [m].
 
     Both (rows, columns) are float32; the price of a cell is that of crossing it.
     """
@@ -179,7 +179,7 @@ def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def lengths(out, poses, member, fields, grid):  # type: ignore[no-untyped-def]
-    """Writes the lengths (N, M) [m] of the ways from poses (N, M, 3), interpolated linearly."""
+    """Write the lengths (N, M) [m] of the ways from poses (N, M, 3), interpolated linearly."""
     for n in range(out.shape[0]):
         p = member[n]
         x = grid.frames[p, 0]

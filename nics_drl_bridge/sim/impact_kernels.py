@@ -105,7 +105,7 @@ def in_own_frame(b: int, moving: Moving) -> bool:
 
 @kernel
 def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, float]:
-    """Returns x, y [m], cosine and sine of the heading of a body at a time."""
+    """Return x, y [m], cosine and sine of the heading of a body at a time."""
     if b < 0:
         return 0.0, 0.0, 1.0, 0.0
     world = moving.world
@@ -153,7 +153,7 @@ def speed_at(b: int, time: float, flights: Array) -> float:
 
 @kernel
 def _between(p: Edge, q: Edge) -> tuple[float, float]:
-    """Returns the vector from the nearest point of q to that of p; zero where they cross."""
+    """Return the vector from the nearest point of q to that of p; zero where they cross."""
     nx, ny = collision.from_segment(p.ax, p.ay, q.ax, q.ay, q.bx, q.by)
     if p.ax == p.bx and p.ay == p.by:
         return nx, ny
@@ -173,7 +173,7 @@ def _between(p: Edge, q: Edge) -> tuple[float, float]:
 
 @kernel
 def _root(gap: float, rate: float, bend: float) -> float:
-    """Returns when gap + rate t - bend t^2 / 2 reaches zero, for a gap > 0."""
+    """Return when gap + rate t - bend t^2 / 2 reaches zero, for a gap > 0."""
     if bend == 0.0:
         return np.inf if rate >= 0.0 else -gap / rate
     both = math.sqrt(rate * rate + 2.0 * bend * gap)
@@ -247,7 +247,7 @@ def _free_time(
 
 @kernel
 def _note(event: Array, nx: float, ny: float, p: Placed, q: Placed) -> None:
-    """Writes where the edges of a contact met: at the corners whose rates it has, or the nearer."""
+    """Write where the edges of a contact met: at the corners whose rates it has, or the nearer."""
     event[NX] = nx
     event[NY] = ny
     event[OWN_X], event[OWN_Y] = _corner(nx, ny, p, event[OWN])
@@ -277,7 +277,7 @@ def touch(
     begin: float,
     moving: Moving,
 ) -> None:
-    """Makes `event` (EVENT,) the first contact of an edge of body a with one of body b, if earlier.
+    """Make `event` (EVENT,) the first contact of an edge of body a with one of body b, if earlier.
 
     The edges are in the bodies' frames, with a radius [m] around each.
     """
@@ -327,7 +327,7 @@ def touch(
 def hold(
     b: int, nx: float, ny: float, px: float, py: float, time: float, moving: Moving
 ) -> None:
-    """Lets the point (px, py) of a robot approach nothing against n from a time on.
+    """Let the point (px, py) of a robot approach nothing against n from a time on.
 
     Of all motions that its holds allow, it makes the one nearest to its wish by the energy of a
     ring: it slides without friction, and a corner that is held turns it aside. The speeds
@@ -408,7 +408,7 @@ def touch_edge(
     begin: float,
     moving: Moving,
 ) -> None:
-    """Makes `event` (EVENT,) a's first contact from `begin` on with an edge, in b's frame."""
+    """Make `event` (EVENT,) a's first contact from `begin` on with an edge, in b's frame."""
     world = moving.world
     flights = moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
@@ -435,7 +435,7 @@ def touch_edge(
 
 @kernel
 def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> None:
-    """Does the same as `touch_edge` for all of body b."""
+    """Do the same as `touch_edge` for all of body b."""
     world = moving.world
     flights = moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
@@ -460,7 +460,7 @@ def _solid(distances: Array, i: int, j: int) -> bool:
 def touch_map(
     event: Array, a: int, grid: MapField, begin: float, moving: Moving
 ) -> None:
-    """Does the same as `touch_edge` for the sides of the solid cells of a map."""
+    """Do the same as `touch_edge` for the sides of the solid cells of a map."""
     distances = grid.distances
     world = moving.world
     size = grid.cell

@@ -50,7 +50,7 @@ class Model(NamedTuple):
 
 
 def model_of_yaml(text: str, source: str = TEXT) -> Model:
-    """Reads an entity of YAML: the keys of `ModelFile`, or those of one shape. ConfigError."""
+    """Read an entity of YAML: the keys of `ModelFile`, or those of one shape. ConfigError."""
     content = parse_yaml(text, source)
     if "kind" in content:
         content = {"shapes": [content]}
@@ -62,7 +62,7 @@ def model_of_yaml(text: str, source: str = TEXT) -> Model:
 
 
 def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
-    """Reads an entity of SDF, whose origin is spawned at a height z [m].
+    """Read an entity of SDF, whose origin is spawned at a height z [m].
 
     Raises ConfigError for no SDF, more than one model, or what is no shape; `AssetsError` of it
     where that is a mesh, or a file that is not there; BridgeError for too many shapes.
@@ -90,7 +90,7 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
 
 @contextmanager
 def file_of(text: str, source: str = TEXT) -> Iterator[Path]:
-    """Gives a file with a text, in errors about which `source` takes the place of its path."""
+    """Give a file with a text, in errors about which `source` takes the place of its path."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "text.sdf"
         file.write_text(text, encoding="utf-8")

@@ -41,7 +41,7 @@ def _share(seed, counter):  # type: ignore[no-untyped-def]
 
 @kernel
 def begin(n: int, state: State, plans: Array) -> None:
-    """Begins an episode of world n: draws the speed of each obstacle."""
+    """Begin an episode of world n: draws the speed of each obstacle."""
     seed = state.seeds[n]
     bodies = state.bodies
     for k in range(plans.shape[0]):
@@ -62,7 +62,7 @@ def begin(n: int, state: State, plans: Array) -> None:
 def steer(
     n: int, state: State, scene: Surroundings, period: float, speeds: Array
 ) -> None:
-    """Sets the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
+    """Set the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
 
     An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
     """
@@ -147,7 +147,7 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
 
 @kernel
 def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
-    """Returns the force (3, 4) of another walker [m/s^2], - V0 grad exp(-b / sigma).
+    """Return the force (3, 4) of another walker [m/s^2], - V0 grad exp(-b / sigma).
 
     2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2), with r [m] from the other to this one, not zero,
     its relative velocity v [m/s], `foresight` dt, `strength` V0 [m^2/s^2] and `reach` sigma [m].
@@ -277,7 +277,7 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
 
 @kernel
 def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
-    """Returns the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
+    """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
     mark = marks[k]
     row = traffic.plans[k]
     body = traffic.bodies[k]

@@ -87,7 +87,7 @@ Motion = Annotated[Patrol | Pedestrian, Field(discriminator="kind")]
 def plan_arrays(
     motions: Sequence[Patrol | Pedestrian | None],
 ) -> tuple[Array, Array]:
-    """Returns the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
+    """Return the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
     rows = np.zeros((len(motions), at.PLAN))
     waypoints = np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):

@@ -24,7 +24,7 @@ ROUNDING = 1e-6  # share of a cell by which a field may exceed whole cells
 
 
 def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
-    """Returns the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
+    """Return the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
     own = sampler.samplers[member].motions
     # what is no part of the world stands
     both = zip_longest(bodies, own[: len(bodies)])
@@ -38,7 +38,7 @@ def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
 def occupancy(
     world: World, obstacles: Sequence[Placed] = (), cell: float = CELL
 ) -> GridMap:
-    """Returns the map of a world: its own map, walls, and the given obstacles.
+    """Return the map of a world: its own map, walls, and the given obstacles.
 
     A cell is occupied if its centre is in something solid, or a wall runs through it; a field with
     walls is closed by cells around it. The `cell` [m] is a greatest one: those of the world's own
@@ -88,7 +88,7 @@ def _frame_of(
 
 
 def _enclose(made: GridMap, half: Array) -> None:
-    """Occupies all around a field of half its size (2,) [m]."""
+    """Occupy all around a field of half its size (2,) [m]."""
     rows, columns = (np.arange(count) for count in made.cells.shape)
     if not made.origin[2]:  # x is that of the column alone
         x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]
@@ -110,7 +110,7 @@ def _along(corners: Array, cell: float) -> Array:
 
 
 def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
-    """Occupies the cells in a shape; of a part that is too thin to hold a centre, its outline."""
+    """Occupy the cells in a shape; of a part that is too thin to hold a centre, its outline."""
     around = made.world_to_cell(pose[:2])
     reach = math.ceil(shape.radius / made.resolution) + 1
     low = np.maximum(around - reach, 0)

@@ -22,5 +22,5 @@ structref.define_proxy(Packed, PackedType, ["content"])
 
 @kernel(allocates=True)
 def pack(content: Any) -> Any:
-    """Makes one argument of a NamedTuple."""
+    """Make one argument of a NamedTuple."""
     return Packed(content)

@@ -180,12 +180,12 @@ class Randomisation(Schema):
 
     @property
     def fingerprint(self) -> str:
-        """Identifies the ranges: 16 digits of a SHA-256."""
+        """Identify the ranges: 16 digits of a SHA-256."""
         return files.hash_bytes(self.model_dump_json().encode())[:16]
 
 
 def load_randomisation(name: str | Path) -> Randomisation:
-    """Loads a shipped randomisation by name (`mild`), or any other by the path of its YAML file."""
+    """Load a shipped randomisation by name (`mild`), or any other by the path of its YAML file."""
     return load_yaml(find_config(name, "randomisation"), Randomisation)
 
 
@@ -214,7 +214,7 @@ class Draws:
     labels: tuple[Label, ...]
 
     def named(self) -> dict[str, NDArray[np.generic]]:
-        """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
+        """Return the drawn numbers by name: (n, M) per robot, (n,) per scene."""
         return {
             name: getattr(self, field)[() if column is None else (..., column)]
             for name, field, column in self.labels
@@ -258,7 +258,7 @@ class Sampler:
         self._labels = tuple(self._name(model))
 
     def draw(self, seeds: ArrayLike) -> Draws:
-        """Draws the numbers of the episodes of some seeds (n,)."""
+        """Draw the numbers of the episodes of some seeds (n,)."""
         chosen = check_seeds(seeds)
         robots = self._robots
         timing = np.floor(_between(self._timing, chosen, robots, LATENCY_GROUP)).astype(
@@ -324,7 +324,7 @@ class Sampler:
 def _between(
     bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0
 ) -> Array:
-    """Draws (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
+    """Draw (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
     drawn = np.empty((len(seeds), robots, len(bounds[0])))
     first = group * PLACES + column
     stride = GROUPS * PLACES
@@ -394,7 +394,7 @@ def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
 
 
 def _latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
-    """Bounds (2,) of delay and age, such that flooring the draws rounds them [substeps]."""
+    """Bound (2,) of delay and age, such that flooring the draws rounds them [substeps]."""
     _, substeps, delay = model.timing
     spans = (
         np.array([ranges.action_latency, ranges.observation_latency]) * substeps + 0.5

@@ -88,7 +88,7 @@ class SceneScratch(NamedTuple):
 
 @kernel
 def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
-    """Lowers the distances of cells to the distances to the walls, in place."""
+    """Lower the distances of cells to the distances to the walls, in place."""
     distances = cells.distances
     for i in range(distances.shape[0]):
         for j in range(distances.shape[1]):
@@ -98,7 +98,7 @@ def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
 
 @kernel
 def place_in(row, column, cells):  # type: ignore[no-untyped-def]
-    """Returns x, y [m] of a place in the grid, given as fractional row and column."""
+    """Return x, y [m] of a place in the grid, given as fractional row and column."""
     u = column * cells.cell
     v = row * cells.cell
     return (
@@ -109,7 +109,7 @@ def place_in(row, column, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def cell_of(x, y, cells):  # type: ignore[no-untyped-def]
-    """Returns row and column of a point, and its distance from the centre of that cell [m]."""
+    """Return row and column of a point, and its distance from the centre of that cell [m]."""
     u, v = collision.in_grid(x, y, cells)
     u = u / cells.cell
     v = v / cells.cell
@@ -120,7 +120,7 @@ def cell_of(x, y, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def area_of(x, y, space):  # type: ignore[no-untyped-def]
-    """Returns the number of the area that contains a point; 0 for none."""
+    """Return the number of the area that contains a point; 0 for none."""
     i, j, _ = cell_of(x, y, space.cells)
     if 0 <= i < space.area.shape[0] and 0 <= j < space.area.shape[1]:
         return space.area[i, j]
@@ -271,7 +271,7 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
 
 @kernel
 def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
-    """Draws a point in one of the chosen cells, given by row-major indices; takes 3 counters."""
+    """Draw a point in one of the chosen cells, given by row-major indices; take 3 counters."""
     cell = int(uniform_of(source, counter) * chosen.shape[0])
     # of all cells, a look-up would only miss the cache
     if chosen.shape[0] < cells.distances.size:
@@ -392,7 +392,7 @@ def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
 
 @kernel
 def _spot(source, counter, places, space):  # type: ignore[no-untyped-def]
-    """Draws x, y, heading of a start or goal in one of the places; takes 4 counters."""
+    """Draw x, y, heading of a start or goal in one of the places; take 4 counters."""
     turn = uniform_of(source, counter + 3)
     if places.shape[0] == 0:
         x, y = _point(source, counter, space.for_robots, space.cells)
@@ -420,7 +420,7 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
 
 @kernel
 def _goal_of(source, counter, x, y, plan):  # type: ignore[no-untyped-def]
-    """Draws a goal, for some worlds uniformly in the ring around the start; takes 4 counters."""
+    """Draw a goal, for some worlds uniformly in the ring around the start; take 4 counters."""
     if not plan.around:
         gx, gy, _ = _spot(source, counter, plan.goals, plan.space)
         return gx, gy
@@ -476,7 +476,7 @@ def _place_robots(source, counter, plan, bodies, starts, goals, scratch):  # typ
 
 @kernel
 def choose_members(seeds, members, out):  # type: ignore[no-untyped-def]
-    """Writes the index of the world of each seed (n,) among the members of a set."""
+    """Write the index of the world of each seed (n,) among the members of a set."""
     for n in range(seeds.shape[0]):
         share = random.uniform(seeds[n], random.MEMBER_STREAM, 0)
         out[n] = min(int(share * members), members - 1)
@@ -484,7 +484,7 @@ def choose_members(seeds, members, out):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
-    """Draws the scenes of some seeds (n,) to bodies (n, K, 7), starts (n, M, 3), goals (n, M, 2).
+    """Draw the scenes of some seeds (n,) to bodies (n, K, 7), start (n, M, 3), goals (n, M, 2).
 
     K may be more than the world has: the others are absent. `wanted` (n,) are numbers of random
     obstacles, -1 for the world's own, and `sizes` (n,) rows of `plan.variants`. Returns the first

@@ -56,7 +56,7 @@ class Scenes(Scene):
 
     @classmethod
     def of(cls, n: int, obstacles: int, robots: int) -> "Scenes":
-        """Allocates n scenes, without anything in them."""
+        """Allocate n scenes, without anything in them."""
         starts = np.zeros((n, robots, 3))
         goals = np.zeros((n, robots, 2))
         return cls(np.zeros((n, obstacles, BODY)), starts, goals, np.zeros(n, np.int64))
@@ -84,7 +84,7 @@ class Catalogue:
 
     @classmethod
     def of(cls, world: AnyWorld, sizes: Sequence[float]) -> "Catalogue":
-        """Lists the shapes of a world or set, scaled."""
+        """List the shapes of a world or set, scaled."""
         shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
         place = {shape: i for i, shape in enumerate(world.shapes)}
         return cls(shapes, place, Outlines.of((*shapes, Circle(radius=1.0))), {})
@@ -139,7 +139,7 @@ class SceneSampler:
         count: ArrayLike | None = None,
         size: ArrayLike | None = None,
     ) -> Scenes:
-        """Draws the scenes of seeds (n,); identical in every process and batch.
+        """Draw the scenes of seeds (n,); identical in every process and batch.
 
         The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
         (n,) is the index of their size. Raises ConfigError if the world has no room for a scene.
@@ -152,7 +152,7 @@ class SceneSampler:
     def draws(
         self, seeds: ArrayLike, count: ArrayLike | None, size: ArrayLike | None
     ) -> tuple[Integers, Integers, Integers]:
-        """Returns seeds, numbers of obstacles (-1 for the world's own) and sizes; see `draw`."""
+        """Return seeds, numbers of obstacles (-1 for the world's own) and sizes; see `draw`."""
         numbers = check_seeds(seeds)
         n = len(numbers)
         if count is None:
@@ -174,7 +174,7 @@ class SceneSampler:
     def draw_into(
         self, scenes: Scenes, draws: tuple[Integers, Integers, Integers], rows: slice
     ) -> None:
-        """Draws some rows of scenes of at least K obstacles; `draws` are those of all rows."""
+        """Draw some rows of scenes of at least K obstacles; `draws` are those of all rows."""
         try:
             scratch = self.scratches.pop()
         except IndexError:
@@ -244,7 +244,7 @@ class SetSampler:
         count: ArrayLike | None = None,
         size: ArrayLike | None = None,
     ) -> Scenes:
-        """Draws the scenes of seeds (n,), see `SceneSampler.draw`; K is the most of all members."""
+        """Draw the scenes of seeds (n,), see `SceneSampler.draw`; K is the most of all members."""
         draws = self.samplers[0].draws(seeds, count, size)
         scenes = Scenes.of(len(draws[0]), self.count, self.robots)
         if len(self.samplers) == 1:
@@ -257,7 +257,7 @@ class SetSampler:
 
 
 def member_of(world: AnyWorld, seed: int) -> int:
-    """Returns the index of the world of a set in which the scene of a seed is."""
+    """Return the index of the world of a set in which the scene of a seed is."""
     chosen = np.zeros(1, np.int64)
     kernels.choose_members(check_seeds(seed), len(world.members), chosen)
     return int(chosen[0])
@@ -266,7 +266,7 @@ def member_of(world: AnyWorld, seed: int) -> int:
 def sample_scene(
     world: AnyWorld, footprint: float, seed: int, robots: int = 1
 ) -> Scene:
-    """Draws the scene of a seed for M robots of a radius [m]; identical in every process."""
+    """Draw the scene of a seed for M robots of a radius [m]; identical in every process."""
     return _sampler(world, footprint, robots).draw([seed])[0]
 
 
@@ -274,7 +274,7 @@ _sampler = lru_cache(maxsize=16)(SetSampler)
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
-    """Returns a shape scaled by a factor."""
+    """Return a shape scaled by a factor."""
     if factor == 1.0:
         return shape
     lengths = ("radius", "size", "ends", "points")
@@ -432,7 +432,7 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
 
 
 def _closed(grid: GridMap) -> MapField:
-    """Returns a map plus a border: unknown cells and everything outside the map are occupied."""
+    """Return a map plus a border: unknown cells and everything outside the map are occupied."""
     closed = np.pad(grid.cells, 1, constant_values=OCCUPIED)
     x, y = grid.cell_to_world([-1.5, -1.5]).tolist()
     heading = grid.origin[2]

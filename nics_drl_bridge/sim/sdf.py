@@ -60,7 +60,7 @@ def read_sdf(
     skip_unknown: bool = False,
     may_be_empty: bool = False,
 ) -> Standing:
-    """Reads what stands in a Gazebo world at a height [m] above z = 0.
+    """Read what stands in a Gazebo world at a height [m] above z = 0.
 
     Args:
         path: of a `.world` or `.sdf` file.
@@ -283,7 +283,7 @@ class _Body(NamedTuple):
     pose: Array  # (4, 4) in the world
 
     def solid(self) -> Solid | None:
-        """Returns the body; None for the ground. Raises ShapelessError, ConfigError for sizes."""
+        """Return the body; None for the ground. Raises ShapelessError, ConfigError for sizes."""
         if isinstance(self.geometry, str):
             raise ShapelessError(self.geometry)
         shape = next(
@@ -341,7 +341,7 @@ class _Body(NamedTuple):
 
 
 def _bodies(scope: _Scope, pose: Array) -> Iterator[_Body]:
-    """Yields all collision geometries of a scope that has a pose (4, 4) in the world."""
+    """Yield all collision geometries of a scope that has a pose (4, 4) in the world."""
     for name, reason in scope.strange:
         yield _Body(name, scope.where, reason, pose)
     for link in scope.element.iterfind("link"):
@@ -446,7 +446,7 @@ def _world(path: Path) -> Element:
 
 
 def root_of(path: Path) -> Element:
-    """Returns the root of an SDF file, with tags as they stand there. Raises ConfigError."""
+    """Return the root of an SDF file, with tags as they stand there. Raises ConfigError."""
     root = _tree(path)
     if root.tag != "sdf":
         raise ConfigError(
@@ -463,7 +463,7 @@ def root_of(path: Path) -> Element:
 
 
 def _tree(path: Path) -> Element:
-    """Reads XML. Raises ConfigError with line and column, and for declared entities, which grow."""
+    """Read XML. Raises ConfigError with line and column, and for declared entities, which grow."""
     try:
         if check_no_device(path).stat().st_size > MOST_BYTES:
             reason = f"is larger than {MOST_BYTES // 2**20} MB, which no such file is"

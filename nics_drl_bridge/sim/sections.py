@@ -74,7 +74,7 @@ class Standing(NamedTuple):
 
     @property
     def obstacles(self) -> tuple[Obstacles, ...]:
-        """Groups of obstacles of one shape each, for a `World`."""
+        """Group of obstacles of one shape each, for a `World`."""
         groups: dict[Shape, list[tuple[float, float, float]]] = {}
         for shape, pose in self.placed:
             groups.setdefault(shape, []).append(pose)
@@ -83,7 +83,7 @@ class Standing(NamedTuple):
         )
 
     def bounds(self, *places: tuple[float, ...]) -> Region:
-        """Returns the least field that holds all shapes, and 1 m around places x, y, ... [m]."""
+        """Return the least field that holds all shapes, and 1 m around places x, y, ... [m]."""
         around = AROUND * np.array([(-1.0, -1.0), (1.0, 1.0)])
         corners = [around + place[:2] for place in places]
         for shape, pose in self.placed:
@@ -98,7 +98,7 @@ class Standing(NamedTuple):
 
 
 def section(solid: Solid, pose: Array, height: float) -> Placed | None:
-    """Cuts a body at a height above the ground.
+    """Cut a body at a height above the ground.
 
     Args:
         solid: the body.

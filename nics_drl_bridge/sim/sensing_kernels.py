@@ -26,7 +26,7 @@ PAST = 12
 
 @kernel
 def begin(n: int, m: int, state: State) -> None:
-    """Records the true state of a robot at the start of an episode."""
+    """Record the true state of a robot at the start of an episode."""
     past = state.past
     pose = state.pose
     odom = state.odom
@@ -50,7 +50,7 @@ def lag_of(age: int, steps: int, rows: int, substeps: int) -> int:
 def at_lag(
     past: Array, n: int, m: int, column: int, lag: int, steps: int, substeps: int
 ) -> tuple[float, float, float]:
-    """Returns three columns of `past`, `lag` substeps before the end of period `steps`."""
+    """Return three columns of `past`, `lag` substeps before the end of period `steps`."""
     rows = past.shape[2]
     new = (steps - lag // substeps) % rows
     share = (lag % substeps) / substeps
@@ -86,7 +86,7 @@ def measure(
     now: Array,
     motion: Dynamics,
 ) -> None:
-    """Measures a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
+    """Measure a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
 
     From the pose (3,) `before`, poses (N, M, 3) by the wheels, and rates (3 + S,) at the end.
     """
@@ -141,7 +141,7 @@ def measure(
 
 @kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
-    """Draws ahead, aside [m], at most std sqrt(3 period), and turn [rad]; moves the state."""
+    """Draw ahead, aside [m], at most std sqrt(3 period), and turn [rad]; move the state."""
     std = state.noise
     counter = state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
@@ -176,7 +176,7 @@ def scan_or_wait(
     motion: Dynamics,
     scratch: Scratch,
 ) -> int:
-    """Scans world n, unless `scan_together` can; returns how many worlds now wait for it."""
+    """Scan world n, unless `scan_together` can; return how many worlds now wait for it."""
     alone = False
     for m in range(state.age.shape[1]):  # a scan that is not of a robot's present pose
         alone = (
@@ -196,7 +196,7 @@ def scan_or_wait(
 def scan_together(
     waiting: int, state: State, members: Members, lidar: LidarArrays, scratch: Scratch
 ) -> None:
-    """Scans the first `waiting` worlds of the list in the scratch memory, as they stand."""
+    """Scan the first `waiting` worlds of the list in the scratch memory, as they stand."""
     scans = scratch.scans
     chosen = scans.waiting[:waiting]
     first = state.velocity.shape[1]
@@ -215,7 +215,7 @@ def scan_together(
 
 @kernel
 def distort(low: int, high: int, state: State, lidar: LidarArrays) -> None:
-    """Applies the faults of each robot's device to the scans of the worlds [low, high)."""
+    """Apply the faults of each robot's device to the scans of the worlds [low, high)."""
     limits = lidar.range_min, lidar.range_max
     for n in range(low, high):
         for m in range(state.ranges.shape[1]):
@@ -289,7 +289,7 @@ def _gather(
     motion: Dynamics,
     scratch: Scratch,
 ) -> int:
-    """Copies the bodies around `spot`, as they were `lag` substeps ago; returns their number."""
+    """Copy the bodies around `spot`, as they were `lag` substeps ago; return their number."""
     scans = scratch.scans
     cells = scratch.cells
     bodies = state.bodies

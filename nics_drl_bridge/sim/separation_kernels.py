@@ -122,7 +122,7 @@ def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
-    """Limits a displacement to `room` along n: bends it, or shortens the whole."""
+    """Limit a displacement to `room` along n: bend it, or shorten the whole."""
     ahead = dx * nx + dy * ny
     room = max(room - SLACK, 0.0)
     if ahead <= room:
@@ -233,7 +233,7 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def restrain(dx, dy, k, traffic, bends):  # type: ignore[no-untyped-def]
-    """Returns the displacement [m] that obstacle k can make of one; with `bends` it slides."""
+    """Return the displacement [m] that obstacle k can make of one; with `bends` it slides."""
     body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):
         wished_x = dx

@@ -67,7 +67,7 @@ class OutsideValidityWarning(UserWarning):
 
 
 def warn(message: str) -> None:
-    """Issues an OutsideValidityWarning to the caller that steps the simulator."""
+    """Issue an OutsideValidityWarning to the caller that steps the simulator."""
     warnings.warn(message, OutsideValidityWarning, stacklevel=5)
 
 
@@ -94,12 +94,12 @@ class CommandBox:
         self.begin()
 
     def begin(self) -> None:
-        """Begins an episode: the next step is checked, and one warning may be issued."""
+        """Begin an episode: the next step is checked, and one warning may be issued."""
         self._steps = 0
         self._armed = True
 
     def check(self, commands: Array) -> None:
-        """Warns once per episode if commands (..., C) are outside the range."""
+        """Warn once per episode if commands (..., C) are outside the range."""
         steps = self._steps
         self._steps = self._steps + 1
         if not self._armed or steps % EVERY:
@@ -121,7 +121,7 @@ class CommandBox:
 
 
 def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
-    """Raises ConfigError if a robot could cross a whole world in one step of its kinematics."""
+    """Raise ConfigError if a robot could cross a whole world in one step of its kinematics."""
     first = len(robot.state)
     most = np.maximum(np.abs(model.low), np.abs(model.high))
     ends = model.apply_curves([robot.command_low, robot.command_high])
@@ -138,7 +138,7 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
 def _check_memory(
     model: SimulatorModel, world: AnyWorld, worlds: int, robots: int
 ) -> None:
-    """Raises ConfigError for more copies of a world than fit in memory, before any allocation."""
+    """Raise ConfigError for more copies of a world than fit in memory, before any allocation."""
     obstacles = max(
         sum(group.counts[1] for group in one.obstacles) for one in world.members
     )
@@ -172,7 +172,7 @@ class EpisodeSampler:
         self.draws = None if given is None else Sampler(given, model, robots)
 
     def draw(self, seeds: ArrayLike) -> tuple[Scenes, Draws | None]:
-        """Draws the scenes and the numbers of seeds (n,)."""
+        """Draw the scenes and the numbers of seeds (n,)."""
         if self.draws is None:
             return self.scenes.draw(seeds), None
         draws = self.draws.draw(seeds)
@@ -271,19 +271,19 @@ class FastSimulator:
         return parts
 
     def sort_bodies(self) -> None:
-        """Sorts bodies into cells anew, after obstacles in `data` were put elsewhere."""
+        """Sort bodies into cells anew, after obstacles in `data` were put elsewhere."""
         for part in self.parts:
             step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
 
     def put_bodies(self, bodies: Array) -> None:
-        """Puts the obstacles of the first world at (K, 7), in the format of scenes."""
+        """Put the obstacles of the first world at (K, 7), in the format of scenes."""
         obstacles = self.data.bodies[0, : self.sampler.count]
         obstacles[:] = bodies
         obstacles[:, SHAPE] = self._in_table[bodies[:, SHAPE].astype(np.int64)]
         self.sort_bodies()
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
-        """Puts a robot of the first world at a pose (3,) with a state (S,); odometry stays."""
+        """Put a robot of the first world at a pose (3,) with a state (S,); odometry stays."""
         self.data.pose[0, robot] = pose
         self.data.state[0, robot] = state
         body = place(pose, self.footprint.radius, self._in_table[-1])
@@ -293,7 +293,7 @@ class FastSimulator:
     def take_over(
         self, other: "FastSimulator", robots: Indices, obstacles: Indices
     ) -> None:
-        """Goes on with the episode of another simulator of this model, in its first world.
+        """Go on with the episode of another simulator of this model, in its first world.
 
         `robots` are indices of the other's robots, which become the first ones here, `obstacles`
         (K,) those of its obstacles; -1 is none of them. Obstacles are put by `put_bodies`.
@@ -330,7 +330,7 @@ class FastSimulator:
         return {sensor.name: sensor.renderer(around) for sensor in self.model.sensors}
 
     def sense(self, worlds: Indices) -> None:
-        """Renders the readings of the further sensors in some worlds (n,)."""
+        """Render the readings of the further sensors in some worlds (n,)."""
         for name, render in self._renders.items():
             render(self.readings[name], worlds)
 
@@ -340,7 +340,7 @@ class FastSimulator:
         worlds: ArrayLike | None = None,
         starts: Starts = None,
     ) -> Scenes:
-        """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
+        """Begin episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
         They may follow from the scenes that were drawn, by a function.
         A seed (n,) fixes scene, start, goal, noise and randomisation. The obstacles of the scenes
@@ -374,7 +374,7 @@ class FastSimulator:
         )
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
-        """Returns the scenes that `reset` would begin with for seeds (n,)."""
+        """Return the scenes that `reset` would begin with for seeds (n,)."""
         return self.episodes.draw(seeds)[0]
 
     @property
@@ -425,16 +425,16 @@ class FastSimulator:
             self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:
-        """Moves every world by one control period under commands (N, M, C), see `data`."""
+        """Move every world by one control period under commands (N, M, C), see `data`."""
         checked = self._checked(slice(0, len(self.data.steps)), commands)
         self.run_parts(lambda part: self._step(part, checked[part]))
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
-        """Runs a function for each of `parts`, one thread per part; returns the results."""
+        """Run a function for each of `parts`, one thread per part; return the results."""
         return run_parts(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
-        """Moves the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
+        """Move the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
         self._step(part, self._checked(part, commands))
 
     def _step(self, part: slice, commands: Array) -> None:

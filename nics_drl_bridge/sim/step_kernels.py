@@ -48,7 +48,7 @@ TOGETHER = 48
 
 @kernel(view=True)
 def surroundings_of(n: int, members: Members) -> Surroundings:
-    """Returns all that stands in world n of the simulation."""
+    """Return all that stands in world n of the simulation."""
     p = members.fixtures.member[n]
     frame = members.fixtures.frames[p]
     distances = cells_of(members.distances, members.fields[p])

@@ -154,7 +154,7 @@ class World(Schema):
         return self._spare
 
     def with_spare(self, shapes: tuple[Shape, ...]) -> "World":
-        """Returns the world with room for further bodies of some shapes."""
+        """Return the world with room for further bodies of some shapes."""
         copy = self.model_copy()
         copy._spare = shapes
         return copy
@@ -206,7 +206,7 @@ class World(Schema):
         return x1, y1, x2, y2
 
     def all_walls(self) -> Array:
-        """Returns (W, 4) the four sides of the field, if any, then the further walls [m]."""
+        """Return (W, 4) the four sides of the field, if any, then the further walls [m]."""
         sides: list[Region] = []
         if self.size is not None:
             x = self.size[0] / 2.0
@@ -216,7 +216,7 @@ class World(Schema):
 
 
 def load_world(name: str | Path, also: Iterable[str] = ()) -> World:
-    """Loads a shipped world by name (`arena`), or a YAML file; an error may offer `also` others."""
+    """Load a shipped world by name (`arena`), or a YAML file; an error may offer `also` others."""
     path = find_config(name, "worlds", also)
     world = load_yaml(path, World)
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
@@ -228,7 +228,7 @@ def load_world(name: str | Path, also: Iterable[str] = ()) -> World:
 
 
 def check_places(world: World) -> None:
-    """Raises ConfigError for an obstacle outside the world, or that does not fit at a waypoint."""
+    """Raise ConfigError for an obstacle outside the world, or that does not fit at a waypoint."""
     for g, group in enumerate(world.obstacles):
         where = f"{world.source}: key 'obstacles.{g}"
         for n, pose in enumerate(group.at):
@@ -247,7 +247,7 @@ def check_places(world: World) -> None:
 def check_place(
     what: str, world: World, x: float, y: float, radius: float = 0.0
 ) -> None:
-    """Raises ConfigError for a place off a world's field, or in a wall within a radius [m]."""
+    """Raise ConfigError for a place off a world's field, or in a wall within a radius [m]."""
     solid = 0.0 if world.grid is None else world.grid.resolution  # room in a full cell
     if (room := room_at(world, x, y)) <= max(radius, solid):
         reason = "is in a wall" if room >= 0.0 else "lies outside the world"

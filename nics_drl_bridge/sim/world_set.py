@@ -50,7 +50,7 @@ class WorldSet:
     spare: tuple[Shape, ...] = ()  # see `World.spare`
 
     def with_spare(self, shapes: tuple[Shape, ...]) -> WorldSet:
-        """Returns the set with room for further bodies of some shapes."""
+        """Return the set with room for further bodies of some shapes."""
         return replace(self, spare=shapes)
 
     @property
@@ -84,7 +84,7 @@ AnyWorld: TypeAlias = World | WorldSet
 
 
 def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
-    """Loads a world or a world set.
+    """Load a world or a world set.
 
     A world is a shipped one by name (`arena`, `barn/7`), or any other by the path of its YAML file.
     A set is a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds, a folder, a glob
