@@ -174,12 +174,13 @@ def _update_estimator(
 class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
-    `truth` adds the true pose to `info`; `timeout_s` bounds each wait; the simulator must draw by
-    the same `randomisation`; `stamped` says whether `cmd_vel` is a TwistStamped, by default as the
-    simulator hears it. The `simulator` of the name `simulation_interfaces` is any that serves
-    these; `standard` are options of them, see `StandardOptions`. Raises BackendError if no
-    simulator is there, it refuses, is not in lock-step, or another node moved it; ModelError if it
-    runs another model or world; StaleDataError if its data do not arrive.
+    `truth` adds the true pose to `info`. `timeout_s` bounds each wait. The simulator must draw from
+    the same `randomisation`. `stamped` selects TwistStamped for `cmd_vel`; by default the type to
+    which the simulator subscribes is used. With the `simulator` named `simulation_interfaces`, any
+    simulator that serves these interfaces will do; `standard` holds its `StandardOptions`.
+
+    Raises BackendError if there is no simulator, it refuses, it is not in lock-step or another node
+    moved it; ModelError if it runs another model or world; StaleDataError if data do not arrive.
     """
 
     def __init__(
@@ -349,7 +350,7 @@ class DdsBackend:
                 self._episodes.repeat()
 
     def facts(self) -> BackendFacts:
-        """Return the newest true pose, if it was asked for."""
+        """Return the newest true pose, if it was requested."""
         return self._facts
 
     def halt(self) -> None:
@@ -384,7 +385,7 @@ class FleetBackend:
         if len(set(namespaces)) < max(2, len(namespaces)):
             given = f"namespaces {list(namespaces)!r}"
             raise ConfigError(
-                f"backend_options: {given} must be of at least two different robots."
+                f"backend_options: {given} must name at least two different robots."
             )
         self._robots: list[DdsBackend] = []
         try:
@@ -453,12 +454,14 @@ def dds_backend(
     randomisation: str | Randomisation | None = None,
     **options: Any,
 ) -> interface.Backend:
-    """Return the backend for the options; ConfigError if they do not go together, BackendError."""
+    """Return the backend for the options. Raises ConfigError if they conflict; BackendError."""
     if not estimator:
-        raise ConfigError("backend 'dds' always estimates; leave out `estimator`.")
+        raise ConfigError(
+            "backend 'dds' always estimates the state; leave out `estimator`."
+        )
     if randomisation is not None:
         if mode != "lockstep" or robots > 1:
-            needed = "one robot in mode 'lockstep' alone can be randomised"
+            needed = "only one robot in mode 'lockstep' can be randomised"
             raise ConfigError(
                 f"backend 'dds': {needed}, not {robots} in mode {mode!r}."
             )

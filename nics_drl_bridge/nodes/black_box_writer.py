@@ -1,11 +1,12 @@
-"""Program that keeps what the gate has seen lately, and writes it to a file at each stop.
+"""Program that keeps the gate's recent inputs and writes them to a file at each stop.
 
-The gate starts it at its own start and feeds it by a pipe, so a stop costs the gate nothing, a disk
-that hangs blocks only this process, and a file is completed even if the gate is killed.
+The gate starts this program when it starts itself, and feeds it through a pipe. So a stop costs the
+gate nothing, a hanging disk blocks only this process, and a file is completed even if the gate is
+killed.
 
 Messages on standard input are lines: `STATE` and `ENTRY` are followed by a line of the black box,
 `WRITE` by JSON with the path and the names of the gate's files. An answer on standard output is
-JSON with the path and what failed, empty if nothing did.
+JSON with the path and the failure, which is empty if there was none.
 """
 
 import contextlib
@@ -25,11 +26,11 @@ from nics_drl_bridge.gate.seal import append_checksum
 STATE = b"S"
 ENTRY = b"E"
 WRITE = b"W"
-KEPT_S = 30.0  # what is kept reaches back at least as far
+KEPT_S = 30.0  # minimum time span of the lines that are kept [s]
 MOST_LINES = 18_000  # fewer than a replay takes
 MOST_BYTES = 48 * 2**20
 MOST_AT_WORK = 3  # files that may wait for the disk
-PATIENCE_S = 20.0  # for which a file may take once the gate has ended
+PATIENCE_S = 20.0  # longest time for a file once the gate has ended [s]
 FILES_KEPT = 20
 NICENESS = 5
 CHUNK_BYTES = 2**20
@@ -50,7 +51,7 @@ class Segment:
 
 
 class Ring:
-    """The latest lines of the black box, which begin with a state of the gate."""
+    """The latest lines of the black box, beginning with a state of the gate."""
 
     def __init__(self, kept_s: float = KEPT_S, most_lines: int = MOST_LINES) -> None:
         self._kept_s = kept_s
@@ -78,13 +79,13 @@ class Ring:
         return lines > self._most_lines or size > MOST_BYTES
 
     def lines(self) -> list[bytes]:
-        """Return what a file holds now: the oldest state, and all entries since."""
+        """Return the lines for a file: the oldest state, and all entries since."""
         kept = [line for each in self._segments for line in each.lines[1:]]
         return [self._segments[0].lines[0], *kept] if self._segments else []
 
 
 class Disk:
-    """Writes files one after the other, in a thread, which alone waits for the disk."""
+    """Writes files one after the other, in a thread of its own that may wait for the disk."""
 
     def __init__(
         self,
@@ -96,21 +97,21 @@ class Disk:
         self._orders: SimpleQueue[tuple[str, Sequence[str], list[bytes]] | None] = (
             SimpleQueue()
         )
-        # for files that are not written yet
+        # permits for files that are not written yet
         self._room = threading.Semaphore(MOST_AT_WORK)
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def write(self, path: str, own: Sequence[str], lines: list[bytes]) -> None:
-        """Let a file be written; `own` are the names of this gate's files, oldest first."""
+        """Queue a file for writing; `own` are the names of this gate's files, oldest first."""
         if not self._room.acquire(blocking=False):
             self._answer(path, "the files before it are still being written")
             return
         self._orders.put((path, own, lines))
 
     def give_up(self) -> None:
-        """Stop what is being written, and leave nothing of it behind."""
+        """Stop writing the current file, and leave nothing of it behind."""
         self._given_up.set()
 
     def finish(self, seconds: float) -> bool:
@@ -142,7 +143,7 @@ class Disk:
 
 
 def prune(folder: Path, own: Sequence[str]) -> None:
-    """Remove the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
+    """Remove the oldest files beyond `FILES_KEPT`; those in `own` count as the newest."""
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(
         folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name)
@@ -167,7 +168,7 @@ def answer(path: str, failed: str) -> None:
 
 
 def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
-    """Keep what the gate sends, and write it whenever the gate says so."""
+    """Keep what the gate sends, and write it whenever the gate asks for it."""
     ring = Ring()
     for kind, content in messages:
         if kind == STATE:
@@ -181,15 +182,17 @@ def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
 
 
 def main() -> None:
-    """Serve the gate until it ends; SIGTERM lets it give up the files that are not written yet."""
-    # the gate's real-time priority is not for its files
+    """Serve the gate until it ends; on SIGTERM, give up the files that are not written yet."""
+    # writing files must not run at the gate's real-time priority
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(NICENESS)
     disk = Disk(answer)
     signal.signal(signal.SIGTERM, lambda *_: disk.give_up())
     serve(read_messages(0), disk)
-    os._exit(0 if disk.finish(PATIENCE_S) else 1)  # also while the disk hangs
+    os._exit(
+        0 if disk.finish(PATIENCE_S) else 1
+    )  # ends the process even while the disk hangs
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Command lines of other Python processes that find the modules which this process finds."""
+"""Command lines for Python processes that find the same modules as this process."""
 
 import sys
 
@@ -6,8 +6,8 @@ import sys
 def module_command(module: str) -> list[str]:
     """Return the command that runs a module; its arguments may follow.
 
-    `python -m` looks for modules in the working folder first, which may hold somebody's data, such
-    as a model with a file `json.py`. PYTHONSAFEPATH prevents that from Python 3.11 on only.
+    `python -m` looks for modules in the working folder first. That folder may hold arbitrary data,
+    such as a model with a file `json.py`. PYTHONSAFEPATH prevents this only since Python 3.11.
     """
     path = f"import sys; sys.path[:] = {sys.path!r}"
     run = f"from runpy import run_module; run_module({module!r}, run_name='__main__')"

@@ -62,20 +62,20 @@ FOREIGN_SETTINGS = {
     command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
     command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
 }
-# a motion that was decided on longer ago than this is decided on again [s]
+# maximum age of a decision; an older one is made again [s]
 STALE_S = 0.05
-# for a slow lidar, default age limit of a command's scan, in its periods
+# default age limit of a command's scan for a slow lidar, in scan periods
 SCAN_PERIODS = 1.75
-ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
+ROTATION = slice(3, 7)  # the quaternion among the numbers of an odometry
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
     "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
-    "capability CAP_SYS_NICE, or set 0. It goes on without."
+    "capability CAP_SYS_NICE, or set 0. The gate runs without it."
 )
 
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
-    """Declare and read a gate's parameters, log doubts; ConfigError if one can't be used."""
+    """Declare and read a gate's parameters, and log doubts. Raises ConfigError for a bad value."""
     for name in sorted(parameters.SPLIT.keys() & runner.given_values(node).keys()):
         raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
     file = str(runner.declare_row(node, parameters.LIMITS))
@@ -95,10 +95,10 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
 
 
 def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersResult:
-    """Refuse another clock: the rules were derived for the one that the gate was started with."""
+    """Refuse a change of `use_sim_time`: the rules were derived for the clock at the start."""
     for parameter in parameters:
         if parameter.name == SIM_TIME and parameter.value != simulated:
-            fix = f"start it anew with `-p {SIM_TIME}:={str(not simulated).lower()}`."
+            fix = f"restart it with `-p {SIM_TIME}:={str(not simulated).lower()}`."
             reason = (
                 f"parameter {SIM_TIME!r} can't be changed while the gate runs; {fix}"
             )
@@ -118,10 +118,10 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
 
 
 def declare_black_box(node: Node) -> Path:
-    """Declare the folder of the recordings of stops, and return that of the node's namespace."""
+    """Declare the folder for recordings of stops; return its subfolder for the node's namespace."""
     given = str(runner.declare_row(node, parameters.BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
-    # So that no gate of another namespace removes its files.
+    # A gate in another namespace must not remove its files.
     return (Path(given) if given else home / "black_box") / str(
         node.get_namespace()
     ).strip("/")
@@ -146,7 +146,7 @@ def _declare_shield(
 
 
 def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
-    """Read a serialised LaserScan; raises `wire.UNREADABLE`, as the other readers."""
+    """Read a serialised LaserScan. Raises `wire.UNREADABLE`, like the other readers."""
     ranges = from_device(wire.ranges_of(content), lidar)
     return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
 
@@ -184,12 +184,12 @@ def command(content: bytes) -> inputs.Command:
 def foreign_command(
     kind: str, oldest_ns: int, newest: inputs.Scan | None, content: bytes
 ) -> inputs.Command:
-    """Read a command of another controller, which counts as computed from the newest scan.
+    """Read a command of another controller; it counts as computed from the newest scan.
 
-    A stamp, if it has one, must not be older than `oldest_ns`. Raises `wire.UNREADABLE`.
+    Its stamp, if any, must not be older than `oldest_ns`. Raises `wire.UNREADABLE`.
     """
     if newest is None:
-        raise ValueError("no scan has come yet that it could be from")
+        raise ValueError("no scan has arrived yet from which it could be computed")
     if kind == TWIST:
         return inputs.Command(newest.stamp_ns, np.array(wire.twist_of(content)))
     if 0 < wire.stamp_of(content) < oldest_ns:
@@ -205,23 +205,28 @@ def e_stop(content: bytes) -> inputs.EStop:
 
 
 def take_priority(priority: int) -> str:
-    """Give all present threads SCHED_FIFO, if not 0; return reason and fix if refused, or ""."""
+    """Give all present threads SCHED_FIFO, unless 0; return reason and fix if refused, or ""."""
     if priority == 0:
         return ""
     try:
         for thread in ("0", *os.listdir("/proc/self/task")):
-            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+            with contextlib.suppress(
+                ProcessLookupError
+            ):  # the thread has ended meanwhile
                 os.sched_setscheduler(
                     int(thread), os.SCHED_FIFO, os.sched_param(priority)
                 )
-    except (OSError, AttributeError) as error:  # the latter on systems without it
+    except (
+        OSError,
+        AttributeError,
+    ) as error:  # AttributeError: the system has no scheduler calls
         reason = str(getattr(error, "strerror", None) or "it has none").lower()
         return REFUSED.format(priority=priority, error=reason)
     return ""
 
 
 class CommandGate(qos.QosWatch):
-    """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process, and starts disarmed."""
+    """The node between `cmd_vel_raw` and `cmd_vel`; it has its own process and starts disarmed."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
@@ -234,7 +239,7 @@ class CommandGate(qos.QosWatch):
             self._config, declare_black_box(self), model.robot.name, logger
         )
         if not self._config.e_stop_required:
-            risk = "an e_stop that was never heard does not stop the robot. That is for simulations"
+            risk = "the robot moves even if e_stop was never received. That is for simulations"
             logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
         if self._config.shield is not None:
             shield.warm_up()
@@ -292,7 +297,7 @@ class CommandGate(qos.QosWatch):
     ) -> None:
         try:
             given = read(content)
-        except wire.UNREADABLE as error:  # of a middleware with another encoding
+        except wire.UNREADABLE as error:  # the middleware uses another encoding
             self._log.refuse(f"{topic}: {error}")
         else:
             self._decide(given)
@@ -312,7 +317,7 @@ class CommandGate(qos.QosWatch):
         self._take("cmd_vel_raw", read_with_source, content)
 
     def _take_e_stop(self, content: bytes) -> None:
-        """Decide on all messages that wait, on a press first, so that none waits for the rest."""
+        """Decide on all waiting messages; a press comes first, so that it waits for no other."""
         contents = [content, *qos.take_waiting(self._button)]
         self._queue.hear(time.monotonic(), len(contents))
         messages = []
@@ -366,7 +371,7 @@ class CommandGate(qos.QosWatch):
         now = time.monotonic()
         before = self._state
         self._state, decision = decide(self._config, before, given, now)
-        # Publish first: the rest may take its time.
+        # Publish first: the rest is not urgent.
         instead = self._say(decision, now) if decision.publish else None
         self._log.note(Entry(now, given, before, decision))
         if instead is not None and not isinstance(given, inputs.Press):
@@ -374,8 +379,8 @@ class CommandGate(qos.QosWatch):
         return decision
 
     def _say(self, decision: Decision, now: float) -> inputs.Input | None:
-        # The only path to the robot except `stop`. A motion that was decided on too long ago, in a
-        # process frozen since, is not sent; so the clock is read immediately before.
+        # Apart from `stop`, this is the only path to the robot. The clock is read immediately
+        # before sending: if the process was frozen since the decision, the motion is not sent.
         content = self._message(decision.twist)
         if not np.isfinite(decision.twist).all():
             self._out.publish(self._message(np.zeros(3)))
@@ -399,7 +404,7 @@ class CommandGate(qos.QosWatch):
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
             return found
-        warning = f"others publish on cmd_vel, too ({others}), and move the robot past this gate"
+        warning = f"others publish on cmd_vel too ({others}) and bypass this gate"
         self.get_logger().warning(warning, throttle_duration_sec=10.0)
         return found._replace(message=f"{found.message}; {warning}", warns=True)
 

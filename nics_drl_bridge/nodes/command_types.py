@@ -1,6 +1,6 @@
-"""The type of a topic of commands, which is a Twist for some robots and a TwistStamped for others.
+"""The message type of a command topic: Twist for some robots, TwistStamped for others.
 
-Topics of the same name and of different types are not connected, and nobody says so.
+ROS 2 does not connect topics that have the same name but different types, and reports nothing.
 """
 
 import contextlib
@@ -27,14 +27,14 @@ def name_of(stamped: bool) -> str:
 
 
 def heard_stamped(node: Node, topic: str) -> bool | None:
-    """True if who hears commands on a topic hears a TwistStamped; None if nobody, or both."""
+    """True if the subscribers of a command topic expect TwistStamped; None if none, or mixed."""
     ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     kinds = {end.topic_type for end in ends} & KINDS.keys()
     return kinds == {TWIST_STAMPED} if len(kinds) == 1 else None
 
 
 def deaf_subscribers(node: Node, topic: str, stamped: bool) -> str:
-    """Return a clause about who subscribes to another type than is published; empty for nobody."""
+    """Return a clause about subscribers that expect another type; empty if there are none."""
     ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     kinds = sorted({end.topic_type for end in ends} - {name_of(stamped)})
     if not kinds:
@@ -46,9 +46,9 @@ def deaf_subscribers(node: Node, topic: str, stamped: bool) -> str:
 
 
 class TypeWatch:
-    """Warns once of each node that publishes another type on a topic than is heard there.
+    """Warns once about each node that publishes a type to which nobody here subscribes.
 
-    `settings` are those that select a type, by the type.
+    `settings` holds, for each type, the setting that selects it.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class TypeWatch:
         self._warned: set[tuple[str, str]] = set()
 
     def look(self, heard: str) -> None:
-        """Look for publishers of another type than the one that is heard."""
+        """Warn about publishers of a type other than the one that is heard."""
         for end in self._node.get_publishers_info_by_topic(self._topic):
             kind = end.topic_type
             who = qos.owner(end)
@@ -70,16 +70,16 @@ class TypeWatch:
             known = kind in self._settings
             fix = f"set {self._settings[kind]}" if known else "another type there"
             self._node.get_logger().warning(
-                f"{self._topic}: {who} publishes {kind}, but {heard} is expected here, so that its "
-                f"commands are not heard; let it publish that, or {fix}."
+                f"{self._topic}: {who} publishes {kind}, but {heard} is expected here, so its "
+                f"commands are not received; make it publish that, or {fix}."
             )
 
 
 class CommandListener:
-    """Subscribes to commands of the type that is published, whatever the parameter says.
+    """Subscribes to commands of the type that is published, even if the parameter differs.
 
-    The parameter chooses the type until somebody publishes. Of two types at a time, the one that
-    is heard stays, and a warning names who publishes the other.
+    The parameter selects the type until a node publishes. If both types are published at once, the
+    present subscription stays, and a warning names the publishers of the other type.
     """
 
     def __init__(
@@ -101,9 +101,9 @@ class CommandListener:
         self._subscription = made
 
     def look(self) -> None:
-        """Follow the type that is published now."""
+        """Subscribe to the type that is published now."""
         if self._subscription is None:
-            # the old one is not gone yet: at the next look
+            # if the old subscription is not gone yet, the next look tries again
             with contextlib.suppress(RuntimeError):
                 self._subscribe()
             return
@@ -125,7 +125,7 @@ class CommandListener:
             f"{self.kind}, not {expected}, and is heard from now on; to hear its first commands "
             f"too, set {SETTINGS[self.kind]}."
         )
-        # A process can have one type of a topic only, and the executor still holds the old one.
+        # A process can use a topic with one type only, and the executor still holds the old one.
         self._unsubscribe()
 
     def _unsubscribe(self) -> None:
@@ -134,6 +134,6 @@ class CommandListener:
             self._subscription = None
 
     def close(self) -> None:
-        """Listen no more."""
+        """End the subscription."""
         self._node.destroy_timer(self._timer)
         self._unsubscribe()

@@ -1,4 +1,4 @@
-"""Conversion of messages to data and back, in pairs: `x_to_ros`, `x_from_ros`; types by name."""
+"""Conversion of messages to data and back, in pairs `x_to_ros`, `x_from_ros`; types by name."""
 
 import array
 import contextlib
@@ -33,7 +33,7 @@ PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
 # variance of z, roll and pitch, which a planar robot does not measure
 UNUSED_VARIANCE = 1e6
-# type, in a `.msg` file
+# the type of a field in a `.msg` file
 FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 
 
@@ -58,7 +58,7 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
 
 
 def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion:
-    """Return an orientation turned about the vertical to a heading [rad]; it stays tilted."""
+    """Return an orientation turned about the vertical to a heading [rad]; its tilt stays."""
     x = stood.x
     y = stood.y
     z = stood.z
@@ -119,10 +119,10 @@ def odometry_to_ros(
     twist: ArrayLike,
     time_ns: int,
     frames: Sequence[str],
-    # of position, heading, linear, angular [SI]
+    # variances of position, heading, linear and angular velocity [SI units]
     variance: tuple[float, float, float, float],
 ) -> Odometry:
-    """Return pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry."""
+    """Return a pose (3,) in a fixed frame and a body twist (3,) as an Odometry."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = Odometry(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
@@ -154,14 +154,14 @@ def covariance_to_ros(planar: Array) -> Array:
 def pose_from_ros(
     message: geometry.PoseStamped | geometry.PoseWithCovarianceStamped,
 ) -> tuple[Array, Array | None]:
-    """Return the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
+    """Return the pose (3,) of a message and its covariance (3, 3), or None without one."""
     known = isinstance(message, geometry.PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
     return np.array(messages.read_whole_pose(message)), covariance
 
 
 def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) -> Array:
-    """Return the pose (3,) in the map of `initialpose`. Raises ConfigError if it can't be used."""
+    """Return the pose (3,) of `initialpose` in the map. Raises ConfigError if it can't be used."""
     frame = message.header.frame_id.strip("/")
     pose = pose_from_ros(message)[0]
     if frame not in ("", map_frame):
@@ -171,7 +171,7 @@ def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) ->
         )
     if not np.isfinite(pose).all():
         fix = "give finite numbers and a quaternion of unit length."
-        raise ConfigError(f"{INITIAL_POSE}: a pose that is none is refused; {fix}")
+        raise ConfigError(f"{INITIAL_POSE}: an invalid pose is refused; {fix}")
     return pose
 
 
@@ -186,7 +186,7 @@ def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamp
 
 
 def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
-    """Return a map as an OccupancyGrid, measured at a time [ns] and in force since."""
+    """Return a map as an OccupancyGrid, measured and valid from a time [ns]."""
     message = OccupancyGrid(data=array.array("b", grid.cells.tobytes()))
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     info, (x, y, heading) = message.info, grid.origin
@@ -209,7 +209,7 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
     ):
         size = f"{info.height} x {info.width} of {info.resolution:g} m"
         raise ConfigError(
-            f"map: {cells.size} cells are no {size}; look at who publishes it."
+            f"map: {cells.size} cells do not make {size}; look at who publishes it."
         )
     place = info.origin.position
     turn = info.origin.orientation
@@ -220,7 +220,7 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
 
 
 def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:
-    """Return a state (S,) as a JointState: angles and lengths as positions, all else as rates."""
+    """Return a state (S,) as a JointState: angles and lengths as positions, the rest as rates."""
     message = JointState()
     message.header.stamp = stamp_to_ros(time_ns)
     for variable, value in zip(
@@ -236,7 +236,7 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
 def message_type(kind: str) -> Any | None:
     """Return the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed.
 
-    Types come from other programs on the network: only a package that has messages is imported.
+    The name may come from any program on the network, so only packages with messages are imported.
     """
     named = re.fullmatch(
         r"([A-Za-z]\w*)/(msg|srv|action)/([A-Za-z]\w*)", kind, re.ASCII
@@ -253,7 +253,7 @@ def message_type(kind: str) -> Any | None:
 
 
 def _has_interfaces(package: str, interface: str) -> bool:
-    """True if a package that is installed has messages; nothing of it is imported for that."""
+    """True if an installed package has messages; nothing is imported to find out."""
     spec = find_spec(package)
     folders = (spec.submodule_search_locations if spec is not None else None) or ()
     return any(Path(folder, interface, "__init__.py").is_file() for folder in folders)
@@ -281,17 +281,17 @@ def sensor_to_ros(
 
 
 def sensor_from_ros(sensor: Sensor, content: bytes) -> NDArray[np.float32]:
-    """Return the reading (S,) of a serialised message. Raises ValueError if it is none."""
+    """Return the reading (S,) of a serialised message. Raises ValueError for another type."""
     kind = sensor_type(sensor)
     try:
         message = deserialize_message(content, kind)
-    except Exception as error:  # noqa: BLE001  (rclpy's is of no public class)
-        raise ValueError(f"is no {sensor.message} ({error})") from None
+    except Exception as error:  # noqa: BLE001  (rclpy raises no public class)
+        raise ValueError(f"is not a {sensor.message} ({error})") from None
     return sensor.read(message)
 
 
 def message_texts(kind: str) -> dict[str, str]:
-    """Return the `.msg` texts of a type and of all types in it, as far as they are installed."""
+    """Return the `.msg` texts of a type and of the types in it, as far as they are installed."""
     texts: dict[str, str] = {}
     waiting = [kind]
     while waiting:
@@ -313,7 +313,7 @@ def _message_file(kind: str) -> Path | None:
 
     package, _, name = kind.split("/")
     prefixes = [sys.prefix]
-    # if ROS 2 comes from wheels, the variable is not set
+    # the variable is not set if ROS 2 comes from wheels
     with contextlib.suppress(OSError):
         prefixes = [*get_search_paths(), sys.prefix]
     files = (

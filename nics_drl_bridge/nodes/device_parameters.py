@@ -1,4 +1,4 @@
-"""Parameters of a device node: devices, frames, episodes, and the pace of world and topics."""
+"""Parameters of a device node: devices, frames, episodes, and the rates of world and topics."""
 
 import math
 import re
@@ -25,9 +25,9 @@ START = "episode_start"
 GIVEN = "episode_start_given"
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-# a step may be early by this share of it, because timers are no more precise
+# fraction of a step by which it may be early, because timers are no more precise
 SLACK = 0.1
-# steps missed for longer than this are not made up for [ns]
+# a backlog longer than this is dropped instead of made up for [ns]
 PATIENCE_NS = NS_PER_S // 2
 
 
@@ -39,7 +39,7 @@ class DeviceTiming(NamedTuple):
     step_ns: int  # of the world
     odom_ns: int  # between two odometries
     scan_ns: int  # between two scans
-    # least delay to publication, and greatest additional one
+    # minimum delay to publication, and maximum additional delay
     scan_late_ns: tuple[int, int]
     odom_late_ns: tuple[int, int]
 
@@ -61,8 +61,8 @@ class Frames(NamedTuple):
 
 
 def declare_device(node: Node, laser_frame: str) -> None:
-    """Declare, and check, all but the parameters of one kind of simulator. ConfigError."""
-    # First, so that it also checks the values that the node is started with.
+    """Declare and check the parameters that all simulators share. Raises ConfigError."""
+    # Added first, so that it also checks the values at startup.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
     fleet = ParameterDescriptor(
         description=ROBOTS.about, read_only=True, dynamic_typing=True
@@ -82,7 +82,7 @@ def number(node: Node, name: str) -> float:
 
 
 def randomisation(node: Node) -> Randomisation | None:
-    """Return what is drawn in each episode, if anything. Raises ConfigError."""
+    """Return the randomisation of each episode, if any. Raises ConfigError."""
     name = str(node.get_parameter("randomisation").value)
     return load_randomisation(name) if name else None
 
@@ -132,7 +132,7 @@ def timed_model(
 
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
-    """Return a parameter that must be one of some words. Raises ConfigError with the nearest."""
+    """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
     value = str(node.get_parameter(name).value)
     if value not in valid:
         raise ConfigError(
@@ -142,7 +142,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
 
 
 def namespaces(node: Node) -> tuple[str, ...]:
-    """Return each robot's namespace, below the node's own and empty for one. ConfigError."""
+    """Return the robots' namespaces below the node's; empty for one robot. Raises ConfigError."""
     value: Any = node.get_parameter("robots").value
     if (
         isinstance(value, int)
@@ -174,7 +174,7 @@ def default_namespaces(robots: int) -> tuple[str, ...]:
 
 
 def frames(node: Node, namespace: str) -> Frames:
-    """Return the frames of a robot; those of a fleet begin with its namespace, except the map."""
+    """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
     prefix = str(node.get_parameter("frame_prefix").value) + (
         f"{namespace}/" if namespace else ""
     )
@@ -191,15 +191,15 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
         if parameter.name == START:
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
-                reason = "episode_start must be three finite numbers: x, y, heading; of each robot."
+                reason = "episode_start must be three finite numbers per robot: x, y, heading."
             elif node.has_parameter(GIVEN) and values.size != (
                 needed := 3 * len(namespaces(node))
             ):
-                reason = f"episode_start has {values.size} numbers; give {needed}, 3 of each robot."
+                reason = f"episode_start has {values.size} numbers; give {needed}, 3 per robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
     names = {parameter.name for parameter in parameters}
-    # A start that is set alone holds; when they are declared, it comes first.
+    # Setting a start alone makes it apply; at declaration it comes before its flag.
     if (
         not reason
         and START in names
@@ -211,7 +211,7 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
 
 
 class TopicPace:
-    """Decides when a topic is due, so that its mean rate is the requested one with any step."""
+    """Decides when a topic is due, so that its mean rate is as requested with any step."""
 
     def __init__(self, period_ns: int, step_ns: int) -> None:
         self._period_ns = period_ns
@@ -219,7 +219,7 @@ class TopicPace:
         self._next_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Start anew: the next message is due now."""
+        """Restart: the next message is due now."""
         self._next_ns = now_ns
 
     def due(self, now_ns: int) -> bool:
@@ -231,7 +231,7 @@ class TopicPace:
 
 
 def common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """Return the longest step, in steps of the model [s], that suits all periods [s] best."""
+    """Return the longest step, in steps `dt` of the model [s], that suits the periods [s] best."""
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 
 

@@ -548,7 +548,7 @@ def test_what_topics_can_not_give_is_refused(model):
     with pytest.raises(ConfigError, match="'dds' always estimates"):
         BridgeEnv("dds", model, estimator=False)
     with pytest.raises(
-        ConfigError, match="one robot in mode 'lockstep' alone can be randomised"
+        ConfigError, match="only one robot in mode 'lockstep' can be randomised"
     ):
         BridgeEnv(
             "dds", model, randomisation="mild", backend_options={"mode": "realtime"}

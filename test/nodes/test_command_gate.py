@@ -410,7 +410,7 @@ def test_another_publisher_of_commands_is_told_of_as_long_as_it_is_there(robot):
     robot.drives()
     other = robot.peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
     robot.peer.until(
-        lambda: "others publish on cmd_vel, too (1)" in robot.diagnosed()[""],
+        lambda: "others publish on cmd_vel too (1)" in robot.diagnosed()[""],
         "the warning",
     )
     robot.peer.node.destroy_publisher(other)

@@ -142,7 +142,7 @@ def test_another_controllers_command_is_refused_if_it_is_old_or_before_any_scan(
         command_gate.foreign_command(
             "TwistStamped", STAMP_NS + 1, scanned(STAMP_NS), content
         )
-    with pytest.raises(ValueError, match="no scan has come yet"):
+    with pytest.raises(ValueError, match="no scan has arrived yet"):
         command_gate.foreign_command("TwistStamped", 0, None, content)
     unstamped = serialize_message(TwistStamped())
     kept = command_gate.foreign_command("TwistStamped", 1, scanned(STAMP_NS), unstamped)

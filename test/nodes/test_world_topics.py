@@ -163,7 +163,7 @@ def test_an_initial_pose_that_can_not_be_used_is_refused_with_a_sentence(simulat
     for wrong, sentence in (
         (at(9.0, 0.0, frame="site"), "x 9.00 m, y 0.00 m is outside the world"),
         (at(0.0, 0.0, frame="kitchen"), "in the frame 'kitchen' is refused"),
-        (at(math.nan, 0.0, frame="site"), "a pose that is none is refused"),
+        (at(math.nan, 0.0, frame="site"), "an invalid pose is refused"),
     ):
         poses.publish(wrong)
         peer.until(lambda text=sentence: text in simulator.log.read_text(), sentence)
