@@ -1,22 +1,24 @@
-"""How long the gate may sleep until the queue of `e_stop` may have lost a press.
+"""How long the gate may sleep before the queue of `e_stop` may lose a press.
 
-A process that the system does not run reads nothing; the messages then wait in the socket's buffer.
-What no longer fits is sent again only as long as the button still has it, and a press that was
-followed by other messages is gone. So a sleep beyond what surely fits counts as a press.
+While the system does not schedule a process, its messages wait in the socket's buffer. Messages
+that do not fit are sent again only while the button still holds them; a press that was followed by
+other messages is lost. So a sleep during which the buffer may overflow counts as a press.
 """
 
 from collections import deque
 
-QUEUE_MESSAGES = 150  # that surely fit: Linux's default buffer was measured to hold 254
-LONGEST_SLEEP_S = 1.0  # a rate that was measured before a longer sleep proves nothing
-RATE_WINDOW_S = 1.0  # over which the rate of messages is measured
+QUEUE_MESSAGES = 150  # certain to fit: Linux's default buffer held 254 when measured
+LONGEST_SLEEP_S = (
+    1.0  # after a longer sleep, the rate measured before it proves nothing
+)
+RATE_WINDOW_S = 1.0  # window over which the rate of messages is measured
 
 
 class EStopQueue:
     """Measures the rate of `e_stop`, and judges each sleep of the gate by it."""
 
     def __init__(self) -> None:
-        # times [s], and messages read at each
+        # (time [s], number of messages read)
         self._heard: deque[tuple[float, int]] = deque()
         self._ticked_s: float | None = None  # last tick of the gate
         self._ever_heard = False
@@ -31,16 +33,14 @@ class EStopQueue:
             self._heard.popleft()
 
     def tick(self, now: float) -> str:
-        """Return why the sleep since the last tick may have lost a press; else ""."""
+        """Return why a press may have been lost since the last tick; "" if none can be."""
         before = self._ticked_s
         self._ticked_s = now
         waiting = self._since_tick
         self._since_tick = 0
-        # a publisher that began in a sleep has no rate from before
+        # if the publisher started during the sleep, there is no earlier rate
         if waiting > QUEUE_MESSAGES:
-            return (
-                f"{waiting} messages came at once, and a press among more may be lost"
-            )
+            return f"{waiting} messages came at once, and a press may have been lost among them"
         if before is None or not self._ever_heard:
             return ""
         asleep = now - before
@@ -48,4 +48,4 @@ class EStopQueue:
         longest = min(LONGEST_SLEEP_S, QUEUE_MESSAGES / max(rate, 1.0))
         if asleep <= longest:
             return ""
-        return f"the gate slept for {asleep:.2f} s, and a press in it may be lost"
+        return f"the gate slept for {asleep:.2f} s, and a press may have been lost meanwhile"

@@ -1,10 +1,9 @@
-"""The end of a node's process: at once while it has nothing to leave behind, and never slowly.
+"""The end of a node's process: immediate while it has nothing to clean up, and never slow.
 
-Python runs its handlers of signals between two steps of its own, and none is run while LLVM
-compiles for seconds. Until a node runs, it has nothing to leave behind, and the signals have their
-default effect: they end the process, whose exit code is then that of the signal. Nor is Python
-finalised in the end, which takes as long again as all else on a busy machine: libraries are
-unloaded while their threads run.
+Python runs signal handlers between two of its own instructions, so none runs while LLVM compiles
+for seconds. Until a node runs, it has nothing to clean up, and signals keep their default effect:
+they end the process, with the signal's exit code. At the end, Python is not finalised either: on a
+busy machine that takes as long as everything before, and unloads libraries while their threads run.
 """
 
 import contextlib
@@ -31,10 +30,10 @@ ENDING = (
     signal.SIGPWR,
     *range(signal.SIGRTMIN, signal.SIGRTMAX + 1),
 )
-"""Signals that end a process unless it handles them, but SIGKILL, those of a fault in the process
-itself, and those that Python ignores, as SIGPIPE."""
-OUTPUT_S = 1.0  # for which the last lines may take to be written
-_own_process = False  # True in a process that is one node and nothing else
+"""Signals that end a process unless it handles them, except SIGKILL, signals of a fault in the
+process itself, and those that Python ignores, such as SIGPIPE."""
+OUTPUT_S = 1.0  # time limit for writing the last lines [s]
+_own_process = False  # True if this process is a single node
 _within = False  # `at_once`
 
 
@@ -48,23 +47,23 @@ def leave(code: int) -> NoReturn:
 
 
 def ending_signals() -> list[int]:
-    """Return the signals at which this process ends in order.
+    """Return the signals at which this process ends cleanly.
 
-    If it was started to outlive its terminal, as by `nohup`, SIGHUP is not one of them.
+    SIGHUP is not among them if the process is to outlive its terminal, as under `nohup`.
     """
     outlives = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [number for number in ENDING if not (outlives and number == signal.SIGHUP)]
 
 
 def own_process() -> None:
-    """Let `at_once` take effect: this process is one node and nothing else."""
+    """Let `at_once` take effect, because this process is a single node."""
     global _own_process
     _own_process = True
 
 
 @contextlib.contextmanager
 def at_once() -> Iterator[None]:
-    """Let the signals that end it end the process at once, whatever it is doing."""
+    """Within this context, let ending signals end the process at once, whatever it is doing."""
     global _within
     if not _own_process or _within:
         yield

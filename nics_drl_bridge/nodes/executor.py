@@ -1,4 +1,4 @@
-"""An executor that keeps its wait set: 1.5 times as many lock-step steps a second as rclpy's."""
+"""An executor that keeps its wait set: 1.5 times as many lock-step steps per second as rclpy's."""
 
 import contextlib
 import inspect
@@ -23,18 +23,19 @@ from rclpy.waitable import NumberOfEntities
 from nics_drl_bridge.interface import NS_PER_S
 
 InvalidHandle = rclpy_implementation.InvalidHandle
-# raised if rclpy differs from what is known here
+# raised if this version of rclpy has other internals
 PARTS_MISSING = (AttributeError, TypeError)
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
-"""Returned by a callback that has woken another thread of this process. The executor then keeps out
-of that thread's way for a part of the time since it last did so, at most for LONGEST_REST_S."""
-# a timer without a period is always ready, and the thread has other work, too
+"""Returned by a callback that has woken another thread of this process. The executor then rests, to
+leave the processor to that thread, for a fraction of the time since it last rested, at most for
+LONGEST_REST_S."""
+# A timer without a period is always ready, but the thread has other work too.
 MOST_AT_ONCE = 32
 
 
 class StandingExecutor(SingleThreadedExecutor):
-    """Handles all that is frequent; callbacks of subscriptions may return `HANDED_OVER`."""
+    """Handles frequent events itself; callbacks of subscriptions may return `HANDED_OVER`."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)
@@ -55,30 +56,30 @@ class StandingExecutor(SingleThreadedExecutor):
             return
         # Before anything else: a peer may be waiting for the answer to a message.
         self._call(received)
-        if received:  # to take what arrived meanwhile costs less than to wait for it
+        if received:  # taking what arrived meanwhile costs less than a wait
             self._call(self._come())
         due = list[Any]()
         asked = list[Callable[[], object]]()
         left = False
         try:
-            # a callback may have shut it down
+            # a callback may have shut down the executor or its context
             if self._entities is not None and self.context.ok():
                 asked = self._entities.asked()
                 woken, others = self._entities.others_ready(self._guard)
-                # adding an entity to a node wakes the executor
+                # the executor is also woken when an entity is added to a node
                 self._changed |= woken or others
-                # So does rclpy itself, after each callback; then there is nothing to handle.
+                # rclpy also wakes it after each callback; then there is nothing to handle.
                 due, left = (
                     self._entities.due(),
                     others or (woken and bool(self._tasks)),
                 )
         except PARTS_MISSING as error:
             self._fall_back(error)
-        if asked:  # a message that was sent before a request is handled before it, too
+        if asked:  # a message sent before a request must also be handled before it
             self._call(self._come())
         for answer in asked:
             answer()
-        # These may have destroyed entities, which can't be waited for.
+        # The callbacks may have destroyed entities, which must leave the wait set.
         self._changed |= bool(asked or due)
         for timer in due:
             self._tick(timer)
@@ -90,7 +91,7 @@ class StandingExecutor(SingleThreadedExecutor):
             entities = self._gathered()
             entities.wait(-1 if timeout_sec is None else int(timeout_sec * NS_PER_S))
         except RuntimeError:
-            # of the library: another thread may have shut down the context
+            # raised by the library if another thread has shut down the context
             if self.context.ok():
                 raise
         if not self.context.ok():
@@ -98,7 +99,7 @@ class StandingExecutor(SingleThreadedExecutor):
         return entities.taken()
 
     def _come(self) -> list[Received]:
-        # a callback may have ended it
+        # a callback may have shut down the executor or its context
         if self._entities is None or not self.context.ok():
             return []
         return self._entities.come()
@@ -120,7 +121,7 @@ class StandingExecutor(SingleThreadedExecutor):
         try:
             if not timer.handle.is_timer_ready():
                 return
-            timer.handle.call_timer()  # it is due again after another period
+            timer.handle.call_timer()  # restarts its period
         except PARTS_MISSING as error:
             self._fall_back(error)
             return
@@ -251,7 +252,7 @@ class _Entities:
         triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
             if guard.handle.pointer in triggered:
-                # waiting has reset it; set again for rclpy
+                # Waiting has reset the flag; rclpy needs it.
                 guard._executor_triggered = True
         woken = own is not None and own.handle.pointer in triggered
         if woken:

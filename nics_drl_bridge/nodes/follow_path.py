@@ -44,15 +44,15 @@ ABORT = "abort"
 CANCELED = "canceled"
 SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
 LOOK_S = 2.0  # time between two looks for another server of `navigate_to_pose` [s]
-PATIENT_PERIODS = 10  # silence of this many control periods is no silence
-TURNING = 1.5  # turn rate at the goal, by the angle that is left [1/s]
+PATIENT_PERIODS = 10  # control periods for which data may always be silent
+TURNING = 1.5  # turn rate at the goal per remaining angle [1/s]
 # [rad/s], and for the time that is left [m/s]
 LEAST_TURN = 0.3
 SLOWEST = 0.1
 
 
 class Refusal(Exception):  # noqa: N818  (an outcome, by the standard's code)
-    """A goal ends here, with a code of its action's result, and a sentence."""
+    """The end of a goal, with a code of its action's result and a sentence."""
 
     def __init__(self, code: str, sentence: str) -> None:
         super().__init__(sentence)
@@ -60,16 +60,16 @@ class Refusal(Exception):  # noqa: N818  (an outcome, by the standard's code)
 
 
 class Wish(NamedTuple):
-    """Motion that a policy asks for, on its way to a goal."""
+    """Motion that a policy requests on the way to a goal."""
 
     twist: Array  # (3,) for `cmd_vel`
     touched: bool
 
 
 class HeldActionServer(ActionServer):
-    """Accepts goals while `open_` says so, and hands each to `begin`, until `finish` ends it.
+    """Accepts goals while `open_` is true; hands each to `begin` and holds it until `finish`.
 
-    None is waited for in a callback: rclpy polls what waits, in every turn of an executor.
+    No callback waits for a goal, because rclpy polls waiting callbacks in each turn of an executor.
     """
 
     def __init__(
@@ -93,11 +93,11 @@ class HeldActionServer(ActionServer):
         )
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
-        """Hold an accepted goal, which counts as executing from now on; see rclpy."""
+        """Hold an accepted goal, which now counts as executing; see rclpy."""
         self._begin(goal_handle)
 
     def finish(self, goal_handle: Any, end: str, result: Any) -> None:
-        """End a goal, by the name of a method of it, with a result."""
+        """End a goal with a result; `end` names the goal handle's method."""
         getattr(goal_handle, end)()
         super().notify_execute(goal_handle, lambda _: result)
 
@@ -112,13 +112,13 @@ class Goal(NamedTuple):
 
     @property
     def code(self) -> str:
-        """Code of a result for a path that can't be driven."""
+        """Result code for a path that can't be driven."""
         return "INVALID_PATH" if self.name == FOLLOW else "UNKNOWN"
 
 
 @dataclass
 class Run:
-    """A goal that is being driven to."""
+    """An accepted goal to which the robot is driving."""
 
     goal: Goal
     frame: str  # of the path
@@ -126,15 +126,15 @@ class Run:
     arrival: GoalChecker
     progress: ProgressChecker
     started_s: float
-    valid_s: float  # last time that the robot could be driven
+    valid_s: float  # last time at which a command was valid
 
 
 class PathActions:
-    """Serves both actions while a node is active; one goal at a time, and the newest one counts.
+    """Serves both actions while a node is active; a new goal replaces the present one.
 
-    `drive` asks the policy for a goal (2,) in the map of the estimate; `anew` empties its memory.
-    Without nav2_msgs nothing is served. `navigate_to_pose` is left to another node that serves it,
-    as Nav2's bt_navigator.
+    `drive` asks the policy to drive to a goal (2,) in the map of the estimate; `anew` empties its
+    memory. Without nav2_msgs nothing is served. If another node, such as Nav2's bt_navigator,
+    serves `navigate_to_pose`, this one does not.
     """
 
     def __init__(
@@ -164,7 +164,9 @@ class PathActions:
             name: conversions.message_type(kind) for name, kind in KINDS.items()
         }
         if None in self._kinds.values():
-            why = "the package nav2_msgs is not installed, so that its actions are not served"
+            why = (
+                "the package nav2_msgs is not installed, so its actions are not served"
+            )
             node.get_logger().info(f"{why}; install it with your ROS 2 distribution.")
             return
         self._serve(FOLLOW, self._follow)
@@ -205,12 +207,12 @@ class PathActions:
 
     @property
     def active(self) -> bool:
-        """True while a goal is being driven to."""
+        """True while the robot is driving to a goal."""
         return self._run is not None
 
     @property
     def led(self) -> bool:
-        """True if another node serves `navigate_to_pose`, and so takes care of `goal_pose`."""
+        """True if another node serves `navigate_to_pose` and thereby handles `goal_pose`."""
         wanted = f"{self._node.resolve_topic_name(NAVIGATE)}/_action/send_goal"
         own = self._node.get_name(), self._node.get_namespace()
         for name, space in self._node.get_node_names_and_namespaces():
@@ -226,7 +228,7 @@ class PathActions:
             self._run is None or self._run.goal.name == FOLLOW
         )
         if own and self.led:
-            told = f"another node serves {NAVIGATE}, so this one does not any more"
+            told = f"another node serves {NAVIGATE}, so this one no longer does"
             self._node.get_logger().info(told)
             self._servers.pop(NAVIGATE).destroy()
 
@@ -257,18 +259,16 @@ class PathActions:
         try:
             run = self._run = begin(goal)
             if before is not None and before.frame == run.frame:
-                # a way that is planned again is no way got on
+                # a replanned path is no progress
                 run.valid_s = before.valid_s
                 if before.progress.check == run.progress.check:
                     run.progress = before.progress
             if before is None or not np.array_equal(before.path.end, run.path.end):
-                self._anew()  # not where the same way is planned again
+                self._anew()  # not if the same path was replanned
         except Refusal as refusal:
             self._end(goal, ABORT, refusal.code, str(refusal))
         if before is not None:
-            self._end(
-                before.goal, ABORT, "UNKNOWN", "a newer goal has taken its place."
-            )
+            self._end(before.goal, ABORT, "UNKNOWN", "a newer goal has replaced it.")
 
     def _follow(self, goal: Goal) -> Run:
         asked = goal.handle.request
@@ -290,9 +290,7 @@ class PathActions:
         asked = goal.handle.request
         if asked.behavior_tree:
             fix = "leave it empty, or let Nav2 serve the action"
-            reason = (
-                f"there are no behaviour trees here, as {asked.behavior_tree!r}; {fix}."
-            )
+            reason = f"behaviour trees such as {asked.behavior_tree!r} are not supported; {fix}."
             raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
         end = np.array([read_pose(asked.pose)])
         frame, end = self._placed(goal, asked.pose.header.frame_id, end)
@@ -308,7 +306,7 @@ class PathActions:
         return self._begin(goal, frame, way, checks)
 
     def _way(self, frame: str, robot: Array, end: Array) -> Array:
-        """Return the way (P, 3) on the map, if there is one; else straight."""
+        """Return the path (P, 3) on the map if there is one, else a straight one."""
         points = np.stack([robot[:2], end[:2]])
         if self._map is not None and frame in ("", self._map[0]):
             points = route(
@@ -325,9 +323,9 @@ class PathActions:
     def _robot_in(self, name: str, frame: str) -> Array:
         robot = self._frames.robot_in(frame)
         if robot is None:
-            fix = "give the goal again when odometry and pose have come"
+            fix = "send the goal again once odometry and pose have arrived"
             raise Refusal(
-                "TF_ERROR", f"{name}: the robot's place is not known yet; {fix}."
+                "TF_ERROR", f"{name}: the robot's pose is not known yet; {fix}."
             )
         return robot
 
@@ -370,10 +368,10 @@ class PathActions:
             why = f"pose {k} of the path, ({x:.2f}, {y:.2f}) m, is off the map; replan it."
             raise Refusal(goal.code, f"{goal.name}: {why}")
 
-    # A goal is driven to.
+    # The robot drives to a goal.
 
     def tick(self) -> bool:
-        """End a goal that was cancelled, or whose data are silent; True if one was ended."""
+        """End a goal that was cancelled or whose data are silent; return True if one was ended."""
         run = self._run
         if run is None:
             return False
@@ -399,7 +397,7 @@ class PathActions:
         return False
 
     def twist(self) -> Array:
-        """Return the twist (3,) towards the end of the path, and report; end the goal there."""
+        """Return the twist (3,) towards the end of the path; report, and end the goal there."""
         run = self._run
         assert run is not None  # noqa: S101
         try:
@@ -420,7 +418,8 @@ class PathActions:
         now_s = self._topics.newest_ns * S_PER_NS
         if run.progress.stuck(now_s, robot):
             raise Refusal(
-                "FAILED_TO_MAKE_PROGRESS", "the robot has not got on for too long."
+                "FAILED_TO_MAKE_PROGRESS",
+                "the robot has made no progress for too long.",
             )
         estimate = self._topics.view()
         ahead = geometry.compose(
@@ -429,11 +428,11 @@ class PathActions:
         drive = self._drive(ahead[:2])
         if drive.touched:
             patience = number(self._node, "failure_tolerance")
-            # it has waited for long enough
+            # the robot has waited long enough
             if 0.0 <= patience < time.monotonic() - run.valid_s:
                 code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
                 raise Refusal(
-                    code, "the robot touches something, so that no command is valid."
+                    code, "the robot touches something, so no command is valid."
                 )
         else:
             run.valid_s = time.monotonic()
@@ -442,7 +441,7 @@ class PathActions:
             most = float(self._robot.to_fields(self._robot.command_high)[2])
             rate = min(max(TURNING * abs(turn), LEAST_TURN), most)
             twist = np.array([0.0, 0.0, math.copysign(rate, turn)])
-        # Slower, down to the speed limit; the robot's way stays the same.
+        # Scale the speed down to the limit without changing the robot's path.
         share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
         steers = self._robot.steers and not self._robot.takes_turn_rate
         twist = twist * np.array([share, share, 1.0 if steers else share])
@@ -501,7 +500,7 @@ def duration_to_ros(seconds: float) -> Duration:
 
 
 def result_of(kind: Any, code: str, sentence: str = "") -> Any:
-    """Return an action's result; distributions differ in what it tells: nothing, code, or both."""
+    """Return an action's result; by distribution it has no fields, a code, or code and sentence."""
     result = kind.Result()
     if hasattr(result, "error_code"):
         result.error_code = getattr(

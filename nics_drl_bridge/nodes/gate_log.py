@@ -1,4 +1,4 @@
-"""Reports of `command_gate`: log lines, counters, and the black box. It never waits for a disk."""
+"""Reports of `command_gate`: log lines, counters and the black box. Never waits for a disk."""
 
 import contextlib
 import fcntl
@@ -25,25 +25,27 @@ from nics_drl_bridge.nodes.black_box_writer import (
 from nics_drl_bridge.nodes.child_python import module_command
 from nics_drl_bridge.nodes.runner import Condition
 
-BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
-LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
-# the same for a kind that does not cease: each time it is doubled [s]
+BURST_S = (
+    3.0  # commands must pass for this long before a stop counts as a new burst [s]
+)
+LINE_S = 2.0  # time between two log lines of a kind; those in between are counted [s]
+# limit of that time, which doubles with each line while a kind persists [s]
 LONGEST_LINE_S = 64.0
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
-GRACE_S = 0.5  # in which the writer may clean up what it gives up [s]
+GRACE_S = 0.5  # time for the writer to clean up files that it gives up [s]
 POLL_S = 0.005
-# after which a file that is not answered counts as not written [s]
+# time without an answer after which a file counts as not written [s]
 OVERDUE_S = PATIENCE_S + 5.0
 RESTART_S = 5.0  # shortest time between two starts of the writer [s]
 STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states
 MOST_BACKLOG = 4 * 2**20  # bytes that wait for the writer; a minute of driving
-MOST_TOLD = 65_536  # bytes of answers that are read at once
-PIPE_BYTES = 2**20  # most that Linux gives a user's process
+MOST_TOLD = 65_536  # largest read of answers [bytes]
+PIPE_BYTES = 2**20  # Linux's maximum for an unprivileged process
 
 
 class GateLog:
-    """Counts all, logs without flooding, writes the first stop of each rule in a burst of stops."""
+    """Counts all events, limits log lines, and records the first stop of each rule in a burst."""
 
     def __init__(
         self, config: GateConfig, folder: Path, robot: str, logger: RcutilsLogger
@@ -55,18 +57,18 @@ class GateLog:
         self._hardware = robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
-        # that stops the robot; "" while commands pass, None at first
+        # the rule that stops the robot; "" while commands pass, None at first
         self._rule: str | None = None
-        # with a written stop since commands last passed for long
+        # rules whose stop was recorded in the present burst
         self._burst: set[str] = set()
-        # Of each kind: time of the last line, and least time until the next [s].
+        # For each kind: time of the last line, and minimum time until the next [s].
         self._said: dict[str, tuple[float, float]] = {}
-        self._kept: Counter[str] = Counter()  # events of a kind since then
+        self._kept: Counter[str] = Counter()  # events of a kind since its last line
         self._owed = False
         self._writer = BoxWriter()
-        # time of the last state that the writer was sent [s]
+        # time of the last state sent to the writer [s]
         self._state_s = float("-inf")
-        self._entries = 0  # that it was sent since
+        self._entries = 0  # sent to the writer since that state
         self._names: list[str] = []
 
     def note(self, entry: Entry) -> None:
@@ -83,9 +85,9 @@ class GateLog:
         if rule != self._rule:
             self._changed(rule)
         self._cause = cause
-        # what does not alternate is told in any case
+        # a rule that persists is always logged
         lasts = entry.now - self._since >= LINE_S
-        # else it is told later
+        # otherwise the line follows later
         if self._owed and (more := self._due(rule, lasts)) is not None:
             self._owed = False
             if cause is None:
@@ -96,7 +98,7 @@ class GateLog:
             self._burst.clear()
 
     def _record(self, entry: Entry) -> None:
-        """Send an entry to the writer, and now and then the state from which it follows."""
+        """Send an entry to the writer, preceded now and then by the state from which it follows."""
         passed = entry.now - self._state_s
         if (
             self._writer.needs_state
@@ -110,12 +112,12 @@ class GateLog:
         self._entries += 1
 
     def refuse(self, reason: str) -> None:
-        """Count an unused input, by the part of the reason before the colon, and log it."""
+        """Count a rejected input by the part of the reason before the colon, and log it."""
         if (more := self._counted(f"refused, {reason.partition(':')[0]}")) is not None:
             self._logger.warning(f"refused: {reason}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
-        """Count and log a decision that is not finite, which must never happen."""
+        """Count and log a decision that is not finite; that must never happen."""
         if (more := self._counted("not finite, sent as zero")) is not None:
             then = f"zero is sent, and the e-stop is pressed{more}"
             self._logger.error(f"decided on {list(twist)}, which is not finite: {then}")
@@ -126,7 +128,7 @@ class GateLog:
         return self._due(kind)
 
     def _due(self, kind: str, certainly: bool = False) -> str | None:
-        """Return what to append to a line; None if one of its kind was logged a moment ago."""
+        """Return a suffix for the line; None if one of its kind was logged a moment ago."""
         said, wait_s = self._said.get(kind, (float("-inf"), LINE_S))
         if not certainly and self._now - said < wait_s:
             return None
@@ -176,32 +178,32 @@ class GateLog:
         return Condition(message, self._cause is not None, facts, self._hardware)
 
     def close(self) -> None:
-        """Wait briefly for files that are being written; none is left incomplete."""
+        """Wait briefly for files that are being written; leave none incomplete."""
         for failure in self._writer.close(CLOSING_S):
             self._failed(failure)
 
 
 class BoxWriter:
-    """The writer of the black box, a process of its own (`black_box_writer.py`).
+    """Handle of the black box's writer, which is a separate process (`black_box_writer.py`).
 
-    It is started anew if it has ended or does not read. Nothing here waits for it but `close`.
+    The writer is restarted if it has ended or does not read. Only `close` waits for it.
     """
 
     def __init__(self) -> None:
         self.needs_state = True  # before the next entry
-        self._backlog = bytearray()  # that the pipe has not taken yet
-        # times [s] of files that are not answered yet, by path
+        self._backlog = bytearray()  # not yet taken by the pipe
+        # path of each file without an answer yet -> time of the order [s]
         self._orders: dict[str, float] = {}
-        self._answers = b""  # the beginning of a line
+        self._answers = b""  # an incomplete line
         self._failed: list[str] = []
         self._entrance = self._exit = -1  # our ends of its pipes
         self._start()
 
     def __del__(self) -> None:
-        self._close_pipes()  # it ends when they are closed
+        self._close_pipes()  # this ends the writer
 
     def state(self, now: float, line: bytes) -> None:
-        """Send the gate's state at a time [s], from which the next entries follow."""
+        """Send the gate's state at a time [s]; the next entries follow from it."""
         self.needs_state = False
         self._send(STATE, f"{now} ".encode() + line)
 
@@ -210,7 +212,7 @@ class BoxWriter:
         self._send(ENTRY, line)
 
     def write(self, path: Path, own: Sequence[str]) -> None:
-        """Let what was sent last be written; `own` are the names of this gate's files."""
+        """Order a file of what was sent last; `own` are the names of this gate's files."""
         self._orders[str(path)] = time.monotonic()
         order = {"path": str(path), "own": list(own)}
         self._send(WRITE, json.dumps(order).encode() + b"\n")
@@ -236,7 +238,7 @@ class BoxWriter:
             self._process.terminate()
             self._finish(GRACE_S)
         reason = f"its writer ended with {self._process.poll()}"
-        # blocked by the disk; it ends when that releases it
+        # the disk blocks the writer, which ends once it is released
         if self._process.poll() is None:
             self._process.kill()
             reason = "the disk does not answer"
@@ -256,7 +258,7 @@ class BoxWriter:
             self._restart("its writer did not read")
 
     def _flush(self) -> None:
-        with contextlib.suppress(OSError):  # it is full, or the writer has ended
+        with contextlib.suppress(OSError):  # the pipe is full, or the writer has ended
             while self._backlog:
                 sent = os.write(self._entrance, self._backlog)
                 del self._backlog[:sent]
@@ -289,7 +291,7 @@ class BoxWriter:
             self._failed.append(f"its writer can't be started ({error.strerror})")
 
     def _start(self) -> None:
-        """Start the writer; it is executed, not forked, as DDS has threads in this process."""
+        """Start the writer; executed, not forked, because DDS has threads in this process."""
         self._close_pipes()
         self._backlog = bytearray()
         self._answers = b""
@@ -299,7 +301,7 @@ class BoxWriter:
         self._exit, target = os.pipe()
         os.set_blocking(self._entrance, False)
         os.set_blocking(self._exit, False)
-        with contextlib.suppress(AttributeError, OSError):  # the usual size will do
+        with contextlib.suppress(AttributeError, OSError):  # the default size will do
             fcntl.fcntl(self._entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         try:
             self._process = subprocess.Popen(
@@ -307,7 +309,7 @@ class BoxWriter:
                 stdin=source,
                 stdout=target,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C reaches all of a session; the gate decides
+                start_new_session=True,  # Ctrl-C would reach the writer; the gate ends it
             )
         finally:
             os.close(source)
@@ -325,6 +327,6 @@ class BoxWriter:
         while self._process.poll() is None and time.monotonic() < deadline:
             self._flush()
             if not self._backlog and self._entrance >= 0:
-                os.close(self._entrance)  # it ends once it has read all
+                os.close(self._entrance)  # the writer ends once it has read everything
                 self._entrance = -1
             time.sleep(POLL_S)

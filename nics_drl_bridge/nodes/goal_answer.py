@@ -1,4 +1,4 @@
-"""What a policy node answers to a goal, as it stands in its diagnostics; without ROS 2."""
+"""A policy node's answer to a goal, as its diagnostics carry it; needs no ROS 2."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ TOLD = "newest goal"
 
 @dataclass(frozen=True)
 class GoalAnswer:
-    """Whether a goal was taken."""
+    """The answer to a goal: accepted or refused."""
 
     stamp_ns: int  # of the goal's message
     taken: bool

@@ -1,4 +1,4 @@
-"""Goals in other frames than the map's, by the estimate, the newest odometry and `/tf_static`."""
+"""Goals in frames other than the map, by the estimate, the newest odometry and `/tf_static`."""
 
 from typing import Any
 
@@ -16,16 +16,16 @@ from nics_drl_bridge.nodes.robot_topics import RobotTopics
 
 
 class GoalFrames:
-    """Knows where the frames of a robot are: map, odometry, the robot, and what is mounted on it.
+    """Tracks the poses of a robot's frames: map, odometry, the robot, and frames mounted on it.
 
-    The frames of odometry and robot are those of its `odom`; `base_frame` is another name of the
-    latter. Of `/tf`, only a localiser's map -> odom is followed, not what moves on the robot.
+    The topic `odom` names the frames of odometry and robot; `base_frame` is another name of the
+    robot's. Of `/tf`, only a localiser's map -> odom is used, not the moving parts of the robot.
     """
 
     def __init__(self, node: Node, topics: RobotTopics) -> None:
         self._node = node
         self._topics = topics
-        # frame: its parent, and its pose there
+        # frame -> its parent, and its pose in the parent
         self._mounted: dict[str, tuple[str, Array]] = {}
         self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
         self._transforms = conversions.message_type("tf2_msgs/msg/TFMessage")
@@ -71,7 +71,7 @@ class GoalFrames:
         return self._topics.view().pose if self._topics.located else None
 
     def in_map(self, goal: PoseStamped) -> Array:
-        """Return x, y (2,) of a goal in the map, as the robot stands now. Raises ConfigError."""
+        """Return x, y (2,) of a goal in the map, given the robot's pose now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
         if not np.isfinite(place).all():
             told = f"({place[0]:g}, {place[1]:g})"
@@ -80,14 +80,14 @@ class GoalFrames:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:
             raise ConfigError(f"goal_pose: {error}") from None
-        # of a localiser, if there is one; else that of the estimate
+        # by a localiser, if there is one; else by the estimate
         if frame == self._map:
             robot = None if self._odom is None else self.robot_in(self._map)
             if robot is None:
                 return place[:2]
         elif (robot := self._topics.in_odom()) is None:
             raise ConfigError(
-                "goal_pose: its place is unknown before odometry comes; wait for it."
+                "goal_pose: its place is unknown until odometry arrives; wait for it."
             )
         there: Array = geometry.compose(
             self._topics.view().pose, geometry.between(robot, place)
@@ -95,10 +95,10 @@ class GoalFrames:
         return there[:2]
 
     def fixed(self, frame: str, places: Array) -> tuple[str, Array]:
-        """Return poses (..., 3) of a frame in the map or `odom`, and which of them it is.
+        """Return poses (..., 3) of a frame in the map or in `odom`, and the name of the one used.
 
-        Those of the robot, or of what is mounted on it, are in `odom`, as the robot stands now.
-        Raises ConfigError for a frame that is not known, or as long as the robot's place is not.
+        Poses in frames of the robot are in `odom`, given the robot's present pose. Raises
+        ConfigError for an unknown frame, and while the robot's pose is unknown.
         """
         asked = frame = frame.strip("/")
         odom, robot = (each.strip("/") for each in self._topics.frames)
@@ -110,9 +110,9 @@ class GoalFrames:
                 reported = self._topics.in_odom()
                 if reported is None or not self._topics.located:
                     why = f"a goal in the frame {asked!r} is refused"
-                    why = f"{why}, as the robot's place is not known yet"
+                    why = f"{why}, because the robot's pose is not known yet"
                     raise ConfigError(
-                        f"{why}; give it again when odometry and pose have come."
+                        f"{why}; send it again once odometry and pose have arrived."
                     )
                 return odom, places if frame == odom else geometry.compose(
                     reported, places
@@ -128,5 +128,5 @@ class GoalFrames:
         if self._transforms is None:
             heard = "one that /tf_static joins to them, which needs tf2_msgs"
             heard = f"{heard} ({how_to_install('tf2_msgs')})"
-        why = f"a goal in the frame {asked!r} is refused, which is not known here"
+        why = f"a goal in the frame {asked!r} is refused: the frame is not known here"
         raise ConfigError(f"{why}; give it in {names}, or {heard}.")

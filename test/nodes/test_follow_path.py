@@ -163,7 +163,7 @@ REFUSED = [
     (
         path((0.0, 0.0), frame="kitchen"),
         CODES.TF_ERROR,
-        "'kitchen' is refused, which is not known",
+        "'kitchen' is refused: the frame is not known",
     ),
     (
         by(controller_id="DWB"),

@@ -127,5 +127,5 @@ def test_frames_that_are_mounted_on_each_other_end_in_a_refusal(frames):
 def test_before_the_robots_place_is_known_only_goals_of_the_map_are_taken(frames):
     frames._topics.reported = None
     assert frames.in_map(goal("map", 1.0, 0.0)) == pytest.approx([1.0, 0.0])
-    with pytest.raises(ConfigError, match="place is not known yet"):
+    with pytest.raises(ConfigError, match="pose is not known yet"):
         frames.in_map(goal("base_link", 1.0, 0.0))
