@@ -1,7 +1,7 @@
-"""Launch descriptions of what `starting` describes, for the launch files in `launch/` and your own.
+"""Launch descriptions of the launches in `starting`, for the files in `launch/` and your own.
 
-A launch file of your own takes a whole launch, as `describe(whole_simulation())`, or puts parts
-and arguments together, as `describe(Launch("...", [bridge], [*common("false"), *of_bridge()]))`.
+Your own launch file can take a whole launch, as in `describe(whole_simulation())`, or combine parts
+and arguments, as in `describe(Launch("...", [bridge], [*common("false"), *of_bridge()]))`.
 """
 
 from typing import Any
@@ -48,7 +48,7 @@ __all__ = [
 
 
 def describe(launch: Launch) -> Any:
-    """Return the launch description of arguments and of the nodes that they ask for."""
+    """Return the launch description of a launch: its arguments, and the nodes that they select."""
 
     def start(context: Any) -> list[Any]:
         names = [argument.name for argument in launch.arguments]
@@ -60,7 +60,7 @@ def describe(launch: Launch) -> Any:
 
 
 def declaration_of(argument: Argument) -> DeclareLaunchArgument:
-    """Return an argument as `launch` declares it."""
+    """Return the `launch` declaration of an argument."""
     default: Any = argument.default
     if argument.same_as:
         default = LaunchConfiguration(argument.same_as)
@@ -73,7 +73,7 @@ def declaration_of(argument: Argument) -> DeclareLaunchArgument:
 
 
 def action_of(node: NodeStart) -> Node:
-    """Return a node as `launch` starts it."""
+    """Return the `launch` action that starts a node."""
     files = [node.params_file] if node.params_file else []
     parameters = {name: parameter_of(value) for name, value in node.parameters.items()}
     return Node(
@@ -89,7 +89,7 @@ def action_of(node: NodeStart) -> Node:
 
 
 def parameter_of(value: Any) -> Any:
-    """Return a parameter; a string stays a string, even if it looks like a number."""
+    """Return the value of a parameter; a string that looks like a number stays a string."""
     if isinstance(value, str):
         return ParameterValue(TextSubstitution(text=value), value_type=str)
     if isinstance(value, list) and all(isinstance(each, str) for each in value):

@@ -1,4 +1,4 @@
-"""Base of the managed nodes: configure, activate, deactivate, cleanup, shutdown."""
+"""Base class of the managed nodes: configure, activate, deactivate, cleanup, shutdown."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -21,9 +21,9 @@ FAILURE = TransitionCallbackReturn.FAILURE
 
 
 class ManagedNode(QosWatch, LifecycleNode):
-    """A lifecycle node; `configure` makes what it needs, with the clean-up on the stack `undo`.
+    """A lifecycle node; `configure` creates its resources and puts their clean-up on `undo`.
 
-    It declares the parameters of the rows, beside those of any managed node and of the sensors.
+    It declares the parameters in `rows`, in addition to those of managed nodes and of sensors.
     """
 
     def __init__(self, name: str, context: Context, rows: Sequence[Row]) -> None:
@@ -34,14 +34,14 @@ class ManagedNode(QosWatch, LifecycleNode):
         if fault := frame_fault(self._parameters.values()):
             raise ConfigError(fault)
         self._autostart = bool(values[0])
-        # `state`: the last primary one
+        # the last primary state
         self.state = UNCONFIGURED
         self._starting = False
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
-        """Create a publisher that is silent unless the node is active, until clean-up."""
+        """Create a publisher, until clean-up, that is silent unless the node is active."""
         profile = copied(qos)
         options = self.publisher_options(topic, profile)
         made = super().create_lifecycle_publisher(kind, topic, profile, **options)
@@ -49,10 +49,10 @@ class ManagedNode(QosWatch, LifecycleNode):
         return made
 
     def configure(self) -> None:
-        """Make what the parameters request. Raises BridgeError if one can't be used."""
+        """Create what the parameters request. Raises BridgeError if one can't be used."""
 
     def activate(self) -> None:
-        """Begin to act."""
+        """Start to act."""
 
     def deactivate(self) -> None:
         """Leave the robot at rest; publish nothing afterwards."""
@@ -61,7 +61,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         """Configure and activate the node, if `autostart` is set. Raises BridgeError."""
         if not self._autostart:
             self.get_logger().info(
-                "unconfigured: waits for `ros2 lifecycle set` (autostart false)"
+                "unconfigured: waiting for `ros2 lifecycle set` (autostart is false)"
             )
             return
         self._starting = True
@@ -82,13 +82,13 @@ class ManagedNode(QosWatch, LifecycleNode):
         reason = frame_fault((*self._parameters.values(), *parameters))
         if late and self.state != UNCONFIGURED:
             lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
-            fix = f"lead it to unconfigured by {lead}, then `cleanup`."
+            fix = f"return it to unconfigured by {lead}, then `cleanup`."
             reason = f"parameter {late[0]!r} is read when the node is configured; {fix}"
         return SetParametersResult(successful=not reason, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Configure; a failure leaves it unconfigured."""
-        with at_once():  # to open a policy may compile; nothing has been commanded yet
+        """Configure the node; a failure leaves it unconfigured."""
+        with at_once():  # opening a policy may compile; nothing was commanded yet
             done = self._attempt(self.configure, INACTIVE)
         if done == FAILURE:
             self.undo.close()
@@ -110,12 +110,12 @@ class ManagedNode(QosWatch, LifecycleNode):
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Leave the robot at rest, from any state; it can be configured again after an error."""
+        """Leave the robot at rest, from any state; after an error it can be configured again."""
         self.stop()
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As at a shutdown; what has failed is kept for `start`."""
+        """Act as at a shutdown; the failure is kept for `start`."""
         failure = self._failure
         done = self.on_shutdown(state)
         self._failure = failure
@@ -124,7 +124,7 @@ class ManagedNode(QosWatch, LifecycleNode):
     def _attempt(
         self, do: Callable[[], None], reached: str
     ) -> TransitionCallbackReturn:
-        """Do the work of a transition; rclpy itself would not report why one failed."""
+        """Do the work of a transition and report a failure, which rclpy does not."""
         self._failure = None
         try:
             do()

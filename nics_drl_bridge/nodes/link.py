@@ -1,4 +1,4 @@
-"""Link: a process's own rclpy entities for a robot, which never leave the robot moving."""
+"""Link to a robot: the rclpy entities of this process, which never leave the robot moving."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 SPIN_S = 0.2
 POLL_S = 0.002
 NO_RANDOMISATION = "none"
-# a request to repeat data that stays unanswered for longer was itself lost [s]
+# a request to repeat data counts as lost if unanswered for this long [s]
 LOST_S = 1.0
 
 
@@ -57,7 +57,7 @@ def _exit_at_signals() -> None:
 
 
 class Link:
-    """A node in its own context and thread, whose end or silence leaves a zero command behind."""
+    """A node in its own context and thread; its end or silence leaves a zero command behind."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Link:
             _exit_at_signals()
         self._context = open_context(domain_id=domain_id)
         self._resources = Resources(self._context)
-        # Also of a link that is never begun, or whose owner can't be made.
+        # Also applies if the link never begins or its owner fails to construct.
         self._closing = weakref.finalize(self, _shut_down, self._resources)
         try:
             overrides = [
@@ -91,7 +91,7 @@ class Link:
             self._began_s = time.monotonic()
             if stamped is None:
                 stamped = self.hears_stamped(command_topic, patience_s)
-            # of the robot, in which commands are; unknown until it is set
+            # frame of the robot, in which commands are given; unknown until it is set
             self.frame = ""
             self.stamped = stamped
             self._kind: Any = TwistStamped if stamped else Twist
@@ -107,7 +107,7 @@ class Link:
             raise
 
     def hears_stamped(self, topic: str, patience_s: float) -> bool:
-        """Wait for who hears commands on a topic; True if stamped ones, or by default."""
+        """Wait for a subscriber of commands; True if it expects stamped ones, or by default."""
         name = self.node.resolve_topic_name(topic)
         holds(lambda: self.node.count_subscribers(name) > 0, patience_s, POLL_S)
         heard = heard_stamped(self.node, topic)
@@ -115,7 +115,7 @@ class Link:
 
     def begin(self) -> None:
         """Start the executor's thread; call it once all subscriptions exist."""
-        gc.collect()  # now, as the next one may take a tenth of a second while the robot moves
+        gc.collect()  # now, because later it may take 0.1 s while the robot moves
         given = (self._context, self.node, self._timeout)
         thread = threading.Thread(
             target=_spin, args=given, daemon=True, name="dds_backend"
@@ -124,7 +124,7 @@ class Link:
         self._resources.thread = thread
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
-        """Publish linear.x, linear.y, angular.z (3,); BackendError and a zero for NaN or inf."""
+        """Publish linear.x, linear.y, angular.z (3,); for NaN or inf, a zero and BackendError."""
         if not all(map(math.isfinite, twist)):
             self.halt()
             fix = "finite, a zero was sent instead; look at what the task's `command` returns."
@@ -154,7 +154,7 @@ class Link:
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
         """Call a service; the executor's thread completes the future. Raises BackendError."""
         deadline = time.monotonic() + timeout_s
-        # A server that hung for long was dropped, and has to be discovered again.
+        # A server that hung for long was dropped and must be discovered again.
         holds(client.service_is_ready, timeout_s, POLL_S)
         future = client.call_async(request)
         if not holds(future.done, deadline - time.monotonic(), POLL_S):
@@ -167,7 +167,7 @@ class Link:
 
     def others_command(self) -> bool:
         """True if another node publishes commands too."""
-        with self.node.handle:  # rclpy's own count first checks the name, each time
+        with self.node.handle:  # rclpy's own count checks the name each time
             return bool(self.node.handle.get_count_publishers(self._topic) > 1)
 
     def check_alone(self) -> None:
@@ -180,7 +180,7 @@ class Link:
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
         raise BackendError(
-            f"{', '.join(names) or 'somebody'} publishes {topic} too; stop it."
+            f"{', '.join(names) or 'another node'} publishes {topic} too; stop it."
         )
 
     def wait_for_peers(
@@ -190,7 +190,7 @@ class Link:
         patience_s: float,
         advice: str,
     ) -> None:
-        """Wait until all peers are matched. Raises BackendError with what is missing."""
+        """Wait until all peers are matched. Raises BackendError naming what is missing."""
         node = self.node
         commands = self.commands
         needed = dict[str, Callable[[], Any]]()
@@ -224,10 +224,10 @@ class Link:
 
 
 class Interrupts:
-    """Halts all open links at Ctrl-C, also where it comes between two of their calls.
+    """Halts all open links at Ctrl-C, even between two of their calls.
 
-    The interrupt then goes on to who had it before: the process may live on, as that of a notebook
-    does, and in lock-step no timeout would end the last command.
+    The interrupt is then passed on to the previous handler. Halting matters because the process may
+    live on, as in a notebook, and in lock-step no timeout would end the last command.
     """
 
     def __init__(self) -> None:
@@ -244,7 +244,7 @@ class Interrupts:
             signal.signal(signal.SIGINT, self._interrupt)
 
     def forget(self, link: Link) -> None:
-        """Leave a link alone, which is closed."""
+        """Stop watching a link that is closed."""
         self._links.discard(link)
         last = not self._links and signal.getsignal(signal.SIGINT) == self._interrupt
         if last and threading.current_thread() is threading.main_thread():
@@ -264,12 +264,12 @@ INTERRUPTS = Interrupts()
 
 @dataclass
 class Resources:
-    """What a link has opened so far, and its end closes."""
+    """Resources that a link has opened so far, to be closed at its end."""
 
     context: Context
     node: Node | None = None
     timeout: CommandTimeout | None = None
-    thread: threading.Thread | None = None  # which destroys the node, once it runs
+    thread: threading.Thread | None = None  # destroys the node, once it runs
 
 
 def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
@@ -282,7 +282,7 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
     except ExternalShutdownException:
         pass
     finally:
-        if context.ok():  # after an error: nothing would notice old data any more
+        if context.ok():  # after an error, since nothing would notice old data
             timeout.end()
             context.try_shutdown()
         executor.shutdown(timeout_sec=1.0)
@@ -290,9 +290,9 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
 
 
 def _shut_down(opened: Resources) -> None:
-    # else Python may exit with a thread inside the middleware's library
+    # Otherwise Python may exit while a thread is inside the middleware's library.
     with uninterrupted():
-        if opened.thread is None:  # it never began, so that nothing was commanded
+        if opened.thread is None:  # it never began, so nothing was commanded
             if opened.node is not None:
                 opened.node.destroy_node()
             opened.context.try_shutdown()
@@ -301,21 +301,21 @@ def _shut_down(opened: Resources) -> None:
             if opened.timeout is not None:
                 opened.timeout.end()
             opened.context.try_shutdown()
-        # Garbage may be collected in any thread, including that one.
+        # Garbage collection may run this in any thread, including the link's own.
         if opened.thread is not threading.current_thread():
             opened.thread.join(timeout=2.0)
 
 
 class CommandTimeout:
-    """Ends a command whose sender, which may have raised or hang, is silent beyond a limit [s]."""
+    """Ends a command if its sender, which may have failed or hang, is silent beyond a limit [s]."""
 
-    # No reference to the link is kept, because it may be garbage.
+    # It keeps no reference to the link, so that the link can be garbage-collected.
     def __init__(self, publisher: Publisher, kind: Any, limit_s: float) -> None:
         self._publisher = publisher
         self._kind = kind
         self._limit_s = limit_s
         self._due_s = self._answered_s = math.inf
-        self.moving = False  # the last command that was sent is none of zero
+        self.moving = False  # the last command sent was not zero
 
     def begin(self, moving: bool) -> None:
         """Restart the timeout; call it before a command is published, zero or not."""
@@ -337,7 +337,7 @@ class CommandTimeout:
 def identity(
     model: SimulatorModel, world: AnyWorld, randomisation: Randomisation | None
 ) -> dict[str, str]:
-    """Return the fingerprints of what a simulator simulates; by `none` of no randomisation."""
+    """Return the fingerprints of what a simulator simulates; randomisation may be `none`."""
     drawn = NO_RANDOMISATION if randomisation is None else randomisation.fingerprint
     return {
         "model": model.fingerprint,
@@ -347,7 +347,7 @@ def identity(
 
 
 class EpisodeServices:
-    """The services of a simulator node that begin an episode of a model in a world."""
+    """The services of a simulator node for beginning an episode of a model in a world."""
 
     def __init__(
         self,
@@ -369,14 +369,14 @@ class EpisodeServices:
         self.clients = [self._reset, self._parameters]
 
     def open(self, timeout_s: float) -> None:
-        """Do nothing: what a simulator runs is checked when an episode begins."""
+        """Do nothing: the simulator's model and world are checked when an episode begins."""
 
     def advance(self) -> None:
-        """Do nothing: the world moves when it has a command."""
+        """Do nothing: a command itself moves the world."""
 
     @property
     def there(self) -> bool:
-        """True if a simulator offers them."""
+        """True if a simulator offers the services."""
         return all(client.service_is_ready() for client in self.clients)
 
     def repeat(self) -> None:

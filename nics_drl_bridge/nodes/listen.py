@@ -1,4 +1,4 @@
-"""Collection of facts about a live robot, by listening, for `report.doctor`."""
+"""Facts about a live robot, collected by listening, for `report.doctor`."""
 
 import time
 from functools import partial
@@ -24,14 +24,14 @@ NAME = "nics_doctor"
 SPIN_S = 0.1
 LOOK_S = 0.5
 DISCOVERY_S = 10.0
-# matches any offer, so hears every topic
+# matches any offer, so it hears every topic
 ANY_PUBLISHER = profile_of(Offer(100, reliable=False))
 
 
 def listen(
     seconds: float, namespace: str = "", domain_id: int | None = None, imu: str = "auto"
 ) -> Facts:
-    """Listen so long [s] from the first message on, awaited for at most 10 s; send nothing."""
+    """Listen for a time [s] after the first message, awaited for at most 10 s; send nothing."""
     context = open_context([], domain_id)
     node = Node(NAME, context=context, start_parameter_services=False)
     executor = SingleThreadedExecutor(context=context)

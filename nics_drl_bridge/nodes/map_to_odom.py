@@ -1,4 +1,4 @@
-"""The transform map -> odom on `/tf`, by the estimate, unless another node publishes it."""
+"""The transform map -> odom on `/tf` from the estimate, unless another node publishes it."""
 
 import math
 import time
@@ -16,14 +16,14 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.recording import messages
 
-QUIET_S = 2.0  # so long after another's transform, ours is published again
-KEPT = 100  # own transforms that are known again when they are heard
+QUIET_S = 2.0  # silence of other publishers after which ours resumes [s]
+KEPT = 100  # recent own transforms, to recognise them on `/tf`
 
 
 def transform_to_ros(
     parent: str, child: str, pose: ArrayLike, stamp: Any
 ) -> TransformStamped:
-    """Return a pose (3,) of a child frame in its parent as a transform."""
+    """Return the pose (3,) of a child frame in its parent as a transform."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id, message.header.stamp = parent, stamp
@@ -33,7 +33,7 @@ def transform_to_ros(
 
 
 def transform_from_ros(message: TransformStamped) -> tuple[str, str, Array]:
-    """Return parent and child of a transform, without slashes, and the child's pose (3,) there."""
+    """Return a transform's parent and child, without slashes, and the child's pose (3,) there."""
     return *messages.get_frames(message), np.array(messages.read_pose(message))
 
 
@@ -43,9 +43,9 @@ def odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
 
 
 class MapToOdom:
-    """Publishes map -> odom, its stamp ahead by a tolerance [s] as AMCL's, so that it is in force.
+    """Publishes map -> odom, stamped ahead by a tolerance [s] like AMCL's, so that it stays valid.
 
-    It is silent without tf2_msgs, and while another node, as a localiser, publishes it.
+    It is silent without tf2_msgs, and while another node, such as a localiser, publishes it.
     """
 
     def __init__(self, node: Node, tolerance_s: float) -> None:
@@ -56,7 +56,9 @@ class MapToOdom:
         self._heard_s = -math.inf
         self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._kind is None:
-            told = "the package tf2_msgs is not installed, so that map -> odom is not published"
+            told = (
+                "the package tf2_msgs is not installed, so map -> odom is not published"
+            )
             node.get_logger().warning(f"{told}; {how_to_install('tf2_msgs')}.")
             return
         self._publisher = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)

@@ -1,4 +1,4 @@
-"""Message packages that the wheels of ROS 2 lack, and how a user comes by them."""
+"""Message packages that are missing from the ROS 2 wheels, and how to install them."""
 
 from collections.abc import Mapping
 from importlib.metadata import distributions
@@ -16,7 +16,7 @@ class Wheels(NamedTuple):
 
 
 def wheels_here() -> Wheels | None:
-    """Return the wheels of ROS 2 that are installed; None if it comes from elsewhere, or not."""
+    """Return the installed wheels of ROS 2; None if ROS 2 is missing or installed otherwise."""
     versions = {}
     for each in distributions():
         name = str(each.metadata["Name"] or "").lower().replace("_", "-")
@@ -29,13 +29,13 @@ def wheels_here() -> Wheels | None:
 
 
 def shipped_packages() -> dict[str, Path]:
-    """Return the folders of the message packages whose files come with this package, by name."""
+    """Return the folders of the message packages shipped with this package, by name."""
     folder = share_folder() / "config" / "messages"
     return {each.name: each for each in sorted(folder.iterdir()) if each.is_dir()}
 
 
 def how_to_install(package: str) -> str:
-    """Return what a user does to have a message package."""
+    """Return the instruction for installing a message package."""
     if package in shipped_packages() and wheels_here() is not None:
         return f"install it by `nics install {package}`"
     return "install it with your ROS 2 distribution"

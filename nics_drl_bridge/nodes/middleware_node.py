@@ -1,4 +1,4 @@
-"""middleware_node: caches a robot's topics and publishes the estimate of its state."""
+"""middleware_node: caches a robot's topics and publishes an estimate of its state."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ class MiddlewareNode(ManagedNode):
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context, middleware())
-        self._rejected: dict[str, int] = {}  # as of the last look
+        self._rejected: dict[str, int] = {}  # counts at the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
 
@@ -52,7 +52,7 @@ class MiddlewareNode(ManagedNode):
         if self.state != ACTIVE:
             return
         estimator = self._topics.middleware.estimator
-        # a pose or a yaw rate may have been newer
+        # a pose or a yaw rate may be newer
         stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
         frames = [
@@ -79,9 +79,9 @@ class MiddlewareNode(ManagedNode):
 
     def _reset(self) -> tuple[bool, str]:
         if self.state == UNCONFIGURED:
-            return False, "it is not configured, so knows nothing"
+            return False, "the node is not configured, so there is nothing to reset"
         self._topics.restart()
-        return True, "the next odometry fixes the map frame"
+        return True, "the next odometry defines the map frame"
 
     def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
@@ -89,7 +89,7 @@ class MiddlewareNode(ManagedNode):
         health = self._topics.middleware.health(self._topics.now_ns())
         if new := sorted(health.rejected.keys() - self._rejected.keys()):
             told = shorten("; ".join(new), LONGEST)
-            self.get_logger().warning(f"not used, but counted in /diagnostics: {told}")
+            self.get_logger().warning(f"rejected data, counted in /diagnostics: {told}")
         awaited = self._topics.expected
         missing = ""
         if self._topics.lacks_gyro:
@@ -105,9 +105,9 @@ class MiddlewareNode(ManagedNode):
 
 
 def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) -> str:
-    """Return a sentence about expected topics without usable data; empty if all have some.
+    """Return a sentence about expected topics without usable data; empty if there are none.
 
-    `before` are earlier counts of `health.rejected`: what has grown since is refused, not silent.
+    `before` holds earlier counts of `health.rejected`: a topic whose count grew is not silent.
     """
     silent = [topic for topic in expected if topic not in health.topics]
     since = "yet"
@@ -131,7 +131,7 @@ def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) 
 
 
 def facts(health: Health) -> dict[str, str]:
-    """Return the health as keys and values for people."""
+    """Return the health as readable keys and values."""
     found = {}
     for topic, each in health.topics.items():
         found[f"{topic} received"] = str(each.received)

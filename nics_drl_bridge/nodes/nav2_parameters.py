@@ -1,4 +1,4 @@
-"""Parameters of Nav2's controller server that a policy in its place goes by."""
+"""Parameters of Nav2's controller server that a policy in its place follows."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from nics_drl_bridge.nodes.parameters import checkers, nav2
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
-# Those that are for its own plugins, or for a loop that a policy, which answers scans, has not.
+# Parameters for Nav2's own plugins, or for a control loop; a policy answers scans instead.
 UNUSED = {
     "controller_frequency",
     "min_x_velocity_threshold",
@@ -34,7 +34,7 @@ KINDS = ("controller", "goal_checker", "progress_checker", "path_handler")
 
 
 class ControllerParameters:
-    """Names of controllers, checkers and path handlers, and the checks by their names."""
+    """The names of controllers, checkers and path handlers, and the checks of a name."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -50,7 +50,7 @@ class ControllerParameters:
             declare_row(node, row)
 
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
-        """Return the checks of two names, as Nav2's checkers of these plugins make them."""
+        """Return the checks of two names; they act like Nav2's checkers of the chosen plugins."""
         arrives = self._filled(GoalCheck, goal)
         gets_on = self._filled(ProgressCheck, progress)
         kinds = [
@@ -71,12 +71,12 @@ class ControllerParameters:
         return kind(**known)
 
     def ignores(self, name: str) -> bool:
-        """True for a parameter of Nav2's own controller, which means nothing to a policy."""
+        """True for a parameter of Nav2's own controller that means nothing to a policy."""
         return name in UNUSED or name.split(".")[0] in chain(*self.names.values())
 
 
 def chosen(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
-    """Return a plugin by its name, the only one by none; and what is wrong, if it is unknown."""
+    """Return a plugin's name and what is wrong with it; an empty name selects the only plugin."""
     if not asked and len(known) == 1:
         return known[0], ""
     if asked in known:

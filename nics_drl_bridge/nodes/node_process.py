@@ -1,4 +1,4 @@
-"""Nodes as processes of their own, which end with this one; needs no ROS 2 itself."""
+"""Nodes as child processes that end with this one; needs no ROS 2 itself."""
 
 import ctypes
 import os
@@ -15,19 +15,19 @@ from nics_drl_bridge.nodes.child_python import module_command
 from nics_drl_bridge.nodes.starting import NodeStart, prefix_of
 
 PR_SET_PDEATHSIG = 1
-PATIENCE_S = 5.0  # for which a process may take to end
+PATIENCE_S = 5.0  # time limit for a process to end [s]
 
 
 def interruptible() -> None:
-    """Let SIGINT end a process that is about to begin, also below a shell that ignores it.
+    """Let SIGINT end a process that is about to begin, even if its shell ignores SIGINT.
 
-    Shells start background jobs so, as in `make test &`, and children inherit it.
+    Shells make background jobs ignore SIGINT, as in `make test &`, and children inherit this.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _prepared() -> Callable[[], None]:
-    """Return what a node's process does before it begins: it ends with its parent, on Linux."""
+    """Return the preparation of a node's process; on Linux it then ends with its parent."""
     if sys.platform != "linux":
         return interruptible
     prctl = ctypes.CDLL(None).prctl
@@ -36,7 +36,7 @@ def _prepared() -> Callable[[], None]:
     def prepare() -> None:
         interruptible()
         prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != parent:  # it died in between
+        if os.getppid() != parent:  # the parent died in between
             os._exit(1)
 
     return prepare
@@ -45,7 +45,7 @@ def _prepared() -> Callable[[], None]:
 def command_of(node: NodeStart, folder: Path) -> list[str]:
     """Return the command line of a node, and write its parameters to a file in a folder."""
     place = f"/{node.namespace}/{node.executable}".replace("//", "/")
-    # The values of a file for just this node take precedence over those for many.
+    # In a parameter file, values for this very node take precedence over those for all nodes.
     nodes = place if node.params_file else "/**"
     file = folder / f"{place.strip('/').replace('/', '.')}.yaml"
     parameters = {nodes: {"ros__parameters": dict(node.parameters)}}
@@ -93,14 +93,14 @@ class ChildProcess:
         environment: Mapping[str, str] | None = None,
         log: Path | None = None,
     ) -> None:
-        """Start it; its output goes to a file, or where that of this process goes."""
+        """Start the process; its output goes to a file, or to the output of this process."""
         self.name = name
         chosen = dict(environment or {})
-        # no modules of the working folder, which may be a model
+        # Import no modules from the working folder, which may be a model.
         chosen["PYTHONSAFEPATH"] = "1"
         output = None if log is None else log.open("wb")
         try:
-            # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
+            # In its own session: Ctrl-C in the terminal reaches only the parent, which ends it.
             self._process = subprocess.Popen(
                 command,
                 env={**os.environ, **chosen},
@@ -116,16 +116,16 @@ class ChildProcess:
         self.pid = self._process.pid
 
     def poll(self) -> int | None:
-        """Return its exit code, or None while it runs."""
+        """Return the exit code, or None while the process runs."""
         return self._process.poll()
 
     def interrupt(self) -> None:
-        """Ask it to end, as Ctrl-C does."""
+        """Ask the process to end, like Ctrl-C."""
         if self.poll() is None:
             self._process.send_signal(signal.SIGINT)
 
     def close(self) -> int:
-        """End it: SIGINT, then SIGKILL if it does not react. Returns its exit code."""
+        """End the process by SIGINT, or SIGKILL if it does not react; return its exit code."""
         self.interrupt()
         try:
             return self._process.wait(PATIENCE_S)

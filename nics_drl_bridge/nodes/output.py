@@ -1,9 +1,9 @@
 """Output of a node's process that never blocks it.
 
-ROS 2, the libraries below it and Python write to the file descriptors 1 and 2, and wait there for a
-terminal that was halted by Ctrl-S, or a pipe that nobody reads. So both lead into a pipe of our own
-that does not block, and a small process passes on what comes (`output_forwarder.py`). The terminal
-itself must not be made non-blocking: that would change it for every process that uses it.
+ROS 2, its libraries and Python write to the file descriptors 1 and 2. A terminal halted by Ctrl-S,
+or a pipe that nobody reads, would block them. So both descriptors lead into a non-blocking pipe,
+and a small process forwards its content (`output_forwarder.py`). The terminal itself must not be
+made non-blocking, because that would affect every process that uses it.
 """
 
 import contextlib
@@ -19,8 +19,8 @@ from pathlib import Path
 PROGRAM = Path(__file__).with_name("output_forwarder.py")
 STDOUT = 1
 STDERR = 2
-PIPE_BYTES = 2**20  # most that Linux gives a user's process
-# of ROS 2: whether log lines are coloured, "0" or "1"
+PIPE_BYTES = 2**20  # Linux's maximum for an unprivileged process
+# variable of ROS 2 that sets whether log lines are coloured, "0" or "1"
 COLOUR = "RCUTILS_COLORIZED_OUTPUT"
 
 DISABLE_FILES = ["--ros-args", "--disable-external-lib-logs"]
@@ -34,7 +34,7 @@ _forwarder: subprocess.Popen[bytes] | None = None
 
 
 class _DroppingFile(io.RawIOBase):
-    """A file descriptor as Python's output, which drops what can't be written at once."""
+    """A file descriptor as Python's output; it drops what can't be written at once."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
@@ -47,15 +47,15 @@ class _DroppingFile(io.RawIOBase):
         return True
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        with contextlib.suppress(OSError):  # the forwarder does not read, or has gone
+        with contextlib.suppress(OSError):  # the forwarder does not read, or has ended
             os.write(self._descriptor, data)
         return len(data)
 
 
 def ros_arguments(words: Sequence[str]) -> list[str]:
-    """Return arguments of ROS 2 with which it writes no log file, where the forwarder does.
+    """Return ROS 2 arguments that turn off its log file, because the forwarder writes one.
 
-    It leaves that to ROS 2 if the words of the user choose something themselves.
+    If the user's words choose a log file themselves, ROS 2 writes it.
     """
     if _forwarder is None or any(word in FILE_CHOICES for word in words):
         return []
@@ -63,7 +63,7 @@ def ros_arguments(words: Sequence[str]) -> list[str]:
 
 
 def log_file(node: str, words: Sequence[str]) -> str:
-    """Return the log file of a node, where ROS 2 would write it; empty if the words choose it."""
+    """Return a node's log file, where ROS 2 would write it; empty if the words choose another."""
     if any(word in FILE_CHOICES for word in words):
         return ""
     home = os.environ.get("ROS_HOME") or os.path.join("~", ".ros")
@@ -73,9 +73,9 @@ def log_file(node: str, words: Sequence[str]) -> str:
 
 
 def forward_output(log: str = "") -> None:
-    """Let a process of its own write the output of this one, also to a file if it is named.
+    """Let a separate process write the output of this one, and to the file `log` if it is named.
 
-    Call it before threads exist.
+    Call this before any thread exists.
     """
     global _forwarder
     if _forwarder is not None:
@@ -107,7 +107,7 @@ def forward_output(log: str = "") -> None:
 
 
 def finish_output(seconds: float) -> None:
-    """Wait until all output is written, or for some time; nothing can be written afterwards."""
+    """Wait until all output is written, or for some time; nothing can be written after that."""
     if _forwarder is None:
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -118,11 +118,11 @@ def finish_output(seconds: float) -> None:
 
 
 def _different_outputs() -> list[int]:
-    """Return the descriptors of the outputs, once if both are the same, so that order is kept."""
+    """Return the outputs' descriptors; only one if both are the same, so that order is kept."""
     for descriptor in (0, STDOUT, STDERR):
         try:
             os.fstat(descriptor)
-        except OSError:  # it was closed; a pipe must not take its number
+        except OSError:  # closed already; a pipe must not take its number
             os.open(os.devnull, os.O_RDWR)
     if os.path.samestat(os.fstat(STDOUT), os.fstat(STDERR)):
         return [STDERR]
@@ -144,7 +144,7 @@ def _start_forwarder(
 def _lead_into(entrance: int, descriptor: int) -> None:
     """Replace an output by the entrance of a pipe."""
     os.set_blocking(entrance, False)
-    # not on every system; the usual size will do
+    # not available on every system; the default size will do
     with contextlib.suppress(AttributeError, OSError):
         fcntl.fcntl(entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
     os.dup2(entrance, descriptor)

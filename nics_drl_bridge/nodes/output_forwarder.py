@@ -1,9 +1,9 @@
-"""Program that passes on what a node writes, so that the node never waits for who reads it.
+"""Program that forwards a node's output, so that the node never waits for a reader.
 
 `python output_forwarder.py LOG FROM:TO ...` copies lines between file descriptors, and all of them
-to the file LOG, unless that is empty. If an output takes nothing, as a terminal after Ctrl-S or a
-disk that hangs, it keeps the newest lines, and drops and counts the older ones. It ends when the
-node has ended and all is told, or nobody has read the rest for a while.
+to the file LOG, unless that is empty. If an output accepts nothing, such as a terminal after Ctrl-S
+or a hanging disk, it keeps the newest lines, and drops and counts older ones. It ends when the node
+has ended and all lines are written, or nobody has read the rest for a while.
 """
 
 import os
@@ -16,21 +16,23 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 
-KEPT_BYTES = 2**20  # of lines that wait for an output
+KEPT_BYTES = 2**20  # most bytes of lines that wait for an output
 CHUNK_BYTES = 65_536
 COLOURS = re.compile(rb"\x1b\[[0-9;]*m")
-PATIENCE_S = 5.0  # for which the rest is offered after the node's end
+PATIENCE_S = 5.0  # time for writing the rest after the node's end [s]
 
 
 class Output:
-    """Lines on their way to one output, which a thread of its own writes."""
+    """The lines that wait for one output, and the thread that writes them."""
 
     def __init__(self, open_output: Callable[[], int]) -> None:
-        self._open_output = open_output  # the disk may hang at that, too
+        self._open_output = (
+            open_output  # called in the thread, because the disk may hang here too
+        )
         self._descriptor = -1
         self._lines: deque[bytes] = deque()
         self._bytes = 0  # of these lines
-        self._dropped = 0  # lines since the last that was written
+        self._dropped = 0  # lines since the last one written
         self._ended = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._write_lines, daemon=True)
@@ -47,7 +49,7 @@ class Output:
             self._changed.notify()
 
     def end(self) -> None:
-        """Tell that no line follows."""
+        """Mark the end: no line follows."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -75,7 +77,7 @@ class Output:
                 if dropped:
                     self._write(told_of(dropped))
                 self._write(line)
-            except OSError:  # whoever read it has gone
+            except OSError:  # the reader has gone
                 self._descriptor = os.open(os.devnull, os.O_WRONLY)
 
     def _write(self, data: bytes) -> None:
@@ -87,13 +89,13 @@ class Output:
 
 
 def told_of(dropped: int) -> bytes:
-    """Return the line that tells how many were dropped."""
+    """Return the line that says how many lines were dropped."""
     lines = "line was" if dropped == 1 else "lines were"
     return f"({dropped} {lines} dropped here: nobody read this output)\n".encode()
 
 
 def open_log(path: str) -> int:
-    """Open a file for the log, in a folder that is made if it is missing."""
+    """Open a log file; its folder is made if missing."""
     os.makedirs(os.path.dirname(path), exist_ok=True)
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
 
@@ -113,7 +115,7 @@ def copy_lines(source: int, outputs: Sequence[Output]) -> None:
 
 
 def put_line(line: bytes, outputs: Sequence[Output]) -> None:
-    """Add a line to outputs, of which the first may show colours."""
+    """Add a line to outputs; only the first may show colours."""
     shown, *others = outputs
     shown.put(line)
     for output in others:

@@ -29,17 +29,21 @@ from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.stateful import begin, resume
 
-POLLS = 0.1  # time between two checks whether to act, as a share of the control period
-LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
+POLLS = (
+    0.1  # time between two checks whether to act, as a fraction of the control period
+)
+LONGEST_REASON = 300  # maximum length of a policy's error text [characters]
 
 
 class PolicyNode(ManagedNode):
-    """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached."""
+    """Answers each scan with a `cmd_vel_raw` of the same stamp, until the goal is reached."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("policy_node", context, policy())
         self._nav2 = ControllerParameters(self)
-        self.ignores = self._nav2.ignores  # of Nav2's file for its controller server
+        self.ignores = (
+            self._nav2.ignores
+        )  # parameters from a file for Nav2's controller server
         self._acted_ns = 0
         self._answer: GoalAnswer | None = None  # to the newest goal
         runner.diagnose(self, "policy", self._look)
@@ -52,7 +56,7 @@ class PolicyNode(ManagedNode):
         if len(self._goal) != 2 or not (
             abs(self._goal).max() <= 1e8 or np.isnan(self._goal).all()
         ):
-            needed = "must be [x, y] within 1e8 m, or NaN both to wait for goal_pose"
+            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
             raise ConfigError(f"parameter 'goal': {needed}, not {self._goal.tolist()}.")
         names = ("rate", "deadline", "late_limit")
         rate, limit, patience = (self.get_parameter(name).value for name in names)
@@ -77,7 +81,7 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
-        # at a new goal
+        # covariance of the pose when the goal was set
         self._covariance = self._topics.middleware.estimator.covariance[:3, :3]
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
@@ -91,7 +95,7 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_timer, timer)
 
     def activate(self) -> None:
-        """Begin with a fresh state of the policy."""
+        """Start with a fresh state of the policy."""
         begin(self._policy)
 
     def deactivate(self) -> None:
@@ -102,7 +106,7 @@ class PolicyNode(ManagedNode):
     def _open_policy(self, model: SimulatorModel) -> None:
         name = str(self.get_parameter("policy").value)
         self._policy, self._task = open_policy(name, model)
-        view = rehearse(model)  # so that all compiles now
+        view = rehearse(model)  # compiles everything now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
         begin(self._policy)
@@ -117,14 +121,14 @@ class PolicyNode(ManagedNode):
     def _on_goal(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_from_ros(message.header.stamp)
         if self._actions.active or self._actions.led:
-            told = "a goal_pose is not used, as an action leads the robot"
+            told = "a goal_pose is ignored while an action leads the robot"
             self.get_logger().info(told, throttle_duration_sec=5.0)
             self._answer = GoalAnswer(stamp_ns, False, told)
             return
         try:
             goal = self._frames.in_map(message)
         except ConfigError as error:
-            self.get_logger().error(f"{error} The goal before it stays.")
+            self.get_logger().error(f"{error} The previous goal stays.")
             self._answer = GoalAnswer(stamp_ns, False, str(error))
             return
         if not np.array_equal(goal, self._goal):
@@ -157,7 +161,7 @@ class PolicyNode(ManagedNode):
         twist = self._twist()
         answer = self._deadline.judge(time.monotonic() - begin_s)
         if answer is not Answer.SEND:
-            told = f"inference was late ({self._deadline.late} so far), its command is dropped"
+            told = f"inference was late ({self._deadline.late} so far); its command is dropped"
             self.get_logger().warning(told, throttle_duration_sec=5.0)
         if answer is not Answer.DROP:
             if answer is Answer.SEND and np.isfinite(twist).all():
@@ -184,7 +188,7 @@ class PolicyNode(ManagedNode):
 
     def _twist(self) -> Array:
         if self._actions.active:
-            self._goal = np.full(2, np.nan)  # the one before is given up
+            self._goal = np.full(2, np.nan)  # the previous goal is given up
             return self._actions.twist()
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
@@ -224,7 +228,7 @@ class PolicyNode(ManagedNode):
             words = shorten(f"{type(error).__name__}: {error}", LONGEST_REASON)
             name = self.get_parameter("policy").value
             where = f"{place.filename}, line {place.lineno}"
-            fix = "the robot is stopped, mend the policy."
+            fix = "the robot is stopped; fix the policy."
             raise BridgeError(
                 f"policy {name!r} raised {words} ({where}); {fix}"
             ) from error

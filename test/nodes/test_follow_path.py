@@ -211,7 +211,7 @@ def test_a_newer_path_takes_the_place_of_the_one_before_and_no_goal_pose_does(tr
     assert "a newer goal" in ended.result.error_msg
     tree.goals.publish(PoseStamped())
     log = tree.policy.log
-    tree.until(lambda: "goal_pose is not used" in log.read_text(), "a sentence")
+    tree.until(lambda: "goal_pose is ignored" in log.read_text(), "a sentence")
     assert tree.end(second).status == SUCCEEDED
 
 

@@ -461,7 +461,7 @@ def test_data_that_are_refused_are_told_of_in_its_log_once(
     peer.until(refused, "what is refused, several times")
     assert (
         middleware.read_text().count(
-            "not used, but counted in /diagnostics: scan: shape (7,)"
+            "rejected data, counted in /diagnostics: scan: shape (7,)"
         )
         == 1
     )

@@ -104,7 +104,7 @@ def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_i
     ahead.header.frame_id = "kitchen"
     goals.publish(ahead)
     peer.until(lambda: "'kitchen' is refused" in policy.log.read_text(), "a refusal")
-    assert "The goal before it stays" in policy.log.read_text()
+    assert "The previous goal stays" in policy.log.read_text()
     peer.until(lambda: speed(said) == 0.0, "a stop")
     truth = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
     wanted = before[:2] + 1.2 * np.array([math.cos(before[2]), math.sin(before[2])])
