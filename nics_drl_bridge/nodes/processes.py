@@ -1,4 +1,4 @@
-"""Processes for the package's nodes, with a reliable end, and a witness of what they do."""
+"""Processes of the package's nodes with a reliable end, and a witness of what they do."""
 
 import json
 import os
@@ -32,7 +32,7 @@ POLL_S = 0.005
 
 
 def free_domain_id() -> int:
-    """Return the environment's domain id (ConfigError if it is none), or a random unused one."""
+    """Return the environment's domain id, or a random unused one. ConfigError if it is invalid."""
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
         every = range(1, LAST_DOMAIN_ID + 1)
@@ -87,7 +87,7 @@ class NodeProcess(ChildProcess):
 
 
 class Witness(AbstractContextManager["Witness", None]):
-    """Observes the true motion of a simulated robot, in its own thread; a context manager."""
+    """Context manager that observes a simulated robot's true motion in its own thread."""
 
     def __init__(
         self, domain_id: int | None = None, topic: str = "ground_truth"
@@ -113,11 +113,11 @@ class Witness(AbstractContextManager["Witness", None]):
         return np.array(self._poses).reshape(-1, 3)
 
     def sees(self, timeout_s: float) -> bool:
-        """Wait for a first pose; False after the time [s]."""
+        """Wait for a first pose; return False after `timeout_s`."""
         return holds(lambda: self._poses, timeout_s, POLL_S)
 
     def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
-        """Wait until the robot is within `radius` of a goal (2,); False after the time [s]."""
+        """Wait until the robot is within `radius` of a goal (2,); False after `timeout_s`."""
 
         def there() -> bool:
             newest = self._poses[-1:]
@@ -128,12 +128,12 @@ class Witness(AbstractContextManager["Witness", None]):
         return holds(there, timeout_s, POLL_S)
 
     def arms(self, gate: str, timeout_s: float) -> str:
-        """Arm a gate, asking until it agrees; return its last reason to refuse, or ''."""
+        """Ask a gate to arm until it agrees; return its last reason for refusing, or ''."""
         answer = self._asked(f"{gate}/arm", timeout_s)
         return "" if answer.success else str(answer.message)
 
     def touched(self, simulator: str, timeout_s: float) -> bool:
-        """True if its robot has touched something in this episode. Raises BackendError."""
+        """True if the simulated robot touched something in this episode. Raises BackendError."""
         answer = self._asked(f"{simulator}/touched", timeout_s)
         if not answer.success:
             raise BackendError(f"the episode can't be judged: {answer.message}.")

@@ -1,7 +1,7 @@
 """Quality of service for each kind of topic, with the reason.
 
-Reliable publishers match all subscribers, so this package publishes reliably, and subscribes best
-effort wherever a lost message does no harm. Nothing is kept for late joiners: old data mislead.
+Reliable publishers match all subscribers, so this package publishes reliably, and subscribes with
+best effort wherever a lost message does no harm. Late joiners get no old data, which would mislead.
 """
 
 import copy
@@ -58,44 +58,45 @@ def offer_of(profile: QoSProfile) -> Offer:
 
 
 SENSOR = profile_of(Offer(5, reliable=False))
-"""Subscriptions to scans, odometry, poses, IMU. A new datum beats a repeated old one: on a lossy
-link a reliable scan arrives half a second late and looks fresh. It matches every publisher. Also in
-lock-step: acknowledging each datum takes a tenth of a step, and lost data are requested again."""
+"""Subscriptions to scans, odometry, poses, IMU; they match every publisher. A new datum is worth
+more than a repeated old one: on a lossy link a reliable scan arrives half a second late and looks
+fresh. Lock-step uses this too: acknowledging each datum takes a tenth of a step, and lost data are
+requested again."""
 
-# publishers of the same: subscribers of both kinds match
+# publishers of the same topics; they match subscribers of both kinds
 SENSOR_RELIABLE = profile_of(Offer(10))
 
 EVERY_COMMAND = profile_of(Offer(10))
-"""Commands in lock-step: each moves the world, and a second publisher must not replace the
-first one's unnoticed."""
+"""Commands in lock-step: each one moves the world, so a second publisher must not replace the
+first one's command unnoticed."""
 
 E_STOP = QoSProfile(
     history=rclpy_qos.HistoryPolicy.KEEP_ALL,
     reliability=rclpy_qos.ReliabilityPolicy.RELIABLE,
     durability=rclpy_qos.DurabilityPolicy.VOLATILE,
 )
-"""Subscriptions to `e_stop`. A press lasts for a single message, and the heartbeats that follow it,
-also those of another publisher, must not push it out of the queue while nobody reads it."""
+"""Subscriptions to `e_stop`. A press is a single message. The heartbeats after it, also those of
+another publisher, must not push it out of the queue while nobody reads."""
 
-# commands and goals: only the newest counts, and it has to arrive
+# commands and goals: only the newest counts, and it must arrive
 COMMAND = profile_of(Offer(1))
-# Commands of which the gate looks at the publisher, too: the one that a second publisher sends
-# at the same moment must not replace the first one's unnoticed.
+# Commands whose publisher the gate checks: one that a second publisher sends at the same moment
+# must not replace the first one's unnoticed.
 EVERY_POLICY = profile_of(Offer(10))
 # `/tf`: like tf2's own, whose listeners request reliable
 TRANSFORMS = profile_of(Offer(100))
-# `/tf_static`, `map`: for late joiners too
+# `/tf_static`, `map`: late joiners get them too
 LATCHED = profile_of(Offer(1, transient_local=True))
 # as the diagnostic aggregator expects `/diagnostics`
 DIAGNOSTICS = profile_of(Offer(10))
 
 MOMENT_S = 0.5
 UNKNOWN = "_UNKNOWN_"
-MOST_WAITING = 10_000  # messages that are taken at once, if a publisher never pauses
+MOST_WAITING = 10_000  # most messages taken at once, in case a publisher never pauses
 
-# parameters of a user for the quality of service of a topic
+# prefix of the parameters that override a topic's quality of service
 OVERRIDES = "qos_overrides."
-# Topics, by the name before any remapping, whose quality of service decides whether a robot stops.
+# Topics (names before remapping) whose quality of service decides whether a robot stops.
 FIXED_TOPICS = ("cmd_vel", "cmd_vel_raw", "e_stop", "ackermann_cmd")
 CHOICES: dict[str, Any] = {
     "history": rclpy_qos.HistoryPolicy,
@@ -154,8 +155,8 @@ def _check_override(name: str, policy: str, value: Any) -> None:
 class QosWatch(Node):
     """A node whose publishers and subscriptions report peers that they can't talk to.
 
-    As in any ROS 2 node, parameters `qos_overrides.TOPIC.publisher.POLICY` override the quality of
-    service of a topic, and `subscription` likewise; not that of `FIXED_TOPICS`.
+    As in any ROS 2 node, parameters `qos_overrides.TOPIC.publisher.POLICY` (or `subscription`)
+    override the quality of service of a topic, except for `FIXED_TOPICS`.
     """
 
     def create_publisher(
@@ -169,7 +170,7 @@ class QosWatch(Node):
     def publisher_options(self, topic: str, profile: QoSProfile) -> dict[str, Any]:
         """Return the options for a publisher that rclpy makes without `create_publisher`.
 
-        The profile is changed where a user has overridden it. Raises ConfigError.
+        `profile` is changed where a user has overridden it. Raises ConfigError.
         """
         warn = partial(self._warn, topic=topic, qos=profile, publishing=True)
         options: dict[str, Any] = {
@@ -218,7 +219,7 @@ class QosWatch(Node):
         return SubscriptionEventCallbacks(incompatible_qos=warn)
 
     def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
-        """Warn after a moment: a peer's name is known later than its quality of service."""
+        """Warn after a moment, because a peer's name is known later than its quality of service."""
         policy = rclpy_qos.qos_policy_name_from_kind(event.last_policy_kind)
         resolved = self.resolve_topic_name(topic)
 
@@ -234,8 +235,8 @@ class QosWatch(Node):
                 cure = f"offer {own}, or put a relay between"
             self.get_logger().warning(
                 f"{resolved}: no message passes between this node and {name}: the {policy.lower()} "
-                f"that the publisher offers ({offered}) is less than what the subscription asks "
-                f"for ({asked}); let {name} {cure}."
+                f"that the publisher offers ({offered}) is weaker than what the subscription "
+                f"asks for ({asked}); let {name} {cure}."
             )
 
         timer = self.create_timer(
@@ -257,7 +258,7 @@ class QosWatch(Node):
 
 
 def take_waiting(subscription: Subscription) -> list[bytes]:
-    """Take the messages that wait in the queue of a raw subscription, oldest first."""
+    """Take the waiting messages from the queue of a raw subscription, oldest first."""
     contents: list[bytes] = []
     with subscription.handle:
         while len(contents) < MOST_WAITING:
@@ -269,7 +270,7 @@ def take_waiting(subscription: Subscription) -> list[bytes]:
 
 
 def copied(qos: Any) -> QoSProfile:
-    """Return a profile of its own: rclpy writes overridden policies into the one it is given."""
+    """Return a copy of a profile, because rclpy writes overridden policies into its argument."""
     return copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
 
 
@@ -279,6 +280,6 @@ def _value(profile: Any, policy: str) -> str:
 
 
 def owner(end: Any) -> str | None:
-    """Return the full name of an endpoint's node; None until it is discovered."""
+    """Return the full name of an endpoint's node, or None until it is discovered."""
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name

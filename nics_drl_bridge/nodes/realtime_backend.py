@@ -1,4 +1,4 @@
-"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as the same synchronous backend."""
+"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as a synchronous backend."""
 
 import math
 import time
@@ -22,11 +22,11 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01
 SAY_EVERY_S = 2.0
-# a peer that shows no services this long after its topics is a vehicle [s]
+# a peer without services this long after its topics appeared is a vehicle [s]
 SERVICES_S = 0.5
-COMMAND_S = 0.5  # least time and periods that a command lasts
-PERIODS = 2  # then a zero follows
-STILL = (0.02, 0.05)  # a slower robot is at rest [m/s, rad/s]
+COMMAND_S = 0.5  # minimum time [s] and number of periods for which a command lasts
+PERIODS = 2  # after them a zero command follows
+STILL = (0.02, 0.05)  # a robot below these speeds is at rest [m/s, rad/s]
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
     "namespace."
@@ -41,25 +41,25 @@ class RealtimeOptions(Schema):
     domain_id: int | None = Field(None, ge=0, le=232)  # the environment's by default
     timeout_s: PositiveFloat = 30.0  # longest wait for a peer or an answer
     vehicle: bool | None = None  # a vehicle has no services; None: detected
-    # of a step; the model's control period by default
+    # duration of a step; the model's control period by default
     period_s: PositiveFloat | None = None
-    stale_after_s: PositiveFloat = 0.5  # age from which data are too old for a view
-    # An episode on a vehicle waits until it stands at the requested pose, or takes the present one.
+    stale_after_s: PositiveFloat = 0.5  # age above which data are too old for a view
+    # On a vehicle, wait until it stands at the requested pose, or start at the present one.
     start: Literal["wait", "present"] = "wait"
-    # The place where it stands counts as the start: `map` is laid so. Not with a pose sensor.
+    # Lay `map` so that the robot's present place is the start; not possible with a pose sensor.
     lays_map: bool = False
-    # of the start's pose [m, rad]
+    # tolerance of the start pose [m, rad]
     tolerance: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.1)
-    start_timeout_s: PositiveFloat = 300.0  # longest wait for that
-    # told what is missing; the node's logger by default
+    start_timeout_s: PositiveFloat = 300.0  # longest wait for the start
+    # receives what is missing for the start; the node's logger by default
     say: Callable[[str], None] | None = None
-    # `cmd_vel_raw` leads through `command_gate`: then each command is a TwistStamped with the stamp
-    # of the scan that it answers.
+    # With `cmd_vel_raw`, commands pass `command_gate`: each is a TwistStamped with the stamp of the
+    # scan that it answers.
     command_topic: str = Field("cmd_vel", min_length=1)
-    # `cmd_vel` is a TwistStamped; None: as the robot hears it
+    # use TwistStamped for `cmd_vel`; None: the type to which the robot subscribes
     stamped: bool | None = None
-    pose_type: str = "none"  # of `pose`, a pose sensor in `map`
-    # Topic of the gyro that turns odometry; `auto`: the usual ones, if the model was made with one
+    pose_type: str = "none"  # message type of `pose`, a pose sensor in `map`
+    # Topic of the gyro for the yaw rate; `auto`: the usual topics, if the model was made with one
     imu: str = Field("auto", min_length=1)
 
     @property
@@ -71,8 +71,8 @@ class RealtimeOptions(Schema):
 class RealtimeBackend:
     """One robot behind its topics, stepped at a fixed period of the steady clock.
 
-    Deadlines that a late caller misses are counted and not made up for. Raises ConfigError if an
-    option can't be used; BackendError if no peer is there, refuses, or does not come to rest;
+    Deadlines that a late caller misses are counted, not made up for. Raises ConfigError if an
+    option can't be used; BackendError if there is no peer, or it refuses or does not come to rest;
     ModelError for another model or world; StaleDataError for data older than `stale_after_s`.
     """
 
@@ -120,7 +120,7 @@ class RealtimeBackend:
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
-        """Begin an episode: by a simulator's service, or when a vehicle stands at the start."""
+        """Begin an episode by a simulator's service, or once a vehicle stands at the start."""
         self._link.check_open()
         self._link.halt()
         if self._is_vehicle():
@@ -140,7 +140,7 @@ class RealtimeBackend:
         return self._fresh_view()[0]
 
     def present_pose(self) -> Array:
-        """Wait until the robot stands, and return its pose (3,) in `map`."""
+        """Wait until the robot stands still, and return its pose (3,) in `map`."""
         self._link.check_open()
         self._await_start(None)
         with self._topics.lock:
@@ -174,7 +174,7 @@ class RealtimeBackend:
             time.sleep(POLL_S)
 
     def _missing(self, start: Start | None) -> str:
-        """Return what is missing for an episode, at a start or anywhere; empty for nothing."""
+        """Return what is missing to begin at `start`, or anywhere if None; empty for nothing."""
         topic, silence_s = self._oldest()
         if math.isinf(silence_s):
             return f"no {topic} yet"
@@ -201,9 +201,9 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
-        """Return the topic that has been silent for longest, and for how long [s]; inf: for ever.
+        """Return the topic that has been silent for longest, and how long [s]; inf: always.
 
-        After a clock jump no datum is left, but when the last one arrived is still known.
+        After a clock jump no datum is left, but the arrival time of the last one is still known.
         """
         now_ns = time.monotonic_ns()
         with self._topics.lock:
@@ -224,7 +224,7 @@ class RealtimeBackend:
         return oldest, silences[oldest]
 
     def _missing_topic(self) -> str | None:
-        """Return a topic without a datum on the present clock, or None."""
+        """Return a topic without a datum on the present clock, or None if there is none."""
         with self._topics.lock:
             there = self._topics.middleware.cache.newest.keys()
             return next(
@@ -233,9 +233,9 @@ class RealtimeBackend:
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publish a command, wait for the end of the period; see `interface.Backend`."""
+        """Publish a command and wait for the end of its period; see `interface.Backend`."""
         self._link.check_open()
-        # A command answers the scan of the view that it was computed from, whatever came since.
+        # A command carries the stamp of the scan that it was computed from, not of the newest scan.
         self._link.send(self._robot.to_cmd_vel(command), self._scan_ns)
         late_ns = time.monotonic_ns() - self._deadline_ns
         if late_ns > 0:
@@ -248,7 +248,7 @@ class RealtimeBackend:
         return self._fresh_view()
 
     def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
-        """Return the present view; after a clock jump, once all topics have come again."""
+        """Return the present view; after a clock jump, wait until all topics have arrived again."""
         limit_s = self._options.stale_after_s
         holds(lambda: self._missing_topic() is None, limit_s, POLL_S)
         with self._topics.lock:
@@ -267,7 +267,7 @@ class RealtimeBackend:
         raise StaleDataError(topic, age_s, limit_s)
 
     def facts(self) -> BackendFacts:
-        """Return nothing: topics tell all that is known."""
+        """Return nothing: the topics carry all that is known."""
         return {}
 
     def halt(self) -> None:

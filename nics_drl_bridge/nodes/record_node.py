@@ -1,4 +1,4 @@
-"""record_node: drives a robot so that it shows its whole motion, and records it."""
+"""record_node: drives a robot through its full range of motion, and records it."""
 
 import sys
 import time
@@ -52,7 +52,7 @@ HALT_S = 0.5
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 PLACE = "recording"
 FEWEST = 2
-# of stamps relative to receipt; beyond it, it is another kind of time
+# plausible rate of stamps relative to receipt; otherwise they are of another kind of time
 SAME_PACE = (0.8, 1.25)
 
 
@@ -62,9 +62,9 @@ class DriveParameters:
 
     plan: DrivePlan
     out: Path  # of the recording
-    odom_timeout: float  # silence of odometry that stops the robot [s]
-    stamped: bool  # `cmd_vel` is a TwistStamped, if chosen; else as the robot hears it
-    roles: TopicRoles  # may name the joints of state and wheels
+    odom_timeout: float  # silence of odometry after which the robot stops [s]
+    stamped: bool  # use TwistStamped for `cmd_vel`, if set; else the robot's type
+    roles: TopicRoles  # may name the joints of the state and the wheels
     imu: str  # topic of the IMU, auto or none
 
 
@@ -85,7 +85,7 @@ def declare_drive(node: Node) -> DriveParameters:
 
 
 class DriveLog:
-    """Keeps a drive in memory; `now` is the clock of receipt [ns], that of the stamps."""
+    """Keeps a drive in memory; `now` is the clock of receipt [ns], the same as for the stamps."""
 
     def __init__(
         self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]
@@ -103,7 +103,7 @@ class DriveLog:
         return (self.rows["cmd_vel"][-1][0] - self.rows["cmd_vel"][0][0]) / NS_PER_S
 
     def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
-        """Add a message; return False if it is not finite, or not newer than the last."""
+        """Add a message; return False if it is not finite or not newer than the last one."""
         rows = self.rows[topic]
         values = np.asarray(values, np.float64)
         if (rows and 0 != header_ns <= rows[-1][1]) or not np.isfinite(values).all():
@@ -125,7 +125,7 @@ class DriveLog:
         self._joints.append(Message(self._now(), message))
 
     def check(self) -> None:
-        """Raise BridgeError if a state is not measured, or stamps run at another rate."""
+        """Raise BridgeError if a state is not measured or stamps run at another rate."""
         measured = [v.name for v in self._spec.state if v.must_be_measured]
         if self._joints:
             read_joint_streams(
@@ -141,7 +141,7 @@ class DriveLog:
         heard = (receive[-1] - receive[0]) / NS_PER_S
         rate = pace(receive, header)
         if not SAME_PACE[0] <= rate <= SAME_PACE[1]:
-            off = f"its stamps went on by {rate * heard:.2f} s within {heard:.2f} s"
+            off = f"its stamps advanced by {rate * heard:.2f} s within {heard:.2f} s"
             fix = "take the time of a simulator by --use-sim-time, or -p use_sim_time:=true."
             raise BackendError(f"topic 'odom': {off}; {fix}")
 
@@ -149,7 +149,7 @@ class DriveLog:
         """Return all streams on their clocks. Raises RecordingError if too little was received."""
         topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
         if len(self.rows["pose"]) >= FEWEST:
-            # which determines its noise
+            # for the noise of the odometry
             topics |= {"pose": "pose", "odometry": "odom twist"}
         data: dict[str, TopicData] = {}
         for name, topic in topics.items():
@@ -165,7 +165,7 @@ class DriveLog:
         try:
             kept: Any = stamp_streams(data, self._roles.stamps, PLACE)
         except RecordingError:
-            # Poorer stamps are better than no recording of a drive that is over.
+            # The drive is over: a recording with poorer stamps is better than none.
             kept = stamp_streams(data, "receive", PLACE)
         tracked = len(self.rows["pose"]) >= FEWEST
         return Recording(
@@ -177,7 +177,7 @@ class DriveLog:
 
 
 def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
-    """Return seconds by stamp per second of receipt, by the least delayed of each half."""
+    """Return stamped seconds per second of receipt, from the least delayed message of each half."""
     heard = receive[-1] - receive[0]
     stamped = header[-1] - header[0]
     if heard <= 0 or stamped <= 0:
@@ -193,13 +193,13 @@ class DriveResult:
     """Result of a drive."""
 
     complete: bool
-    failure: BridgeError | None  # why not; None also if it was interrupted
-    recording: Recording | None  # saved
+    failure: BridgeError | None  # why the drive failed; None also if it was interrupted
+    recording: Recording | None  # the saved recording
     line: str  # one sentence about it
 
 
 class RecordNode(qos.QosWatch):
-    """Sends `cmd_vel` at 20 Hz, zeros at the end or on a fault; records what it hears."""
+    """Sends `cmd_vel` at 20 Hz, and zeros at the end or on a fault; records what it hears."""
 
     def __init__(
         self, context: Context, given: Mapping[str, Any] | None = None
@@ -224,7 +224,7 @@ class RecordNode(qos.QosWatch):
         )
         take_pose = partial(self._take, "pose", read_pose)
         self.create_subscription(PoseStamped, "pose", take_pose, qos.SENSOR)
-        self._imu_topic = ""  # the first that speaks
+        self._imu_topic = ""  # the first topic that is heard
         self._gyro = GyroReader()
         for topic in list_imu_topics(self._order.imu, by_default=True):
             self.create_subscription(
@@ -236,7 +236,7 @@ class RecordNode(qos.QosWatch):
         self._pose: Array | None = None
         self._frame = ""  # of the robot, by its odometry
         self._start: Array = np.zeros(3)
-        # Steady: the robot's guard must not depend on the time source of the node.
+        # On the steady clock: the guard must not depend on the node's time source.
         runner.steadily(self, POLL_S, self._on_time)
 
     def _speak(self, stamped: bool) -> None:
@@ -271,7 +271,7 @@ class RecordNode(qos.QosWatch):
         self._frame = message.child_frame_id
         if self._ticks:
             self._drive.observe(geometry.between(self._start, pose))
-            self._on_time()  # at once: with a fast simulated time a poll may be a tick late
+            self._on_time()  # now: with fast simulated time a poll may be a tick late
 
     def _on_time(self) -> None:
         if self.outcome is not None:
@@ -326,7 +326,7 @@ class RecordNode(qos.QosWatch):
             return
         if self._ticks < STILL_S / PERIOD_S <= self._ticks + due:
             self._log.check()
-        for _ in range(due):  # several if time advances in larger steps
+        for _ in range(due):  # more than one if time advances in larger steps
             command = self._drive.choose_command()
             self._ticks += 1
         self._send(command)
@@ -335,7 +335,7 @@ class RecordNode(qos.QosWatch):
         age = time.monotonic() - self._heard
         limit = self._order.odom_timeout
         if age > limit:
-            reason = f"nothing new for {age:.2f} s, which may be {limit:g} s"
+            reason = f"nothing new for {age:.2f} s (the limit is {limit:g} s)"
             place = self._place("odom")
             raise BackendError(
                 f"topic {place}: {reason}; find out why odometry stopped."
@@ -347,7 +347,7 @@ class RecordNode(qos.QosWatch):
         )
         if np.hypot(x, y) + radius > bound:
             where = f"at x {x:.2f}, y {y:.2f} m from the start with a radius of {radius:g} m"
-            fix = "give it a larger bound, less speed, or the parameters that it really has."
+            fix = "give a larger bound, less speed, or the robot's true parameters."
             raise BackendError(
                 f"the robot left its circle of {bound:g} m, {where}; {fix}"
             )
@@ -363,14 +363,14 @@ class RecordNode(qos.QosWatch):
         return stamped if self._stamped else stamped.twist
 
     def stop(self) -> None:
-        """Leave the robot at rest, and save what was recorded."""
+        """Leave the robot at rest, and save the recording."""
         if self.outcome is None:
             self._end(None)
 
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
         self.outcome = DriveResult(complete, failure, None, "")
         recording = None
-        told = "the robot was not moved, nothing is recorded"
+        told = "the robot was not moved; nothing is recorded"
         if self._ticks:
             self._halt()
             recording, told = self._save()
@@ -401,7 +401,7 @@ class RecordNode(qos.QosWatch):
 def record(
     given: dict[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
-    """Drive and record until the end, an error or a signal, with parameters beside `args`."""
+    """Drive and record until the end, an error or a signal; parameters may also come in `args`."""
     node: RecordNode = runner.run_node(
         partial(RecordNode, given=given), args, "record_node"
     )

@@ -1,4 +1,4 @@
-"""A robot's topics, fed into the middleware; shared by all listening nodes."""
+"""A robot's topics, fed into the middleware; used by all listening nodes."""
 
 import threading
 from collections.abc import Callable
@@ -48,7 +48,7 @@ KINDS_OF_POSE = {
 
 
 def declare_sensors(node: Node, stamped: bool | None = None) -> None:
-    """Declare a robot's sensors but scan and odometry, and the type of its commands, if known."""
+    """Declare a robot's sensors except scan and odometry, and the command type, if known."""
     for row in sensors():
         if row.name == STAMPED and stamped is not None:
             row = row._replace(default=stamped)
@@ -58,10 +58,10 @@ def declare_sensors(node: Node, stamped: bool | None = None) -> None:
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
-    The first odometry fixes `map`, or with a pose sensor the first pose. A reader in another thread
-    holds `lock`. `on_odometry` and `on_scan` get the stamp [ns] of what was used; `on_lidar` the
-    lidar of a header unlike the model's, whose scans are rejected if it raises ConfigError. Raises
-    ConfigError if `pose_type` is unknown.
+    The first odometry defines `map`, or with a pose sensor the first pose. Readers in other threads
+    must hold `lock`. `on_odometry` and `on_scan` get the stamp [ns] of used data. `on_lidar` gets
+    the lidar of a header that differs from the model's; if it raises ConfigError, such scans are
+    rejected. Raises ConfigError if `pose_type` is unknown.
     """
 
     def __init__(
@@ -140,10 +140,10 @@ class RobotTopics:
         return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
 
     def _hear_imu(self) -> None:
-        """Subscribe to the gyro, if one is named or the model was made with one."""
+        """Subscribe to the gyro if one is named or the model was made with one."""
         wanted = str(self._node.get_parameter(IMU).value)
         topics = list_imu_topics(wanted, self._model.gyro)
-        self._imu_topic = ""  # the first that speaks
+        self._imu_topic = ""  # the first topic that is heard
         self._gyro = GyroReader()
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
@@ -169,17 +169,17 @@ class RobotTopics:
         self.middleware.reset(0, np.zeros(3))
 
     def begin(self, stamp_ns: int, pose: Array) -> None:
-        """Clear all state before a stamp [ns], at which the robot stands at a pose (3,)."""
+        """Clear all state before a stamp [ns] at which the robot stands at a pose (3,)."""
         self._started = True
         self._since_ns = stamp_ns
         self.middleware.reset(stamp_ns, pose)
 
     def place(self, pose: Array) -> None:
-        """Take the robot to stand at a pose (3,), which thereby defines `map`."""
+        """Define `map` so that the robot's present pose in it is `pose` (3,)."""
         self.middleware.place(pose, START_STD**2 * np.eye(3))
 
     def hear_initial_pose(self) -> None:
-        """Subscribe to `initialpose`, which says where in the map the robot is."""
+        """Subscribe to `initialpose`, the robot's pose in the map."""
         kind = PoseWithCovarianceStamped
         self._subscribe(INITIAL_POSE, kind, self._take_initial_pose, qos.COMMAND)
 
@@ -189,7 +189,7 @@ class RobotTopics:
             pose = initial_pose(
                 message, str(self._node.get_parameter("map_frame").value)
             )
-            # where nothing corrects it, it defines the map
+            # without any correction, this pose defines the map
             spread = START_STD**2 * np.eye(3)
             if self._posed:
                 covariance = conversions.pose_from_ros(message)[1]
@@ -208,11 +208,11 @@ class RobotTopics:
         )
 
     def in_odom(self) -> Array | None:
-        """Return the robot's pose (3,) by odometry at the newest datum; None before any."""
+        """Return the robot's odometry pose (3,) at the newest datum; None before any."""
         newest = self.middleware.cache.newest.get(measurement.ODOM)
         if newest is None:
             return None
-        pose, twist = newest.value  # the robot has gone on since
+        pose, twist = newest.value  # the robot has moved since
         since_s = (self.newest_ns - newest.stamp_ns) * S_PER_NS
         return geometry.compose(pose, geometry.exp(twist * since_s))
 
@@ -326,9 +326,9 @@ class RobotTopics:
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
-    """Return facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum.
+    """Return facts for `info`: each topic's newest datum, and the covariance of the pose (3, 3).
 
-    And the covariance (3, 3) of the estimated pose.
+    Of each datum they hold its number, its stamp [ns] and the silence since it arrived [s].
     """
     facts: dict[str, Any] = {
         "covariance": middleware.estimator.covariance[:3, :3].copy()

@@ -142,7 +142,7 @@ def test_stamps_at_another_pace_than_the_receipt_are_a_simulators():
     for k in range(10):
         drive.hears(k, stamp_ns=START_NS + 5 * k * PERIOD_NS)
     with pytest.raises(
-        BackendError, match=r"stamps went on by 4.50 s within 0.90 s.*use_sim_time"
+        BackendError, match=r"stamps advanced by 4.50 s within 0.90 s.*use_sim_time"
     ):
         drive.log.check()
 
