@@ -51,7 +51,7 @@ class Piece(NamedTuple):
 
 
 def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
-    """Write a policy file as a bundle; return its YAML file. For errors see `write_whole_folder`."""
+    """Write a policy file as a bundle; return its YAML file. Errors: see `write_whole_folder`."""
     content = policy.path.read_bytes()
     place = Path(folder)
     marker = f"{place.resolve().name}.yaml"
