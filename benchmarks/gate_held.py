@@ -60,17 +60,17 @@ LEAST_JUDGED = 0.5
 def zero_thresholds() -> None:
     """Lets any scan contradict odometry, in this process."""
     settings = scan_motion.Settings(
-        least_path=0.0,
-        least_turn=0.0,
-        least_half=0.0,
-        least_change=0.0,
+        min_path=0.0,
+        min_turn=0.0,
+        min_half=0.0,
+        min_change=0.0,
         deviations=0.0,
-        least_sectors=1,
+        min_sectors=1,
         agreeing=0.0,
         sector_share=np.inf,
         held_share=np.inf,
         confirmed_s=0.0,
-        greatest_changed=np.inf,
+        max_changed=np.inf,
     )
     scan_motion.watch_scan = partial(scan_motion.watch_scan, settings=settings)
 

@@ -1,9 +1,9 @@
 """Detects a held body: odometry shows motion, but the scans show none.
 
-A recent scan is moved as odometry says, which predicts the newest one. Where that prediction
-differs clearly from the recent scan, the newest scan must have changed; if it has not, the wheels
-spin but the body stands. A scene that looks the same after the motion, as a corridor does along
-its walls, decides nothing.
+A recent scan and the motion by odometry predict the newest scan. Where the prediction differs
+clearly from the recent scan, the newest scan must have changed; if it has not, the wheels spin but
+the body stands. A scene that looks the same after the motion, such as a long corridor, decides
+nothing.
 """
 
 import math
@@ -40,38 +40,40 @@ class Settings:
     spacing: float = math.radians(2.0)
     window: float = math.radians(3.0)
     sector: float = math.radians(20.0)  # a person nearby fills one or two of them
-    # Scans that are compared: the oldest not older than `longest_s`, kept `kept_every_s` apart.
+    # Scans are kept `kept_every_s` apart; the newest one is compared with one that is at most
+    # about `longest_s` older.
     longest_s: float = 0.56
     kept_every_s: float = 0.08
-    # Least motion by odometry between the two [m], [rad], and its least share in either half of
-    # that time: else a scan that is up to a quarter of a second older than its stamp, of a robot
-    # that has just started, would look like that of a held one.
-    least_path: float = 0.04
-    least_turn: float = 0.05
-    least_half: float = 0.25
-    # If the robot turned by more than the first since a scan, a younger one is preferred; by more
-    # than the second, the scan is never used, as a room may repeat itself.
+    # Minimum motion by odometry between the two scans [m], [rad], and its minimum fraction in
+    # either half of that time. With less, a robot that has just started would look held if its
+    # scans were up to a quarter of a second older than their stamps.
+    min_path: float = 0.04
+    min_turn: float = 0.05
+    min_half: float = 0.25
+    # If the robot turned by more than the first since a scan, a younger scan is preferred; if by
+    # more than the second, the scan is never used, because a room may repeat itself.
     usual_turn: float = 0.6
-    greatest_turn: float = 1.4
-    # A sector tells something if its ranges must change by this [m], and by so many standard
-    # deviations of the lidar's noise, in the root mean square.
-    least_change: float = 0.03
+    max_turn: float = 1.4
+    # A sector is compared if the root mean square of the changes of its ranges must be this [m],
+    # and this many standard deviations of the lidar's noise.
+    min_change: float = 0.03
     deviations: float = 1.8
     # A range changed visibly if it did by this [m] and by so many of these deviations.
     visible_change: float = 0.05
     visible_deviations: float = 3.0
-    gap: float = 0.25  # neighbours whose ranges differ by this share are two surfaces
-    # Held: of at least so many sectors that tell something this share shows less than
-    # `sector_share` of the motion, the median shows less than `held_share`, and in the median less
-    # than `greatest_changed` of a sector's ranges changed visibly. A skid-steer robot whose
-    # odometry turns 30 % too far shows 0.77, one on ice 0.5, and one that begins to turn, in DART,
-    # for half a second a tenth of the turn: it is not held, as its ranges change by what it drives
-    # ahead.
-    least_sectors: int = 5
+    # Neighbours whose ranges differ by more than this fraction are on two surfaces.
+    gap: float = 0.25
+    # A body is held if, of at least `min_sectors` compared sectors, the fraction `agreeing` shows
+    # less than `sector_share` of the motion, the median shows less than `held_share`, and in the
+    # median less than `max_changed` of a sector's ranges changed visibly. A skid-steer robot whose
+    # odometry turns 30 % too far shows 0.77, and one on ice 0.5. One that begins to turn in DART
+    # shows a tenth of the turn for half a second, but is not held: its ranges change because it
+    # also drives.
+    min_sectors: int = 5
     agreeing: float = 0.6
     sector_share: float = 0.45
     held_share: float = 0.2
-    greatest_changed: float = 0.5
+    max_changed: float = 0.5
     # time for which scans must contradict odometry, without one that agrees
     confirmed_s: float = 0.15
     # time after which an unconfirmed contradiction is forgotten
@@ -84,8 +86,10 @@ SETTINGS = Settings()
 class Verdict(NamedTuple):
     """What two scans say about the motion in between."""
 
-    sectors: int  # that tell something
-    share: float  # median share of the motion that they show; NaN if too few tell something
+    sectors: int  # number of compared sectors
+    share: (
+        float  # median fraction of the motion that they show; NaN if there are too few
+    )
     held: bool  # they contradict odometry
     reference: ReducedScan | None = (
         None  # the older of the two scans, if they were compared
@@ -97,14 +101,14 @@ UNDECIDED = Verdict(0, math.nan, False)
 
 def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Array:
     """Returns the pose (3,) at a stamp near the newest odometry, extrapolated by its twist."""
-    late = np.clip((stamp_ns - odometry.stamp_ns) * S_PER_NS, -longest_s, longest_s)
-    return compose(odometry.pose, exp(late * odometry.twist))
+    seconds = np.clip((stamp_ns - odometry.stamp_ns) * S_PER_NS, -longest_s, longest_s)
+    return compose(odometry.pose, exp(seconds * odometry.twist))
 
 
 def watch_scan(
     config: GateConfig, state: GateState, scan: Scan, settings: Settings = SETTINGS
 ) -> ScanMotion:
-    """Returns what is known about the motion in scans after a new one."""
+    """Returns what recent scans show of the motion, after a new scan."""
     before = state.scan_motion
     if (
         not config.stop_when_held
@@ -118,7 +122,7 @@ def watch_scan(
         _reduce(config, scan.ranges, settings),
     )
     oldest_ns = scan.stamp_ns - round(_compute_memory_s(config, settings) / S_PER_NS)
-    kept = tuple(one for one in before.views if one.stamp_ns >= oldest_ns)
+    kept = tuple(view for view in before.views if view.stamp_ns >= oldest_ns)
     verdict = UNDECIDED
     since_ns = None
     # Only a robot that is commanded to move can be held. Each push is judged alone: tyres that
@@ -129,8 +133,8 @@ def watch_scan(
             before.held_since_ns, verdict, scan.stamp_ns, settings
         )
     held = _explain_contradiction(newest, verdict, since_ns, settings)
-    apart_ns = round(settings.kept_every_s / S_PER_NS)
-    if not kept or newest.stamp_ns - kept[-1].stamp_ns >= apart_ns:
+    spacing_ns = round(settings.kept_every_s / S_PER_NS)
+    if not kept or newest.stamp_ns - kept[-1].stamp_ns >= spacing_ns:
         kept = (*kept, newest)
     return ScanMotion(kept, since_ns, held, verdict.share)
 
@@ -140,8 +144,8 @@ def _compute_memory_s(config: GateConfig, settings: Settings) -> float:
 
     At least `longest_s`; up to 15 % longer to hold three periods of a slow lidar, and always two.
     """
-    three = min(3.1 / config.scan_rate, 1.15 * settings.longest_s)
-    return max(settings.longest_s, three, 2.2 / config.scan_rate)
+    three_periods = min(3.1 / config.scan_rate, 1.15 * settings.longest_s)
+    return max(settings.longest_s, three_periods, 2.2 / config.scan_rate)
 
 
 def _update_held_since(
@@ -150,9 +154,11 @@ def _update_held_since(
     """Returns the stamp of the first contradiction that is neither outdated nor refuted."""
     if before_ns is not None and (now_ns - before_ns) * S_PER_NS > settings.forgotten_s:
         before_ns = None
-    if verdict.held:
-        return now_ns if before_ns is None else before_ns
-    return before_ns if math.isnan(verdict.share) else None
+    if math.isnan(verdict.share):
+        return before_ns
+    if not verdict.held:
+        return None
+    return now_ns if before_ns is None else before_ns
 
 
 def _explain_contradiction(
@@ -169,8 +175,9 @@ def _explain_contradiction(
         return ""
     x, y, turn = between(reference.pose, newest.pose).tolist()
     seconds = (newest.stamp_ns - reference.stamp_ns) * S_PER_NS
-    claimed = f"odometry shows {math.hypot(x, y):.2f} m and {abs(turn):.2f} rad in {seconds:.2f} s"
-    return f"{claimed}, the scans show none of it: the body is held, or the wheels slip"
+    motion = f"{math.hypot(x, y):.2f} m and {abs(turn):.2f} rad in {seconds:.2f} s"
+    fault = "the scans show none of it: the body is held, or the wheels slip"
+    return f"odometry shows {motion}, {fault}"
 
 
 def judge_motion(
@@ -180,37 +187,37 @@ def judge_motion(
     settings: Settings,
 ) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
-    old = _select_reference(kept, newest, settings)
-    if old is None:
+    reference = _select_reference(kept, newest, settings)
+    if reference is None:
         return UNDECIDED
     mount = np.array(config.mount)
-    moved = between(compose(old.pose, mount), compose(newest.pose, mount))
+    moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
     directions = get_directions(config, settings)
-    predicted = np.empty_like(old.ranges)
-    kernels.predict_scan(old.ranges, directions, moved, settings.gap, predicted)
+    predicted = np.empty_like(reference.ranges)
+    kernels.predict_scan(reference.ranges, directions, moved, settings.gap, predicted)
     sector = round(settings.sector / directions.step) or 1
     thresholds = Thresholds(
-        settings.least_change,
+        settings.min_change,
         settings.deviations,
         settings.visible_change,
         settings.visible_deviations,
     )
     noise = compute_noise(config, directions)
-    shares, changed = kernels.compare_sectors(
-        old.ranges, newest.ranges, predicted, sector, noise, thresholds
+    observed, changed = kernels.compare_sectors(
+        reference.ranges, newest.ranges, predicted, sector, noise, thresholds
     )
-    known = ~np.isnan(shares)
-    sectors = int(np.count_nonzero(known))
-    if sectors < max(settings.least_sectors, 1):
+    is_compared = ~np.isnan(observed)
+    sectors = int(np.count_nonzero(is_compared))
+    if sectors < max(settings.min_sectors, 1):
         return UNDECIDED._replace(sectors=sectors)
-    share = float(np.median(shares[known]))
-    unmoved = np.count_nonzero(np.abs(shares[known]) < settings.sector_share)
+    share = float(np.median(observed[is_compared]))
+    unmoved = np.count_nonzero(np.abs(observed[is_compared]) < settings.sector_share)
     held = (
         unmoved >= settings.agreeing * sectors
         and abs(share) < settings.held_share
-        and np.median(changed[known]) < settings.greatest_changed
+        and np.median(changed[is_compared]) < settings.max_changed
     )
-    return Verdict(sectors, share, bool(held), old)
+    return Verdict(sectors, share, bool(held), reference)
 
 
 def _select_reference(
@@ -218,35 +225,33 @@ def _select_reference(
 ) -> ReducedScan | None:
     """Returns the scan to compare the newest one with; None if odometry shows too little motion."""
     chosen = None
-    for index, old in enumerate(kept[:-1]):
-        turn = abs(_measure_turn(old, newest))
-        if turn > settings.greatest_turn:
+    for index, scan in enumerate(kept[:-1]):
+        turn = abs(_measure_turn(scan, newest))
+        if turn > settings.max_turn:
             continue
         chosen = index
         if turn <= settings.usual_turn:
             break
     if chosen is None:
         return None
-    old = kept[chosen]
-    half_ns = (old.stamp_ns + newest.stamp_ns) // 2
-    middle = min(kept[chosen + 1 :], key=lambda one: abs(one.stamp_ns - half_ns))
-    whole = _measure_motion(old, newest, settings)
-    halves = min(
-        _measure_motion(old, middle, settings),
+    reference = kept[chosen]
+    half_ns = (reference.stamp_ns + newest.stamp_ns) // 2
+    middle = min(kept[chosen + 1 :], key=lambda scan: abs(scan.stamp_ns - half_ns))
+    motion = _measure_motion(reference, newest, settings)
+    lesser_half = min(
+        _measure_motion(reference, middle, settings),
         _measure_motion(middle, newest, settings),
     )
-    enough = whole >= 1.0 and halves >= settings.least_half * whole
-    return old if enough else None
+    is_enough = motion >= 1.0 and lesser_half >= settings.min_half * motion
+    return reference if is_enough else None
 
 
 def _measure_motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
-    """Returns the motion that odometry shows between two scans; 1 is the least that is judged."""
+    """Returns the motion that odometry shows between two scans, in multiples of the minimum."""
     path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
     turn = abs(_measure_turn(old, new))
-    tiny = 1e-9  # the benchmark has a control with least motions of zero
-    return max(
-        path / max(settings.least_path, tiny), turn / max(settings.least_turn, tiny)
-    )
+    tiny = 1e-9  # the minimum may be set to zero
+    return max(path / max(settings.min_path, tiny), turn / max(settings.min_turn, tiny))
 
 
 def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
@@ -256,9 +261,9 @@ def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
 
 def _reduce(config: GateConfig, ranges: Ranges, settings: Settings) -> Ranges:
     directions = get_directions(config, settings)
-    out = np.empty(round(len(ranges) / directions.beams), np.float32)
-    kernels.reduce_scan(ranges, directions, out)
-    return out
+    reduced = np.empty(round(len(ranges) / directions.beams), np.float32)
+    kernels.reduce_scan(ranges, directions, reduced)
+    return reduced
 
 
 def get_directions(config: GateConfig, settings: Settings = SETTINGS) -> Directions:
@@ -278,18 +283,23 @@ def _make_directions(
     beams: int, first: float, step: float, spacing: float, window: float
 ) -> Directions:
     count = min(beams, max(1, round(beams * step / spacing)))
-    each = beams / count
+    beams_per_direction = beams / count
     reach = min(
         int(window / step + 1e-6), (kernels.LARGEST_WINDOW - 1) // 2, (beams - 1) // 2
     )
     full_circle = beams * step > FULL_CIRCLE - 0.5 * step
-    middle = first + (int(0.5 * each)) * step
-    return Directions(middle, each * step, each, reach, full_circle)
+    return Directions(
+        first=first + int(0.5 * beams_per_direction) * step,
+        step=beams_per_direction * step,
+        beams=beams_per_direction,
+        reach=reach,
+        full_circle=full_circle,
+    )
 
 
 def compute_noise(config: GateConfig, directions: Directions) -> Noise:
     """Returns the standard deviation of the change of a reduced range."""
-    # Of the difference of two medians of n normal numbers each.
+    # That of the difference of two medians, each of `count` normal numbers.
     count = 2 * directions.reach + 1
     factor = math.sqrt(2.0) * min(1.0, 1.25 / math.sqrt(count))
     constant, proportional = config.range_noise
@@ -303,13 +313,13 @@ def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 
 def warm_up(config: GateConfig) -> None:
-    """Compiles what a new scan calls: that takes seconds, which a moving robot does not have."""
+    """Compiles the kernels for a scan; that takes seconds, which a moving robot does not have."""
     view = ReducedScan(
         0,
         np.zeros(3),
         _reduce(config, np.ones(len(config.beam_angles), np.float32), SETTINGS),
     )
-    seen = tuple(
+    views = tuple(
         replace(view, stamp_ns=k, pose=np.array([0.1 * k, 0.0, 0.0])) for k in range(3)
     )
-    judge_motion(config, seen[:2], seen[2], SETTINGS)
+    judge_motion(config, views[:2], views[2], SETTINGS)
