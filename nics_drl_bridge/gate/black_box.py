@@ -93,9 +93,8 @@ class Replay(NamedTuple):
     """Content of a black box, with the recorded decisions."""
 
     entries: tuple[Entry, ...]
-    differing: tuple[
-        int, ...
-    ]  # indices of the entries that are now decided differently
+    # indices of the entries that are now decided differently
+    differing: tuple[int, ...]
 
     @property
     def story(self) -> list[str]:
@@ -126,24 +125,24 @@ def replay(path: str | Path) -> Replay:
     head, *lines = _read_records(path)
     try:
         config, state = from_plain(head["config"]), from_plain(head["state"])
-        given = [
+        events = [
             (line["now"], from_plain(line["given"]), line["decision"]) for line in lines
         ]
-        recorded = [from_plain(decision) for *_, decision in given]
-        _check_kinds(config, state, given, recorded)
+        recorded = [from_plain(decision) for *_, decision in events]
+        _check_kinds(config, state, events, recorded)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
         raise _explain_damage(path, error) from None
     entries = []
     differing = []
     for index, ((now, event, plain), decision) in enumerate(
-        zip(given, recorded, strict=True)
+        zip(events, recorded, strict=True)
     ):
         entries.append(Entry(now, event, state, decision))
         try:
-            state, anew = decide(config, state, event, now)
+            state, replayed = decide(config, state, event, now)
         except Exception as error:  # noqa: BLE001 - false records break the rules in any way
             raise _explain_damage(path, error) from None
-        if json.dumps(to_plain(anew)) != json.dumps(plain):
+        if json.dumps(to_plain(replayed)) != json.dumps(plain):
             differing.append(index)
     return Replay(tuple(entries), tuple(differing))
 
@@ -155,22 +154,22 @@ def _explain_damage(path: str | Path, error: Exception) -> ConfigError:
 
 
 def _check_kinds(
-    config: Any, state: Any, given: list[Any], recorded: list[Any]
+    config: Any, state: Any, events: list[Any], recorded: list[Any]
 ) -> None:
     """Raises TypeError or ValueError unless everything that was read belongs in a black box."""
-    if len(given) > MOST_INPUTS:
+    if len(events) > MOST_INPUTS:
         raise ValueError(
-            f"{len(given)} inputs, where at most {MOST_INPUTS} are replayed"
+            f"{len(events)} inputs, where at most {MOST_INPUTS} are replayed"
         )
     kinds = (
         (config, GateConfig),
         (state, GateState),
-        *((one, Decision) for one in recorded),
+        *((decision, Decision) for decision in recorded),
     )
     for value, kind in kinds:
         if not isinstance(value, kind):
             raise TypeError(f"a {type(value).__name__} stands for a {kind.__name__}")
-    for now, event, _ in given:
+    for now, event, _ in events:
         if not (isinstance(now, float | int) and abs(now) < LATEST_S):
             raise ValueError("the time of an input is no time")
         if not isinstance(event, get_args(Input)):
@@ -214,7 +213,7 @@ def to_plain(value: Any) -> Any:
     """Returns a record of the gate as plain data for JSON; arrays and floats keep their bits."""
     if is_dataclass(value) and not isinstance(value, type):
         content = {
-            each.name: to_plain(getattr(value, each.name)) for each in fields(value)
+            field.name: to_plain(getattr(value, field.name)) for field in fields(value)
         }
         return {KIND: type(value).__name__, **content}
     if isinstance(value, np.ndarray):
@@ -226,14 +225,14 @@ def to_plain(value: Any) -> Any:
             "data": data,
         }
     if isinstance(value, tuple):
-        return [to_plain(each) for each in value]
+        return [to_plain(part) for part in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
 def from_plain(value: Any) -> Any:
     """Returns the record that `to_plain` was given. Raises ValueError if it is damaged."""
     if isinstance(value, list):
-        return tuple(from_plain(each) for each in value)
+        return tuple(from_plain(part) for part in value)
     if not isinstance(value, dict):
         return value
     content = dict(value)
@@ -246,6 +245,6 @@ def from_plain(value: Any) -> Any:
                 .reshape(content["shape"])
                 .copy()
             )
-        return KINDS[kind](**{name: from_plain(each) for name, each in content.items()})
+        return KINDS[kind](**{name: from_plain(part) for name, part in content.items()})
     except (KeyError, TypeError) as error:
         raise ValueError(f"{kind!r} can't be read ({error})") from None

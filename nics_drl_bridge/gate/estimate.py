@@ -1,9 +1,9 @@
-"""The estimate of the robot's pose: it must go on from where it was, and stay about as certain.
+"""Checks the estimate of the robot's pose: it must not jump, nor become uncertain quickly.
 
 Without a localiser the covariance of a pose in `map` grows for ever, by noise and by the distance
-from the origin at which the heading is uncertain. That tells nothing about the next metres: goal
-and scan are near. So uncertainty is counted from a recent estimate, and arming begins anew: of the
-covariance, only that part counts which has come since.
+from the origin at which the heading is uncertain. That says nothing about the next metres, and goal
+and scan are near. So only the part of the covariance counts that has been added since a recent
+estimate, or since arming.
 """
 
 import math
@@ -23,7 +23,7 @@ from nics_drl_bridge.gate.state import (
 from nics_drl_bridge.geometry import between
 
 WINDOW_S = 10.0  # in which uncertainty is counted, but only since arming [s]
-MARK_S = 1.0  # time between two marks [s]
+ESTIMATE_MARK_S = 1.0  # time between two marks [s]
 SLIP = 2.0  # factor by which a robot may exceed its speeds
 TOPIC = "odometry/filtered"
 REMEDY = (
@@ -33,7 +33,7 @@ REMEDY = (
 
 
 class Growth(NamedTuple):
-    """What a pose has become uncertain by since an earlier estimate, as standard deviations."""
+    """Uncertainty of a pose relative to an earlier estimate, as standard deviations."""
 
     position: float  # [m]
     heading: float  # [rad]
@@ -41,7 +41,7 @@ class Growth(NamedTuple):
 
 def compute_growth(mark: EstimateMark, estimate: Estimate) -> Growth:
     """Returns the uncertainty of an estimate's pose relative to an earlier one."""
-    # An old error of the heading moves the pose by the way since, at right angles.
+    # An old error of the heading shifts the pose at right angles to the path since then.
     x, y = (estimate.pose[:2] - mark.pose[:2]).tolist()
     carried = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     gained = np.diag(estimate.covariance - carried @ mark.covariance @ carried.T)
@@ -62,7 +62,7 @@ def track_estimate(
     fault = fault or _explain_uncertainty(config, marks[0], estimate, now)
     if fault:
         return EstimateTrack((newest,), fault, fault)
-    if now - marks[-1].time_s >= MARK_S:
+    if now - marks[-1].time_s >= ESTIMATE_MARK_S:
         marks = (*marks, newest)
     return EstimateTrack(marks, "", track.last_fault)
 
@@ -73,12 +73,13 @@ def _find_jump(
     """Returns what is wrong with a pose that the robot can't have driven to, or nothing."""
     x, y, turn = between(before.pose, after.pose).tolist()
     path = math.hypot(x, y)
-    speed, turn_rate = (
-        get_maximum_speeds(config.limits) if config.limits else (math.inf, math.inf)
-    )
-    far = config.estimate_position + SLIP * speed * passed_s
-    round_ = config.estimate_heading + SLIP * turn_rate * passed_s
-    if path <= far and abs(turn) <= round_:
+    speed = math.inf
+    turn_rate = math.inf
+    if config.limits is not None:
+        speed, turn_rate = get_maximum_speeds(config.limits)
+    max_path = config.estimate_position + SLIP * speed * passed_s
+    max_turn = config.estimate_heading + SLIP * turn_rate * passed_s
+    if path <= max_path and abs(turn) <= max_turn:
         return ""
     return f"it jumped by {path:.3g} m and {abs(turn):.3g} rad in {passed_s:.2f} s"
 
@@ -87,14 +88,14 @@ def _explain_uncertainty(
     config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float
 ) -> str:
     """Returns by how much an estimate has become too uncertain; empty if it has not."""
-    grown = compute_growth(origin, estimate)
+    growth = compute_growth(origin, estimate)
     if (
-        grown.position <= config.estimate_position
-        and grown.heading <= config.estimate_heading
+        growth.position <= config.estimate_position
+        and growth.heading <= config.estimate_heading
     ):
         return ""
     return (
-        f"it became uncertain by {grown.position:.3g} m and {grown.heading:.3g} rad in "
+        f"it became uncertain by {growth.position:.3g} m and {growth.heading:.3g} rad in "
         f"{now - origin.time_s:.1f} s, the limits are {config.estimate_position:g} m and "
         f"{config.estimate_heading:g} rad"
     )

@@ -24,14 +24,16 @@ from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
 
 Taken = tuple[GateState, str]  # and the reason why an input is not taken, or ""
-# greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
-GREATEST_SPEED = 100.0
-SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
-"""A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
+# maximum speed that the odometry of a mobile robot can show [m/s, rad/s]
+MAX_SPEED = 100.0
+# Downhill or pushed, a robot may exceed its limits by this factor, plus [m/s] and [rad/s].
+SLIP = 2.0
+SLIP_SPEED = 0.5
+SLIP_TURN = 1.0
 # jump of an odometry pose that may come from imprecision [m, rad]
 LEAP = 0.1
 LEAP_TURN = 0.2
-# greatest deviation of the last beam from its declared angle [rad]
+# maximum deviation of the last beam from its declared angle [rad]
 ANGLE_TOLERANCE = 1e-3
 BEHIND_S = 0.2  # by which irregular stamps may fall behind while the gate settles
 Check = Callable[
@@ -61,13 +63,13 @@ def decide(
             state = replace(state, latched=cause)
         publish = was_moving or isinstance(given, inputs.Tick)
         state = _stop(config, state, now if publish else state.moved_s, disarm=latches)
-    elif (
-        isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S
-    ):
+    elif isinstance(given, inputs.Tick) and not now - state.moved_s < limits.MIN_STEP_S:
         publish = True
-        still = np.zeros(len(config.fields))
-        wish = still if state.command is None else config.command(state.command.twist)
-        motion = Motion(wish, still)
+        zero = np.zeros(len(config.fields))
+        target = zero
+        if state.command is not None:
+            target = config.command(state.command.twist)
+        motion = Motion(target, zero)
         for shape in SHAPERS:
             motion = shape(config, state, motion, now)
         if motion.fault:
@@ -101,17 +103,16 @@ def _serve(
         if failed := [f"{name}: {answer}" for name, answer in answers if answer]:
             return state, "; ".join(failed), False
         sensors = tuple(
-            replace(each, arrivals=reset_envelope(each.arrivals))
-            for each in state.sensors
+            replace(sensor, arrivals=reset_envelope(sensor.arrivals))
+            for sensor in state.sensors
         )
-        ground = shield.update_ground(
-            config, state.views, None
-        )  # it may have been carried here
+        # Ground that was known is forgotten: somebody may have carried the robot here.
+        ground = shield.update_ground(config, state.views, None)
         if ground is not None:
-            seen = shield.find_obstacles(
+            obstacles = shield.find_obstacles(
                 config, state.views[-1].ranges, state.views, ground
             )
-            state = replace(state, ground=ground, obstacles=seen)
+            state = replace(state, ground=ground, obstacles=obstacles)
         return (
             replace(
                 state,
@@ -142,7 +143,9 @@ def _stop(
     config: GateConfig, state: GateState, moved_s: float, disarm: bool
 ) -> GateState:
     zero = np.zeros_like(state.value)
-    published = moved_s > state.moved_s
+    recent = state.recent
+    if moved_s > state.moved_s:  # the stop is published
+        recent = _append_recent(config, state, zero, moved_s)
     return replace(
         state,
         value=zero,
@@ -150,9 +153,7 @@ def _stop(
         moved_s=moved_s,
         push=None,
         shielded=False,
-        recent=_append_recent(config, state, zero, moved_s)
-        if published
-        else state.recent,
+        recent=recent,
         armed=state.armed and not disarm,
     )
 
@@ -166,7 +167,9 @@ def _append_recent(
     since = now - config.shield.latency_s - config.scan_age_s
     sent = (*state.recent, (now, value))
     # A command from before `since` was in force until the next one.
-    return tuple(one for one, after in pairwise((*sent, sent[-1])) if after[0] >= since)
+    return tuple(
+        command for command, (until, _) in pairwise((*sent, sent[-1])) if until >= since
+    )
 
 
 def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
@@ -178,36 +181,44 @@ def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
     last_off = abs(first - angles[0]) + abs(step - increment) * (len(angles) - 1)
     if not last_off <= ANGLE_TOLERANCE:
         return "scan: its angles are not those of the declared lidar"
-    return "scan: every range is NaN" if np.isnan(scan.ranges).all() else ""
+    if np.isnan(scan.ranges).all():
+        return "scan: every range is NaN"
+    return ""
 
 
 def check_reading(config: GateConfig, reading: inputs.SensorReading) -> str:
     """The reading is of an unknown sensor, or not finite."""
     if reading.name not in config.sensors:
         return f"{reading.name}: there is no such sensor"
-    return "" if np.isfinite(reading.points).all() else f"{reading.name}: NaN or inf"
+    if not np.isfinite(reading.points).all():
+        return f"{reading.name}: NaN or inf"
+    return ""
 
 
 def check_odometry(config: GateConfig, odometry: inputs.Odometry) -> str:
     """The odometry is not finite, or too fast for a mobile robot."""
     if not (np.isfinite(odometry.pose).all() and np.isfinite(odometry.twist).all()):
         return "odom: NaN, inf, or no rotation"
-    fast = np.abs(odometry.twist).max() > GREATEST_SPEED
-    return f"odom: faster than {GREATEST_SPEED:g} m/s or rad/s" if fast else ""
+    if np.abs(odometry.twist).max() > MAX_SPEED:
+        return f"odom: faster than {MAX_SPEED:g} m/s or rad/s"
+    return ""
 
 
 def estimate_malformed(config: GateConfig, estimate: inputs.Estimate) -> str:
-    """The estimate is not finite, or its covariance is none."""
+    """The estimate is not finite, or its covariance has a negative variance."""
     parts = (estimate.twist, estimate.pose, estimate.covariance)
     if not all(np.isfinite(part).all() for part in parts):
         return "odometry/filtered: NaN or inf"
-    negative = bool((np.diag(estimate.covariance) < 0.0).any())
-    return "odometry/filtered: a variance is negative" if negative else ""
+    if (np.diag(estimate.covariance) < 0.0).any():
+        return "odometry/filtered: a variance is negative"
+    return ""
 
 
 def check_finite(config: GateConfig, command: inputs.Command) -> str:
     """The command is not finite."""
-    return "" if np.isfinite(command.twist).all() else "cmd_vel_raw: NaN or inf"
+    if not np.isfinite(command.twist).all():
+        return "cmd_vel_raw: NaN or inf"
+    return ""
 
 
 def check_plausible(config: GateConfig, command: inputs.Command) -> str:
@@ -258,10 +269,8 @@ def take(
         state = _take_command(state, given, now)
     elif isinstance(given, inputs.EStop):
         pressed = given.pressed
-        known = state.e_stop
-        stop = replace(
-            known, latched=known.latched or pressed, held=pressed, heard_s=now
-        )
+        latched = state.e_stop.latched or pressed
+        stop = replace(state.e_stop, latched=latched, held=pressed, heard_s=now)
         state = replace(state, e_stop=stop)
     elif isinstance(given, inputs.Press):
         stop = replace(state.e_stop, latched=True, reason=given.reason)
@@ -294,10 +303,9 @@ def _take_scan(
         config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
     )
     if fault:
-        jumped = stops.SCAN if fault == "jumped" else ""
-        return replace(state, scans=arrivals, jumped=jumped), f"scan: its stamp {fault}"
+        return _refuse_stamp(replace(state, scans=arrivals), SCAN, fault)
     pose = None if state.odometry is None else state.odometry.pose
-    seen, why = frozen.look(config, state.seen, scan.ranges, pose)
+    seen, frozen_fault = frozen.look(config, state.seen, scan.ranges, pose)
     views = shield.add_view(config, state, scan)
     ground = shield.update_ground(config, views, state.ground)
     state = replace(
@@ -305,7 +313,7 @@ def _take_scan(
         scans=arrivals,
         scan=scan,
         seen=seen,
-        frozen=why,
+        frozen=frozen_fault,
         views=views,
         ground=ground,
         scan_motion=scan_motion.watch_scan(config, state, scan),
@@ -323,10 +331,7 @@ def _take_odometry(
         config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
     )
     if fault:
-        jumped = stops.ODOM if fault == "jumped" else ""
-        return replace(
-            state, odometries=arrivals, jumped=jumped
-        ), f"odom: its stamp {fault}"
+        return _refuse_stamp(replace(state, odometries=arrivals), ODOM, fault)
     leap = _find_leap(config, state, odometry, now)
     if leap:  # later poses are judged relative to this one
         state = replace(state, odometry=odometry, leap=leap, push=None, seen=())
@@ -340,25 +345,29 @@ def _take_odometry(
 def _take_reading(
     config: GateConfig, state: GateState, reading: inputs.SensorReading, now: float
 ) -> Taken:
-    place = config.sensors.index(reading.name)
-    before = state.sensors[:place]
-    after = state.sensors[place + 1 :]
+    index = config.sensors.index(reading.name)
+    sensors = list(state.sensors)
     arrivals, fault = stops.account_for_arrival(
         config,
-        state.sensors[place].arrivals,
+        sensors[index].arrivals,
         reading.stamp_ns,
         now,
         config.scan_age_s,
         state.armed,
     )
-    points = state.sensors[place].points if fault else reading.points
-    state = replace(
-        state, sensors=(*before, records.SensorState(arrivals, points), *after)
-    )
+    points = sensors[index].points if fault else reading.points
+    sensors[index] = records.SensorState(arrivals, points)
+    state = replace(state, sensors=tuple(sensors))
     if fault:
-        jumped = reading.name if fault == "jumped" else ""
-        return replace(state, jumped=jumped), f"{reading.name}: its stamp {fault}"
+        return _refuse_stamp(state, reading.name, fault)
     return state, ""
+
+
+def _refuse_stamp(state: GateState, topic: str, fault: str) -> Taken:
+    """Refuses data whose stamp repeated or jumped."""
+    if fault == stops.JUMPED:
+        state = replace(state, jumped=topic)
+    return state, f"{topic}: its stamp {fault}"
 
 
 def _find_leap(
@@ -371,13 +380,13 @@ def _find_leap(
         return ""
     stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
     passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
-    slip, turned = (frozen.NOISE * std * passed for std in config.odom_std)
-    speed, turn = limits.get_maximum_speeds(bounds)
-    far = LEAP + (SLIP * speed + SLIP_SPEED) * passed + slip
-    round_ = LEAP_TURN + (SLIP * turn + SLIP_TURN) * passed + turned
+    path_noise, turn_noise = (frozen.NOISE * std * passed for std in config.odom_std)
+    speed, turn_rate = limits.get_maximum_speeds(bounds)
+    max_path = LEAP + (SLIP * speed + SLIP_SPEED) * passed + path_noise
+    max_turn = LEAP_TURN + (SLIP * turn_rate + SLIP_TURN) * passed + turn_noise
     x, y, heading = between(before.pose, odometry.pose)
     path = float(np.hypot(x, y))
-    if path <= far and abs(heading) <= round_:
+    if path <= max_path and abs(heading) <= max_turn:
         return ""
     return (
         f"its pose jumped by {path:.3g} m and {abs(heading):.3g} rad in {passed:.3f} s"
@@ -396,12 +405,11 @@ def _check_fresh(
 def _check_sensors(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
-    both = zip(config.sensors, state.sensors, strict=True)
-    wrong = (
-        _check_fresh(name, each.arrivals, config.scan_age_s, config, now)
-        for name, each in both
-    )
-    return next(filter(None, wrong), "")
+    for name, sensor in zip(config.sensors, state.sensors, strict=True):
+        fault = _check_fresh(name, sensor.arrivals, config.scan_age_s, config, now)
+        if fault:
+            return fault
+    return ""
 
 
 def _check_rate(
@@ -443,9 +451,9 @@ def _check_clocks(
     stamped = (
         (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * S_PER_NS / config.clock_rate
     )
-    apart = stamped - (scans.times[-1] - odometries.times[-1])
-    if abs(apart) > config.clock_jump_s:
-        return f"the stamps of scan are {apart:.3f} s ahead of those of odom"
+    lead = stamped - (scans.times[-1] - odometries.times[-1])
+    if abs(lead) > config.clock_jump_s:
+        return f"the stamps of scan are {lead:.3f} s ahead of those of odom"
     for topic, arrivals in ((SCAN, scans), (ODOM, odometries)):
         ahead = stops.measure_creep(arrivals)
         behind = 0.0 if config.simulated else -ahead
@@ -477,8 +485,9 @@ def _check_estimator(
 def _check_publishers(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
-    count = request.publishers
-    return "" if count == 1 else f"cmd_vel has {count} publishers, not this gate alone"
+    if request.publishers == 1:
+        return ""
+    return f"cmd_vel has {request.publishers} publishers, not this gate alone"
 
 
 def _check_policies(
@@ -490,8 +499,9 @@ def _check_policies(
 def _check_standing(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> str:
-    still = state.odometry is not None and now - state.restless_s >= config.settle_s
-    return "" if still else f"the robot has not stood still for {config.settle_s} s"
+    if state.odometry is not None and now - state.restless_s >= config.settle_s:
+        return ""
+    return f"the robot has not stood still for {config.settle_s} s"
 
 
 def _check_e_stop(
@@ -587,7 +597,7 @@ STOPS: tuple[Rule, ...] = (
 def saturate(
     config: GateConfig, state: GateState, motion: Motion, now: float
 ) -> Motion:
-    """Brings the value within its limits, see `limits.saturate`; without limits it is zero."""
+    """Clips the value to its limits, see `limits.saturate`; without limits it is zero."""
     if config.limits is None:
         return Motion(np.zeros_like(motion.value), np.zeros_like(motion.slope))
     return replace(motion, value=limits.saturate(motion.value, config.limits))
@@ -597,10 +607,12 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     """Limits rate and jerk, see `limits.follow`."""
     if config.limits is None:
         return motion
-    since = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
+    dt = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
     # A turn need not wait for a speed that the shield holds back.
-    given = motion.value, since, config.limits, not state.shielded
-    value, slope = limits.follow(state.value, state.slope, *given)
+    waits = not state.shielded
+    value, slope = limits.follow(
+        state.value, state.slope, motion.value, dt, config.limits, waits
+    )
     return replace(motion, value=value, slope=slope)
 
 
@@ -609,8 +621,12 @@ def bound(config: GateConfig, state: GateState, motion: Motion, now: float) -> M
 
     What is denormal becomes zero as well.
     """
-    good = config.limits is None or limits.is_within(motion.value, config.limits)
-    if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
+    is_within = config.limits is None or limits.is_within(motion.value, config.limits)
+    if (
+        is_within
+        and np.isfinite(motion.value).all()
+        and np.isfinite(motion.slope).all()
+    ):
         value = limits.flush_denormals(motion.value)
         return replace(motion, value=value, slope=limits.flush_denormals(motion.slope))
     zero = np.zeros_like(motion.value)

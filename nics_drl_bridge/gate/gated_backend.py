@@ -20,22 +20,23 @@ class GatedBackend:
     """Passes commands on as `command_gate` would, armed at the beginning of each episode.
 
     The gate decides once per control period, at its beginning, on what the robot sees and the
-    command. Limits are a shipped file or a YAML file, and hold the shield. `info` tells the rule
-    that stopped a command as `stopped_by`, else "", and as `shielded` if the shield reduced it.
+    command. Limits are a shipped file or a YAML file, which may hold the shield. In `info`,
+    `stopped_by` is the rule that stopped a command, or "", and `shielded` is True if the shield
+    reduced it.
     """
 
     def __init__(
         self, backend: interface.Backend, model: SimulatorModel, limits: str
     ) -> None:
         model.robot.require_cmd_vel()
-        given = load_limits(limits, model.robot)
-        shield, _ = shield_config(model, given, limits)
+        command_limits = load_limits(limits, model.robot)
+        shield, _ = shield_config(model, command_limits, limits)
         self._backend = backend
         self._model = model
         self._period_ns = round(model.control_period * interface.NS_PER_S)
         self._config = make_gate_config(
             model,
-            given,
+            command_limits,
             shield,
             simulated=True,
             e_stop_required=False,
@@ -49,10 +50,10 @@ class GatedBackend:
 
     def reset(self, start: interface.Start) -> interface.RobotView:
         """Begins the episode of a seed; see `interface.Backend`."""
-        # Arming is what a person does before: the data of that time are not driven again.
+        # A person arms the gate beforehand; that time is not simulated.
         self._state = replace(begin(self._config), armed=True)
         self._now_ns = FIRST_NS
-        return self._seen(self._backend.reset(start))
+        return self._pass_on(self._backend.reset(start))
 
     def step(
         self, command: interface.Array
@@ -64,13 +65,13 @@ class GatedBackend:
         view, facts = self._backend.step(robot.from_cmd_vel(decision.twist))
         self._now_ns += self._period_ns
         cause = "" if decision.cause is None else decision.cause.rule
-        return self._seen(view), {
+        return self._pass_on(view), {
             **facts,
             "stopped_by": cause,
             "shielded": decision.shielded,
         }
 
-    def _seen(self, view: interface.RobotView) -> interface.RobotView:
+    def _pass_on(self, view: interface.RobotView) -> interface.RobotView:
         lidar = self._model.lidar
         now = self._now_ns
         self._give(inputs.Odometry(now, view.pose.copy(), view.twist.copy()))

@@ -15,32 +15,32 @@ from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
 # a command beyond this multiple of its limit is a fault, and refused
 IMPLAUSIBLE = 10.0
-# motions closer in time are not published: their derivatives would be noise
-LEAST_STEP_S = 1e-3
+# motions closer in time are not published, because their derivatives would be noise [s]
+MIN_STEP_S = 1e-3
 PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the whole range within one is a typo
-SNAP = 1e-12  # a value this close to its target, as a share of the greatest value, has reached it
-GREATEST = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
+SNAP = 1e-12  # a value this close to its target, as a fraction of the maximum, has reached it
+HUGE = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
 STILL = 1e-9
-LEAST_NORMAL = float(
-    np.finfo(np.float64).tiny
-)  # numbers nearer to zero lose digits: denormal
+# numbers nearer to zero are denormal and lose digits
+SMALLEST_NORMAL = float(np.finfo(np.float64).tiny)
 # if no speed may exceed this, the robot can't be driven [m/s or rad/s]
-LEAST_MOTION = 0.01
-LONGEST_START_S, STARTED = 10.0, 0.01
-"""Within the first [s] a command must be able to reach the second (share of its greatest value)."""
+MIN_MOTION = 0.01
+# Within this time [s] a command must be able to reach this fraction of its maximum.
+LONGEST_START_S = 10.0
+STARTED = 0.01
 SPEED = "m/s"
 TURN = "rad/s"
-# greatest turn rate of a robot that is commanded by steering angle [rad/s]
+# maximum turn rate of a robot that is commanded by steering angle [rad/s]
 CAR_TURN = 4.0
 
 
 class CommandLimit(Schema):
     """Limits of one command, in its unit; an angle's rate is the steering rate."""
 
-    min: float = Field(le=0.0)  # least value that the gate lets pass
-    max: float = Field(ge=0.0)  # greatest value that the gate lets pass
-    rate: float = Field(gt=0.0)  # greatest change per second, in both directions
-    jerk: float = Field(gt=0.0)  # greatest change of the rate per second
+    min: float = Field(le=0.0)  # minimum that the gate lets pass
+    max: float = Field(ge=0.0)  # maximum that the gate lets pass
+    rate: float = Field(gt=0.0)  # maximum change per second, in both directions
+    jerk: float = Field(gt=0.0)  # maximum change of the rate per second
 
     @model_validator(mode="after")
     def _ordered(self) -> "CommandLimit":
@@ -52,16 +52,14 @@ class CommandLimit(Schema):
 class Stopping(Schema):
     """Stopping behaviour, for the shield: distance = v latency + v^2 / (2 deceleration)."""
 
-    latency: float = Field(
-        ge=0.0
-    )  # from a command until the robot follows it, with lags [s]
-    deceleration: float = Field(gt=0.0)  # of the braking that follows [m/s^2]
-    margin: float = Field(
-        default=0.05, ge=0.0
-    )  # clearance kept around the footprint [m]
-    obstacle_speed: float = Field(
-        default=1.0, ge=0.0
-    )  # of approaching ones; 0: static [m/s]
+    # from a command until the robot follows it, with lags [s]
+    latency: float = Field(ge=0.0)
+    # of the braking that follows [m/s^2]
+    deceleration: float = Field(gt=0.0)
+    # clearance kept around the footprint [m]
+    margin: float = Field(default=0.05, ge=0.0)
+    # of obstacles that approach [m/s]; 0 if all stand still
+    obstacle_speed: float = Field(default=1.0, ge=0.0)
 
 
 class LimitsFile(Schema):
@@ -89,13 +87,13 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
     if file.robot != robot.name:
-        other = f"the limits are for {file.robot!r}, not for {robot.name!r}"
-        raise ConfigError(f"{path}: key 'robot': {other}; name the file of this robot.")
+        fault = f"the limits are for {file.robot!r}, not for {robot.name!r}"
+        raise ConfigError(f"{path}: key 'robot': {fault}; name the file of this robot.")
     names = [variable.name for variable in robot.command]
-    for given in file.commands:
-        if given not in names:
+    for name in file.commands:
+        if name not in names:
             raise ConfigError(
-                f"{path}: unknown key 'commands.{given}'; {suggest(given, names)}"
+                f"{path}: unknown key 'commands.{name}'; {suggest(name, names)}"
             )
     for variable in robot.command:
         if variable.name not in file.commands:
@@ -108,7 +106,7 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
             variable,
         )
     low, high, rate, jerk = (
-        np.array([getattr(file.commands[each], bound) for each in names])
+        np.array([getattr(file.commands[name], bound) for name in names])
         for bound in ("min", "max", "rate", "jerk")
     )
     units = np.array([variable.unit for variable in robot.command])
@@ -116,8 +114,8 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     speeds = limits.linear | limits.turn
     if (speeds.any() or robot.takes_cmd_vel) and get_maximum(
         limits, speeds
-    ) < LEAST_MOTION:
-        fault = f"none of its speeds and turn rates may reach {LEAST_MOTION:g}"
+    ) < MIN_MOTION:
+        fault = f"none of its speeds and turn rates may reach {MIN_MOTION:g}"
         raise ConfigError(
             f"{path}: the robot could never move: {fault}; raise a `max`."
         )
@@ -140,13 +138,13 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
     far = max(-limit.min, limit.max)
     for name, order, per in (("rate", 1, "/s"), ("jerk", 2, "/s^2")):
         value = getattr(limit, name)
-        most = span / PERIOD_S**order
+        maximum = span / PERIOD_S**order
         reach = value * LONGEST_START_S**order / order
-        if value > most:
+        if value > maximum:
             fault = f"{value:g} {unit}{per} crosses the robot's whole range"
             within = f"within a period of the gate, {PERIOD_S:g} s, and limits nothing"
             raise ConfigError(
-                f"{key}.{name}': {fault} {within}; give at most {most:g}."
+                f"{key}.{name}': {fault} {within}; give at most {maximum:g}."
             )
         if reach < STARTED * far:
             come = f"after {LONGEST_START_S:g} s it has come to {reach:.2g} of {far:g} {unit}"
@@ -155,15 +153,15 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
 
 
 def get_maximum(limits: Limits, which: NDArray[np.bool_]) -> float:
-    """Returns the greatest magnitude allowed for some commands (C,); 0 if there are none."""
+    """Returns the maximum magnitude allowed for some commands (C,); 0 if there are none."""
     return float(np.maximum(-limits.low, limits.high)[which].max(initial=0.0))
 
 
 def get_maximum_speeds(limits: Limits) -> tuple[float, float]:
-    """Returns the greatest speed [m/s] and turn rate [rad/s] that the commands allow."""
-    each = np.maximum(-limits.low, limits.high)
+    """Returns the maximum speed [m/s] and turn rate [rad/s] that the commands allow."""
+    magnitudes = np.maximum(-limits.low, limits.high)
     turn = get_maximum(limits, limits.turn) if limits.turn.any() else CAR_TURN
-    return float(np.hypot.reduce(each[limits.linear])), turn
+    return float(np.hypot.reduce(magnitudes[limits.linear])), turn
 
 
 def is_implausible(command: Array, limits: Limits) -> bool:
@@ -179,15 +177,15 @@ def is_within(value: Array, limits: Limits) -> bool:
 
 
 def flush_denormals(values: Array) -> Array:
-    """Returns values (...) of which those that are denormal, hence no speeds, are exactly zero."""
-    return np.where(np.abs(values) < LEAST_NORMAL, 0.0, values)
+    """Returns values (...) with denormal ones, which are no speeds, replaced by zero."""
+    return np.where(np.abs(values) < SMALLEST_NORMAL, 0.0, values)
 
 
 def saturate(command: Array, limits: Limits) -> Array:
-    """Returns the command (C,) within its limits, speeds and turns scaled alike: the same path."""
+    """Returns the command (C,) within its limits; speeds and turn rates keep their ratio."""
     speeds = limits.linear | limits.turn
     factor = 1.0
-    out = flush_denormals(np.clip(command, -GREATEST, GREATEST))  # 0 times inf is NaN
+    out = flush_denormals(np.clip(command, -HUGE, HUGE))  # 0 times inf is NaN
     for i, value in enumerate(out):
         bound = limits.high[i] if value > 0.0 else limits.low[i]
         if bound == 0.0:
@@ -211,24 +209,24 @@ def follow(
     wanted = target.copy()
     after = value.copy()
     change = slope.copy()
-    given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
+    rows = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
     for turning in (False, True):
         if turning and waits:
             wanted[limits.turn] *= _compute_progress(
                 after[limits.linear], target[limits.linear]
             )
         for i in np.flatnonzero(limits.turn == turning):
-            after[i], change[i] = _follow_one(dt, *(float(each[i]) for each in given))
+            after[i], change[i] = _follow_one(dt, *(float(row[i]) for row in rows))
     return after, change
 
 
 def _compute_progress(speed: Array, wanted: Array) -> float:
-    """Returns the share of the wanted speed that is reached, along its direction, in [0, 1]."""
-    most = float(np.abs(wanted).max(initial=0.0))
-    if most < STILL:
+    """Returns the fraction of the wanted speed reached along its direction, in [0, 1]."""
+    maximum = float(np.abs(wanted).max(initial=0.0))
+    if maximum < STILL:
         return 1.0
-    along = wanted / most  # keeps the squares from overflowing
-    return min(1.0, max(0.0, float((speed / most) @ along) / float(along @ along)))
+    along = wanted / maximum  # keeps the squares from overflowing
+    return min(1.0, max(0.0, float((speed / maximum) @ along) / float(along @ along)))
 
 
 def _follow_one(
@@ -236,40 +234,43 @@ def _follow_one(
     value: float,
     slope: float,
     target: float,
-    least_value: float,
-    most_value: float,
+    min_value: float,
+    max_value: float,
     rate: float,
     jerk: float,
 ) -> tuple[float, float]:
-    # A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
-    # intervals, as the sum over them lies below the integral: a value that far within the bounds
-    # stays so. In shares of the greatest value and steps of this interval, nothing overflows.
-    scale = max(-least_value, most_value)
-    low = least_value / scale
-    high = most_value / scale
-    here = value / scale
-    there = target / scale
-    step = min(dt / scale, GREATEST)  # per unit of slope
-    least = -(high - low)
-    most = high - low
-    rate_step = min(rate * step, most)
-    before = min(max(slope * step, least), most)
-    jerk_step = min(jerk * dt * step, 2.0 * most)
-    wanted = _step_towards(there - here, jerk_step)
-    wanted = min(
-        max(wanted, before - jerk_step, -rate_step), before + jerk_step, rate_step
+    # A slope a can be brought back to zero within a change of a^2 / (2 jerk), whatever the coming
+    # intervals, because the sum over them lies below the integral. So a value that far within its
+    # bounds stays within them. Values are fractions of the maximum and slopes are steps of this
+    # interval, so that nothing overflows.
+    scale = max(-min_value, max_value)
+    low = min_value / scale
+    high = max_value / scale
+    now = value / scale
+    goal = target / scale
+    step_per_slope = min(dt / scale, HUGE)
+    span = high - low
+    rate_step = min(rate * step_per_slope, span)
+    last_step = min(max(slope * step_per_slope, -span), span)
+    jerk_step = min(jerk * dt * step_per_slope, 2.0 * span)
+    step = _step_towards(goal - now, jerk_step)
+    step = min(
+        max(step, last_step - jerk_step, -rate_step), last_step + jerk_step, rate_step
     )
-    wanted = min(wanted, _step_towards(high - here, jerk_step))
-    wanted = max(wanted, _step_towards(low - here, jerk_step))
-    after = here + wanted
-    change = min(max(wanted / step if step > 0.0 else 0.0, -rate), rate)
-    if abs(there - after) < SNAP:
-        return target, change
-    return min(max(after * scale, least_value), most_value), change
+    step = min(step, _step_towards(high - now, jerk_step))
+    step = max(step, _step_towards(low - now, jerk_step))
+    after = now + step
+    new_slope = 0.0
+    if step_per_slope > 0.0:
+        new_slope = step / step_per_slope
+    new_slope = min(max(new_slope, -rate), rate)
+    if abs(goal - after) < SNAP:
+        return target, new_slope
+    return min(max(after * scale, min_value), max_value), new_slope
 
 
 def _step_towards(gap: float, jerk: float) -> float:
-    """Returns the greatest step a that can still end at a gap: a + a^2 / (2 jerk) = gap."""
+    """Returns the maximum step a that can still end at a gap: a + a^2 / (2 jerk) = gap."""
     reach = 2.0 * jerk * abs(gap)
     if reach == 0.0:
         return 0.0

@@ -25,7 +25,7 @@ from nics_drl_bridge.gate.state import (
     ScanMotion,
     replace,
 )
-from nics_drl_bridge.gate.stops import SCAN
+from nics_drl_bridge.gate.stops import SCAN, make_cause
 from nics_drl_bridge.geometry import between, compose, exp
 from nics_drl_bridge.interface import S_PER_NS, Array
 
@@ -308,8 +308,7 @@ def compute_noise(config: GateConfig, directions: Directions) -> Noise:
 
 def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The scans show none of the motion that odometry shows: the body is held, its wheels spin."""
-    held = state.scan_motion.held
-    return Cause("body_held", SCAN, held) if held else None
+    return make_cause("body_held", SCAN, state.scan_motion.held)
 
 
 def warm_up(config: GateConfig) -> None:

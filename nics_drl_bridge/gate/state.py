@@ -1,5 +1,6 @@
 """Configuration, state and decisions of the gate: frozen records, and `replace` for copies."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -20,14 +21,14 @@ NAN = float("nan")
 
 def replace(record: Record, **changes: Any) -> Record:
     """Copies a frozen record without slots with changes, faster than `dataclasses.replace`."""
-    held = vars(record)
-    if not changes.keys() <= held.keys():
+    values = vars(record)
+    if not changes.keys() <= values.keys():
         raise TypeError(
-            f"{type(record).__name__} has no {sorted(changes.keys() - held.keys())}"
+            f"{type(record).__name__} has no {sorted(changes.keys() - values.keys())}"
         )
-    made = object.__new__(type(record))
-    vars(made).update(held, **changes)
-    return made
+    copy = object.__new__(type(record))
+    vars(copy).update(values, **changes)
+    return copy
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,11 @@ class ShieldConfig:
     # of moving obstacles that approach [m/s]; 0: all are static
     obstacle_speed: float = 0.0
     range_max: float = INF  # of the lidar [m]
-    range_noise: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # std, in metres and as a share of the range
-    # of unknown beams from which a direction counts as blocked
+    # standard deviation, in metres and as a fraction of the range
+    range_noise: tuple[float, float] = (0.0, 0.0)
+    # fraction of unknown beams from which a direction counts as blocked
     unknown_share: float = 0.5
-    unknown_width: float = 0.35  # angle over which that share is taken [rad]
+    unknown_width: float = 0.35  # angle over which that fraction is taken [rad]
     # Corners of the footprint in `base_link`, in order [m]; none of a robot that is a circle.
     outline: tuple[tuple[float, float], ...] = ()
     lever: float = 0.0  # by which a turn rate adds to the speed that is braked [m]
@@ -63,19 +62,17 @@ class ShieldConfig:
 class GateConfig:
     """Fixed configuration of a gate."""
 
-    fields: tuple[
-        int, ...
-    ]  # (C,) place of each command in linear.x, linear.y, angular.z; but
-    # of a car that takes turn rates, angular.z is that of a `bicycle` at its steering angle
+    # (C,) index of each command in linear.x, linear.y, angular.z. For a car that takes turn rates,
+    # angular.z is the turn rate of a `bicycle` at its steering angle.
+    fields: tuple[int, ...]
     limits: Limits | None  # of the commands; None lets nothing pass
     beam_angles: Array  # (B,) of the lidar [rad]
-    mount: tuple[
-        float, float, float
-    ]  # of the lidar in `base_link`: x [m], y [m], heading [rad]
+    # of the lidar in `base_link`: x [m], y [m], heading [rad]
+    mount: tuple[float, float, float]
     range_min: float  # of the lidar [m]
     scan_rate: float  # declared [Hz]
     odom_rate: float  # declared [Hz]
-    # else it is the least that a model needs: more is as good
+    # False: it is the minimum that a model needs, and a higher rate is fine
     odom_rate_declared: bool = True
     range_max: float = 0.0  # of the lidar [m]; 0 if unknown
     # greatest age of the newest scan, and of the scan behind a command
@@ -107,10 +104,8 @@ class GateConfig:
     # stop when scans show none of the motion that odometry shows
     stop_when_held: bool = True
     odom_std: tuple[float, float] = (0.0, 0.0)  # of odometry's twist [m/s, rad/s]
-    range_noise: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # std, in metres and as a share of the range
+    # standard deviation, in metres and as a fraction of the range
+    range_noise: tuple[float, float] = (0.0, 0.0)
     shield: ShieldConfig | None = None
     sensors: tuple[str, ...] = ()  # further ones, which must be as fresh as the scan
     bicycle: Bicycle | None = None
@@ -142,10 +137,12 @@ class Cause:
     @property
     def line(self) -> str:
         """One line for a log."""
-        topic = f" topic={self.topic}" if self.topic else ""
-        old = self.limit_s == self.limit_s
-        age = f" age={self.age_s:.3f}s limit={self.limit_s:.3f}s" if old else ""
-        return f"{self.rule}:{topic}{age} {self.detail}"
+        words = [f"{self.rule}:"]
+        if self.topic:
+            words.append(f"topic={self.topic}")
+        if not math.isnan(self.limit_s):
+            words.append(f"age={self.age_s:.3f}s limit={self.limit_s:.3f}s")
+        return " ".join([*words, self.detail])
 
 
 Mark = tuple[float, int, int, float]
@@ -172,9 +169,8 @@ class Sameness:
 
     ranges: Ranges  # (B,) of the first scan that showed it [m]
     count: int  # scans that showed it
-    first: (
-        Array | None
-    )  # (3,) odometry pose at the first; None if there was no odometry yet
+    # (3,) odometry pose at the first; None if there was no odometry yet
+    first: Array | None
 
 
 @dataclass(frozen=True)
@@ -197,12 +193,11 @@ class EstimateMark:
 
 @dataclass(frozen=True)
 class EstimateTrack:
-    """Whether the estimate goes on from where it was."""
+    """Recent estimates, and whether the newest continues them."""
 
-    marks: tuple[
-        EstimateMark, ...
-    ] = ()  # recent ones, oldest first; the first is the origin
-    # why the newest estimate does not go on from them; it is the new origin
+    # recent ones, oldest first; the first is the origin
+    marks: tuple[EstimateMark, ...] = ()
+    # why the newest estimate does not continue them; it is then the new origin
     fault: str = ""
     last_fault: str = ""  # the newest such reason
 
@@ -218,13 +213,13 @@ class ReducedScan:
 
 @dataclass(frozen=True)
 class ScanMotion:
-    """Whether recent scans show the motion that odometry shows."""
+    """Recent scans, and how much of the motion by odometry they show."""
 
     views: tuple[ReducedScan, ...] = ()  # recent ones, oldest first
     # stamp of the first scan that contradicts odometry
     held_since_ns: int | None = None
     held: str = ""  # what the newest scan contradicts, once others have before
-    # of the motion by odometry that the newest scan shows; NaN: undecided
+    # fraction of the motion by odometry that the newest scan shows; NaN: undecided
     share: float = NAN
 
 
@@ -233,10 +228,10 @@ class Ground:
     """Ground around a robot whose lidar does not see all around it."""
 
     since_ns: int  # stamp from which times count
-    corner: tuple[
-        int, int
-    ]  # cells from the origin of odometry to the first: along x, along y
-    times: Ranges  # (n, n), rows along y, when a cell was last known to be free [s]; -inf: is not
+    # cells from the origin of odometry to the first: along x, along y
+    corner: tuple[int, int]
+    # (n, n), rows along y: when a cell was last known to be free [s]; -inf: it is not known to be
+    times: Ranges
     unseen: Array  # (Q, 2) middles of the cells where that ends, in `base_link` [m]
 
 
@@ -247,7 +242,8 @@ class Push:
     since_s: float  # start
     last_s: float  # last integration
     moving_s: float  # last time that motion was commanded
-    told: Array  # (3,) sum of its twists x time [m, m, rad]; there and back again cancels out
+    # (3,) integral of the commanded twists [m, m, rad], in which forth and back cancel out
+    told: Array
     # Times [s], `told` at those times, and poses (3,) by odometry, oldest first.
     marks: tuple[tuple[float, Array, Array], ...] = ()
 
@@ -268,9 +264,8 @@ class SensorState:
     """Known state of a further sensor."""
 
     arrivals: Arrivals = Arrivals()  # of its accepted readings
-    points: Array = field(
-        default_factory=lambda: np.zeros((0, 2))
-    )  # (Q, 2) of the newest
+    # (Q, 2) of the newest
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True)
@@ -303,20 +298,18 @@ class GateState:
     pending: Command | None = None  # whose scan has not arrived yet
     # since when commands name such scans; None: the newest does not
     pending_s: float | None = None
-    views: tuple[
-        View, ...
-    ] = ()  # recent ones, for the detection of motion; empty without shield
+    # recent ones, for the detection of motion; empty without shield
+    views: tuple[View, ...] = ()
     # None if the lidar sees all around, and without shield
     ground: Ground | None = None
     # (P, 3) in the newest scan: x, y in `base_link` [m], and greatest speed of each [m/s].
     obstacles: Array | None = None
-    behind_s: float = (
-        -INF
-    )  # arrival of the scan behind the newest command, less its delay
+    # arrival of the scan behind the newest command, less its delay
+    behind_s: float = -INF
     malformed: str = ""  # what is wrong with the newest command
     source: str = ""  # the publisher of the newest command that named one
     source_s: float = -INF  # its arrival
-    mixed: str = ""  # at this input: two publishers command the robot in turn
+    mixed: str = ""  # at this input: two publishers command the robot alternately
     last_mixed: str = ""  # the newest such sentence
     mixed_s: float = -INF  # its time
     seen: tuple[Sameness, ...] = ()  # pictures that the lidar has shown, newest last

@@ -26,8 +26,8 @@ SHIELD_SPANS = {  # beyond them the robot could never move
     "obstacle_speed": (0, 100),
 }
 HARDEST = SHIELD_SPANS["deceleration"][1]
-# least number that must arrive while the gate settles, for a rate to be known
-LEAST_DATA = 2
+# minimum number of data that must arrive while the gate settles, for a rate to be known
+MIN_DATA = 2
 
 
 def make_gate_config(
@@ -39,8 +39,9 @@ def make_gate_config(
     """Returns the configuration of a robot's gate; `rules` are further fields of it."""
     lidar = model.lidar
     robot = model.robot
-    least_rate = {"odom_rate": 1.0 / model.control_period, "odom_rate_declared": False}
-    given = rules if "odom_rate" in rules else {**least_rate, **rules}
+    if "odom_rate" not in rules:
+        rules["odom_rate"] = 1.0 / model.control_period
+        rules.setdefault("odom_rate_declared", False)
     return GateConfig(
         fields=robot.cmd_vel_places,
         bicycle=robot.bicycle if robot.takes_turn_rate else None,
@@ -54,7 +55,7 @@ def make_gate_config(
         odom_std=model.noise.odometry,
         range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
         shield=shield,
-        **given,
+        **rules,
     )
 
 
@@ -64,16 +65,19 @@ def shield_config(
     file: str | Path = "",
     given: Mapping[str, float] | None = None,
 ) -> tuple[ShieldConfig, str]:
-    """Returns a robot's shield, and a sentence on its values; ConfigError: can't be used."""
-    # It is the `shield` of a file of limits, else of model and limits; given values override it.
+    """Returns a robot's shield, and a sentence on its values; ConfigError if one can't be used.
+
+    Values are from `shield` in the file of limits, else derived from model and limits; `given`
+    values override them.
+    """
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
-    told = set() if given is None else set(given)
+    given = given or {}
     try:
         braking = derive_braking(model, limits)
-    except ConfigError as error:  # how it stops has to be told
-        if measured is None and not told >= {"latency", "deceleration"}:
-            advice = "or tell it: `shield: {latency: .., deceleration: ..}` in the file of limits"
+    except ConfigError as error:
+        if measured is None and not given.keys() >= {"latency", "deceleration"}:
+            advice = "or give it: `shield: {latency: .., deceleration: ..}` in the file of limits"
             raise ConfigError(f"{str(error).removesuffix('.')}, {advice}.") from None
         braking = Braking(0.0, math.inf)
     stopping = measured
@@ -81,11 +85,11 @@ def shield_config(
         stopping = Stopping(
             latency=braking.reaction_s, deceleration=min(braking.deceleration, HARDEST)
         )
-    values = stopping.model_copy(update=dict(given or {}))
+    values = stopping.model_copy(update=dict(given))
     for name, value in values.model_dump().items():
-        least, most = SHIELD_SPANS[name]
-        if not least <= value <= most:
-            needed = f"it must be from {least:g} to {most:g}"
+        low, high = SHIELD_SPANS[name]
+        if not low <= value <= high:
+            needed = f"it must be from {low:g} to {high:g}"
             raise ConfigError(f"parameter 'shield_{name}' is {value:g}; {needed}.")
     lidar = model.lidar
     config = ShieldConfig(
@@ -102,7 +106,7 @@ def shield_config(
         lever=braking.lever_m,
         order=braking.order,
         drift=braking.drift,
-        turn=_turn_as_told(braking, values),
+        turn=_adapt_turn(braking, values),
     )
     source = f"by {path}" if measured is not None else "derived from model and limits"
     if given:
@@ -113,22 +117,22 @@ def shield_config(
     return config, f"the shield is on: {listed} ({source})"
 
 
-def _turn_as_told(braking: Braking, told: Stopping) -> TurnBraking | None:
-    """Returns the turn's own braking, which is worse if the speed is told to brake worse."""
-    if braking.turn is None:
+def _adapt_turn(braking: Braking, stopping: Stopping) -> TurnBraking | None:
+    """Returns the turn's braking, worsened as much as `stopping` is worse than the speed's."""
+    turn = braking.turn
+    if turn is None:
         return None
-    later = max(0.0, told.latency - braking.reaction_s)
-    weaker = min(1.0, told.deceleration / min(braking.deceleration, HARDEST))
-    own = braking.turn
-    deceleration = min(own.deceleration * weaker, HARDEST)
-    return replace(own, reaction_s=own.reaction_s + later, deceleration=deceleration)
+    delay = max(0.0, stopping.latency - braking.reaction_s)
+    weakening = min(1.0, stopping.deceleration / min(braking.deceleration, HARDEST))
+    deceleration = min(turn.deceleration * weakening, HARDEST)
+    return replace(turn, reaction_s=turn.reaction_s + delay, deceleration=deceleration)
 
 
 def derive_braking(model: SimulatorModel, limits: Limits | None) -> Braking:
-    """Returns how a robot stops by its model, when it is told to by its gate.
+    """Returns how a robot stops, by its model, when its gate commands it to.
 
-    Its base looks for one command per period, and brakes no harder than its limits allow.
-    Raises ConfigError for a model that does not come to rest.
+    Its base reads one command per period, and brakes no harder than its limits allow. Raises
+    ConfigError for a model that does not come to rest.
     """
     robot = model.robot
     linear = np.array([variable.unit == SPEED for variable in robot.command])
@@ -157,10 +161,8 @@ def get_wheelbase(robot: RobotSpec) -> float:
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
             fault = f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`"
-            known = (
-                f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad"
-            )
-            raise ConfigError(f"{known}, and {fault}.")
+            accepted = "the shield knows commands in m/s, rad/s and rad"
+            raise ConfigError(f"robot {robot.name!r}: {accepted}, and {fault}.")
     if not robot.steers:
         return 0.0
     if not robot.knows_wheelbase:
@@ -186,17 +188,18 @@ def require_possible(config: GateConfig) -> None:
             raise ConfigError(
                 f"parameter '{topic}_age': {fault}; give more than {1.0 / rate:.3g}."
             )
-        if rate * config.settle_s < LEAST_DATA:
+        if rate * config.settle_s < MIN_DATA:
             fault = f"{declared}, too seldom to be judged within {config.settle_s:g} s"
-            needed = f"the gate needs {LEAST_DATA / config.settle_s:g} Hz or more"
+            needed = f"the gate needs {MIN_DATA / config.settle_s:g} Hz or more"
             raise ConfigError(f"{fault}, so the robot could never move; {needed}.")
 
 
 def warn_of_age_limit(config: GateConfig, control_period_s: float) -> str:
     """Returns a warning about an age limit that only suits a policy with a shorter period [s]."""
-    age = f"{config.command_age_s:g} s"
+    if config.command_age_s > control_period_s:
+        return ""
+    age = f"parameter 'command_age': {config.command_age_s:g} s"
     period = f"{control_period_s:g}"
-    every = f"a policy commands every {period} s unless it is told otherwise"
+    pace = f"a policy commands every {period} s unless it is configured otherwise"
     advice = f"the robot would stop between any two commands; give more than {period}."
-    late = config.command_age_s <= control_period_s
-    return f"parameter 'command_age': {age}: {every}, and {advice}" if late else ""
+    return f"{age}: {pace}, and {advice}"

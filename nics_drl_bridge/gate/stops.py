@@ -1,7 +1,7 @@
 """Rules that stop the robot by the age of data, the gate's own clock, commands and e-stop."""
-# Age is the time since arrival on the steady clock, plus delay. The greatest lead of stamps over
-# that clock, the envelope, is that of the fastest data. Found before the gate is armed, it follows
-# at most the drift of real clocks: stamps that creep ahead or behind do not become the new normal.
+# Age is the time since arrival on the steady clock, plus delay. The envelope is the maximum lead of
+# stamps over that clock, the lead of the fastest data. Once the gate is armed, the envelope changes
+# no faster than real clocks drift: stamps that creep ahead or behind do not become the new normal.
 
 import math
 
@@ -20,14 +20,17 @@ SCAN = "scan"
 ODOM = "odom"
 RAW = "cmd_vel_raw"
 E_STOP = "e_stop"
+# faults of a stamp
+REPEATED = "repeated"
+JUMPED = "jumped"
 # number of remembered stamps; a command on an older scan is on an unknown one
-KEPT = 64
+KEPT_STAMPS = 64
 MARK_S = 0.05  # time between two marks [s]
 DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
-SIMULATED_LAG = 0.2  # share of real time that a simulator may lose
+SIMULATED_LAG = 0.2  # fraction of real time that a simulator may lose
 # data of an armed gate that lead the envelope by this are from the future [s]
 AHEAD_S = 0.1
-SOURCE_S = 1.0  # time after which another publisher's first command is no turn, but a new start [s]
+SOURCE_S = 1.0  # time after which a command of another publisher is a new start [s]
 # a running clock does not give this many inputs in a row the same time
 FROZEN_INPUTS = 20
 
@@ -56,13 +59,13 @@ def account_for_arrival(
         return fresh, ""
     step = (stamp_ns - arrivals.stamps_ns[-1]) * S_PER_NS
     if step < -config.clock_jump_s:
-        return fresh, "jumped"
+        return fresh, JUMPED
     if step <= 0.0:
-        return arrivals, "repeated"
+        return arrivals, REPEATED
     first_ns, first_s = arrivals.origin
     lead = (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
-        return fresh, "jumped"
+        return fresh, JUMPED
     marks = _append_mark(arrivals, stamp_ns, now, lead, config.settle_s)
     passed = now - arrivals.times[-1]
     envelope = max(mark[3] for mark in marks)
@@ -72,9 +75,9 @@ def account_for_arrival(
         highest = arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
     return Arrivals(
-        (*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
-        (*arrivals.times[1 - KEPT :], now),
-        (*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)),
+        (*arrivals.stamps_ns[1 - KEPT_STAMPS :], stamp_ns),
+        (*arrivals.times[1 - KEPT_STAMPS :], now),
+        (*arrivals.late[1 - KEPT_STAMPS :], max(0.0, envelope - lead)),
         arrivals.origin,
         arrivals.count + 1,
         envelope,
@@ -101,13 +104,21 @@ def reset_envelope(arrivals: Arrivals) -> Arrivals:
 
 def compute_age(arrivals: Arrivals, now: float) -> float:
     """Returns the age of the newest datum with its delay [s]; inf if there is none."""
-    return now - arrivals.times[-1] + arrivals.late[-1] if arrivals.times else math.inf
+    if not arrivals.times:
+        return math.inf
+    return now - arrivals.times[-1] + arrivals.late[-1]
 
 
 def _judge_age(
-    rule: str, topic: str, detail: str, old: float, limit: float
+    rule: str, topic: str, detail: str, age: float, limit: float
 ) -> Cause | None:
-    return None if old <= limit else Cause(rule, topic, detail, old, limit)
+    """Returns the cause of a stop if an age is beyond its limit [s], or NaN."""
+    return None if age <= limit else Cause(rule, topic, detail, age, limit)
+
+
+def make_cause(rule: str, topic: str, detail: str) -> Cause | None:
+    """Returns the cause of a stop; None if there is no detail."""
+    return Cause(rule, topic, detail) if detail else None
 
 
 def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -123,24 +134,26 @@ def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | Non
 
 def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest reading of a further sensor is too old: it has stopped."""
-    both = zip(config.sensors, state.sensors, strict=True)
-    old, name = max(
-        ((compute_age(each.arrivals, now), name) for name, each in both),
-        default=(0.0, ""),
-    )
-    return _judge_age("sensor_silent", name, "no fresh data", old, config.scan_age_s)
+    ages = [
+        (compute_age(sensor.arrivals, now), name)
+        for name, sensor in zip(config.sensors, state.sensors, strict=True)
+    ]
+    age, name = max(ages, default=(0.0, ""))
+    return _judge_age("sensor_silent", name, "no fresh data", age, config.scan_age_s)
 
 
 def odom_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest odometry is too old: it has stopped."""
-    old = compute_age(state.odometries, now)
-    return _judge_age("odom_silent", ODOM, "no fresh data", old, config.odom_age_s)
+    age = compute_age(state.odometries, now)
+    return _judge_age("odom_silent", ODOM, "no fresh data", age, config.odom_age_s)
 
 
 def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """A sensor's clock has jumped or runs ahead: its stamps lie in the future, or far back."""
+    if not state.jumped:
+        return None
     detail = "its stamps have jumped, or run ahead of time"
-    return Cause("stamps_jumped", state.jumped, detail) if state.jumped else None
+    return Cause("stamps_jumped", state.jumped, detail)
 
 
 def measure_rate(
@@ -178,14 +191,12 @@ def take_time(
         fault = ""
     ticked = state.tick_s
     awake = state.awake_s
-    if (
-        ticked is not None and now - ticked > config.gap_s
-    ):  # at whatever input wakes it up
+    if ticked is not None and now - ticked > config.gap_s:
+        # Any input may wake the gate up.
         fault = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s"
         awake = now
-    elif (
-        now - awake <= config.gap_s
-    ):  # a single zero may be lost: only the newest command counts
+    elif now - awake <= config.gap_s:
+        # A single zero may be lost, because only the newest command counts.
         fault = f"awake again for only {now - awake:.3f} s"
     return replace(
         state,
@@ -199,7 +210,7 @@ def take_time(
 
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The gate's clock is not to be trusted, or the gate was asleep."""
-    return Cause("own_clock", "", state.clock_fault) if state.clock_fault else None
+    return make_cause("own_clock", "", state.clock_fault)
 
 
 def watch_source(state: GateState, command: Command, now: float) -> GateState:
@@ -220,28 +231,29 @@ def watch_source(state: GateState, command: Command, now: float) -> GateState:
 
 
 def two_policies(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Two publishers command the robot in turn."""
-    return Cause("two_policies", RAW, state.mixed) if state.mixed else None
+    """Two publishers command the robot alternately."""
+    return make_cause("two_policies", RAW, state.mixed)
 
 
 def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest command is malformed."""
-    return Cause("command_malformed", RAW, state.malformed) if state.malformed else None
+    return make_cause("command_malformed", RAW, state.malformed)
 
 
 def command_missing(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """No command has arrived yet."""
-    heard = state.command is not None or state.pending is not None
-    return None if heard else Cause("command_missing", RAW, "no command yet")
+    if state.command is not None or state.pending is not None:
+        return None
+    return Cause("command_missing", RAW, "no command yet")
 
 
 def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The policy has stopped, or hangs."""
     if state.command is None:
         return None
-    old = now - state.command_s
+    age = now - state.command_s
     return _judge_age(
-        "command_silent", RAW, "no fresh command", old, config.command_age_s
+        "command_silent", RAW, "no fresh command", age, config.command_age_s
     )
 
 
@@ -262,23 +274,25 @@ def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause |
     if state.command is None:
         return None
     detail = f"the scan behind {RAW} is old"
-    old = now - state.behind_s
-    return _judge_age("scan_behind_old", SCAN, detail, old, config.scan_age_s)
+    age = now - state.behind_s
+    return _judge_age("scan_behind_old", SCAN, detail, age, config.scan_age_s)
 
 
 def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The emergency stop was pressed."""
-    detail = "pressed" if state.e_stop.held else state.e_stop.reason or "was pressed"
-    return Cause("e_stop_pressed", E_STOP, detail) if state.e_stop.latched else None
+    if not state.e_stop.latched:
+        return None
+    if state.e_stop.held:
+        return Cause("e_stop_pressed", E_STOP, "pressed")
+    return Cause("e_stop_pressed", E_STOP, state.e_stop.reason or "was pressed")
 
 
 def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The emergency stop is silent: a cut cable? An optional one must have been heard before."""
-    heard = state.e_stop.heard_s
-    if heard is None and not config.e_stop_required:
+    age = math.inf
+    if state.e_stop.heard_s is not None:
+        age = now - state.e_stop.heard_s
+    elif not config.e_stop_required:
         return None
-    old = math.inf if heard is None else now - heard
-    limit = config.e_stop_silence_s
-    return _judge_age(
-        "e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit
-    )
+    detail = "its heartbeat is silent, as if pressed"
+    return _judge_age("e_stop_silent", E_STOP, detail, age, config.e_stop_silence_s)
