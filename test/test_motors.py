@@ -306,8 +306,9 @@ def test_a_model_that_is_written_steps_as_it_did(model, tmp_path, commands):
     ):
         assert np.array_equal(one, other)
     assert "dead: 0.12" in model.text
-    assert "less 0.4*vx*|vx|, less dry friction of 0.2" in model.kinematics.restraint(
-        "d_vx"
+    assert (
+        "less 0.4*vx*|vx|, less dry friction of 0.2"
+        in model.kinematics.describe_limits("d_vx")
     )
     assert "inputs" not in replace(model, kinematics=replace(motors(), inputs=())).text
 

@@ -25,7 +25,7 @@ from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import RobotSpec, kind_names
+from nics_drl_bridge.robot.spec import RobotSpec, list_kinds
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import SetFile
@@ -55,7 +55,7 @@ SHORT = (
     "\n\nA file that begins with `kind:` needs a `footprint` or a `footprint_radius` and nothing "
     "else: name, commands, state and parameters are those of its kind, unless it gives its own. "
     "`free` needs its commands, too. "
-    f"Kinds are {', '.join(f'`{name}`' for name in kind_names())}."
+    f"Kinds are {', '.join(f'`{name}`' for name in list_kinds())}."
 )
 KINDS = {
     "robot": Kind(

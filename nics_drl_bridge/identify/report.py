@@ -108,7 +108,7 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
             mark = " (assumed)" if (dof, name) in model.assumed else ""
             number = with_error(abs(value), errors.get(dof, {}).get(name))
             text += f"{sign}{number}" + ("" if name == "1" else f"*{shown}") + mark
-        lines.append(f"{dof} = {text or '0'}{model.restraint(dof)}  [{unit}]")
+        lines.append(f"{dof} = {text or '0'}{model.describe_limits(dof)}  [{unit}]")
     return lines
 
 

@@ -16,7 +16,7 @@ from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.pose_guess import PoseGuess, list_used_columns
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.recording.table import Column
-from nics_drl_bridge.robot.spec import find_kind, kind_names
+from nics_drl_bridge.robot.spec import find_kind, list_kinds
 from nics_drl_bridge.robot.template import list_names
 
 # Words that say that something was sent to the robot: beyond doubt, and of a goal of a controller.
@@ -296,7 +296,7 @@ def _choose_kind(
     """Returns the kind of robot that these columns drive best, and its commands by its names."""
     kinds = [
         (name, kind.template.words)
-        for name in kind_names()
+        for name in list_kinds()
         if (kind := find_kind(name))
     ]
     best: tuple[str | None, dict[str, Candidate]] = (None, {})
@@ -354,7 +354,7 @@ def find_look_alikes(name: str) -> list[str]:
         return []
     commands = [{*list_names(names)} for names in kind.template.commands]
     look_alikes = []
-    for other_name in kind_names():
+    for other_name in list_kinds():
         other = find_kind(other_name)
         if other_name == name or other is None:
             continue

@@ -363,7 +363,7 @@ def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     """Draws the curve of each command that has one, and what becomes of the rates of states."""
     model = identified.model
     curves = [curve for curve in model.inputs if curve.bends]
-    restrained = [dof for dof in model.dofs if model.restraint(dof)]
+    restrained = [dof for dof in model.dofs if model.describe_limits(dof)]
     if not (count := len(curves) + len(restrained)):
         return None
     figure, grid = make_panels(1, count, (4.2 * count, 3.8))
@@ -416,7 +416,7 @@ def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
             )
     unit = model.dof_units[d]
     axes.set(xlabel=f"{dof} by its terms [{unit}]", ylabel=f"{dof} [{unit}]")
-    _finish(axes, dof + model.restraint(dof))
+    _finish(axes, dof + model.describe_limits(dof))
 
 
 def _finish(axes: Axes, title: str) -> None:

@@ -1,27 +1,35 @@
 """A car: the rear axle drives, the front wheels steer; `base_link` is the middle of the rear axle.
 
-Commanded are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel; of
-`ackermann_throttle` shares of throttle and steering in [-1, 1]: the speed comes to `speed_gain`
-[m/s] times the throttle, the steering angle to `greatest_steering` [rad] times the share; drag, a
-dead zone and slip are for a recording to show.
+Its commands are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel;
+those of `ackermann_throttle` are throttle and steering in [-1, 1]. Its speed goes to `speed_gain`
+[m/s] times the throttle, its steering angle to `greatest_steering` [rad] times the steering; drag,
+a dead zone and slip can only come from a recording.
 """
 
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot import kinds
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import (
-    SHARES,
+    RATIO_RANGE,
     STEERED,
     STEERED_LAGS,
     Template,
     list_names,
-    usual,
+    make_command,
 )
 
 LENGTHS = {"wheelbase": 1.3}
-TEMPLATE = Template((STEERED,), POSE_RATES, (), STEERED_LAGS, LENGTHS)
-THROTTLE = (usual("throttle", "1", SHARES), usual("steering", "1", SHARES))
-# The lag of the speed is that of rolling on, so that it is long.
+TEMPLATE = Template(
+    commands=(STEERED,),
+    moves=POSE_RATES,
+    parameters=STEERED_LAGS,
+    lengths=LENGTHS,
+)
+THROTTLE = (
+    make_command("throttle", "1", RATIO_RANGE),
+    make_command("steering", "1", RATIO_RANGE),
+)
+# The lag of the speed is long, because the car rolls on.
 GAINS = {
     "speed_gain": 3.0,
     "greatest_steering": 0.4,
@@ -30,54 +38,61 @@ GAINS = {
 }
 
 
-def kinematics(spec: RobotSpec) -> kinds.Textbook:
+def derive_kinematics(spec: RobotSpec) -> kinds.Textbook:
     """Curvature tan(angle) / wheelbase."""
-    return kinds.steered(
+    return kinds.make_steered(
         spec, Bicycle(spec.parameters["wheelbase"]), list_names(STEERED)
     )
 
 
-def by_throttle(spec: RobotSpec) -> kinds.Textbook:
-    """The same, of shares of the greatest speed and steering angle."""
-    p = spec.parameters
-    gain = p["speed_gain"], p["greatest_steering"]
-    return kinds.steered(spec, Bicycle(p["wheelbase"]), list_names(THROTTLE), gain)
+def derive_throttle_kinematics(spec: RobotSpec) -> kinds.Textbook:
+    """The same for throttle and steering, in fractions of maximum speed and steering angle."""
+    bicycle = Bicycle(spec.parameters["wheelbase"])
+    gain = (spec.parameters["speed_gain"], spec.parameters["greatest_steering"])
+    return kinds.make_steered(spec, bicycle, list_names(THROTTLE), gain)
 
 
 def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
-    """Returns `track` and `wheel_radius` [m]; by default shares of the wheelbase."""
-    base = parameters["wheelbase"]
-    return parameters.get("track", 0.8 * base), parameters.get(
-        "wheel_radius", 0.18 * base
-    )
+    """Returns `track` and `wheel_radius` [m], by default in proportion to the wheelbase."""
+    wheelbase = parameters["wheelbase"]
+    track = parameters.get("track", 0.8 * wheelbase)
+    radius = parameters.get("wheel_radius", 0.18 * wheelbase)
+    return track, radius
 
 
-def drawing(spec: RobotSpec) -> kinds.Drawing:
+def draw(spec: RobotSpec) -> kinds.Drawing:
     """A box on four wheels; the right front wheel follows the left one."""
     wheelbase = spec.parameters["wheelbase"]
-    angle = kinds.steering_angle(spec)
+    angle = kinds.find_steering_angle(spec)
     track, radius = track_and_radius(spec.parameters)
     wheels = []
     for side, y, suffix in (
         ("left", 0.5 * track, ""),
         ("right", -0.5 * track, "_right"),
     ):
-        if angle:
+        pivot = None
+        if angle is not None:
             pivot = kinds.Pivot(f"{side}_knuckle", angle.name + suffix, angle)
-        else:
-            pivot = None
-        wheels.append(kinds.Wheel(f"rear_{side}_wheel", (0.0, y), radius))
-        wheels.append(
-            kinds.Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot)
-        )
+        rear = kinds.Wheel(f"rear_{side}_wheel", (0.0, y), radius)
+        front = kinds.Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot)
+        wheels += [rear, front]
     return kinds.Drawing(
-        (1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius), tuple(wheels)
+        body=(1.3 * wheelbase, 0.7 * track),
+        centre=(0.45 * wheelbase, radius),
+        wheels=tuple(wheels),
     )
 
 
-KIND = kinds.RobotKind(kinematics, drawing, TEMPLATE)
+KIND = kinds.RobotKind(derive_kinematics, draw, TEMPLATE)
 VARIANTS = {
     "ackermann_throttle": kinds.RobotKind(
-        by_throttle, drawing, Template((THROTTLE,), POSE_RATES, (), GAINS, LENGTHS)
+        kinematics=derive_throttle_kinematics,
+        drawing=draw,
+        template=Template(
+            commands=(THROTTLE,),
+            moves=POSE_RATES,
+            parameters=GAINS,
+            lengths=LENGTHS,
+        ),
     )
 }

@@ -1,9 +1,9 @@
-"""Braking: how far a robot still moves after it was told to stop, by a simulation of its model.
+"""Braking: how far a robot still moves after the command to stop, by simulating its model.
 
 The model is brought to the steady motion of many commands over their range: forwards, backwards,
-sideways, turning, and mixtures. Each motion is then stopped. From all stops follow a reaction time
-and a deceleration that bound every one of them from above. A turn that ends apart from the speed,
-as that of a robot whose turn rate lags more than its speed, has a bound of its own: `OwnTurn`.
+sideways, turning, and mixtures. Each motion is then stopped. The stops yield a reaction time and a
+deceleration that bound each of them from above. A turn that does not end together with the speed,
+because the turn rate lags more, has a bound of its own: `TurnBraking`.
 """
 
 import math
@@ -19,56 +19,59 @@ from scipy.optimize import linprog
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import BEYOND, TaylorModel
+from nics_drl_bridge.robot.taylor import STATE_MARGIN, TaylorModel
 
-# a robot that still moves after this time cannot be shown to stop [s]
-LONGEST_STOP_S = 60.0
-LONGEST_START_S = 30.0  # given to a held command to reach its steady motion [s]
-# a robot that moves no faster than this stands [m/s, of its whole footprint]
+MAX_STOP_S = 60.0  # a robot that still moves after this time does not stop [s]
+MAX_START_S = 30.0  # time in which a held command reaches its steady motion [s]
+# A robot is at rest if no point of its footprint moves faster [m/s].
 CREEP = 0.05
-BIAS = 0.05  # share of its greatest speed at which a model may creep at rest, by a bias of its fit
-BIAS_STEERED = 0.15  # likewise with steered wheels: a polynomial is less exact there
-FIXED = 1e-9  # a state that changes by less in a step has settled, as a share of the greatest
-# standard errors of the model's coefficients by which it may respond slower
-DEVIATIONS = 2.0
-SLOWEST = 0.5  # least factor on the response of a model by its standard errors
-# length beside which a stopping distance need not be bounded tightly [m]
-SLACK_M = 0.15
-STRAIGHT = 0.1  # a motion turns if its turn moves the footprint by more than this share
-# a lesser component of a twist counts from this share of the greatest one on
-MINOR = 0.1
+# A model may creep at rest by a bias of its fit, at this fraction of its maximum speed; polynomials
+# are less exact with steered wheels.
+BIAS = 0.05
+BIAS_STEERED = 0.15
+# A state has settled if it changes by less in a step, as a fraction of the largest state.
+SETTLED = 1e-9
+DEVIATIONS = (
+    2.0  # standard errors of the coefficients by which a model may respond slower
+)
+MIN_RESPONSE = (
+    0.5  # lower bound on the factor on a model's response by its standard errors
+)
+SLACK_M = 0.15  # stopping distances need not be bounded tightly relative to this length
+# A motion is straight if its turn moves the footprint by at most this fraction of its speed.
+STRAIGHT = 0.1
+MINOR = 0.1  # smaller fractions of the largest component of a twist do not count
 ALIKE = 0.1  # components whose braking times differ by less stop together
+# Candidates of `Braking.lever_m`, in footprint radii, and of `Braking.order`
 LEVERS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)
-"""That are tried, in footprint radii."""
-ORDERS = (2.0, math.inf, 1.0)  # that are tried, see `Braking.order`
-NEGLIGIBLE = 0.02  # by which a lever may bound the stops less tightly than the best one
-LEAST_SHARE = 0.05  # least share of its bound by which a component is said to move
-MISSED_M = 0.01  # by which two bounds of their own may miss a motion whose speed is a creep [m]
-MOST_MOTIONS = 2500
+ORDERS = (2.0, math.inf, 1.0)
+NEGLIGIBLE = 0.02  # a bound may be less tight than the best one by this slack
+MIN_FRACTION = 0.05  # lower bound on `TurnBraking.least_turn` and `least_path`
+MAX_MISSED_M = 0.01  # separate bounds may miss a motion that creeps by this length
+MAX_MOTIONS = 2500
 INSTANT = 1e-6  # 1/(2a) [s^2/m] below which the deceleration counts as infinite
+# By the number of commands: fractions of each range whose mixtures are stopped
 LEVELS: dict[int, tuple[float, ...]] = {
     1: (0.5, 1.0),
     2: (0.1, 0.25, 0.5, 0.75, 1.0),
     3: (0.15, 0.4, 0.7, 1.0),
 }
-"""By the number of commands: shares of each range whose mixtures are stopped."""
-ALONE = tuple(k / 20 for k in range(1, 21))  # shares of the range of one command alone
-_KEPT: "OrderedDict[Any, Braking]" = OrderedDict()  # least recently used first
-MOST_KEPT = 32
+SINGLE_LEVELS = tuple(k / 20 for k in range(1, 21))  # likewise, of one command alone
+CACHE_SIZE = 32
+_CACHE: "OrderedDict[Any, Braking]" = OrderedDict()  # least recently used first
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How a robot leaves its arc while it brakes, as some of its motion ends before the rest.
+    """How a robot leaves its arc while it brakes, because parts of its motion end before the rest.
 
     The components of a twist are compared as speeds, a turn as that of the whole footprint. While
-    the greatest one is braked, a lesser one moves the robot by a factor more than along the arc.
+    the largest one is braked, a smaller one moves the robot by a factor more than along the arc.
     """
 
-    least: float = 1.0  # factor
-    greatest: float = 1.0  # factor
-    # greatest share of the greatest component that a lesser one comes to
-    share: float = 1.0
+    least: float = 1.0  # minimum factor
+    greatest: float = 1.0  # maximum factor
+    share: float = 1.0  # maximum ratio of a smaller component to the largest one
 
     @property
     def is_none(self) -> bool:
@@ -81,19 +84,16 @@ NO_DRIFT = Drift()
 
 @dataclass(frozen=True)
 class TurnBraking:
-    """How a turn ends that brakes apart from the speed.
+    """How a turn ends that brakes independently of the speed.
 
     The robot turns no further than if it kept its turn rate for the reaction time, and then braked
-    it evenly by the deceleration. It may stop sooner, but not by much: the least shares tell.
+    it evenly by the deceleration. It may stop a little sooner, see the minimum fractions.
     """
 
     reaction_s: float  # until the braking of the turn counts, lags included
-    deceleration: (
-        float  # of the turn that follows; infinite if the lags are all [rad/s^2]
-    )
-    least_turn: float = 1.0  # share of this bound by which the robot turns at least
-    # share of the bound of its path that the robot moves at least
-    least_path: float = 1.0
+    deceleration: float  # of the turn that follows; infinite for lags alone [rad/s^2]
+    least_turn: float = 1.0  # fraction of this bound by which the robot turns at least
+    least_path: float = 1.0  # fraction of its path's bound that it moves at least
 
     def mean_time_s(self, rate: Array) -> Array:
         """Returns the times (...) at full turn rates (...) in which the robot turns as far."""
@@ -102,48 +102,44 @@ class TurnBraking:
 
 @dataclass(frozen=True)
 class Braking:
-    """An upper bound of a robot's stops.
+    """An upper bound on a robot's stops.
 
-    A robot that moves with a pace p when it is told to stop moves no further than if it kept its
+    A robot that moves at a pace p when it is told to stop moves no further than if it kept its
     twist for the reaction time, and then braked evenly by the deceleration.
     """
 
-    reaction_s: (
-        float  # from the command to stop until the braking counts, lags included
-    )
-    deceleration: (
-        float  # of the braking that follows; infinite if the lags are all [m/s^2]
-    )
-    # by which a turn rate adds to the speed in the pace [m]: wheels that turn the robot brake both
+    reaction_s: float  # from the command to stop until braking counts, lags included
+    deceleration: float  # of the braking that follows; infinite for lags alone [m/s^2]
+    # Factor of the turn rate in the pace [m]: wheels that also turn the robot brake both
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes
-    # of the norm of ahead and sideways: infinite if the slower of both stops as if it were alone,
-    # 1 if the brakes have to take away the sum, 2 otherwise
+    # Order of the norm of ahead and sideways: infinite if the slower of both stops as if it were
+    # alone, 1 if the brakes have to take away the sum, 2 otherwise
     order: float = 2.0
     turn: TurnBraking | None = None  # None if the turn brakes as the speed does
 
     def pace(self, twist: Array) -> Array:
         """Returns the speed that the brakes take away (...) from twists (..., 3) [m/s]."""
-        across = np.linalg.norm(twist[..., :2], ord=self.order, axis=-1)
-        return np.asarray(across + self.lever_m * np.abs(twist[..., 2]))
+        speed = np.linalg.norm(twist[..., :2], ord=self.order, axis=-1)
+        return np.asarray(speed + self.lever_m * np.abs(twist[..., 2]))
 
     def time_s(self, twist: Array) -> Array:
         """Returns the times to rest (...) from twists (..., 3)."""
         times = self.reaction_s + self.pace(twist) / self.deceleration
-        if self.turn is not None:
-            turning = (
-                self.turn.reaction_s + np.abs(twist[..., 2]) / self.turn.deceleration
-            )
-            times = np.maximum(times, np.where(twist[..., 2] == 0.0, 0.0, turning))
-        return np.asarray(times)
+        if self.turn is None:
+            return np.asarray(times)
+        rate = np.abs(twist[..., 2])
+        turn_times = self.turn.reaction_s + rate / self.turn.deceleration
+        return np.asarray(np.maximum(times, np.where(rate == 0.0, 0.0, turn_times)))
 
     def mean_time_s(self, twist: Array) -> Array:
         """Returns the times (...) at full twists (..., 3) in which the robot moves as far."""
         times = self.reaction_s + self.pace(twist) / (2.0 * self.deceleration)
-        if self.turn is not None:
-            turning = self.turn.mean_time_s(twist[..., 2])
-            times = np.maximum(times, np.where(twist[..., 2] == 0.0, 0.0, turning))
-        return np.asarray(times)
+        if self.turn is None:
+            return np.asarray(times)
+        rate = twist[..., 2]
+        turn_times = self.turn.mean_time_s(rate)
+        return np.asarray(np.maximum(times, np.where(rate == 0.0, 0.0, turn_times)))
 
     def distance(self, speed: float) -> float:
         """Returns the length of the path to rest from a speed straight ahead [m]."""
@@ -156,8 +152,8 @@ class Stops(NamedTuple):
     twist: Array  # (K, 3) at the command to stop: vx, vy [m/s], wz [rad/s]
     path: Array  # (K,) length of the path to rest [m]
     travel: Array  # (K, 3) the same of each component: |vx|, |vy| [m], |wz| [rad]
-    left: Array  # (K, 3) twist that is left at the end
-    holds: NDArray[np.bool_]  # (K,) True where steering angles were held meanwhile
+    last_twist: Array  # (K, 3) at the end of the simulation
+    holds_angle: NDArray[np.bool_]  # (K,) True where steering angles were held
 
 
 def find_braking(
@@ -167,88 +163,92 @@ def find_braking(
     high: Array | None = None,
     ramp: Array | None = None,
 ) -> Braking:
-    """Returns the bound of all stops of a model; the last `MOST_KEPT` results are cached.
+    """Returns the bound of all stops of a model; the last `CACHE_SIZE` results are cached.
 
     Args:
-        robot: whose model it is.
+        robot: the robot of the model.
         model: its kinematics, with all that its motors do.
-        low: least commands (C,), those of the robot if not given.
-        high: greatest commands (C,), likewise.
-        ramp: (C,) greatest change of each command per second on the way to rest; infinite for
-            those that go to rest at once, as all do if it is not given.
+        low: minimum commands (C,), by default the robot's.
+        high: maximum commands (C,), likewise.
+        ramp: (C,) maximum change of each command per second on the way to rest; infinite for
+            commands that go to rest at once, which is the default for all.
 
     Raises ConfigError for a model that does not come to rest.
     """
-    low = robot.command_low if low is None else low
-    high = robot.command_high if high is None else high
-    ramp = np.full(len(low), np.inf) if ramp is None else ramp
-    key = _key(robot, model, low, high, ramp)
-    if key not in _KEPT:
-        _KEPT[key] = _bound(robot, model, low, high, ramp)
-    _KEPT.move_to_end(key)
-    while len(_KEPT) > MOST_KEPT:
-        _KEPT.popitem(last=False)
-    return _KEPT[key]
+    if low is None:
+        low = robot.command_low
+    if high is None:
+        high = robot.command_high
+    if ramp is None:
+        ramp = np.full(len(low), np.inf)
+    key = _make_cache_key(robot, model, low, high, ramp)
+    if key not in _CACHE:
+        _CACHE[key] = _bound(robot, model, low, high, ramp)
+    _CACHE.move_to_end(key)
+    while len(_CACHE) > CACHE_SIZE:
+        _CACHE.popitem(last=False)
+    return _CACHE[key]
 
 
-def _key(robot: RobotSpec, model: TaylorModel, *arrays: Array) -> tuple[Any, ...]:
-    values = (getattr(model, each.name) for each in fields(model))
-    content = (v.tobytes() if isinstance(v, np.ndarray) else repr(v) for v in values)
-    return (robot.model_dump_json(), *content, *(each.tobytes() for each in arrays))
+def _make_cache_key(
+    robot: RobotSpec, model: TaylorModel, *arrays: Array
+) -> tuple[Any, ...]:
+    key: list[Any] = [robot.model_dump_json()]
+    for field in fields(model):
+        value = getattr(model, field.name)
+        key.append(value.tobytes() if isinstance(value, np.ndarray) else repr(value))
+    return (*key, *(array.tobytes() for array in arrays))
 
 
 def _bound(
     robot: RobotSpec, model: TaylorModel, low: Array, high: Array, ramp: Array
 ) -> Braking:
-    commands = motions(low, high)
-    slower = derive_slowest_model(model)
-    variants = (model,) if slower is None else (model, slower)
-    ramped = _together(
-        [simulate_stops(robot, each, commands, ramp) for each in variants]
-    )
-    at_once = np.full_like(ramp, np.inf)
+    commands = list_motions(low, high)
+    models = [model]
+    slowest = derive_slowest_model(model)
+    if slowest is not None:
+        models.append(slowest)
+    ramped = _simulate_all(robot, models, commands, ramp)
     sudden = ramped
     if np.isfinite(ramp).any():
-        sudden = _together(
-            [simulate_stops(robot, each, commands, at_once) for each in variants]
-        )
-    for stops in (ramped, sudden):
-        _require_rest(robot, stops)
+        sudden = _simulate_all(robot, models, commands, np.full_like(ramp, np.inf))
+    _require_rest(robot, ramped)
+    _require_rest(robot, sudden)
     radius = robot.footprint_radius
     shared = fit_bound(ramped, radius, robot.footprint is not None)
-    shared = replace(shared, drift=_drift(sudden, radius))
+    shared = replace(shared, drift=_find_drift(sudden, radius))
     if robot.steers or (shared.lever_m == 0.0 and shared.drift.is_none):
         return shared
-    apart = fit_apart(_together([ramped, sudden]), radius)
-    if (
-        apart is None
-        or _slack(apart, ramped, radius) > _slack(shared, ramped, radius) - NEGLIGIBLE
-    ):
+    separate = fit_separate_bounds(_join_stops([ramped, sudden]), radius)
+    if separate is None:
         return shared
-    return apart
+    max_slack = _measure_slack(shared, ramped, radius) - NEGLIGIBLE
+    if _measure_slack(separate, ramped, radius) > max_slack:
+        return shared
+    return separate
 
 
-def motions(low: Array, high: Array) -> Array:
+def list_motions(low: Array, high: Array) -> Array:
     """Returns commands (K, C) over the whole range of each, and all mixtures of them."""
     count = len(low)
-    shares = LEVELS.get(count, (1.0,))
-    levels = (*(-share for share in shares), 0.0, *shares)
-    if len(levels) ** count <= MOST_MOTIONS:
+    fractions = LEVELS.get(count, (1.0,))
+    levels = (*(-fraction for fraction in fractions), 0.0, *fractions)
+    if len(levels) ** count <= MAX_MOTIONS:
         mixed = np.array(list(product(levels, repeat=count)))
     else:
-        mixed = _pairs(count)
-    alone = [
-        sign * share * row
+        mixed = _combine_pairs(count)
+    single = [
+        sign * fraction * row
         for row in np.eye(count)
-        for share in ALONE
+        for fraction in SINGLE_LEVELS
         for sign in (-1, 1)
     ]
-    chosen = np.concatenate([mixed, alone])
+    chosen = np.concatenate([mixed, single])
     return np.clip(np.where(chosen < 0.0, -chosen * low, chosen * high), low, high)
 
 
-def _pairs(count: int) -> Array:
-    """Returns the shares (K, C) of any two of many commands."""
+def _combine_pairs(count: int) -> Array:
+    """Returns the fractions (K, C) of any two of many commands at the ends of their ranges."""
     rows = []
     for i, j in combinations(range(count), 2):
         for first, second in product((-1.0, 1.0), repeat=2):
@@ -260,61 +260,71 @@ def _pairs(count: int) -> Array:
 
 
 def derive_slowest_model(model: TaylorModel) -> TaylorModel | None:
-    """Returns the model as slow as its standard errors allow; None if they tell nothing.
+    """Returns the model as slow as its standard errors allow; None if they do not matter.
 
-    Each state responds slower by the relative error of the term that draws it to rest; where a
-    held command leads is as before.
+    Each state responds slower by the relative error of the term that draws it to rest. The steady
+    motion of a held command stays the same.
     """
     if not model.std_errors.size:
         return None
     factors = np.ones(len(model.dofs))
     for s in range(model.state_size):
-        own = np.zeros(len(model.variables), np.int64)
-        own[s] = 1
-        for k in np.flatnonzero((model.powers == own).all(axis=1)):
+        powers = np.zeros(len(model.variables), np.int64)
+        powers[s] = 1
+        for k in np.flatnonzero((model.powers == powers).all(axis=1)):
             size = abs(model.coefficients[3 + s, k])
             error = DEVIATIONS * float(np.nan_to_num(model.std_errors[3 + s, k]))
             if size > 0.0:
-                factors[3 + s] = max(1.0 - error / size, SLOWEST)
+                factors[3 + s] = max(1.0 - error / size, MIN_RESPONSE)
     if factors.min() > 1.0 - 1e-3:
         return None
     return replace(model, coefficients=model.coefficients * factors[:, None])
+
+
+def _simulate_all(
+    robot: RobotSpec, models: list[TaylorModel], commands: Array, ramp: Array
+) -> Stops:
+    return _join_stops(
+        [simulate_stops(robot, model, commands, ramp) for model in models]
+    )
 
 
 def simulate_stops(
     robot: RobotSpec, model: TaylorModel, commands: Array, ramp: Array
 ) -> Stops:
     """Stops the steady motions of commands (K, C), with steering angles held and released."""
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # a model that diverges is refused later
-        state = _steady(robot, model, commands)
+    # A model that diverges is refused later.
+    with np.errstate(over="ignore", invalid="ignore"):
+        state = _find_steady_states(robot, model, commands)
         rest = np.clip(0.0, robot.command_low, robot.command_high)
-        angles = np.array([each.unit == "rad" for each in robot.command])
-        stops = [
-            _stop(robot, model, state, commands, np.where(angles, commands, rest), ramp)
-        ]
-        if angles.any():
+        is_angle = np.array([command.unit == "rad" for command in robot.command])
+        held = np.where(is_angle, commands, rest)
+        stops = [_simulate_stop(robot, model, state, commands, held, ramp)]
+        if is_angle.any():
             released = np.broadcast_to(rest, commands.shape)
-            stops.append(_stop(robot, model, state, commands, released, ramp))
-    return _together(stops)
+            stop = _simulate_stop(robot, model, state, commands, released, ramp)
+            stops.append(stop)
+    return _join_stops(stops)
 
 
-def _together(stops: list[Stops]) -> Stops:
+def _join_stops(stops: list[Stops]) -> Stops:
     return Stops(*(np.concatenate(parts) for parts in zip(*stops, strict=True)))
 
 
-def _steady(robot: RobotSpec, model: TaylorModel, commands: Array) -> Array:
-    """Returns the states (K, S) to which held commands lead, within those that the robot has."""
-    # How fast it gets there is of no interest: without limits of rates it is soon.
-    quick = replace(model, limits=np.zeros((0, 2)))
-    count = model.state_size
-    least, most = _range_of_states(robot, model)
-    effect = model.apply_curves(commands)
-    state = np.zeros((len(commands), count))
-    for _ in range(round(LONGEST_START_S / model.dt)):
-        rates = quick.rates(np.concatenate([state, effect], axis=-1))
-        after = np.clip(state + rates[:, 3:] * model.dt, least, most)
+def _join_inputs(model: TaylorModel, state: Array, command: Array) -> Array:
+    """Returns X (K, V) of states (K, S) and commands (K, C) before their curves."""
+    return np.concatenate([state, model.apply_curves(command)], axis=-1)
+
+
+def _find_steady_states(robot: RobotSpec, model: TaylorModel, commands: Array) -> Array:
+    """Returns the states (K, S) to which held commands lead, within the robot's own range."""
+    # Only the end counts, which is reached soon without limits of rates.
+    unlimited = replace(model, limits=np.zeros((0, 2)))
+    low, high = _find_state_range(robot, model)
+    state = np.zeros((len(commands), model.state_size))
+    for _ in range(round(MAX_START_S / model.dt)):
+        rates = unlimited.rates(_join_inputs(model, state, commands))
+        after = np.clip(state + rates[:, 3:] * model.dt, low, high)
         settled = _is_settled(state, after)
         state = after
         if settled:
@@ -322,19 +332,19 @@ def _steady(robot: RobotSpec, model: TaylorModel, commands: Array) -> Array:
     return state
 
 
-def _range_of_states(robot: RobotSpec, model: TaylorModel) -> tuple[Array, Array]:
-    """Returns the least and the greatest state (S,) from which stops are simulated."""
+def _find_state_range(robot: RobotSpec, model: TaylorModel) -> tuple[Array, Array]:
+    """Returns the minimum and maximum states (S,) from which stops are simulated."""
     count = model.state_size
-    least = np.array([variable.min for variable in robot.state])
-    most = np.array([variable.max for variable in robot.state])
+    recorded_low = model.low[:count]
+    recorded_high = model.high[:count]
+    low = np.array([variable.min for variable in robot.state])
+    high = np.array([variable.max for variable in robot.state])
     if robot.takes_cmd_vel:  # the commands bound its speeds
-        return np.minimum(least, model.low[:count]), np.maximum(
-            most, model.high[:count]
-        )
+        return np.minimum(low, recorded_low), np.maximum(high, recorded_high)
     # A throttle that is held may lead to speeds that the robot never had.
-    margin = BEYOND * (model.high[:count] - model.low[:count])
-    low = np.maximum(least, model.low[:count] - margin)
-    high = np.minimum(most, model.high[:count] + margin)
+    margin = STATE_MARGIN * (recorded_high - recorded_low)
+    low = np.maximum(low, recorded_low - margin)
+    high = np.minimum(high, recorded_high + margin)
     return low, np.maximum(low, high)
 
 
@@ -342,10 +352,10 @@ def _is_settled(before: Array, after: Array) -> bool:
     if not before.size:
         return True
     scale = max(1.0, float(np.abs(after).max()))
-    return bool(np.abs(after - before).max() <= FIXED * scale)
+    return bool(np.abs(after - before).max() <= SETTLED * scale)
 
 
-def _stop(
+def _simulate_stop(
     robot: RobotSpec,
     model: TaylorModel,
     state: Array,
@@ -355,67 +365,54 @@ def _stop(
 ) -> Stops:
     """Simulates stops: each command goes to rest (K, C) by its ramp, after its own delay."""
     dt = model.dt
-    count = len(commands)
     delays = model.delays
     gap = rest - commands
     low, high = model.state_box
-    idle = _idle_twist(robot, model, rest)
-    idle_speed = np.hypot(idle[:, 0], idle[:, 1])
-    holds = (rest == commands) & np.array(
-        [each.unit == "rad" for each in robot.command]
-    )
-    path = np.zeros(count)
-    travel = np.zeros((count, 3))
-    first = np.zeros((count, 3))
-    twist = first
-    for step in range(round((LONGEST_STOP_S + delays.max(initial=0.0)) / dt)):
-        since_told = (step + 0.5) * dt - delays  # in the middle of this step
-        changed = np.where(
-            since_told > 0.0, ramp * np.maximum(since_told, dt / 2.0), 0.0
-        )
-        moved = np.sign(gap) * np.minimum(np.abs(gap), changed)
-        x = np.concatenate([state, model.apply_curves(commands + moved)], axis=-1)
-        rates = model.rates(x)
+    # By a bias of its fit, a model may creep at rest.
+    rest_state = _find_steady_states(robot, model, rest)
+    creep = model.rates(_join_inputs(model, rest_state, rest))[:, :3]
+    creep_speed = np.hypot(creep[:, 0], creep[:, 1])
+    first_twist = model.rates(_join_inputs(model, state, commands))[:, :3]
+    twist = first_twist
+    path = np.zeros(len(commands))
+    travel = np.zeros((len(commands), 3))
+    for step in range(round((MAX_STOP_S + delays.max(initial=0.0)) / dt)):
+        passed = (step + 0.5) * dt - delays  # in the middle of this step
+        change = np.where(passed > 0.0, ramp * np.maximum(passed, dt / 2.0), 0.0)
+        moved = np.sign(gap) * np.minimum(np.abs(gap), change)
+        rates = model.rates(_join_inputs(model, state, commands + moved))
         twist = rates[:, :3]
-        if step == 0:
-            held = np.concatenate([state, model.apply_curves(commands)], axis=-1)
-            first = model.rates(held)[:, :3]
-        path += np.maximum(np.hypot(twist[:, 0], twist[:, 1]) - idle_speed, 0.0) * dt
-        travel += np.maximum(np.abs(twist) - np.abs(idle), 0.0) * dt
+        speed = np.hypot(twist[:, 0], twist[:, 1])
+        path += np.maximum(speed - creep_speed, 0.0) * dt
+        travel += np.maximum(np.abs(twist) - np.abs(creep), 0.0) * dt
         after = np.clip(state + rates[:, 3:] * dt, low, high)
         settled = _is_settled(state, after) and bool((moved == gap).all())
         state = after
         if settled:
             break
-    return Stops(first, path, travel, twist, (holds & (commands != 0.0)).any(axis=1))
-
-
-def _idle_twist(robot: RobotSpec, model: TaylorModel, rest: Array) -> Array:
-    """Returns the twists (K, 3) by which a model at rest still drifts, by a bias of its fit."""
-    state = _steady(robot, model, rest)
-    return model.rates(np.concatenate([state, model.apply_curves(rest)], axis=-1))[
-        :, :3
-    ]
+    is_angle = np.array([command.unit == "rad" for command in robot.command])
+    holds_angle = ((rest == commands) & is_angle & (commands != 0.0)).any(axis=1)
+    return Stops(first_twist, path, travel, twist, holds_angle)
 
 
 def _require_rest(robot: RobotSpec, stops: Stops) -> None:
     """Raises ConfigError if a motion did not end."""
-    left = np.hypot(stops.left[:, 0], stops.left[:, 1])
-    left = left + robot.footprint_radius * np.abs(stops.left[:, 2])
+    last = stops.last_twist
+    left = np.hypot(last[:, 0], last[:, 1])
+    left = left + robot.footprint_radius * np.abs(last[:, 2])
     finite = np.isfinite(stops.path) & np.isfinite(left)
     left = np.where(finite, left, np.inf)
     speeds = np.hypot(stops.twist[:, 0], stops.twist[:, 1])
-    fastest = float(speeds[finite].max(initial=0.0))
-    creep = np.maximum(np.where(stops.holds, BIAS_STEERED, BIAS) * fastest, CREEP)
-    if (left <= creep).all():
+    max_speed = float(speeds[finite].max(initial=0.0))
+    bias = np.where(stops.holds_angle, BIAS_STEERED, BIAS)
+    if (left <= np.maximum(bias * max_speed, CREEP)).all():
         return
-    worst = float(left.max())
     k = int(np.argmax(left))
     raise ConfigError(
-        f"robot {robot.name!r}: by its model it does not stop: {LONGEST_STOP_S:g} s after the "
-        f"command to stop from {speeds[k]:.3g} m/s and {abs(stops.twist[k, 2]):.3g} rad/s it moves "
-        f"at {worst:.3g} m/s; generate the model from a drive that stops several times, or correct "
-        "what brakes it (its terms, `friction`, `drag` or `limits`)."
+        f"robot {robot.name!r}: according to its model, it does not stop: {MAX_STOP_S:g} s after "
+        f"the command to stop from {speeds[k]:.3g} m/s and {abs(stops.twist[k, 2]):.3g} rad/s it "
+        f"moves at {left[k]:.3g} m/s; generate the model from a drive that stops several times, or "
+        "correct what brakes it (its terms, `friction`, `drag` or `limits`)."
     )
 
 
@@ -423,182 +420,194 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
     """Returns the tightest reaction time and deceleration that bound all stops.
 
     Args:
-        stops: of motions of all kinds.
+        stops: motions of all kinds.
         radius: of the circle around the footprint [m].
-        turns_count: True if a turn alone sweeps ground, as that of a footprint with corners.
+        turns_count: True if a turn alone sweeps ground, because the footprint has corners.
     """
     speed = np.hypot(stops.twist[:, 0], stops.twist[:, 1])
-    turn = np.abs(stops.twist[:, 2])
-    whole = speed + radius * turn
-    distance = stops.path + radius * stops.travel[:, 2]
-    counts = whole > CREEP
+    turn_speed = radius * np.abs(stops.twist[:, 2])
+    counts = speed + turn_speed > CREEP
     if not counts.any():
         return Braking(0.0, math.inf)
     twist = stops.twist[counts]
-    speed, turn, whole, distance = (
-        each[counts] for each in (speed, turn, whole, distance)
-    )
-    straight = radius * turn <= STRAIGHT * speed
+    speed = speed[counts]
+    turn_speed = turn_speed[counts]
+    whole = speed + turn_speed
+    distance = (stops.path + radius * stops.travel[:, 2])[counts]
+    straight = turn_speed <= STRAIGHT * speed
     if not straight.any():
         straight = np.ones_like(straight)
-    worst = _envelope(whole[straight], distance[straight])
-    sideways = np.abs(twist[:, :2]).min(axis=1) > MINOR * speed
-    orders = ORDERS if sideways.any() else (2.0,)
-    tried = [
-        Braking(0.0, 1.0, share * radius, order=order)
-        for share in LEVERS
+    worst = _compute_envelope(whole[straight], distance[straight])
+    orders = _list_orders(np.abs(twist[:, :2]).min(axis=1) > MINOR * speed)
+    bounds = [
+        Braking(0.0, 1.0, lever * radius, order=order)
+        for lever in LEVERS
         for order in orders
     ]
-    found = []
-    for each in tried:
-        pace = each.pace(twist)
+    fits = []
+    for bound in bounds:
+        pace = bound.pace(twist)
         if turns_count:
-            pace = np.maximum(pace, radius * turn)
-        found.append(_tightest(whole, pace, distance, straight, worst))
-    least = min(slack for slack, _, _ in found)
-    chosen = next(i for i, row in enumerate(found) if row[0] <= least + NEGLIGIBLE)
-    _, reaction, inverse = found[chosen]
-    return _rounded(tried[chosen], reaction, inverse)
+            pace = np.maximum(pace, turn_speed)
+        fits.append(_fit_tightest(whole, pace, distance, straight, worst))
+    max_slack = min(fit.slack for fit in fits) + NEGLIGIBLE
+    best = next(i for i, fit in enumerate(fits) if fit.slack <= max_slack)
+    return _round_bound(bounds[best], fits[best])
 
 
-def _rounded(bound: Braking, reaction: float, inverse: float) -> Braking:
+def _list_orders(sideways: NDArray[np.bool_]) -> tuple[float, ...]:
+    """Returns the candidates of `Braking.order`: of no account if nothing moves diagonally."""
+    if sideways.any():
+        return ORDERS
+    return (2.0,)
+
+
+class _Fit(NamedTuple):
+    """Tightest bound for one candidate."""
+
+    slack: float
+    reaction_s: float
+    inverse: float  # half the inverse of the deceleration [s^2/m]
+
+
+def _round_bound(bound: Braking, fit: _Fit) -> Braking:
     """Returns a bound in whole milliseconds and three digits of the deceleration."""
-    reaction = math.ceil(1e3 * reaction - 1e-3) / 1e3
-    if inverse < INSTANT:
-        return replace(bound, reaction_s=reaction, deceleration=math.inf)
-    deceleration = 0.5 / inverse
+    reaction_s = math.ceil(1e3 * fit.reaction_s - 1e-3) / 1e3
+    if fit.inverse < INSTANT:
+        return replace(bound, reaction_s=reaction_s, deceleration=math.inf)
+    deceleration = 0.5 / fit.inverse
     digit = 10.0 ** (math.floor(math.log10(deceleration)) - 2)
     deceleration = math.floor(deceleration / digit + 1e-3) * digit
-    return replace(
-        bound, reaction_s=reaction, deceleration=float(f"{deceleration:.3g}")
-    )
+    deceleration = float(f"{deceleration:.3g}")
+    return replace(bound, reaction_s=reaction_s, deceleration=deceleration)
 
 
-def _envelope(speed: Array, distance: Array) -> Array:
-    """Returns the greatest distance (K,) of any motion that is no faster than each."""
+def _compute_envelope(speed: Array, distance: Array) -> Array:
+    """Returns, for each motion, the maximum distance (K,) of all that are no faster."""
     order = np.argsort(speed, kind="stable")
-    greatest = np.empty_like(distance)
-    greatest[order] = np.maximum.accumulate(distance[order])
-    return greatest
+    envelope = np.empty_like(distance)
+    envelope[order] = np.maximum.accumulate(distance[order])
+    return envelope
 
 
-def _tightest(
+def _fit_tightest(
     whole: Array,
     pace: Array,
     distance: Array,
     straight: NDArray[np.bool_],
     worst: Array,
-) -> tuple[float, float, float]:
-    """Returns slack, reaction time [s] and half the inverse of the deceleration [s^2/m].
+) -> _Fit:
+    """Fits the bound of every motion, distance <= whole (reaction + pace inverse).
 
-    They bound the distance of every motion, distance <= whole (reaction + pace inverse), and have
-    the least slack: the mean of how far they are above the worst of the straight ones, as a share.
+    It has the minimum slack: the mean excess over the worst of the straight motions, as a fraction.
     """
     weight = 1.0 / (worst + SLACK_M)
     ahead = whole[straight] * weight
     cost = np.array([ahead.mean(), (ahead * pace[straight]).mean()])
-    result = linprog(
-        cost, np.stack([-whole, -whole * pace], axis=-1), -distance, bounds=(0.0, None)
-    )
+    rows = np.stack([-whole, -whole * pace], axis=-1)
+    result = linprog(cost, rows, -distance, bounds=(0.0, None))
     if not result.success:
-        return math.inf, float((distance / whole).max()), 0.0
+        return _Fit(math.inf, float((distance / whole).max()), 0.0)
     reaction, inverse = result.x
     slack = float(cost @ result.x - (worst * weight).mean())
     # The solver meets each bound up to its tolerance.
     missing = float((distance / whole - reaction - pace * inverse).max())
-    return slack, float(reaction) + max(missing, 0.0), float(inverse)
+    return _Fit(slack, float(reaction) + max(missing, 0.0), float(inverse))
 
 
-def fit_apart(stops: Stops, radius: float) -> Braking | None:
-    """Returns the tightest bound of the path and of the turn, each by itself; None if none holds.
+def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
+    """Returns the tightest separate bounds of the path and of the turn; None if none holds.
 
     Args:
-        stops: of motions of all kinds.
+        stops: motions of all kinds.
         radius: of the circle around the footprint [m].
     """
     rate = np.abs(stops.twist[:, 2])
-    speeds = stops.twist[:, :2]
-    moves = np.hypot(speeds[:, 0], speeds[:, 1]) > CREEP
+    speeds = np.abs(stops.twist[:, :2])
+    speed = np.hypot(speeds[:, 0], speeds[:, 1])
+    moves = speed > CREEP
     turns = radius * rate > CREEP
     if not (moves.any() and turns.any()):
         return None
-    sideways = np.abs(speeds).min(axis=1) > MINOR * np.abs(speeds).max(axis=1)
-    found = []
-    for order in ORDERS if sideways[moves].any() else (2.0,):
-        speed = np.hypot(speeds[:, 0], speeds[:, 1])
-        pace = Braking(0.0, 1.0, order=order).pace(stops.twist)
-        found.append(
-            (order, *_bound_alone(speed[moves], pace[moves], stops.path[moves]))
-        )
-    order, _, reaction, inverse = min(found, key=lambda row: row[1])
-    bound = _rounded(Braking(0.0, 1.0, order=order), reaction, inverse)
+    sideways = speeds.min(axis=1) > MINOR * speeds.max(axis=1)
+    bounds = [Braking(0.0, 1.0, order=order) for order in _list_orders(sideways[moves])]
+    fits = []
+    for bound in bounds:
+        pace = bound.pace(stops.twist)
+        fits.append(_fit_alone(speed[moves], pace[moves], stops.path[moves]))
+    best = min(range(len(fits)), key=lambda i: fits[i].slack)
+    bound = _round_bound(bounds[best], fits[best])
     turned = stops.travel[:, 2]
-    _, reaction, inverse = _bound_alone(rate[turns], rate[turns], turned[turns])
-    turn = _rounded(Braking(0.0, 1.0), reaction, inverse)
-    own = TurnBraking(turn.reaction_s, turn.deceleration)
-    most_path = _path_bound(bound, stops.twist)
-    most_turn = rate * own.mean_time_s(rate)
-    missed = np.maximum(stops.path - most_path, radius * (turned - most_turn))
-    if float(missed.max()) > MISSED_M:
+    turn_fit = _fit_alone(rate[turns], rate[turns], turned[turns])
+    turn_bound = _round_bound(Braking(0.0, 1.0), turn_fit)
+    turn = TurnBraking(turn_bound.reaction_s, turn_bound.deceleration)
+    max_path = _bound_path(bound, stops.twist)
+    max_turn = rate * turn.mean_time_s(rate)
+    missed = np.maximum(stops.path - max_path, radius * (turned - max_turn))
+    if float(missed.max()) > MAX_MISSED_M:
         return None
     mixed = moves & turns
     if mixed.any():
-        least_path = _least_share(stops.path[mixed], most_path[mixed])
-        least_turn = _least_share(turned[mixed], most_turn[mixed])
-        least_path, least_turn = np.clip(
-            [least_path, least_turn], LEAST_SHARE, 1.0
-        ).tolist()
-        own = replace(own, least_turn=least_turn, least_path=least_path)
-    return replace(bound, turn=own)
+        turn = replace(
+            turn,
+            least_turn=_find_min_fraction(turned[mixed], max_turn[mixed]),
+            least_path=_find_min_fraction(stops.path[mixed], max_path[mixed]),
+        )
+    return replace(bound, turn=turn)
 
 
-def _least_share(distance: Array, most: Array) -> float:
-    """Returns the least share of its bound that a distance (K,) comes to; 1 if all bounds are 0."""
-    shares = np.divide(distance, most, out=np.ones_like(distance), where=most > 0.0)
-    return float(shares.min())
+def _find_min_fraction(distance: Array, bound: Array) -> float:
+    """Returns the minimum fraction of its bound that a distance (K,) comes to.
+
+    It is at least `MIN_FRACTION`, and 1 if all bounds are 0.
+    """
+    fractions = np.divide(
+        distance, bound, out=np.ones_like(distance), where=bound > 0.0
+    )
+    return float(np.clip(fractions.min(), MIN_FRACTION, 1.0))
 
 
-def _bound_alone(
-    speed: Array, pace: Array, distance: Array
-) -> tuple[float, float, float]:
-    """Returns what `_tightest` does of a component by itself, which counts at all speeds."""
-    return _tightest(speed, pace, distance, np.ones(len(speed), np.bool_), distance)
+def _fit_alone(speed: Array, pace: Array, distance: Array) -> _Fit:
+    """Does what `_fit_tightest` does for one component alone, which counts at all speeds."""
+    return _fit_tightest(speed, pace, distance, np.ones(len(speed), np.bool_), distance)
 
 
-def _path_bound(bound: Braking, twist: Array) -> Array:
+def _bound_path(bound: Braking, twist: Array) -> Array:
     """Returns the bound of the paths (K,) of twists (K, 3), as far as the speed brakes [m]."""
     speed = np.hypot(twist[:, 0], twist[:, 1])
     return speed * (bound.reaction_s + bound.pace(twist) / (2.0 * bound.deceleration))
 
 
-def _slack(bound: Braking, stops: Stops, radius: float) -> float:
-    """Returns the mean, over all motions, of how far a bound is above them, as a share."""
+def _measure_slack(bound: Braking, stops: Stops, radius: float) -> float:
+    """Returns the mean excess of a bound over all motions, as a fraction."""
     rate = np.abs(stops.twist[:, 2])
-    turn_time = bound.reaction_s + bound.pace(stops.twist) / (2.0 * bound.deceleration)
-    if bound.turn is not None:
+    if bound.turn is None:
+        pace = bound.pace(stops.twist)
+        turn_time = bound.reaction_s + pace / (2.0 * bound.deceleration)
+    else:
         turn_time = bound.turn.mean_time_s(rate)
-    assumed = _path_bound(bound, stops.twist) + radius * rate * turn_time
+    assumed = _bound_path(bound, stops.twist) + radius * rate * turn_time
     needed = stops.path + radius * stops.travel[:, 2]
     return float(((assumed - needed) / (needed + SLACK_M)).mean())
 
 
-def _drift(stops: Stops, radius: float) -> Drift:
-    """Returns how lesser components of a twist outlast the greatest, or end before it."""
+def _find_drift(stops: Stops, radius: float) -> Drift:
+    """Returns how smaller components of a twist outlast the largest one, or end before it."""
     scale = np.array([1.0, 1.0, radius])
     sizes = np.abs(stops.twist) * scale
-    greatest = sizes.max(axis=1)
+    largest = sizes.max(axis=1)
     rows = np.arange(len(sizes))
     main = sizes.argmax(axis=1)
     times = stops.travel * scale / np.maximum(sizes, 1e-12)
     ratios = times / np.maximum(times[rows, main], 1e-12)[:, None]
-    shares = sizes / np.maximum(greatest, 1e-12)[:, None]
-    counts = (shares > MINOR) & (greatest > CREEP)[:, None]
+    fractions = sizes / np.maximum(largest, 1e-12)[:, None]
+    counts = (fractions > MINOR) & (largest > CREEP)[:, None]
     counts[rows, main] = False
     if not counts.any():
         return NO_DRIFT
-    least = float(ratios[counts].min())
-    most = float(ratios[counts].max())
-    if least > 1.0 - ALIKE and most < 1.0 + ALIKE:
+    low = float(ratios[counts].min())
+    high = float(ratios[counts].max())
+    if low > 1.0 - ALIKE and high < 1.0 + ALIKE:
         return NO_DRIFT
-    share = float((ratios * shares)[counts].max())
-    return Drift(min(least, 1.0), max(most, 1.0), max(share, 1.0))
+    fraction = float((ratios * fractions)[counts].max())
+    return Drift(min(low, 1.0), max(high, 1.0), max(fraction, 1.0))

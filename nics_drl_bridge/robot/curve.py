@@ -10,28 +10,25 @@ from pydantic import AllowInfNan, Field
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.geometry import Array
 
-LONGEST_DELAY_S = 60.0  # simulators and estimators keep all commands of such a time
-End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # infinite maybe, but not NaN
+LONGEST_DELAY_S = 60.0  # simulators and estimators keep the commands of this time
+End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # may be infinite, but not NaN
 
 
 class InputCurve(Schema):
     """A dead zone about zero, unequal gains, and saturation: a monotone curve of one command."""
 
     command: str
-    # a smaller command moves nothing, in its unit; below 0, any command does so much more
+    # Smaller commands have no effect, in the command's unit; if negative, all have this much more
     dead: float = Field(default=0.0, allow_inf_nan=False)
-    # smaller and greater commands do no more than these, in its unit; 0 never does anything
-    least: End = -np.inf
+    least: End = -np.inf  # commands saturate here, in their unit; the effect of 0 is 0
     most: End = np.inf
-    back: float = Field(
-        default=1.0, ge=0.0
-    )  # gain of negative commands; that of positive ones: 1
-    # after the latency of all commands [s]
+    back: float = Field(default=1.0, ge=0.0)  # gain of negative commands
+    # On top of the latency of all commands [s]
     delay: float = Field(default=0.0, ge=0.0, le=LONGEST_DELAY_S)
 
     @property
     def bends(self) -> bool:
-        """True if it does more than to delay the command."""
+        """True if it does more than delay the command."""
         return self != InputCurve(command=self.command, delay=self.delay)
 
     @property
@@ -39,22 +36,29 @@ class InputCurve(Schema):
         """The curve as text: `throttle' = 0 within +-0.12, else throttle -+ 0.12`."""
         name = self.command
         dead = f"{abs(self.dead):.4g}"
-        text = f"0 within +-{dead}, else {name} -+ {dead}" if self.dead > 0.0 else name
-        text += f" +- {dead}, 0 at 0" * (self.dead < 0.0)
+        text = f"{name}' = "
+        if self.dead > 0.0:
+            text += f"0 within +-{dead}, else {name} -+ {dead}"
+        elif self.dead < 0.0:
+            text += f"{name} +- {dead}, 0 at 0"
+        else:
+            text += name
         text += ends(self.least, self.most, name)
-        text += f", backwards times {self.back:.4g}" * (self.back != 1.0)
-        return f"{name}' = {text}" + f", {self.delay:.3f} s later" * (self.delay > 0.0)
+        if self.back != 1.0:
+            text += f", backwards times {self.back:.4g}"
+        if self.delay > 0.0:
+            text += f", {self.delay:.3f} s later"
+        return text
 
     def of(self, command: ArrayLike) -> Array:
-        """Returns the commands in effect (...): beyond the dead zone, in proportion."""
-        held = np.clip(
-            np.asarray(command, np.float64), min(self.least, 0.0), max(self.most, 0.0)
-        )
-        beyond = np.sign(held) * np.maximum(np.abs(held) - self.dead, 0.0)
-        return np.where(beyond < 0.0, self.back * beyond, beyond)
+        """Returns the effects (...) of commands (...)."""
+        command = np.asarray(command, np.float64)
+        clipped = np.clip(command, min(self.least, 0.0), max(self.most, 0.0))
+        effect = np.sign(clipped) * np.maximum(np.abs(clipped) - self.dead, 0.0)
+        return np.where(effect < 0.0, self.back * effect, effect)
 
     def invert(self, effect: ArrayLike) -> Array:
-        """Returns the commands (...) of effects; infinite where greater ones do no more."""
+        """Returns the commands (...) of effects (...); infinite beyond saturation."""
         effect = np.asarray(effect, dtype=np.float64)
         gain = np.where((effect < 0.0) & (self.back > 0.0), self.back, 1.0)
         command = np.sign(effect) * np.maximum(np.abs(effect) / gain + self.dead, 0.0)
@@ -63,12 +67,16 @@ class InputCurve(Schema):
 
 
 def ends(least: float, most: float, name: str = "") -> str:
-    """Returns those of two ends that are finite, as text: `, throttle at most 0.8`."""
-    both = (("at least", least), ("at most", most))
-    named = f"{name} " if name else ""
-    return "".join(
-        f", {named}{word} {end:.4g}" for word, end in both if np.isfinite(end)
-    )
+    """Describes the finite ones of two ends: `, throttle at most 0.8`."""
+    prefix = ", "
+    if name:
+        prefix += f"{name} "
+    text = ""
+    if np.isfinite(least):
+        text += f"{prefix}at least {least:.4g}"
+    if np.isfinite(most):
+        text += f"{prefix}at most {most:.4g}"
+    return text
 
 
 def apply_curves(
@@ -77,12 +85,12 @@ def apply_curves(
     """Returns the commands in effect (..., C) of commands with C names."""
     values = np.array(command, dtype=np.float64)
     for curve in curves:
-        place = names.index(curve.command)
-        values[..., place] = curve.of(values[..., place])
+        column = names.index(curve.command)
+        values[..., column] = curve.of(values[..., column])
     return values
 
 
 def delays(names: Sequence[str], curves: tuple[InputCurve, ...]) -> Array:
     """Returns the delays (C,) of commands with C names beyond their common latency [s]."""
-    known = {curve.command: curve.delay for curve in curves}
-    return np.array([known.get(name, 0.0) for name in names])
+    by_name = {curve.command: curve.delay for curve in curves}
+    return np.array([by_name.get(name, 0.0) for name in names])

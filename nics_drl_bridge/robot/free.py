@@ -1,7 +1,12 @@
-"""Any robot: no textbook tells where its commands lead, only its recording."""
+"""Any robot: only its recording shows where its commands lead."""
 
-from nics_drl_bridge.robot.kinds import RobotKind, disc
+from nics_drl_bridge.robot.kinds import RobotKind, draw_disc
 from nics_drl_bridge.robot.spec import POSE_RATES
 from nics_drl_bridge.robot.template import Template
 
-KIND = RobotKind(None, disc, Template(moves=POSE_RATES), sideways=True)
+KIND = RobotKind(
+    kinematics=None,
+    drawing=draw_disc,
+    template=Template(moves=POSE_RATES),
+    sideways=True,
+)

@@ -1,7 +1,7 @@
 """Kinds of robots: textbook kinematics and a drawing for each; `spec` finds them by name.
 
-Commands are identified by their field of `cmd_vel`, without any by their name, else by their place;
-speed and steering angle in the state by their units. An actuator is of first order (parameters
+Commands are identified by their field of `cmd_vel`; if there is none, by name, else by order. Speed
+and steering angle in the state are identified by unit. An actuator is of first order (parameters
 `wheel_lag`, `speed_lag`, `steering_lag` [s]) or rate-limited (`wheel_rate`, `speed_rate`,
 `steering_rate` [its unit/s]). Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile
 Robots, ch. 3; the paper's reference for Table I.
@@ -24,15 +24,15 @@ from nics_drl_bridge.robot.spec import (
     RobotSpec,
     StateVariable,
     find_kind,
-    kind_names,
+    list_kinds,
 )
 from nics_drl_bridge.robot.template import Template
 
-BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
-# least likeness of a misspelt parameter; other parameters' are less alike
-MISSPELT = 0.8
-MOST_VARIED = 6
-AT_ONCE_S = 1e-9  # lag of a robot whose commands are what its wheels do
+LIMIT_TOLERANCE = 0.01  # fraction by which rounded figures may exceed a limit
+# Minimum similarity of a misspelt parameter; names of different parameters are less similar
+MISSPELT_NAME = 0.8
+MAX_VARIED = 6  # commands whose ends are combined
+NO_LAG_S = 1e-9  # lag of actuators that do at once what is commanded
 T = TypeVar("T")
 
 
@@ -40,30 +40,24 @@ T = TypeVar("T")
 class Textbook:
     """Textbook kinematics of a robot."""
 
-    twist: Callable[
-        [Array], Array
-    ]  # gives the body twist (..., 3) for a state (..., S)
-    target: Callable[
-        [Array], Array
-    ]  # gives the state (..., S) that a command (..., C) requests
+    twist: Callable[[Array], Array]  # body twist (..., 3) for a state (..., S)
+    target: Callable[[Array], Array]  # state (..., S) that a command (..., C) requests
     lag: Array  # (S,) time constants of first-order actuators [s]
     rate: Array  # (S,) of rate-limited actuators [its unit/s]; inf for first-order ones
-    structure: dict[
-        str, tuple[str, ...]
-    ]  # possible products of states, by component of the twist
-    # gives the command (..., C), maybe out of range, that leads to a twist (..., 3), if known
+    # Possible products of states, by component of the twist
+    structure: dict[str, tuple[str, ...]]
+    # Command (..., C), maybe out of range, that leads to a twist (..., 3), if known
     command: Callable[[Array], Array] | None = None
 
     def compute_twist(self, command: Array) -> Array:
-        """Returns the body twist (..., 3) to which commands (..., C) lead when they are held."""
+        """Returns the body twist (..., 3) to which held commands (..., C) lead."""
         return self.twist(self.target(command))
 
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
         """Returns the exact state (..., S) at time t [s] on its way from `state` to `goal`."""
         gap = state - goal
-        ramp = np.sign(gap) * np.maximum(
-            np.abs(gap) - np.where(self.limited, self.rate, 0) * t, 0
-        )
+        rate = np.where(self.limited, self.rate, 0)
+        ramp = np.sign(gap) * np.maximum(np.abs(gap) - rate * t, 0)
         return goal + np.where(self.limited, ramp, gap * np.exp(-t / self.lag))
 
     @property
@@ -74,10 +68,10 @@ class Textbook:
 
 @dataclass(frozen=True)
 class Pivot:
-    """Vertical axis about which a wheel is steered; another joint follows the variable's."""
+    """Vertical axis about which a wheel is steered."""
 
     link: str
-    joint: str
+    joint: str  # follows the joint named like the angle, if its own name differs
     angle: StateVariable
 
 
@@ -101,8 +95,8 @@ class Drawing:
     wheels: tuple[Wheel, ...]
 
 
-def disc(spec: RobotSpec) -> Drawing:
-    """The looks of a robot of which no more is known."""
+def draw_disc(spec: RobotSpec) -> Drawing:
+    """Draws a robot of an unknown kind."""
     return Drawing(spec.footprint_radius, (0.0, 0.02), ())
 
 
@@ -112,13 +106,16 @@ def place_wheels(
     radius: float,
     names: tuple[str, ...],
 ) -> tuple[Wheel, ...]:
-    """Returns wheels at places; those of a state of as many wheels turn by its variables."""
-    if turns := bool(spec.state) and all(
+    """Returns wheels at places; if the state is the wheels' speeds, they turn by its variables."""
+    turns = bool(spec.state) and all(
         v.unit == "rad/s" and v.twist is None for v in spec.state
-    ):
+    )
+    if turns:
         names = tuple(v.name for v in spec.state)
-    both = zip(names, places, strict=True)
-    return tuple(Wheel(name, place, radius, turns=turns) for name, place in both)
+    wheels = []
+    for name, place in zip(names, places, strict=True):
+        wheels.append(Wheel(name, place, radius, turns=turns))
+    return tuple(wheels)
 
 
 def places_of_four(parameters: Mapping[str, float]) -> dict[str, tuple[float, float]]:
@@ -126,121 +123,124 @@ def places_of_four(parameters: Mapping[str, float]) -> dict[str, tuple[float, fl
 
     They stand at `half_length` and `half_width`, each half a `track` where it is not given.
     """
-    x, y = (
-        parameters[k] if k in parameters else 0.5 * parameters["track"]
-        for k in ("half_length", "half_width")
-    )
+    x = _read_half(parameters, "half_length")
+    y = _read_half(parameters, "half_width")
     return {
-        f"{end}_{side}": (s * x, t * y)
-        for end, s in (("front", 1.0), ("rear", -1.0))
-        for side, t in (("left", 1.0), ("right", -1.0))
+        "front_left": (x, y),
+        "front_right": (x, -y),
+        "rear_left": (-x, y),
+        "rear_right": (-x, -y),
     }
+
+
+def _read_half(parameters: Mapping[str, float], name: str) -> float:
+    if name in parameters:
+        return parameters[name]
+    return 0.5 * parameters["track"]
 
 
 @dataclass(frozen=True)
 class RobotKind:
     """A kind of robot. Its functions raise KeyError for a parameter that the spec lacks."""
 
-    kinematics: (
-        Callable[[RobotSpec], Textbook] | None
-    )  # of its actuators; None: not known
+    kinematics: Callable[[RobotSpec], Textbook] | None  # of its actuators, if known
     drawing: Callable[[RobotSpec], Drawing]
     template: Template = field(default_factory=Template)
-    # True if it is driven sideways by commands other than a twist's
+    # True if commands other than a twist's drive it sideways
     sideways: bool = False
-    slips: bool = False  # True if it moves otherwise than the twist that is commanded
+    slips: bool = False  # True if its twist differs from the commanded one
     front_drive: bool = False  # True if the speed is that of the steered wheel
 
 
 def textbook(spec: RobotSpec) -> Textbook:
     """Returns a robot's textbook kinematics; ConfigError if its spec names none or does not fit."""
-    book = actuated(spec)
+    book = find_actuator_kinematics(spec)
     if spec.state and all(v.twist is not None for v in spec.state):
-        return _through_lags(spec, book)
-    if not spec.state and not _made(
+        return _add_lags(spec, book)
+    if not spec.state and not _apply_to_kind(
         spec, lambda kind: kind.template.moves or kind.template.state
     ):
-        return replace(book, lag=np.full(len(book.lag), AT_ONCE_S))
+        return replace(book, lag=np.full(len(book.lag), NO_LAG_S))
     if len(spec.state) != len(book.lag):
-        have = ", ".join(v.name for v in spec.state) or "none"
-        needed = (
-            f"the {spec.textbook} kinematics need a state of {len(book.lag)} actuators"
-        )
+        names = ", ".join(v.name for v in spec.state) or "none"
+        reason = f"need a state of {len(book.lag)} actuators, not {names}"
         fix = "correct `state:`, or leave it to the kind"
-        raise ConfigError(f"robot {spec.name!r}: {needed}, not {have}; {fix}.")
+        raise _make_error(spec, f"{reason}; {fix}.")
     return book
 
 
-def actuated(spec: RobotSpec) -> Textbook:
-    """Returns the textbook kinematics of a robot's actuators; ConfigError as `textbook`."""
+def find_actuator_kinematics(spec: RobotSpec) -> Textbook:
+    """Returns the textbook kinematics of a robot's actuators; ConfigError like `textbook`."""
 
     def make(kind: RobotKind) -> Textbook:
         if kind.kinematics is None:
-            fault = f"no textbook tells where the commands of the kind {spec.textbook!r} lead"
-            fix = "do without, by a recording and its model, or choose another kind"
+            fault = f"the kind {spec.textbook!r} has no textbook kinematics"
+            fix = "use a recording and its model instead, or choose another kind"
             raise ConfigError(f"robot {spec.name!r}: {fault}; {fix}.")
         return kind.kinematics(spec)
 
-    return _made(spec, make)
+    return _apply_to_kind(spec, make)
 
 
 def has_textbook(spec: RobotSpec) -> bool:
-    """True if a robot's textbook kinematics are known, but maybe for a parameter."""
+    """True if a robot's textbook kinematics are known; parameters may still be missing."""
     return getattr(find_kind(spec.textbook or ""), "kinematics", None) is not None
 
 
-def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
+def _add_lags(spec: RobotSpec, book: Textbook) -> Textbook:
     """Returns the kinematics of a robot whose state is its twist, behind lags of its actuators."""
-    # Speeds take the lag of the first actuator, the turn rate that of the last, as of a steering.
     dofs = [POSE_RATES.index(v.twist) for v in spec.state if v.twist is not None]
     if book.limited.any():
         fault = "a rate limit of an actuator needs the actuators as state"
         raise ConfigError(
             f"robot {spec.name!r}: {fault}; give lags, or correct `state:`."
         )
-    named = zip(
-        spec.state,
-        [float(book.lag[-1 if dof == 2 else 0]) for dof in dofs],
-        strict=True,
+    lag = np.zeros(len(dofs))
+    for i, v in enumerate(spec.state):
+        # Speeds have the lag of the first actuator, turn rates that of the last one (steering).
+        actuator = -1 if dofs[i] == 2 else 0
+        lag[i] = spec.parameters.get(f"{v.name}_lag", book.lag[actuator])
+    structure: dict[str, tuple[str, ...]] = dict.fromkeys(POSE_RATES, ())
+    for v in spec.state:
+        structure[str(v.twist)] = (v.name,)
+
+    def compose_twist(state: Array) -> Array:
+        twist = np.zeros((*state.shape[:-1], 3))
+        twist[..., dofs] = state
+        return twist
+
+    return Textbook(
+        twist=compose_twist,
+        target=lambda command: book.compute_twist(command)[..., dofs],
+        lag=lag,
+        rate=np.full(len(lag), np.inf),
+        structure=structure,
+        command=book.command,
     )
-    lag = np.array([spec.parameters.get(f"{v.name}_lag", one) for v, one in named])
-
-    def twist(state: Array) -> Array:
-        whole = np.zeros((*state.shape[:-1], 3))
-        whole[..., dofs] = state
-        return whole
-
-    names: dict[str, tuple[str, ...]] = dict.fromkeys(POSE_RATES, ())
-    names |= {str(v.twist): (v.name,) for v in spec.state}
-    target = lambda command: book.compute_twist(command)[..., dofs]  # noqa: E731
-    return Textbook(twist, target, lag, np.full(len(lag), np.inf), names, book.command)
 
 
-def drawing(spec: RobotSpec) -> Drawing:
-    """Returns the looks of a robot. Raises ConfigError as `textbook` does."""
-    return _made(spec, lambda kind: kind.drawing(spec))
+def draw_robot(spec: RobotSpec) -> Drawing:
+    """Returns the drawing of a robot. Raises ConfigError like `textbook`."""
+    return _apply_to_kind(spec, lambda kind: kind.drawing(spec))
 
 
-def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
-    robot = f"robot {spec.name!r}"
+def _apply_to_kind(spec: RobotSpec, function: Callable[[RobotKind], T]) -> T:
+    """Applies a function to a robot's kind; ConfigError if the kind or a parameter is unknown."""
     kind = find_kind(require_textbook(spec))
     if kind is None:
-        known = ", ".join(kind_names())
         raise ConfigError(
-            f"{robot}: `textbook:` must be one of {known}, not {spec.textbook!r}."
+            f"robot {spec.name!r}: `textbook:` must be one of {', '.join(list_kinds())}, "
+            f"not {spec.textbook!r}."
         )
     try:
-        return make(kind)
+        return function(kind)
     except KeyError as error:
-        needed = f"the {spec.textbook} kinematics need the parameter {error}"
-        usual = {
-            *kind.template.parameters,
-            *kind.template.lengths,
-        }  # no slips of the pen
-        own = [name for name in spec.parameters if name not in usual]
-        near = difflib.get_close_matches(str(error.args[0]), own, n=1, cutoff=MISSPELT)
+        usual = {*kind.template.parameters, *kind.template.lengths}
+        unusual = [name for name in spec.parameters if name not in usual]
+        name = str(error.args[0])
+        near = difflib.get_close_matches(name, unusual, n=1, cutoff=MISSPELT_NAME)
         fix = f"is {near[0]!r} it?" if near else "add it under `parameters:`."
-        raise ConfigError(f"{robot}: {needed}; {fix}") from None
+        raise _make_error(spec, f"need the parameter {error}; {fix}") from None
 
 
 def require_textbook(spec: RobotSpec) -> str:
@@ -252,31 +252,32 @@ def require_textbook(spec: RobotSpec) -> str:
 
 
 def compute_steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
-    """Returns the body twist (..., 3) to which commands (..., C) lead when they are held.
+    """Returns the body twist (..., 3) to which held commands (..., C) lead.
 
-    Raises ConfigError if neither kinematics nor wheelbase of a robot are known that needs them.
+    Raises ConfigError if kinematics or wheelbase are needed and unknown.
     """
     if is_twist_commanded(spec):
         return spec.to_cmd_vel(command)
     if spec.textbook is None and spec.steers:
-        return _by_turn_rate(spec).to_cmd_vel(command)
-    return actuated(spec).compute_twist(np.asarray(command, dtype=np.float64))
+        return _use_turn_rate(spec).to_cmd_vel(command)
+    book = find_actuator_kinematics(spec)
+    return book.compute_twist(np.asarray(command, dtype=np.float64))
 
 
 def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
     """Returns the command (..., C) within its limits that leads to a body twist (..., 3), if any.
 
-    A car that is to turn on the spot stands. Raises ConfigError as `steady_twist`.
+    A car that is asked to turn on the spot stands. Raises ConfigError like `compute_steady_twist`.
     """
     twist = np.asarray(twist, dtype=np.float64)
     if is_twist_commanded(spec):
         command = spec.from_cmd_vel(twist)
     elif spec.textbook is None and spec.steers:
-        command = _by_turn_rate(spec).from_cmd_vel(twist)
+        command = _use_turn_rate(spec).from_cmd_vel(twist)
     else:
-        book = actuated(spec)
+        book = find_actuator_kinematics(spec)
         if book.command is None:
-            fault = f"which command leads to a twist is not known of a {spec.textbook}"
+            fault = f"the kind {spec.textbook!r} does not say which command leads to a twist"
             raise ConfigError(
                 f"robot {spec.name!r}: {fault}; use continuous actions, no planner."
             )
@@ -285,86 +286,93 @@ def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
 
 
 def reach(spec: RobotSpec) -> Array:
-    """Returns the greatest steady twist (3,) of a robot's commands; ConfigError: see there."""
-    return np.asarray(np.abs(compute_steady_twist(spec, _corners(spec))).max(axis=0))
+    """Returns the maximum steady twist (3,) of a robot; ConfigError like `compute_steady_twist`."""
+    twists = compute_steady_twist(spec, _combine_ends(spec))
+    return np.asarray(np.abs(twists).max(axis=0))
 
 
-def _corners(spec: RobotSpec) -> Array:
-    """All combinations (K, C) of least, nearest to zero, and greatest commands."""
-    ends = np.stack([spec.command_low, np.zeros(len(spec.command)), spec.command_high])
-    ends[1] = np.clip(ends[1], ends[0], ends[2])
-    # No kind uses more; if there are more, they are not varied one by one.
-    return np.array(list(product(*ends.T))) if ends.shape[1] <= MOST_VARIED else ends
+def _combine_ends(spec: RobotSpec) -> Array:
+    """Returns all combinations (K, C) of minimum, rest (or nearest to it) and maximum commands."""
+    low = spec.command_low
+    high = spec.command_high
+    ends = np.stack([low, np.clip(np.zeros(len(low)), low, high), high])
+    if ends.shape[1] > MAX_VARIED:
+        return ends
+    return np.array(list(product(*ends.T)))
 
 
 def describe_overdrive(spec: RobotSpec) -> str | None:
-    """A sentence if a robot's commands ask for more than a wheel's or a steering's own limit."""
-    if not (has_textbook(spec) and spec.state and _own_state(spec)):
+    """Returns a sentence if commands ask for more than the limits of wheels or steering."""
+    if not (has_textbook(spec) and spec.state and _has_actuator_state(spec)):
         return None
-    asked = textbook(spec).target(_corners(spec))
-    for values, one in zip(asked.T, spec.state, strict=True):
+    targets = textbook(spec).target(_combine_ends(spec))
+    for values, v in zip(targets.T, spec.state, strict=True):
         worst = float(values[np.abs(values).argmax()])
-        if (
-            not one.min - BEYOND * abs(one.min)
-            <= worst
-            <= one.max + BEYOND * abs(one.max)
-        ):
-            limits = f"beyond its limits {one.min:g} and {one.max:g}"
+        low = v.min - LIMIT_TOLERANCE * abs(v.min)
+        high = v.max + LIMIT_TOLERANCE * abs(v.max)
+        if not low <= worst <= high:
+            limits = f"beyond its limits {v.min:g} and {v.max:g}"
             fix = "narrow the commands, or widen the limits of the state"
-            return f"the commands ask for {one.name} at {worst:.3g} {one.unit}, {limits}; {fix}."
+            return f"the commands ask for {v.name} at {worst:.3g} {v.unit}, {limits}; {fix}."
     return None
 
 
-def _by_turn_rate(spec: RobotSpec) -> RobotSpec:
+def _use_turn_rate(spec: RobotSpec) -> RobotSpec:
     return spec.model_copy(update={"angular_is": "turn_rate"})
 
 
 def is_twist_commanded(spec: RobotSpec) -> bool:
-    """True if a robot's commands are the components of its body twist, but for their lags."""
+    """True if a robot's commands are the components of its body twist, apart from lags."""
     return all(command.is_twist for command in spec.command) and not slips(spec)
 
 
 def slips(spec: RobotSpec) -> bool:
-    """True if a robot's kind moves otherwise than the twist that is commanded."""
+    """True if the twist of a robot's kind differs from the commanded one."""
     return bool(getattr(find_kind(spec.textbook or ""), "slips", False))
 
 
-def steered(
+def make_steered(
     spec: RobotSpec,
     geometry: Bicycle,
     names: tuple[str, ...],
     gain: tuple[float, float] = (1, 1),
 ) -> Textbook:
-    """Builds the kinematics of a robot that is driven by a speed and a steering angle.
+    """Returns the kinematics of a robot that is driven by a speed and a steering angle.
 
     Both are its actuators, and the `gain` times its commands, in any order; its turn rate is, to
-    second order, a multiple of their product. `names` are usual ones of the commands.
+    second order, a multiple of their product. `names` are the usual names of the commands.
     """
-    v, phi = _states(spec)
-    command = _commands(spec, ("linear.x", "angular.z"), names, 2)
-    order = np.argsort([v, phi])
-    speed, angle = (
-        spec.state[i].name if _own_state(spec) else names[i] for i in (v, phi)
-    )
-    lag, rate = _actuators(spec.parameters, ("speed", "steering"))
+    places = _find_state_places(spec)
+    speed, angle = places
+    columns = _find_columns(spec, ("linear.x", "angular.z"), names, 2)
+    order = np.argsort(places)
+    if _has_actuator_state(spec):
+        names = tuple(v.name for v in spec.state)
+    turn_term = f"{names[speed]}*{names[angle]}"
+    lag, rate = _read_actuators(spec.parameters, ("speed", "steering"))
+
+    def compute_command(twist: Array) -> Array:
+        values = np.stack(geometry.command(twist), axis=-1) / gain
+        return _place_values(spec, columns, values)
+
     return Textbook(
-        twist=lambda state: geometry.twist(state[..., v], state[..., phi]),
-        target=lambda given: (given[..., command] * gain)[..., order],
+        twist=lambda state: geometry.twist(state[..., speed], state[..., angle]),
+        target=lambda command: (command[..., columns] * gain)[..., order],
         lag=lag[order],
         rate=rate[order],
-        structure={"vx": (speed,), "vy": (), "wz": (f"{speed}*{angle}",)},
-        command=lambda twist: _placed(
-            spec, command, np.stack(geometry.command(twist), axis=-1) / gain
-        ),
+        structure={"vx": (names[speed],), "vy": (), "wz": (turn_term,)},
+        command=compute_command,
     )
 
 
-def steering_angle(spec: RobotSpec) -> StateVariable | None:
-    """Returns the state variable of the steering angle of a robot that is `steered`, if any."""
-    return spec.state[_states(spec)[1]] if _own_state(spec) else None
+def find_steering_angle(spec: RobotSpec) -> StateVariable | None:
+    """Returns the state variable of the steering angle of a steered robot, if any."""
+    if not _has_actuator_state(spec):
+        return None
+    return spec.state[_find_state_places(spec)[1]]
 
 
-def wheeled(
+def make_wheeled(
     spec: RobotSpec,
     inverse: Array,
     forward: Array,
@@ -372,88 +380,103 @@ def wheeled(
     wheels: tuple[str, ...],
     slip: float = 1.0,
 ) -> Textbook:
-    """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its actuators.
+    """Returns the kinematics of a robot whose twist is linear in its wheel speeds, its actuators.
 
     `inverse` (W, M) gives wheel speeds per component of the twist that the wheels can move, by name
     in `moves`; `forward` (3, W) the body twist per wheel speed, whose turn rate slips by a factor.
     It is commanded by its twist, else by its wheel speeds, with the usual names `wheels`.
     """
-    if _own_state(spec) and len(spec.state) != len(inverse):
+    if _has_actuator_state(spec) and len(spec.state) != len(inverse):
         needed = f"have {len(inverse)} wheels as state, not {len(spec.state)} variables"
-        raise _unfit(spec, f"{needed}; correct `state:`.")
+        raise _make_error(spec, f"{needed}; correct `state:`.")
     dofs = [POSE_RATES.index(dof) for dof in moves]
     fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
-    by_wheels = all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command)
-    into = np.eye(len(inverse)) if by_wheels else inverse
-    command = _commands(spec, fields, wheels if by_wheels else (), into.shape[1])
-    undone = inverse if by_wheels else np.eye(len(dofs))
-    slipping = np.array([1.0, 1.0, slip])
-    out = forward * slipping[:, None]
-    names = tuple(v.name for v in spec.state) if _own_state(spec) else wheels
-    lag, rate = _actuators(spec.parameters, ("wheel",) * len(inverse))
+    if all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command):
+        wheels_from_command = np.eye(len(inverse))
+        command_from_twist = inverse
+        columns = _find_columns(spec, fields, wheels, len(inverse))
+    else:
+        wheels_from_command = inverse
+        command_from_twist = np.eye(len(dofs))
+        columns = _find_columns(spec, fields, (), len(dofs))
+    slip_factors = np.array([1.0, 1.0, slip])
+    twist_from_wheels = forward * slip_factors[:, None]
+    if _has_actuator_state(spec):
+        wheels = tuple(v.name for v in spec.state)
+    lag, rate = _read_actuators(spec.parameters, ("wheel",) * len(inverse))
+
+    def compute_command(twist: Array) -> Array:
+        values = (twist / slip_factors)[..., dofs] @ command_from_twist.T
+        return _place_values(spec, columns, values)
+
     return Textbook(
-        twist=lambda state: state @ out.T,
-        target=lambda given: given[..., command] @ into.T,
+        twist=lambda state: state @ twist_from_wheels.T,
+        target=lambda command: command[..., columns] @ wheels_from_command.T,
         lag=lag,
         rate=rate,
-        structure={dof: names if dof in moves else () for dof in POSE_RATES},
-        command=lambda twist: _placed(
-            spec, command, (twist / slipping)[..., dofs] @ undone.T
-        ),
+        structure={dof: wheels if dof in moves else () for dof in POSE_RATES},
+        command=compute_command,
     )
 
 
-def _own_state(spec: RobotSpec) -> bool:
+def _has_actuator_state(spec: RobotSpec) -> bool:
     """True if the state consists of actuators."""
     return any(v.twist is None for v in spec.state)
 
 
-def _commands(
+def _find_columns(
     spec: RobotSpec,
     fields: tuple[specs.CmdVelField, ...],
     names: tuple[str, ...],
     count: int,
 ) -> list[int]:
-    have = [c.cmd_vel for c in spec.command]
-    if not any(have):
-        if len(have) != count:
-            raise _unfit(
-                spec, f"need {count} commands, not {len(have)}; correct `command:`."
-            )
-        called = [c.name for c in spec.command]
-        if names and set(names) == set(called):
-            return [called.index(name) for name in names]
-        return list(range(len(have)))
-    for one in fields:
-        if one not in have:
-            raise _unfit(spec, f"need a command with `cmd_vel: {one}`; add it.")
-    return [have.index(field) for field in fields]
+    """Returns which commands have these fields of `cmd_vel`, or these names if none has a field."""
+    command_fields = [c.cmd_vel for c in spec.command]
+    if not any(command_fields):
+        if len(command_fields) != count:
+            reason = f"need {count} commands, not {len(command_fields)}"
+            raise _make_error(spec, f"{reason}; correct `command:`.")
+        command_names = [c.name for c in spec.command]
+        if names and set(names) == set(command_names):
+            return [command_names.index(name) for name in names]
+        return list(range(count))
+    for name in fields:
+        if name not in command_fields:
+            raise _make_error(spec, f"need a command with `cmd_vel: {name}`; add it.")
+    return [command_fields.index(name) for name in fields]
 
 
-def _placed(spec: RobotSpec, places: list[int], values: Array) -> Array:
-    """Returns commands (..., C) with values at places, else 0."""
+def _place_values(spec: RobotSpec, columns: list[int], values: Array) -> Array:
+    """Returns commands (..., C) with values in some columns, else 0."""
     command = np.zeros((*values.shape[:-1], len(spec.command)))
-    command[..., places] = values
+    command[..., columns] = values
     return command
 
 
-def _unfit(spec: RobotSpec, reason: str) -> ConfigError:
+def _make_error(spec: RobotSpec, reason: str) -> ConfigError:
     return ConfigError(f"robot {spec.name!r}: the {spec.textbook} kinematics {reason}")
 
 
-def _states(spec: RobotSpec) -> tuple[int, int]:
-    if not _own_state(spec):
+def _find_state_places(spec: RobotSpec) -> tuple[int, int]:
+    """Returns the places of speed and steering angle in the state."""
+    if not _has_actuator_state(spec):
         return 0, 1
-    have = [v.unit for v in spec.state]
-    if sorted(have) != ["m/s", "rad"]:
-        given = ", ".join(have) or "nothing"
-        raise _unfit(
-            spec, f"need a state in m/s and rad, not in {given}; correct `state:`."
-        )
-    return have.index("m/s"), have.index("rad")
+    units = [v.unit for v in spec.state]
+    if sorted(units) != ["m/s", "rad"]:
+        reason = f"need a state in m/s and rad, not in {', '.join(units) or 'nothing'}"
+        raise _make_error(spec, f"{reason}; correct `state:`.")
+    return units.index("m/s"), units.index("rad")
 
 
-def _actuators(p: dict[str, float], parts: tuple[str, ...]) -> tuple[Array, Array]:
-    rate = np.array([p.get(f"{part}_rate", np.inf) for part in parts])
-    lag = [p[f"{part}_lag"] if f"{part}_rate" not in p else 1.0 for part in parts]
-    return np.array(lag), rate
+def _read_actuators(
+    parameters: dict[str, float], parts: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """Returns lags and rate limits of actuators; each has one or the other."""
+    lag = np.ones(len(parts))
+    rate = np.full(len(parts), np.inf)
+    for i, part in enumerate(parts):
+        if f"{part}_rate" in parameters:
+            rate[i] = parameters[f"{part}_rate"]
+        else:
+            lag[i] = parameters[f"{part}_lag"]
+    return lag, rate

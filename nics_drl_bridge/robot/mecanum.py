@@ -1,7 +1,7 @@
 """A robot on four mecanum wheels: front left, front right, rear left, rear right.
 
 Its commands are the body twist: speeds forward and to the left [m/s], and the turn rate [rad/s].
-`base_link` is the centre of the wheels; `half_length` and `half_width` lead from it to each wheel.
+`base_link` is the centre of the wheels, which stand at `half_length` and `half_width` [m] from it.
 """
 
 import numpy as np
@@ -10,8 +10,8 @@ from nics_drl_bridge.robot.kinds import (
     Drawing,
     RobotKind,
     Textbook,
+    make_wheeled,
     place_wheels,
-    wheeled,
 )
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import (
@@ -31,7 +31,7 @@ TEMPLATE = Template(
 )
 
 
-def kinematics(spec: RobotSpec) -> Textbook:
+def derive_kinematics(spec: RobotSpec) -> Textbook:
     """The least-squares twist of four wheels for three degrees of freedom."""
     p = spec.parameters
     arm = p["half_length"] + p["half_width"]
@@ -40,10 +40,10 @@ def kinematics(spec: RobotSpec) -> Textbook:
         / p["wheel_radius"]
     )
     forward = np.asarray(np.linalg.pinv(inverse), dtype=np.float64)
-    return wheeled(spec, inverse, forward, POSE_RATES, list_names(FOUR_WHEELS))
+    return make_wheeled(spec, inverse, forward, POSE_RATES, list_names(FOUR_WHEELS))
 
 
-def drawing(spec: RobotSpec) -> Drawing:
+def draw(spec: RobotSpec) -> Drawing:
     """A box on four wheels."""
     p = spec.parameters
     length = p["half_length"]
@@ -54,4 +54,4 @@ def drawing(spec: RobotSpec) -> Drawing:
     return Drawing((2.0 * length + radius, 1.4 * width), (0.0, radius), wheels)
 
 
-KIND = RobotKind(kinematics, drawing, TEMPLATE, sideways=True)
+KIND = RobotKind(derive_kinematics, draw, TEMPLATE, sideways=True)

@@ -10,7 +10,7 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MEASURED: Literal["measured"] = "measured"
-# of an unmeasured state within a second, as a share of its range
+# Drift of an unmeasured state within a second, as a fraction of its range
 ASSUMED_STATE_DRIFT = 0.1
 
 
@@ -37,8 +37,8 @@ class Noise(Schema):
     """Noise of a robot's odometry and pose sensor, and drift of its pose and its state by name.
 
     Drift is motion that the model does not explain; it grows with the square root of time. The
-    simulator draws the odometry noise, and the drift if it was measured: if assumed, it is a margin
-    for the estimator, which takes its R from odometry and pose, its Q from the drift.
+    simulator draws the odometry noise, and measured drift; assumed drift is only a margin for the
+    estimator, which takes its R from odometry and pose, its Q from the drift.
     """
 
     odom_linear: Level = assume_level(0.01, "m/s")
@@ -50,7 +50,7 @@ class Noise(Schema):
     state_drift: dict[str, Level] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _units(self) -> "Noise":
+    def _check_units(self) -> "Noise":
         for name, field in type(self).model_fields.items():
             level = getattr(self, name)
             if isinstance(level, Level) and level.unit != field.default.unit:
@@ -69,51 +69,51 @@ class Noise(Schema):
 
     def drift(self, spec: RobotSpec) -> NDArray[np.float64]:
         """Returns the drift (3 + S,) of pose and state that the estimator expects in a second."""
-        return np.array([level.std for level in self._drift(spec)])
+        return np.array([level.std for level in self._list_drift(spec)])
 
     def simulated_drift(self, spec: RobotSpec) -> NDArray[np.float64]:
         """Returns the drift (3 + S,) that the simulator draws: measured levels, else zero."""
-        return np.array(
-            [level.std if level.measured else 0.0 for level in self._drift(spec)]
-        )
+        levels = self._list_drift(spec)
+        return np.array([level.std if level.measured else 0.0 for level in levels])
 
-    def _drift(self, spec: RobotSpec) -> list[Level]:
+    def _list_drift(self, spec: RobotSpec) -> list[Level]:
         levels = [self.position_drift, self.position_drift, self.heading_drift]
         for v in spec.state:
-            unknown = assume_level(
-                ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)"
-            )
-            levels.append(self.state_drift.get(v.name, unknown))
+            std = ASSUMED_STATE_DRIFT * (v.max - v.min)
+            assumed = assume_level(std, f"{v.unit}/sqrt(s)")
+            levels.append(self.state_drift.get(v.name, assumed))
         return levels
 
     def sentences(self) -> list[str]:
         """Returns one human-readable line per level."""
-        named = {name: getattr(self, name) for name in type(self).model_fields}
-        levels = {n: level for n, level in named.items() if isinstance(level, Level)}
-        levels |= {
-            f"state_drift of {name}": level for name, level in self.state_drift.items()
-        }
-        return [
-            f"{name.replace('_', ' '):<28} {level.std:.3g} {level.unit}"
-            + (
-                f" (+- {level.uncertainty:.1g})"
-                if level.uncertainty is not None
-                else ""
-            )
-            + ("" if level.measured else ", assumed")
-            for name, level in levels.items()
-        ]
+        lines = []
+        for name in type(self).model_fields:
+            level = getattr(self, name)
+            if isinstance(level, Level):
+                lines.append(_describe_level(name, level))
+        for name, level in self.state_drift.items():
+            lines.append(_describe_level(f"state_drift of {name}", level))
+        return lines
+
+
+def _describe_level(name: str, level: Level) -> str:
+    line = f"{name.replace('_', ' '):<28} {level.std:.3g} {level.unit}"
+    if level.uncertainty is not None:
+        line += f" (+- {level.uncertainty:.1g})"
+    if not level.measured:
+        line += ", assumed"
+    return line
 
 
 class Delay(Schema):
-    """A uniform distribution of delays: the `least`, and how much longer the greatest is [s]."""
+    """A uniform distribution of delays, from `least` to `least + jitter` [s]."""
 
     least: float = Field(ge=0.0)
     jitter: float = Field(ge=0.0)
 
 
 class Latency(Schema):
-    """Delays to receipt, of a scan from its last beam, of odometry from its stamp, if known."""
+    """Delays until receipt: of a scan since its last beam, of odometry since its stamp."""
 
     scan: Delay | None = None
     odom: Delay | None = None
@@ -126,8 +126,9 @@ class Latency(Schema):
 
     def sentences(self) -> list[str]:
         """Returns one human-readable line per topic."""
-        return [
-            f"{topic} comes {1e3 * delay.least:.1f} to {1e3 * (delay.least + delay.jitter):.1f} ms "
-            "after it was measured"
-            for topic, delay in self.measured.items()
-        ]
+        lines = []
+        for topic, delay in self.measured.items():
+            low = f"{1e3 * delay.least:.1f}"
+            high = f"{1e3 * (delay.least + delay.jitter):.1f}"
+            lines.append(f"{topic} arrives {low} to {high} ms after it was measured")
+        return lines

@@ -1,20 +1,24 @@
-"""A robot that moves in every direction, on wheels of any sort, by its body twist as commands."""
+"""A robot that moves in every direction, on any wheels; its commands are its body twist."""
 
 import numpy as np
 
-from nics_drl_bridge.robot.kinds import RobotKind, Textbook, disc, wheeled
+from nics_drl_bridge.robot.kinds import RobotKind, Textbook, draw_disc, make_wheeled
 from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS, POSE_RATES, POSE_UNITS, RobotSpec
-from nics_drl_bridge.robot.template import LAGS, Template, usual
+from nics_drl_bridge.robot.template import LAGS, Template, make_command
 
-REACH = (1.0, 1.0, 2.0)
-COMMANDS = tuple(map(usual, POSE_RATES, POSE_UNITS, REACH, CMD_VEL_FIELDS))
-
-
-def kinematics(spec: RobotSpec) -> Textbook:
-    """Its twist follows its commands, with the lag of its wheels."""
-    return wheeled(spec, np.eye(3), np.eye(3), POSE_RATES, POSE_RATES)
-
-
-KIND = RobotKind(
-    kinematics, disc, Template((COMMANDS,), POSE_RATES, (), LAGS), sideways=True
+MAX_TWIST = (1.0, 1.0, 2.0)
+TEMPLATE = Template(
+    commands=(
+        tuple(map(make_command, POSE_RATES, POSE_UNITS, MAX_TWIST, CMD_VEL_FIELDS)),
+    ),
+    moves=POSE_RATES,
+    parameters=LAGS,
 )
+
+
+def derive_kinematics(spec: RobotSpec) -> Textbook:
+    """Its twist follows its commands, with the lag of its wheels."""
+    return make_wheeled(spec, np.eye(3), np.eye(3), POSE_RATES, POSE_RATES)
+
+
+KIND = RobotKind(derive_kinematics, draw_disc, TEMPLATE, sideways=True)

@@ -1,9 +1,9 @@
-"""A robot whose wheels or tracks on either side turn alike, so that it skids when it turns.
+"""A robot whose wheels or tracks on each side turn together, so that it skids when it turns.
 
-Its commands are its body twist, or the speeds of both sides [rad/s]. It turns by the distance
-`effective_track` between the centres about which its sides turn, no less than its `track` [m], by
-which its drive makes wheel speeds of a turn rate (Mandow et al. 2007). Its four wheels stand at
-`half_length` and `half_width` [m] from `base_link`, half a track if they are not given.
+Its commands are its body twist, or the speeds of both sides [rad/s]. Its drive converts a turn rate
+to wheel speeds by its `track` [m]; it turns by its `effective_track` [m], the distance between the
+centres about which its sides turn, which is no less (Mandow et al. 2007). Its four wheels stand at
+`half_length` and `half_width` [m] from `base_link`, by default half a track.
 """
 
 from nics_drl_bridge.robot import differential
@@ -25,19 +25,21 @@ TEMPLATE = Template(
 )
 
 
-def kinematics(spec: RobotSpec) -> Textbook:
-    """A differential robot's kinematics, of which the effective track takes a share."""
+def derive_kinematics(spec: RobotSpec) -> Textbook:
+    """A differential robot's kinematics, whose turn rate the effective track reduces."""
     slip = spec.parameters["track"] / spec.parameters["effective_track"]
-    return differential.kinematics(spec, slip)
+    return differential.derive_kinematics(spec, slip)
 
 
-def drawing(spec: RobotSpec) -> Drawing:
-    """A box on four wheels, which stand still."""
+def draw(spec: RobotSpec) -> Drawing:
+    """A box on four wheels, which do not turn."""
     places = places_of_four(spec.parameters)
     radius = spec.parameters["wheel_radius"]
     x, y = places["front_left"]
-    wheels = (Wheel(f"{name}_wheel", at, radius) for name, at in places.items())
-    return Drawing((2.0 * (x + radius), 1.6 * y), (0.0, 1.2 * radius), tuple(wheels))
+    wheels = tuple(
+        Wheel(f"{name}_wheel", place, radius) for name, place in places.items()
+    )
+    return Drawing((2.0 * (x + radius), 1.6 * y), (0.0, 1.2 * radius), wheels)
 
 
-KIND = RobotKind(kinematics, drawing, TEMPLATE, slips=True)
+KIND = RobotKind(derive_kinematics, draw, TEMPLATE, slips=True)

@@ -1,8 +1,8 @@
 """RobotSpec: the single definition of a robot's state and command: order, units and limits.
 
-A module here that defines `KIND`, a `kinds.RobotKind`, adds a kind of its name for `textbook:` in
-YAML files; its `VARIANTS` are kinds of longer names. Other packages add kinds by entry points of
-the group `nics_drl_bridge.kinds`.
+A module of this folder that defines `KIND`, a `kinds.RobotKind`, adds a kind of its own name for
+`textbook:` in YAML files; its `VARIANTS` are kinds of longer names. Other packages add kinds by
+entry points of the group `nics_drl_bridge.kinds`.
 """
 
 import math
@@ -44,11 +44,11 @@ TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 Unit = Literal[
     "m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"
 ]
-MOST_CORNERS = 512  # of a footprint
-MOST_VARIABLES = 32  # of a state or a command
-# reach of a footprint [m]: none of a robot or a car, but many in centimetres
-LARGEST = 10.0
-LENGTHS = {
+MAX_CORNERS = 512  # of a footprint
+MAX_VARIABLES = 32  # of a state or a command
+# Maximum radius of a footprint [m]; a larger one is probably given in centimetres
+MAX_RADIUS = 10.0
+LENGTH_PARAMETERS = {
     "wheelbase",
     "track",
     "effective_track",
@@ -56,48 +56,50 @@ LENGTHS = {
     "half_length",
     "half_width",
 }
-LONGEST = 20.0  # of these parameters, in reaches of the footprint
+MAX_LENGTH = 20.0  # of these parameters, in radii of the footprint
 FARTHEST_STEERED = 3.2  # angle of a wheel [rad]
-# Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
-SHARPEST = 0.2
-FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
+# 1 + cosine at a corner; at sharper corners, a grown outline does not keep its edges parallel
+MIN_CORNER = 0.2
+MAX_VALUE = 1e6  # absolute value of a variable, in its unit
 
 
-def kind_names() -> list[str]:
-    """Names of all kinds of robots."""
-    modules = (module.name for module in iter_modules([str(Path(__file__).parent)]))
-    own = (name for module in modules for name in _own_kinds(module))
-    return sorted({*own, *extensions.find_extensions("kinds")})
+def list_kinds() -> list[str]:
+    """Returns the names of all kinds of robots."""
+    names = set(extensions.find_extensions("kinds"))
+    for module in iter_modules([str(Path(__file__).parent)]):
+        names.update(_load_kinds(module.name))
+    return sorted(names)
 
 
 def find_kind(name: str) -> Any | None:
     """Returns a `kinds.RobotKind`; None if there is none of that name."""
     if name in extensions.find_extensions("kinds"):
         return extensions.load("kinds", name)
-    return (_own_kinds(name) or _own_kinds(name.rpartition("_")[0])).get(name)
+    return (_load_kinds(name) or _load_kinds(name.rpartition("_")[0])).get(name)
 
 
-def _own_kinds(module: str) -> dict[str, Any]:
+def _load_kinds(module: str) -> dict[str, Any]:
     place = f"{__package__}.{module}"
     if not module.isidentifier() or find_spec(place) is None:
         return {}
-    found = import_module(place)
-    kind = getattr(found, "KIND", None)
-    return {} if kind is None else {module: kind, **getattr(found, "VARIANTS", {})}
+    loaded = import_module(place)
+    kind = getattr(loaded, "KIND", None)
+    if kind is None:
+        return {}
+    return {module: kind, **getattr(loaded, "VARIANTS", {})}
 
 
 class Variable(Schema):
     """A component of the state or of the command."""
 
-    name: str = Field(
-        pattern=r"^[a-z][a-z0-9_]*$"
-    )  # unique; small letters, digits and _
+    # unique; small letters, digits and _
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     unit: Unit  # of its values, in SI; 1 is a ratio or a count
-    min: float = Field(ge=-FASTEST, le=FASTEST)  # least value, in this unit
-    max: float = Field(ge=-FASTEST, le=FASTEST)  # greatest value, in this unit
+    min: float = Field(ge=-MAX_VALUE, le=MAX_VALUE)  # minimum, in this unit
+    max: float = Field(ge=-MAX_VALUE, le=MAX_VALUE)  # maximum, in this unit
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Variable":
+    def _check_order(self) -> "Variable":
         if not self.min < self.max:
             raise ValueError(f"min must be less than max of variable {self.name!r}")
         return self
@@ -112,7 +114,7 @@ class StateVariable(Variable):
 
     @property
     def must_be_measured(self) -> bool:
-        """True if neither a command nor the pose tells it."""
+        """True if neither a command nor the pose determines it."""
         return self.follows is None and self.twist is None
 
 
@@ -129,7 +131,7 @@ class CommandVariable(Variable):
 
     @property
     def steers(self) -> bool:
-        """True for a steering angle: how fast it turns the robot depends on the speed."""
+        """True for a steering angle, whose turn rate depends on the speed."""
         return self.turns and self.unit == "rad"
 
     @property
@@ -145,12 +147,10 @@ class RobotSpec(Schema):
     description: str = ""  # one sentence for people who read the file
     # its kind: textbook kinematics, to make recordings, or to assume what a drive did not show
     textbook: str | None = None
-    parameters: dict[str, float] = Field(
-        default_factory=dict
-    )  # [m, s], see the module of its kind
-    assumed: tuple[
-        str, ...
-    ] = ()  # parameters that its kind guessed, lengths by the footprint
+    # [m, s], see the module of its kind
+    parameters: dict[str, float] = Field(default_factory=dict)
+    # parameters that its kind assumed, lengths in proportion to the footprint
+    assumed: tuple[str, ...] = ()
     # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
     # steering angle [rad] itself
     angular_is: Literal["turn_rate", "steering"] = "turn_rate"
@@ -158,52 +158,52 @@ class RobotSpec(Schema):
     footprint_radius: float = Field(ge=1e-3)
     # corners of a polygon instead, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(
-        default=None, min_length=3, max_length=MOST_CORNERS
+        default=None, min_length=3, max_length=MAX_CORNERS
     )
     # its usual lidar, a shipped one or a YAML file, where none is given; None: that of the paper
     lidar: str | None = Field(default=None, min_length=1)
     # where that is, x, y [m] and heading [rad] in `base_link`; None: as the lidar's own file says
     lidar_mount: Mount | None = None
     # what follows commands with a lag, or is measured, in the order of every state vector
-    state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
+    state: tuple[StateVariable, ...] = Field(default=(), max_length=MAX_VARIABLES)
     # what drives it, in the order of every command vector
-    command: tuple[CommandVariable, ...] = Field(
-        min_length=1, max_length=MOST_VARIABLES
-    )
+    command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MAX_VARIABLES)
 
     @field_validator("textbook")
     @classmethod
-    def _known(cls, textbook: str | None) -> str | None:
+    def _check_textbook(cls, textbook: str | None) -> str | None:
         if textbook is not None and find_kind(textbook) is None:
-            raise ValueError(f"must be one of {', '.join(kind_names())}")
+            raise ValueError(f"must be one of {', '.join(list_kinds())}")
         return textbook
 
     @model_validator(mode="before")
     @classmethod
-    def _with_radius(cls, data: Any) -> Any:
-        return _circumscribed(data) if isinstance(data, dict) else data
+    def _add_radius(cls, data: Any) -> Any:
+        return _add_circumradius(data) if isinstance(data, dict) else data
 
     @model_serializer(mode="wrap")
-    def _without_none(
+    def _drop_none(
         self, dump: pydantic.SerializerFunctionWrapHandler
     ) -> dict[str, Any]:
-        # Models and policies are known by what is written: a key that says nothing is left out.
+        # Models and policies are identified by their content: an empty key must not change it.
         data: dict[str, Any] = dump(self)
-        silent = [
-            name for name in ("lidar", "lidar_mount") if getattr(self, name) is None
-        ]
-        return {key: value for key, value in data.items() if key not in silent}
+        for name in ("lidar", "lidar_mount"):
+            if getattr(self, name) is None:
+                del data[name]
+        return data
 
     @model_validator(mode="after")
-    def _consistent(self) -> "RobotSpec":
+    def _check_consistency(self) -> "RobotSpec":
         if any(part in self.name for part in ("/", "\\", "..")):
             raise ValueError(
-                f"name {self.name!r}: files are named so; leave out .., / and \\"
+                f"name {self.name!r}: it names files, so leave out .., / and \\"
             )
-        if not self.footprint_radius <= LARGEST:
-            told = f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
+        if not self.footprint_radius <= MAX_RADIUS:
+            fault = (
+                f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
+            )
             raise ValueError(
-                f"{told}, at most {LARGEST:g} m can be; lengths are in metres"
+                f"{fault}, at most {MAX_RADIUS:g} m can be; lengths are in metres"
             )
         if self.footprint is not None:
             if geometry.has_crossing_edges(np.array(self.footprint)):
@@ -218,18 +218,24 @@ class RobotSpec(Schema):
                     f"{radius:.6g} m; leave footprint_radius out"
                 )
         for name, size in self.parameters.items():
-            if not size > 0.0 and (name in LENGTHS or name.endswith("_lag")):
+            if not size > 0.0 and (name in LENGTH_PARAMETERS or name.endswith("_lag")):
                 raise ValueError(f"{name} {size:g}: must be more than 0")
-            if name in LENGTHS and abs(size) > LONGEST * self.footprint_radius:
-                told = f"{name} {size:g} m is too long for a robot of {self.footprint_radius:.3g} m"
-                raise ValueError(f"{told} around base_link; lengths are in metres")
+            if (
+                name in LENGTH_PARAMETERS
+                and abs(size) > MAX_LENGTH * self.footprint_radius
+            ):
+                raise ValueError(
+                    f"{name} {size:g} m is too long for a robot of {self.footprint_radius:.3g} m "
+                    "around base_link; lengths are in metres"
+                )
         names = self.variable_names
         if len(set(names)) != len(names):
             raise ValueError("every state and command variable needs a name of its own")
-        for name, follows in ((v.name, v.follows) for v in self.state):
-            if follows is not None and follows not in [c.name for c in self.command]:
+        commands = [c.name for c in self.command]
+        for v in self.state:
+            if v.follows is not None and v.follows not in commands:
                 raise ValueError(
-                    f"state {name!r} follows {follows!r}, which is no command"
+                    f"state {v.name!r} follows {v.follows!r}, which is not a command"
                 )
         fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
         if len(set(fields)) != len(fields):
@@ -238,35 +244,35 @@ class RobotSpec(Schema):
         if len(set(twists)) != len(twists):
             raise ValueError("two states are the same component of the twist")
         for v in self.state:
-            if v.twist is not None and v.unit != (unit := DOF_UNITS[v.twist]):
+            if v.twist is not None and v.unit != DOF_UNITS[v.twist]:
                 raise ValueError(
-                    f"state {v.name!r} is {v.twist} of the twist, so its unit is {unit}"
+                    f"state {v.name!r} is {v.twist} of the twist, so its unit is "
+                    f"{DOF_UNITS[v.twist]}"
                 )
         return self
 
     def grow_footprint(self, margin: float) -> "RobotSpec":
-        """The robot with a footprint that is larger all around by a margin [m].
+        """Returns the robot with a footprint that is larger all around by a margin [m].
 
-        With an outline `footprint_radius` stays, by which worlds place robots: where the robot has
-        room so has this one, but for the margin.
+        With an outline, `footprint_radius` stays the same, because worlds place robots by it: this
+        robot fits wherever the original fits, apart from the margin.
         """
         if self.footprint is None:
-            return self.model_copy(
-                update={"footprint_radius": self.footprint_radius + margin}
-            )
+            radius = self.footprint_radius + margin
+            return self.model_copy(update={"footprint_radius": radius})
         corners = np.array(self.footprint)
-        following = np.roll(corners, -1, axis=0)
-        x, y = (following - corners).T
-        left = np.sign(
-            np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0])
+        next_corners = np.roll(corners, -1, axis=0)
+        x, y = (next_corners - corners).T
+        doubled_area = np.sum(
+            corners[:, 0] * next_corners[:, 1] - corners[:, 1] * next_corners[:, 0]
         )
-        after = (
-            left * np.stack([y, -x], axis=-1) / np.hypot(x, y)[:, None]
-        )  # out of each edge
-        before = np.roll(after, 1, axis=0)
-        bend = 1.0 + np.sum(before * after, axis=-1, keepdims=True)
-        moved = corners + margin * (before + after) / np.maximum(bend, SHARPEST)
-        return self.model_copy(update={"footprint": tuple(map(tuple, moved.tolist()))})
+        normals = np.sign(doubled_area) * np.stack([y, -x], axis=-1)
+        normals = normals / np.hypot(x, y)[:, None]  # outward
+        last_normals = np.roll(normals, 1, axis=0)
+        corner = 1.0 + np.sum(last_normals * normals, axis=-1, keepdims=True)
+        shift = margin * (last_normals + normals) / np.maximum(corner, MIN_CORNER)
+        moved = (corners + shift).tolist()
+        return self.model_copy(update={"footprint": tuple(map(tuple, moved))})
 
     @property
     def variable_names(self) -> tuple[str, ...]:
@@ -331,12 +337,12 @@ class RobotSpec(Schema):
 
     @cached_property
     def command_low(self) -> NDArray[np.float64]:
-        """Least command (C,)."""
+        """Minimum command (C,)."""
         return np.array([c.min for c in self.command])
 
     @cached_property
     def command_high(self) -> NDArray[np.float64]:
-        """Greatest command (C,)."""
+        """Maximum command (C,)."""
         return np.array([c.max for c in self.command])
 
     @cached_property
@@ -346,12 +352,8 @@ class RobotSpec(Schema):
                 reason = f"the command {command.name!r} names no field of cmd_vel"
                 fix = "add `cmd_vel:` to it, or drive it in process, without ROS 2"
                 raise ConfigError(f"robot {self.name!r}: {reason}; {fix}.")
-        fields = [
-            CMD_VEL_FIELDS.index(c.cmd_vel)
-            for c in self.command
-            if c.cmd_vel is not None
-        ]
-        return np.array(fields, dtype=np.intp)
+        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
+        return np.array([CMD_VEL_FIELDS.index(f) for f in fields], dtype=np.intp)
 
     @property
     def cmd_vel_places(self) -> tuple[int, ...]:
@@ -390,7 +392,7 @@ class RobotSpec(Schema):
         return np.asarray(np.clip(command, *limits.T))
 
     def pass_through_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Returns commands (..., C) as a robot that hears `cmd_vel` takes them; else as they are.
+        """Returns commands (..., C) as they arrive through `cmd_vel`, if the robot uses it.
 
         They differ by rounding, and a car that takes turn rates does not steer at rest.
         """
@@ -399,7 +401,7 @@ class RobotSpec(Schema):
         return np.asarray(command, dtype=np.float64)
 
     def require_cmd_vel(self) -> None:
-        """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
+        """Raises ConfigError if a node can't drive the robot, because `to_cmd_vel` fails."""
         self.to_cmd_vel(self.command_low)
 
     def to_fields(self, command: ArrayLike) -> NDArray[np.float64]:
@@ -410,18 +412,17 @@ class RobotSpec(Schema):
         return values
 
     def from_fields(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""
+        """Returns commands (..., C) from values (..., 3) by field of `cmd_vel`."""
         return np.asarray(values, dtype=np.float64)[..., self._cmd_vel_index]
 
 
-def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
+def _add_circumradius(data: dict[str, Any]) -> dict[str, Any]:
     outline = data.get("footprint")
     if outline is None or "footprint_radius" in data:
         return data
-    with suppress(
-        OverflowError, TypeError, ValueError
-    ):  # the field's own check reports it
-        if len(outline) <= MOST_CORNERS:
+    # The field's own check reports a fault.
+    with suppress(OverflowError, TypeError, ValueError):
+        if len(outline) <= MAX_CORNERS:
             data = data | {"footprint_radius": _reach(outline)}
     return data
 
@@ -436,52 +437,49 @@ def load_robot(name: str | Path) -> RobotSpec:
 
 
 def build_robot(
-    given: str | Path | Mapping[str, Any], ranges: Ranges | None = None
+    definition: str | Path | Mapping[str, Any], ranges: Ranges | None = None
 ) -> RobotSpec:
-    """Makes a robot of a shipped one's name, the path of a YAML file, or the content of such a one.
+    """Builds a robot from a shipped robot's name, the path of a YAML file, or its content.
 
     With a `kind` instead of `textbook`, all that the kind knows may be left out: names, units and
-    ranges of commands, state and parameters. `ranges` (least, greatest) of recorded commands, by
-    name, are theirs unless given. Raises ConfigError.
+    ranges of commands, state and parameters. `ranges` (minimum, maximum) of recorded commands, by
+    name, are the default of their ranges. Raises ConfigError.
     """
-    data = read_definition(given)
-    if isinstance(given, Mapping):
-        source = "robot"
-    else:
-        source = str(find_config(given, "robots"))
+    ranges = ranges or {}
+    data = read_definition(definition)
+    source = "robot"
+    if not isinstance(definition, Mapping):
+        source = str(find_config(definition, "robots"))
     if "kind" in data:
-        data = _of_kind(data, ranges or {}, source)
+        data = _fill_from_kind(data, ranges, source)
     spec = validate(data, RobotSpec, source)
     for c in spec.command:
-        end = max(
-            c.min, c.max, key=abs
-        )  # one that was recorded is judged with its mapping
-        if (
-            c.steers
-            and abs(end) > FARTHEST_STEERED
-            and end not in (ranges or {}).get(c.name, ())
-        ):
+        end = max(c.min, c.max, key=abs)
+        is_recorded = end in ranges.get(c.name, ())  # then its mapping is to blame
+        if c.steers and abs(end) > FARTHEST_STEERED and not is_recorded:
             fault = f"key 'command': {c.name} reaches {end:g} rad, and no wheel steers so far"
             raise ConfigError(f"{source}: {fault}; angles are in radians.")
     return spec
 
 
-def read_definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the content of a robot's YAML file, called as the file unless it says."""
-    if isinstance(given, Mapping):
-        return dict(given)
-    path = find_config(given, "robots")
+def read_definition(definition: str | Path | Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the content of a robot's YAML file; the robot is named after the file by default."""
+    if isinstance(definition, Mapping):
+        return dict(definition)
+    path = find_config(definition, "robots")
     return {"name": path.stem} | parse_yaml(read_text(path), str(path))
 
 
-def _of_kind(data: dict[str, Any], ranges: Ranges, source: str) -> dict[str, Any]:
+def _fill_from_kind(
+    data: dict[str, Any], ranges: Ranges, source: str
+) -> dict[str, Any]:
     kind = find_kind(str(data["kind"]))
     if kind is None:
-        hint = suggest(str(data["kind"]), kind_names())
+        hint = suggest(str(data["kind"]), list_kinds())
         raise ConfigError(f"{source}: key 'kind': there is no {data['kind']!r}; {hint}")
     if "textbook" in data:
         raise ConfigError(
             f"{source}: has a `kind` and a `textbook`; remove one of them."
         )
-    filled: dict[str, Any] = kind.template.filled(_circumscribed(data), ranges)
-    return filled
+    whole: dict[str, Any] = kind.template.fill(_add_circumradius(data), ranges)
+    return whole

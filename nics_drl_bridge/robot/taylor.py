@@ -1,6 +1,6 @@
 """TaylorModel: rates of pose and state as a short polynomial of state and command (Eq. 1)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
 from typing import Annotated
@@ -15,60 +15,58 @@ from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.curve import InputCurve, apply_curves, delays, ends
 
-BEYOND = 0.25  # share of its range by which a bounded state may leave it, on both ends
+STATE_MARGIN = (
+    0.25  # fraction of its range by which a bounded state may leave it, on both ends
+)
 
 
 @dataclass(frozen=True)
 class TaylorModel:
     """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2), and what motors do around them.
 
-    Commands of X are those in effect, after the input curves. A motor pulls the less the faster it
-    turns: by its back-EMF. The rate of a state is cut to its limits; then drag by its square slows
-    it, and dry friction draws it to zero, where it sticks.
+    The commands in X are those in effect, after the input curves. Back-EMF weakens a motor as it
+    turns faster. The rate of a state is clipped to its limits; then drag by its square slows it,
+    and dry friction draws it to zero, where it sticks.
     """
 
     variables: tuple[str, ...]  # V names of X = [state, command]
-    dofs: tuple[
-        str, ...
-    ]  # D = 3 + S names of dQ/dt: vx, vy, wz, then the state's rates
+    # D = 3 + S names of dQ/dt: vx, vy, wz, then the state's rates
+    dofs: tuple[str, ...]
     dof_units: tuple[str, ...]
-    powers: NDArray[
-        np.int64
-    ]  # (K, V) exponents of the terms that any degree of freedom keeps
+    # (K, V) exponents of the terms that any degree of freedom keeps
+    powers: NDArray[np.int64]
     coefficients: Array  # (D, K); zero where a degree of freedom does not keep a term
     dt: float  # the step for which the rates are valid [s]; the simulator's step
-    low: Array  # `low`, `high`: (V,) the box of X that the recording covered
-    high: Array
-    assumed: tuple[
-        tuple[str, str], ...
-    ] = ()  # terms (dof, term) of the textbook, not of the drive
-    # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if none is known
+    low: Array  # (V,) minimum of X in the recording
+    high: Array  # (V,) maximum of X in the recording
+    # Terms (dof, term) taken from the textbook, not from the drive
+    assumed: tuple[tuple[str, str], ...] = ()
+    # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if all are unknown
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: "Quality | None" = None
     bounded: bool = False  # True if the state is held in the recording's box, widened
     inputs: tuple[InputCurve, ...] = ()  # of the commands that have one
-    friction: Array = field(
-        default_factory=lambda: np.zeros(0)
-    )  # (S,) [unit of the state / s]
-    drag: Array = field(
-        default_factory=lambda: np.zeros(0)
-    )  # (S,) [1 / (unit of the state s)]
+    # (S,) [unit of the state / s]
+    friction: Array = field(default_factory=lambda: np.zeros(0))
+    # (S,) [1 / (unit of the state s)]
+    drag: Array = field(default_factory=lambda: np.zeros(0))
     # (S, C) by which each command in effect, of either sign, brakes [1 / (its unit s)]
     back_emf: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    # (S, 2) greatest fall and rise of each state's rate [unit of the state / s]
+    # (S, 2) minimum and maximum of each state's rate [unit of the state / s]
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
-        for name in ("friction", "drag"):
+        states = self.state_size
+        commands = len(self.variables) - states
+        defaults = {
+            "friction": np.zeros(states),
+            "drag": np.zeros(states),
+            "back_emf": np.zeros((states, commands)),
+            "limits": np.tile([-np.inf, np.inf], (states, 1)),
+        }
+        for name, default in defaults.items():
             if not getattr(self, name).size:
-                object.__setattr__(self, name, np.zeros(self.state_size))
-        if not self.back_emf.size:
-            none = np.zeros((self.state_size, len(self.variables) - self.state_size))
-            object.__setattr__(self, "back_emf", none)
-        if not self.limits.size:
-            object.__setattr__(
-                self, "limits", np.tile([-np.inf, np.inf], (self.state_size, 1))
-            )
+                object.__setattr__(self, name, default)
 
     @property
     def state_size(self) -> int:
@@ -77,9 +75,12 @@ class TaylorModel:
 
     @property
     def state_box(self) -> tuple[Array, Array]:
-        """Least and greatest state (S,), at which it is held; infinite unless `bounded`."""
-        low, high = (edge[: self.state_size] for edge in (self.low, self.high))
-        margin = BEYOND * np.maximum(high - low, 1e-3) if self.bounded else np.inf
+        """Minimum and maximum state (S,), at which it is held; infinite unless `bounded`."""
+        low = self.low[: self.state_size]
+        high = self.high[: self.state_size]
+        margin = np.full_like(low, np.inf)
+        if self.bounded:
+            margin = STATE_MARGIN * np.maximum(high - low, 1e-3)
         return low - margin, high + margin
 
     @property
@@ -89,14 +90,15 @@ class TaylorModel:
 
     @property
     def is_plain(self) -> bool:
-        """True if the motors do nothing beside the terms."""
+        """True if there are only the terms."""
         return not self.inputs and self.is_free
 
     @property
     def is_free(self) -> bool:
         """True if the rates of the state are those of the terms."""
-        still = self.friction, self.drag, self.back_emf, np.isfinite(self.limits)
-        return not any(each.any() for each in still)
+        has_limits = np.isfinite(self.limits).any()
+        has_losses = self.friction.any() or self.drag.any() or self.back_emf.any()
+        return not (has_limits or has_losses)
 
     @property
     def delays(self) -> Array:
@@ -105,35 +107,35 @@ class TaylorModel:
 
     @property
     def drivers(self) -> NDArray[np.intp]:
-        """Place (S,) of the command that moves each state most, over the box of X."""
-        reach = np.maximum(np.abs(self.low), np.abs(self.high))
-        size = np.abs(self.coefficients[3:]) * np.prod(reach**self.powers, axis=1)
-        return np.asarray(
-            np.argmax(size @ (self.powers[:, self.state_size :] > 0), axis=1)
-        )
+        """Index (S,) of the command that moves each state most, over the box of X."""
+        largest = np.maximum(np.abs(self.low), np.abs(self.high))
+        effect = np.abs(self.coefficients[3:]) * np.prod(largest**self.powers, axis=1)
+        has_command = self.powers[:, self.state_size :] > 0
+        return np.asarray(np.argmax(effect @ has_command, axis=1))
 
     def apply_curves(self, command: ArrayLike) -> Array:
-        """Returns what commands (..., C) come to after their delays, by the input curves."""
+        """Returns the commands in effect (..., C) of delayed commands, by the input curves."""
         return apply_curves(command, self.variables[self.state_size :], self.inputs)
 
     def rates(self, x: ArrayLike) -> Array:
         """Returns dQ/dt (..., D) in a step from X (..., V), whose commands are those in effect."""
         x = np.asarray(x, dtype=np.float64)
-        dq = self._free_rates(x)
+        dq = self._evaluate_terms(x)
         if not self.is_free:
             state = x[..., : self.state_size]
-            dq[..., 3:] = (self._moved(state, dq[..., 3:] * self.dt) - state) / self.dt
+            moved = self._move_states(state, dq[..., 3:] * self.dt)
+            dq[..., 3:] = (moved - state) / self.dt
         return dq
 
-    def _free_rates(self, x: Array) -> Array:
+    def _evaluate_terms(self, x: Array) -> Array:
         """Returns dQ/dt (..., D) by the terms and the back-EMF."""
         dq = evaluate(x, self.powers) @ self.coefficients.T
         states = self.state_size
         dq[..., 3:] -= np.abs(x[..., states:]) @ self.back_emf.T * x[..., :states]
         return dq
 
-    def _moved(self, state: Array, change: Array) -> Array:
-        """Returns states (..., S) that change in a step, as limits, drag and friction let them."""
+    def _move_states(self, state: Array, change: Array) -> Array:
+        """Returns states (..., S) after a step's change, by limits, drag and friction."""
         moved = state + np.clip(change, *(self.dt * self.limits.T))
         moved = moved / (1.0 + self.dt * self.drag * np.abs(moved))
         stick = self.dt * self.friction
@@ -144,14 +146,10 @@ class TaylorModel:
     ) -> tuple[Array, Array]:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
-        dq = (
-            self._free_rates(
-                np.concatenate([state, self.apply_curves(command)], axis=-1)
-            )
-            * self.dt
-        )
-        moved = np.clip(self._moved(state, dq[..., 3:]), *self.state_box)
-        return geometry.compose(pose, geometry.exp(dq[..., :3])), moved
+        x = np.concatenate([state, self.apply_curves(command)], axis=-1)
+        change = self._evaluate_terms(x) * self.dt
+        moved = np.clip(self._move_states(state, change[..., 3:]), *self.state_box)
+        return geometry.compose(pose, geometry.exp(change[..., :3])), moved
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -169,64 +167,68 @@ class TaylorModel:
         curved = [curve.command for curve in self.inputs]
         return tuple(f"{name}'" if name in curved else name for name in self.variables)
 
-    def restraint(self, dof: str) -> str:
-        """Returns limits, drag, friction of a degree of freedom as text, beginning with a comma."""
+    def describe_limits(self, dof: str) -> str:
+        """Returns limits, drag, friction of a degree of freedom as text, starting with a comma."""
         d = self.dofs.index(dof) - 3
         if d < 0:
             return ""
-        friction = self.friction[d]
-        drag = self.drag[d]
         name = self.variables[d]
-        emf = zip(
-            self.back_emf[d].tolist(), self.shown_names[self.state_size :], strict=True
-        )
-        less = "".join(f", less {k:.4g}*{name}*|{command}|" for k, command in emf if k)
-        less += f", less {drag:.4g}*{name}*|{name}|" if drag else ""
-        less += f", less dry friction of {friction:.4g}" if friction else ""
-        return ends(*self.limits[d].tolist()) + less
+        commands = self.shown_names[self.state_size :]
+        text = ends(*self.limits[d].tolist())
+        for emf, command in zip(self.back_emf[d].tolist(), commands, strict=True):
+            if emf:
+                text += f", less {emf:.4g}*{name}*|{command}|"
+        if self.drag[d]:
+            text += f", less {self.drag[d]:.4g}*{name}*|{name}|"
+        if self.friction[d]:
+            text += f", less dry friction of {self.friction[d]:.4g}"
+        return text
 
     @property
     def named_errors(self) -> dict[str, dict[str, float]]:
-        """Known standard errors of the kept terms: dof -> term -> error."""
-        known = self.coefficients != 0.0
-        known &= np.isfinite(self.std_errors) if self.std_errors.size else False
+        """Known standard errors of the kept terms, by degree of freedom and term."""
+        if not self.std_errors.size:
+            return {}
+        has_error = (self.coefficients != 0.0) & np.isfinite(self.std_errors)
         names = self.term_names
-        return {
-            dof: {
-                names[k]: float(self.std_errors[d, k]) for k in np.flatnonzero(known[d])
-            }
-            for d, dof in enumerate(self.dofs)
-            if known[d].any()
-        }
+        errors = {}
+        for d, dof in enumerate(self.dofs):
+            kept = np.flatnonzero(has_error[d])
+            if kept.size:
+                errors[dof] = {names[k]: float(self.std_errors[d, k]) for k in kept}
+        return errors
 
     def add_errors(self, errors: Mapping[str, Mapping[str, float]]) -> "TaylorModel":
         """Returns the model with standard errors by dof and term; NaN for kept terms without."""
         if not errors:
             return replace(self, std_errors=np.zeros((0, 0)))
         names = self.term_names
-        rows = [
-            [errors.get(dof, {}).get(name, np.nan) for name in names]
-            for dof in self.dofs
-        ]
-        known = np.array(rows, dtype=np.float64).reshape(self.coefficients.shape)
-        return replace(self, std_errors=np.where(self.coefficients != 0.0, known, 0.0))
+        values = np.full(self.coefficients.shape, np.nan)
+        for d, dof in enumerate(self.dofs):
+            for k, name in enumerate(names):
+                values[d, k] = errors.get(dof, {}).get(name, np.nan)
+        return replace(self, std_errors=np.where(self.coefficients != 0.0, values, 0.0))
 
     def equations(self) -> list[str]:
         """Returns a line per curve, and per dof with units: `wz = 4.6*speed*steering  [rad/s]`."""
         lines = [curve.equation for curve in self.inputs]
-        names = self.term_names
         for d, dof in enumerate(self.dofs):
             terms = [
-                f"{self.coefficients[d, k]:.5g}"
-                + ("" if names[k] == "1" else f"*{self.shown_terms[k]}")
-                + (" (assumed)" if (dof, names[k]) in self.assumed else "")
-                for k in np.flatnonzero(self.coefficients[d])
+                self._describe_term(d, k) for k in np.flatnonzero(self.coefficients[d])
             ]
-            text = " + ".join(terms).replace("+ -", "- ")
-            lines.append(
-                f"{dof} = {text or '0'}{self.restraint(dof)}  [{self.dof_units[d]}]"
-            )
+            text = " + ".join(terms).replace("+ -", "- ") or "0"
+            limits = self.describe_limits(dof)
+            lines.append(f"{dof} = {text}{limits}  [{self.dof_units[d]}]")
         return lines
+
+    def _describe_term(self, d: int, k: int) -> str:
+        name = self.term_names[k]
+        text = f"{self.coefficients[d, k]:.5g}"
+        if name != "1":
+            text += f"*{self.shown_terms[k]}"
+        if (self.dofs[d], name) in self.assumed:
+            text += " (assumed)"
+        return text
 
     @property
     def named(self) -> "NamedTaylorModel":
@@ -238,24 +240,15 @@ class TaylorModel:
         }
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
         states = self.variables[: self.state_size]
-        limits = map(tuple, self.limits.tolist())
-        friction, drag = (
-            {
-                s: each
-                for s, each in zip(states, values.tolist(), strict=True)
-                if each > 0.0
-            }
-            for values in (self.friction, self.drag)
-        )
-        commands = self.variables[len(states) :]
-        emf = {
-            s: named
-            for s, row in zip(states, self.back_emf.tolist(), strict=True)
-            if (named := {c: k for c, k in zip(commands, row, strict=True) if k > 0.0})
-        }
-        limited = {
-            s: k for s, k in zip(states, limits, strict=True) if np.isfinite(k).any()
-        }
+        commands = self.variables[self.state_size :]
+        emf = {}
+        limited = {}
+        for s, state in enumerate(states):
+            brakes = _name_positive(commands, self.back_emf[s])
+            if brakes:
+                emf[state] = brakes
+            if np.isfinite(self.limits[s]).any():
+                limited[state] = tuple(self.limits[s].tolist())
         return NamedTaylorModel.model_construct(
             dt=self.dt,
             units=dict(zip(self.dofs, self.dof_units, strict=True)),
@@ -266,11 +259,17 @@ class TaylorModel:
             quality=self.quality,
             bounded=self.bounded,
             inputs=self.inputs,
-            friction=friction or None,
-            drag=drag or None,
+            friction=_name_positive(states, self.friction) or None,
+            drag=_name_positive(states, self.drag) or None,
             limits=limited or None,
             back_emf=emf or None,
         )
+
+
+def _name_positive(names: tuple[str, ...], values: Array) -> dict[str, float]:
+    """Returns the positive ones of values by name."""
+    pairs = zip(names, values.tolist(), strict=True)
+    return {name: value for name, value in pairs if value > 0.0}
 
 
 def list_exponents(variables: int, order: int) -> NDArray[np.int64]:
@@ -278,11 +277,11 @@ def list_exponents(variables: int, order: int) -> NDArray[np.int64]:
 
     `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product twice; here it occurs once.
     """
-    rows = [
-        np.bincount(np.array(chosen, dtype=np.int64), minlength=variables)
-        for degree in range(order + 1)
-        for chosen in combinations_with_replacement(range(variables), degree)
-    ]
+    rows = []
+    for degree in range(order + 1):
+        for factors in combinations_with_replacement(range(variables), degree):
+            columns = np.array(factors, dtype=np.int64)
+            rows.append(np.bincount(columns, minlength=variables))
     return np.array(rows, dtype=np.int64).reshape(len(rows), variables)
 
 
@@ -298,19 +297,19 @@ def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def format_term(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
     """Returns a term as text: `1`, `speed*steering`, `speed^2`."""
-    factors = [
-        names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)
-    ]
+    factors = []
+    for v in np.flatnonzero(row):
+        factors.append(names[v] if row[v] == 1 else f"{names[v]}^{row[v]}")
     return "*".join(factors) or "1"
 
 
-def canonical(row: NDArray[np.int64]) -> tuple[int, ...]:
-    """Returns a sort key for exponents (V,) in the order of `exponents`: order, then variable."""
+def make_sort_key(row: NDArray[np.int64]) -> tuple[int, ...]:
+    """Returns a key that sorts exponents (V,) as `list_exponents` does: by order, then variable."""
     return (int(row.sum()), *(-int(power) for power in row))
 
 
 def parse_term(text: str, names: tuple[str, ...]) -> NDArray[np.int64]:
-    """Parses a term written by `term_name` to exponents (V,). Raises ValueError otherwise."""
+    """Parses a term written by `format_term` to exponents (V,). Raises ValueError otherwise."""
     row = np.zeros(len(names), dtype=np.int64)
     if text == "1":
         return row
@@ -335,7 +334,7 @@ class EndErrors:
 
 @dataclass(frozen=True)
 class HorizonErrors:
-    """Errors of predictions of one length, on data that the fit never saw, and of yardsticks."""
+    """Errors of predictions over one horizon on held-out data, and of baselines."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # errors may be inf
 
@@ -343,15 +342,15 @@ class HorizonErrors:
     windows: int  # number of predictions
     path_m: float  # mean length of the measured path
     model: EndErrors
-    kept_twist: EndErrors  # of a robot that keeps the twist of the start
-    # of the textbook, fitted to the same part; None: not fitted
+    kept_twist: EndErrors  # of a robot that keeps its initial twist
+    # Of the textbook, fitted to the same data; None: not fitted
     textbook: EndErrors | None = None
     band_m: float | None = None  # distance within which 95 % of the ends are expected
-    coverage: float | None = None  # share of the ends within it
-    # Noise of the differences between the model's errors and those of the yardsticks [m]
+    coverage: float | None = None  # fraction of the ends within it
+    # Noise of the differences between the model's errors and those of the baselines [m]
     kept_twist_noise_m: float | None = None
     textbook_noise_m: float | None = None
-    # of a robot that never moves; None: an older file
+    # Of a robot that never moves; None in older files
     standing: EndErrors | None = None
     standing_noise_m: float | None = None  # of the difference to it [m]
 
@@ -363,14 +362,13 @@ class Quality:
     __pydantic_config__ = ConfigDict(extra="forbid")  # a figure of merit may be inf
 
     samples: int  # number of rows that the fit used
-    outliers: dict[str, float]  # share of the rows that were dropped as outliers
+    outliers: dict[str, float]  # fraction of the rows that were dropped as outliers
     condition: dict[str, float]  # condition number of the standardised kept features
-    rmse: dict[str, float]  # `rmse`, `r2`: of the rates on the training part
+    rmse: dict[str, float]  # of the rates, on the training data
     r2: dict[str, float]
-    # `held_out_rmse`, `held_out_r2`: the same on data that the fit never saw; empty if none
-    held_out_rmse: dict[str, float]
+    held_out_rmse: dict[str, float]  # the same on held-out data; empty without
     held_out_r2: dict[str, float]
-    # of open-loop predictions on that data, 0 if none; mean errors at the ends, mean path length
+    # Of open-loop predictions on held-out data, 0 without: mean errors at the ends, mean path
     open_loop_horizon_s: float = 0.0
     open_loop_position_error_m: float = 0.0
     open_loop_heading_error_rad: float = 0.0
@@ -404,20 +402,23 @@ class NamedTaylorModel(Schema):
         """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
         variables = tuple(self.valid)
         dofs = tuple(self.terms)
-        every = dict.fromkeys(name for row in self.terms.values() for name in row)
         try:
             units = tuple(self.units[dof] for dof in dofs)
-            parsed = {name: parse_term(name, variables) for name in every}
+            parsed = {
+                name: parse_term(name, variables)
+                for row in self.terms.values()
+                for name in row
+            }
         except KeyError as error:
             raise ModelError(
                 f"kinematics: {error} has no unit; generate the model anew."
             ) from None
         except (OverflowError, ValueError) as error:
             raise ModelError(f"kinematics: {error}; generate the model anew.") from None
-        names = sorted(parsed, key=lambda name: canonical(parsed[name]))
+        names = sorted(parsed, key=lambda name: make_sort_key(parsed[name]))
         powers = np.array([parsed[name] for name in names], dtype=np.int64)
         rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]
-        low, high = np.array(list(self.valid.values())).reshape(len(variables), 2).T
+        box = np.array(list(self.valid.values())).reshape(len(variables), 2)
         states = variables[: len(dofs) - 3]
         friction = self.friction or {}
         drag = self.drag or {}
@@ -432,8 +433,8 @@ class NamedTaylorModel(Schema):
             powers.reshape(len(names), len(variables)),
             np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)),
             self.dt,
-            low,
-            high,
+            box[:, 0],
+            box[:, 1],
             self.assumed,
             quality=self.quality,
             bounded=self.bounded,
@@ -448,18 +449,19 @@ class NamedTaylorModel(Schema):
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
         curved = [curve.command for curve in self.inputs]
-        by_state = {"friction": self.friction, "drag": self.drag, "limits": self.limits}
-        emf = self.back_emf or {}
-        keys = (
-            ("inputs", curved, commands),
-            *((k, v, states) for k, v in by_state.items()),
-            ("back_emf", emf, states),
-            *(("back_emf", row, commands) for row in emf.values()),
-        )
-        for key, names, known in keys:
-            for name in names or ():
-                if name not in known:
-                    fault = f"key {key!r} has {name!r}, not one of ({', '.join(known)})"
-                    raise ModelError(f"kinematics: {fault}; correct the name.")
+        _check_names("inputs", curved, commands)
+        _check_names("friction", self.friction or (), states)
+        _check_names("drag", self.drag or (), states)
+        _check_names("limits", self.limits or (), states)
+        _check_names("back_emf", self.back_emf or (), states)
+        for row in (self.back_emf or {}).values():
+            _check_names("back_emf", row, commands)
         if len(set(curved)) < len(curved):
             raise ModelError("kinematics: key 'inputs' has a command twice; keep one.")
+
+
+def _check_names(key: str, names: Iterable[str], allowed: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in allowed:
+            fault = f"key {key!r} has {name!r}, not one of ({', '.join(allowed)})"
+            raise ModelError(f"kinematics: {fault}; correct the name.")

@@ -1,201 +1,224 @@
 """Templates: what a kind of robot knows by itself, so that a robot's file may leave it out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
 
 from nics_drl_bridge.errors import ConfigError, suggest
 
-Given = Mapping[str, Any]  # a part of a robot's file
+Part = Mapping[str, Any]  # a part of a robot's file
 Ranges = Mapping[str, tuple[float, float]]
-# Unit, and range in both directions, of a component of the body twist in the state; a state that a
-# command tells in its own unit may come to a multiple of that.
+# Unit, and range in both directions, of a component of the body twist in the state
 TWIST_RANGES = {"vx": ("m/s", 10.0), "vy": ("m/s", 10.0), "wz": ("rad/s", 10.0)}
-BEYOND = 2.0
-# least likeness of a misspelt parameter: "steering_rate" is no "steering_lag"
-MISSPELT = 0.85
-SHARES = 1.0  # range of a command without a unit, in both directions
+# Range of a state that has a command in its own unit, as a multiple of the command's range
+STATE_RANGE_FACTOR = 2.0
+# Minimum similarity of a misspelt parameter: "steering_rate" is not "steering_lag"
+MISSPELT_PARAMETER = 0.85
+RATIO_RANGE = 1.0  # range of a command without a unit, in both directions
 
 
-def usual(
-    name: str, unit: str, reach: float, field: str | None = None
+def make_command(
+    name: str, unit: str, limit: float, field: str | None = None
 ) -> dict[str, Any]:
-    """Returns a command as a template has it."""
-    data = {"name": name, "unit": unit, "min": -reach, "max": reach}
-    return data if field is None else data | {"cmd_vel": field}
+    """Returns a command of a template, with a range of `limit` in both directions."""
+    command = {"name": name, "unit": unit, "min": -limit, "max": limit}
+    if field is not None:
+        command["cmd_vel"] = field
+    return command
 
 
 TWIST = (
-    usual("forward_command", "m/s", 1.0, "linear.x"),
-    usual("turn_command", "rad/s", 2.0, "angular.z"),
+    make_command("forward_command", "m/s", 1.0, "linear.x"),
+    make_command("turn_command", "rad/s", 2.0, "angular.z"),
 )
-SIDEWAYS = usual("left_command", "m/s", 1.0, "linear.y")
+SIDEWAYS = make_command("left_command", "m/s", 1.0, "linear.y")
 STEERED = (
-    usual("speed_command", "m/s", 1.0, "linear.x"),
-    usual("steering_command", "rad", 0.5, "angular.z"),
+    make_command("speed_command", "m/s", 1.0, "linear.x"),
+    make_command("steering_command", "rad", 0.5, "angular.z"),
 )
-# that follows the command of this field, whatever its name is
+# Each follows the command of this field, whatever its name is.
 STEERED_STATE = (
     {"name": "speed", "unit": "m/s", "cmd_vel": "linear.x"},
     {"name": "steering", "unit": "rad", "cmd_vel": "angular.z"},
 )
 LAGS = {"wheel_lag": 0.1}
 STEERED_LAGS = {"speed_lag": 0.1, "steering_lag": 0.1}
-WHEELS = tuple(usual(f"{side}_wheel", "rad/s", 10.0) for side in ("left", "right"))
-FOUR_WHEELS = tuple(
-    usual(f"{end}_{side}_wheel", "rad/s", 10.0)
-    for end in ("front", "rear")
-    for side in ("left", "right")
+WHEELS = (
+    make_command("left_wheel", "rad/s", 10.0),
+    make_command("right_wheel", "rad/s", 10.0),
+)
+FOUR_WHEELS = (
+    make_command("front_left_wheel", "rad/s", 10.0),
+    make_command("front_right_wheel", "rad/s", 10.0),
+    make_command("rear_left_wheel", "rad/s", 10.0),
+    make_command("rear_right_wheel", "rad/s", 10.0),
 )
 
 
-def list_names(way: Sequence[Given]) -> tuple[str, ...]:
-    """Returns the usual names of commands."""
-    return tuple(one["name"] for one in way)
+def list_names(commands: Sequence[Part]) -> tuple[str, ...]:
+    """Returns the names of commands."""
+    return tuple(command["name"] for command in commands)
 
 
 @dataclass(frozen=True)
 class Template:
     """Parts of a robot of one kind, in the form of its file."""
 
-    # ways in which such a robot is commanded, of which the first is usual; none: any commands
-    commands: tuple[tuple[Given, ...], ...] = ()
+    # Sets of commands for such a robot, the usual set first; none: any commands
+    commands: tuple[tuple[Part, ...], ...] = ()
     moves: tuple[str, ...] = ()  # components of the body twist that are its state, or
-    state: tuple[Given, ...] = ()  # a state that follows the commands
+    state: tuple[Part, ...] = ()  # a state that follows the commands
     parameters: Mapping[str, float] = field(default_factory=dict)
-    lengths: Mapping[str, float] = field(
-        default_factory=dict
-    )  # in radii of the footprint
-    # its commands by words that others have for them, from which `nics inspect` guesses the kind
+    # Further parameters, in radii of the footprint
+    lengths: Mapping[str, float] = field(default_factory=dict)
+    # Its commands by other words for them, from which `nics inspect` guesses the kind
     words: Mapping[str, str] = field(default_factory=dict)
 
-    def filled(self, given: Given, ranges: Ranges) -> dict[str, Any]:
+    def fill(self, robot: Part, ranges: Ranges) -> dict[str, Any]:
         """Returns a robot's whole file; ConfigError if the names of its commands do not fit."""
-        kind = given["kind"]
-        data = {"name": kind, **given, "textbook": kind}
+        kind = robot["kind"]
+        data = {"name": kind, **robot, "textbook": kind}
         del data["kind"]
-        data["command"] = command = self._command(given, ranges)
-        if _mappings(command):
-            data["state"] = self._state(given.get("state"), command)
-        own = given.get("parameters", {})
-        radius = given.get("footprint_radius")
-        if isinstance(own, Mapping) and isinstance(radius, int | float):
-            sizes = {
-                name: round(share * radius, 4) for name, share in self.lengths.items()
-            }
-            usual = {**sizes, **self.parameters}
-            for name in own:  # one of the user's own may have any other name
-                if get_close_matches(str(name), usual.keys() - own.keys(), 1, MISSPELT):
-                    fault = f"unknown parameter {name!r}; {suggest(name, usual)}"
-                    raise ConfigError(f"robot {data['name']!r}: {fault}")
-            data["parameters"], data["assumed"] = (
-                {**usual, **own},
-                sorted(set(usual) - set(own)),
-            )
+        command = self._fill_command(robot, ranges)
+        data["command"] = command
+        if _is_mappings(command):
+            data["state"] = self._fill_state(robot.get("state"), command)
+        parameters = robot.get("parameters", {})
+        radius = robot.get("footprint_radius")
+        if not isinstance(parameters, Mapping) or not isinstance(radius, int | float):
+            return data
+        defaults = {name: round(k * radius, 4) for name, k in self.lengths.items()}
+        defaults |= self.parameters
+        missing = defaults.keys() - parameters.keys()
+        for name in parameters:  # it may have any name that does not look misspelt
+            if get_close_matches(str(name), missing, 1, MISSPELT_PARAMETER):
+                fault = f"unknown parameter {name!r}; {suggest(name, defaults)}"
+                raise ConfigError(f"robot {data['name']!r}: {fault}")
+        data["parameters"] = {**defaults, **parameters}
+        data["assumed"] = sorted(missing)
         return data
 
-    def _command(self, given: Given, ranges: Ranges) -> Any:
-        own = given.get("command")
-        kind = given["kind"]
-        if own is not None and not _mappings(own):
-            return own  # the check of the whole file reports it
-        names = [one.get("name") for one in own] if own is not None else list(ranges)
-        way = max(
-            self.commands, key=lambda way: _alike(way, names, own or ()), default=()
+    def _fill_command(self, robot: Part, ranges: Ranges) -> Any:
+        kind = robot["kind"]
+        command = robot.get("command")
+        if command is not None and not _is_mappings(command):
+            return command  # the check of the whole file reports it
+        if command is None:
+            names: list[Any] = list(ranges)
+        else:
+            names = [part.get("name") for part in command]
+        usual = max(
+            self.commands,
+            key=lambda commands: _count_matches(commands, names, command or ()),
+            default=(),
         )
-        known = {one["name"]: one for one in way}
-        known |= {name.removesuffix("_command"): one for name, one in known.items()}
-        these = len(way) == len(names) and all(known.get(name) in way for name in names)
-        if own is None and way and ranges and not these:
-            usual = _list(name for name in known if not name.endswith("_command"))
-            fault = f"commands of the kind {kind!r} are {usual}, not {_list(names)}"
-            fix = (
-                "name them so, or list them in that order under `command:` of the robot"
-            )
-            raise ConfigError(f"robot {given.get('name', kind)!r}: {fault}; {fix}.")
-        if own is None:
-            own = [{"name": name} for name in (names or list_names(way))]
-        if not own:
+        by_name = {}
+        for part in usual:
+            by_name[part["name"]] = part
+        for part in usual:
+            by_name[part["name"].removesuffix("_command")] = part
+        if command is None and usual and ranges:
+            fits = all(by_name.get(name) in usual for name in names)
+            if not fits or len(usual) != len(names):
+                needed = _join_names(n for n in by_name if not n.endswith("_command"))
+                fault = f"commands of the kind {kind!r} are {needed}"
+                fix = "use these names, or list yours in that order under `command:` of the robot"
+                raise ConfigError(
+                    f"robot {robot.get('name', kind)!r}: {fault}, "
+                    f"not {_join_names(names)}; {fix}."
+                )
+        if command is None:
+            command = [{"name": name} for name in (names or list_names(usual))]
+        if not command:
             fix = "name them under `command:` of the robot, or give a recording"
             raise ConfigError(
                 f"the commands of a robot of the kind {kind!r} are not known; {fix}."
             )
-        places = [known.get(one.get("name")) for one in own]
-        if None in places and len(own) == len(way):
-            places = list(way)  # names of the user's own, in the usual order
+        matches = [by_name.get(part.get("name")) for part in command]
+        if None in matches and len(command) == len(usual):
+            matches = list(usual)  # names of the user's own, in the usual order
         return [
-            _whole(place or {}, one, ranges)
-            for place, one in zip(places, own, strict=True)
+            _complete_command(match or {}, part, ranges)
+            for match, part in zip(matches, command, strict=True)
         ]
 
-    def _state(self, own: Any, command: Sequence[Given]) -> Any:
-        """Returns the state: the user's own in so far as it is given, the usual one if None."""
-        taken = [one.get("name") for one in command]
-        usual = [dict(one) for one in self.state]
-        for one in usual:  # it follows a command, by whatever name
-            place = one.pop("cmd_vel")
-            one["follows"] = {c.get("cmd_vel"): c.get("name") for c in command}.get(
-                place
-            )
-            one["name"] = (
-                f"actual_{one['name']}" if one["name"] in taken else one["name"]
-            )
-        usual += [
-            {"name": f"body_{d}" if d in taken else d, "twist": d} for d in self.moves
+    def _fill_state(self, state: Any, command: Sequence[Part]) -> Any:
+        """Returns the state: the user's, completed by the usual one, which it is by default."""
+        taken = [part.get("name") for part in command]
+        by_field = {part.get("cmd_vel"): part.get("name") for part in command}
+        usual = []
+        for part in self.state:
+            name = part["name"]
+            if name in taken:
+                name = f"actual_{name}"
+            follows = by_field.get(part["cmd_vel"])
+            usual.append({"name": name, "unit": part["unit"], "follows": follows})
+        for component in self.moves:
+            name = f"body_{component}" if component in taken else component
+            usual.append({"name": name, "twist": component})
+        if state is None:
+            return [_complete_state(part, command) for part in usual]
+        if not _is_mappings(state):
+            return state
+        by_name = {part["name"]: part for part in usual}
+        return [
+            _complete_state({**by_name.get(part.get("name"), {}), **part}, command)
+            for part in state
         ]
-        if own is not None and not _mappings(own):
-            return own
-        known = {one["name"]: one for one in usual}
-        if own is None:
-            chosen = usual
-        else:
-            chosen = [{**known.get(c.get("name"), {}), **c} for c in own]
-        return [_ranged(one, command) for one in chosen]
 
 
-def _mappings(own: Any) -> bool:
-    """True for mappings whose names, units and places are words."""
-    return isinstance(own, list | tuple) and all(
-        isinstance(one, Mapping)
-        and not any(isinstance(v, list | dict) for v in one.values())
-        for one in own
+def _is_mappings(parts: Any) -> bool:
+    """True for mappings whose values are plain."""
+    return isinstance(parts, list | tuple) and all(
+        isinstance(part, Mapping)
+        and not any(isinstance(value, list | dict) for value in part.values())
+        for part in parts
     )
 
 
-def _alike(way: Sequence[Given], names: Sequence[Any], own: Any) -> int:
-    """Counts the commands of a way that are given by name or unit."""
-    units = [one.get("unit") for one in own]
-    return sum(one["name"] in names or one["unit"] in units for one in way)
+def _count_matches(
+    commands: Sequence[Part], names: Sequence[Any], given: Sequence[Part]
+) -> int:
+    """Counts the commands that are given by name or unit."""
+    units = [part.get("unit") for part in given]
+    return sum(
+        command["name"] in names or command["unit"] in units for command in commands
+    )
 
 
-def _list(names: Any) -> str:
+def _join_names(names: Iterable[Any]) -> str:
     return ", ".join(repr(str(name)) for name in names)
 
 
-def _whole(template: Given, own: Given, ranges: Ranges) -> dict[str, Any]:
-    """Returns a command with its unit and range: its own, else the recorded, else the usual one."""
-    data = {"unit": "1", **template, **own}
+def _complete_command(usual: Part, command: Part, ranges: Ranges) -> dict[str, Any]:
+    """Returns a command with its unit and range: its own, else recorded, else usual."""
+    data = {"unit": "1", **usual, **command}
     if data["unit"] == "1":
-        data = {"min": -SHARES, "max": SHARES, **data}
+        data = {"min": -RATIO_RANGE, "max": RATIO_RANGE, **data}
     low, high = ranges.get(data.get("name", ""), (0.0, 0.0))
-    if low < high or low:  # at rest, a command is 0
-        data |= {
-            "min": own.get("min", min(low, 0.0)),
-            "max": own.get("max", max(high, 0.0)),
-        }
+    if low < high or low:
+        # The range includes 0, the command at rest.
+        data["min"] = command.get("min", min(low, 0.0))
+        data["max"] = command.get("max", max(high, 0.0))
     return data
 
 
-def _ranged(state: Given, command: Sequence[Given]) -> dict[str, Any]:
-    """Returns a state with its unit and range, by the command that it follows, or by the twist."""
-    unit, reach = TWIST_RANGES.get(state.get("twist", ""), (None, None))
+def _complete_state(state: Part, command: Sequence[Part]) -> dict[str, Any]:
+    """Returns a state with its unit and range, by the command that it follows or by the twist."""
+    unit, limit = TWIST_RANGES.get(state.get("twist", ""), (None, None))
     unit = state.get("unit", unit)
-    telling = [one for one in command if one.get("unit") == unit and one.get("cmd_vel")]
-    if follows := state.get("follows"):
-        telling = [one for one in command if one.get("name") == follows]
-    ends = [one.get(end) for one in telling for end in ("min", "max")]
-    bounds = [abs(end) for end in ends if isinstance(end, int | float)]
-    reach = BEYOND * max(bounds) if bounds else reach
-    usual = {} if reach is None else {"unit": unit, "min": -reach, "max": reach}
-    return {**usual, **state}
+    follows = state.get("follows")
+    if follows:
+        related = [part for part in command if part.get("name") == follows]
+    else:
+        related = [
+            part for part in command if part.get("unit") == unit and part.get("cmd_vel")
+        ]
+    ends = [part.get(end) for part in related for end in ("min", "max")]
+    sizes = [abs(end) for end in ends if isinstance(end, int | float)]
+    if sizes:
+        limit = STATE_RANGE_FACTOR * max(sizes)
+    if limit is None:
+        return dict(state)
+    return {"unit": unit, "min": -limit, "max": limit, **state}

@@ -1,4 +1,4 @@
-"""A tricycle: the front wheel drives and steers, two roll; `base_link` is amid the rear axle.
+"""A tricycle: the front wheel drives and steers; `base_link` is the middle of the rear axle.
 
 Its commands are the front wheel's speed along its own direction [m/s] and steering angle [rad].
 """
@@ -23,19 +23,18 @@ TEMPLATE = Template(
 )
 
 
-def kinematics(spec: RobotSpec) -> kinds.Textbook:
+def derive_kinematics(spec: RobotSpec) -> kinds.Textbook:
     """The front wheel pulls forward by its cosine, and turns the base by its sine."""
     bicycle = Bicycle(spec.parameters["wheelbase"], front_drive=True)
-    return kinds.steered(spec, bicycle, list_names(STEERED))
+    return kinds.make_steered(spec, bicycle, list_names(STEERED))
 
 
-def drawing(spec: RobotSpec) -> kinds.Drawing:
+def draw(spec: RobotSpec) -> kinds.Drawing:
     """A box on three wheels of one size."""
-    p = spec.parameters
-    angle = kinds.steering_angle(spec)
-    wheelbase = p["wheelbase"]
-    track = p["track"]
-    radius = p["wheel_radius"]
+    wheelbase = spec.parameters["wheelbase"]
+    track = spec.parameters["track"]
+    radius = spec.parameters["wheel_radius"]
+    angle = kinds.find_steering_angle(spec)
     fork = kinds.Pivot("fork", angle.name, angle) if angle else None
     wheels = (
         kinds.Wheel("rear_left_wheel", (0.0, 0.5 * track), radius),
@@ -47,4 +46,4 @@ def drawing(spec: RobotSpec) -> kinds.Drawing:
     )
 
 
-KIND = kinds.RobotKind(kinematics, drawing, TEMPLATE, front_drive=True)
+KIND = kinds.RobotKind(derive_kinematics, draw, TEMPLATE, front_drive=True)

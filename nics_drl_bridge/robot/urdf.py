@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from xml.etree import ElementTree
 
-from nics_drl_bridge.robot.kinds import Wheel, drawing
+from nics_drl_bridge.robot.kinds import Wheel, draw_robot
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Element = ElementTree.Element
@@ -22,83 +22,97 @@ def make_urdf(
 ) -> str:
     """Returns the text of a robot's URDF.
 
-    `base_link` and wheels stand on the ground; `laser` is at the height of `base_link`, as the
+    `base_link` and wheels stand on the ground; `laser` is at the height of `base_link`, because the
     package's world is flat. Moving joints have the names of the state variables in `joint_states`.
     A robot without textbook kinematics has no wheels here. Mounts are x [m], y [m], heading [rad]
-    in `base`, of the lidar's frame `laser` and of the `further` sensors by frame.
+    in `base`, of the lidar's frame `laser` and of `further` sensors by frame.
     """
     robot = Element("robot", name=spec.name)
     for name, colour in COLOURS.items():
         _add(_add(robot, "material", name=name), "color", rgba=colour)
     link = _add(robot, "link", name=base)
-    disc = (spec.footprint_radius, BODY_HEIGHT)
-    _collision(_add(link, "collision"), spec)
+    _add_collision(_add(link, "collision"), spec)
     if spec.textbook is None:
-        _visual(link, "body", disc, (0.0, 0.0, BODY_HEIGHT))
+        disc = (spec.footprint_radius, BODY_HEIGHT)
+        _add_visual(link, "body", disc, (0.0, 0.0, BODY_HEIGHT))
     else:
-        looks = drawing(spec)
-        body = looks.body if isinstance(looks.body, tuple) else (looks.body,)
-        _visual(
-            link, "body", (*body, BODY_HEIGHT), (looks.centre[0], 0.0, looks.centre[1])
-        )
-        for wheel in looks.wheels:
-            _wheel(robot, base, wheel)
-    for frame, (x, y, yaw) in {laser: mount, **(further or {})}.items():
-        _visual(
-            _add(robot, "link", name=frame), "laser", (0.02, 0.03), (0.0, 0.0, 0.07)
-        )
+        drawing = draw_robot(spec)
+        body = drawing.body
+        if not isinstance(body, tuple):
+            body = (body,)
+        place = (drawing.centre[0], 0.0, drawing.centre[1])
+        _add_visual(link, "body", (*body, BODY_HEIGHT), place)
+        for wheel in drawing.wheels:
+            _add_wheel(robot, base, wheel)
+    mounts = {laser: mount, **(further or {})}
+    for frame, sensor_mount in mounts.items():
         joint = "laser_mount" if frame == laser else f"{frame}_mount"
-        _joint(robot, joint, "fixed", (base, frame), (x, y, 0.0), yaw=yaw)
+        _add_sensor(robot, base, frame, joint, sensor_mount)
     ElementTree.indent(robot)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 
 
-def _collision(parent: Element, spec: RobotSpec) -> None:
-    """Adds the footprint: a disc, or the box around its corners, as URDF has no prism."""
+def _add_collision(parent: Element, spec: RobotSpec) -> None:
+    """Adds the footprint: a disc, or the box around its corners, because URDF has no prism."""
     if spec.footprint is None:
-        _geometry(parent, (spec.footprint_radius, BODY_HEIGHT), (0.0, 0.0, BODY_HEIGHT))
+        disc = (spec.footprint_radius, BODY_HEIGHT)
+        _add_geometry(parent, disc, (0.0, 0.0, BODY_HEIGHT))
         return
-    (back, front), (right, left) = (
-        (min(of), max(of)) for of in zip(*spec.footprint, strict=True)
-    )
-    middle = (0.5 * (back + front), 0.5 * (right + left), BODY_HEIGHT)
-    _geometry(parent, (front - back, left - right, BODY_HEIGHT), middle)
+    x, y = zip(*spec.footprint, strict=True)
+    size = (max(x) - min(x), max(y) - min(y), BODY_HEIGHT)
+    middle = (0.5 * (min(x) + max(x)), 0.5 * (min(y) + max(y)), BODY_HEIGHT)
+    _add_geometry(parent, size, middle)
 
 
-def _wheel(robot: Element, parent: str, wheel: Wheel) -> None:
-    """Adds a wheel; one that turns turns forwards about y, a steered one's pivot about z."""
+def _add_wheel(robot: Element, parent: str, wheel: Wheel) -> None:
+    """Adds a wheel, which may turn forwards about y, and be steered by a pivot about z."""
     place: Place = (*wheel.place, wheel.radius)
     if wheel.pivot is not None:
         pivot = wheel.pivot
         angle = wheel.pivot.angle
         _add(robot, "link", name=pivot.link)
-        joint = _joint(robot, pivot.joint, "revolute", (parent, pivot.link), place)
+        joint = _add_joint(robot, pivot.joint, "revolute", (parent, pivot.link), place)
         _add(joint, "axis", xyz="0 0 1")
-        limits = {"lower": f"{angle.min:g}", "upper": f"{angle.max:g}"}
-        _add(joint, "limit", **limits, effort="1", velocity="10")
+        _add(
+            joint,
+            "limit",
+            lower=f"{angle.min:g}",
+            upper=f"{angle.max:g}",
+            effort="1",
+            velocity="10",
+        )
         if pivot.joint != angle.name:
             _add(joint, "mimic", joint=angle.name)
         parent = pivot.link
         place = (0.0, 0.0, 0.0)
     name = wheel.name
     kind = "continuous" if wheel.turns else "fixed"
-    joint = _joint(robot, name, kind, (parent, f"{name}_link"), place)
+    joint = _add_joint(robot, name, kind, (parent, f"{name}_link"), place)
     if wheel.turns:
         _add(joint, "axis", xyz="0 1 0")
     size = (wheel.radius, 0.4 * wheel.radius)
     link = _add(robot, "link", name=f"{name}_link")
-    _visual(link, "wheel", size, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
+    _add_visual(link, "wheel", size, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
+
+
+def _add_sensor(
+    robot: Element, base: str, frame: str, joint: str, mount: Place
+) -> None:
+    link = _add(robot, "link", name=frame)
+    _add_visual(link, "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
+    x, y, yaw = mount
+    _add_joint(robot, joint, "fixed", (base, frame), (x, y, 0.0), yaw=yaw)
 
 
 def _add(parent: Element, tag: str, **attributes: str) -> Element:
     return ElementTree.SubElement(parent, tag, attributes)
 
 
-def _numbers(*values: float) -> str:
+def _format_numbers(*values: float) -> str:
     return " ".join(f"{value:.6g}" for value in values)
 
 
-def _joint(
+def _add_joint(
     robot: Element,
     name: str,
     kind: str,
@@ -107,26 +121,43 @@ def _joint(
     yaw: float = 0.0,
 ) -> Element:
     joint = _add(robot, "joint", name=name, type=kind)
-    _add(joint, "origin", xyz=_numbers(*place), rpy=_numbers(0.0, 0.0, yaw))
+    _add(
+        joint, "origin", xyz=_format_numbers(*place), rpy=_format_numbers(0.0, 0.0, yaw)
+    )
     _add(joint, "parent", link=links[0])
     _add(joint, "child", link=links[1])
     return joint
 
 
-def _visual(
-    link: Element, material: str, size: tuple[float, ...], at: Place, roll: float = 0.0
+def _add_visual(
+    link: Element,
+    material: str,
+    size: tuple[float, ...],
+    place: Place,
+    roll: float = 0.0,
 ) -> None:
     visual = _add(link, "visual")
-    _geometry(visual, size, at, roll)
+    _add_geometry(visual, size, place, roll)
     _add(visual, "material", name=material)
 
 
-def _geometry(
-    parent: Element, size: tuple[float, ...], at: Place, roll: float = 0.0
+def _add_geometry(
+    parent: Element, size: tuple[float, ...], place: Place, roll: float = 0.0
 ) -> None:
-    _add(parent, "origin", xyz=_numbers(*at), rpy=_numbers(roll, 0.0, 0.0))
+    """Adds a box (length, width, height) or a cylinder (radius, length)."""
+    _add(
+        parent,
+        "origin",
+        xyz=_format_numbers(*place),
+        rpy=_format_numbers(roll, 0.0, 0.0),
+    )
     shape = _add(parent, "geometry")
     if len(size) == 3:
-        _add(shape, "box", size=_numbers(*size))
+        _add(shape, "box", size=_format_numbers(*size))
     else:
-        _add(shape, "cylinder", radius=_numbers(size[0]), length=_numbers(size[1]))
+        _add(
+            shape,
+            "cylinder",
+            radius=_format_numbers(size[0]),
+            length=_format_numbers(size[1]),
+        )

@@ -330,5 +330,7 @@ def test_planners_look_ahead_as_far_as_ever_for_robots_that_stop_soon(robot):
 @pytest.mark.parametrize("name", ["dynamic_window", "mppi"])
 def test_a_planner_refuses_a_model_that_does_not_stop(name):
     model = weak_jackal(1e-5)
-    with pytest.raises(ConfigError, match=r"'jackal': by its model it does not stop"):
+    with pytest.raises(
+        ConfigError, match=r"'jackal': according to its model, it does not stop"
+    ):
         make_policy(name, Navigation(model.robot, model.lidar), model)

@@ -18,10 +18,10 @@ from nics_drl_bridge.robot.braking import (
     Braking,
     Drift,
     TurnBraking,
-    _least_share,
+    _find_min_fraction,
     derive_slowest_model,
     find_braking,
-    motions,
+    list_motions,
 )
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import build_robot
@@ -380,7 +380,7 @@ def test_a_bound_is_computed_once_for_each_model(monkeypatch):
 def test_many_commands_are_tried_alone_and_in_pairs():
     low = np.full(12, -1.0)
     high = np.full(12, 2.0)
-    tried = motions(low, high)
+    tried = list_motions(low, high)
     assert len(tried) < 2000
     assert {tuple(row) for row in 2.0 * np.eye(12)} <= {tuple(row) for row in tried}
     assert (np.count_nonzero(tried, axis=1) <= 2).all()
@@ -397,6 +397,6 @@ def test_time_and_distance_are_those_of_even_braking_after_the_reaction():
 
 
 def test_no_share_of_a_bound_of_zero_is_taken():
-    bounded = _least_share(np.array([0.0, 0.3]), np.array([0.0, 0.5]))
+    bounded = _find_min_fraction(np.array([0.0, 0.3]), np.array([0.0, 0.5]))
     assert bounded == pytest.approx(0.6)
-    assert _least_share(np.zeros(2), np.zeros(2)) == 1.0
+    assert _find_min_fraction(np.zeros(2), np.zeros(2)) == 1.0

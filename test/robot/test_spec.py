@@ -144,7 +144,7 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
             {"state": [TWIST | {"unit": "rad"}]},
             "state 'a' is vx of the twist, so its unit is m/s",
         ),
-        ({"name": "../../evil"}, "name '../../evil': files are named so"),
+        ({"name": "../../evil"}, "name '../../evil': it names files"),
         ({"name": "a\\b"}, "leave out .., / and \\"),
         ({"angular_is": "sideways"}, "'turn_rate' or 'steering'"),
         ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
@@ -179,7 +179,7 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
         ),
         (
             {"state": [{"name": "a", "unit": "m", "min": 0, "max": 1, "follows": "b"}]},
-            "state 'a' follows 'b', which is no command",
+            "state 'a' follows 'b', which is not a command",
         ),
         (
             {"command": [{**c, "cmd_vel": "linear.x"} for c in data()["command"]]},

@@ -7,7 +7,7 @@ import pytest
 
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot.kinds import find_kind, kind_names, textbook
+from nics_drl_bridge.robot.kinds import find_kind, list_kinds, textbook
 from nics_drl_bridge.robot.spec import (
     RobotSpec,
     build_robot,
@@ -39,7 +39,7 @@ def commands(robot):
     return [(c.name, c.unit, c.min, c.max) for c in robot.command]
 
 
-@pytest.mark.parametrize("kind", kind_names())
+@pytest.mark.parametrize("kind", list_kinds())
 def test_two_words_are_a_whole_robot_of_every_kind(kind):
     robot = made(kind)
     assert robot.name == robot.textbook == kind
@@ -48,7 +48,7 @@ def test_two_words_are_a_whole_robot_of_every_kind(kind):
         assert len(textbook(robot).lag) == len(robot.state)
 
 
-@pytest.mark.parametrize("kind", kind_names())
+@pytest.mark.parametrize("kind", list_kinds())
 def test_its_state_is_its_twist_unless_it_follows_commands_or_wheels_are_the_motion(
     kind,
 ):
@@ -228,13 +228,13 @@ def test_the_content_of_a_file_is_a_robot_too():
         (
             {"kind": "ackermann", "name": "kart"},
             {"forward_command": (0, 1), "turn_command": (0, 1)},
-            "'speed', 'steering', not 'forward_command', 'turn_command'; name them so",
+            "'speed', 'steering', not 'forward_command', 'turn_command'; use these names",
         ),
         (
             {"kind": "ackermann_throttle", "name": "kart"},
             {"gas": (0, 1), "wheel": (0, 1)},
             "robot 'kart': commands of the kind 'ackermann_throttle' are 'throttle', 'steering', "
-            "not 'gas', 'wheel'; name them so",
+            "not 'gas', 'wheel'; use these names",
         ),
     ],
 )
