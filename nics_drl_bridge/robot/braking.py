@@ -191,7 +191,9 @@ def find_braking(
 
 
 def _make_cache_key(
-    robot: RobotSpec, model: TaylorModel, *arrays: Array
+    robot: RobotSpec,
+    model: TaylorModel,
+    *arrays: Array,
 ) -> tuple[Any, ...]:
     key: list[Any] = [robot.model_dump_json()]
     for field in fields(model):
@@ -201,7 +203,11 @@ def _make_cache_key(
 
 
 def _bound(
-    robot: RobotSpec, model: TaylorModel, low: Array, high: Array, ramp: Array
+    robot: RobotSpec,
+    model: TaylorModel,
+    low: Array,
+    high: Array,
+    ramp: Array,
 ) -> Braking:
     commands = list_motions(low, high)
     models = [model]
@@ -282,7 +288,10 @@ def derive_slowest_model(model: TaylorModel) -> TaylorModel | None:
 
 
 def _simulate_all(
-    robot: RobotSpec, models: list[TaylorModel], commands: Array, ramp: Array
+    robot: RobotSpec,
+    models: list[TaylorModel],
+    commands: Array,
+    ramp: Array,
 ) -> Stops:
     return _join_stops(
         [simulate_stops(robot, model, commands, ramp) for model in models]
@@ -290,7 +299,10 @@ def _simulate_all(
 
 
 def simulate_stops(
-    robot: RobotSpec, model: TaylorModel, commands: Array, ramp: Array
+    robot: RobotSpec,
+    model: TaylorModel,
+    commands: Array,
+    ramp: Array,
 ) -> Stops:
     """Stops the steady motions of commands (K, C), with steering angles held and released."""
     # A model that diverges is refused later.
@@ -392,7 +404,13 @@ def _simulate_stop(
             break
     is_angle = np.array([command.unit == "rad" for command in robot.command])
     holds_angle = ((rest == commands) & is_angle & (commands != 0.0)).any(axis=1)
-    return Stops(first_twist, path, travel, twist, holds_angle)
+    return Stops(
+        twist=first_twist,
+        path=path,
+        travel=travel,
+        last_twist=twist,
+        holds_angle=holds_angle,
+    )
 
 
 def _require_rest(robot: RobotSpec, stops: Stops) -> None:
@@ -507,12 +525,20 @@ def _fit_tightest(
     rows = np.stack([-whole, -whole * pace], axis=-1)
     result = linprog(cost, rows, -distance, bounds=(0.0, None))
     if not result.success:
-        return _Fit(math.inf, float((distance / whole).max()), 0.0)
+        return _Fit(
+            slack=math.inf,
+            reaction_s=float((distance / whole).max()),
+            inverse=0.0,
+        )
     reaction, inverse = result.x
     slack = float(cost @ result.x - (worst * weight).mean())
     # The solver meets each bound up to its tolerance.
     missing = float((distance / whole - reaction - pace * inverse).max())
-    return _Fit(slack, float(reaction) + max(missing, 0.0), float(inverse))
+    return _Fit(
+        slack=slack,
+        reaction_s=float(reaction) + max(missing, 0.0),
+        inverse=float(inverse),
+    )
 
 
 def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
@@ -610,4 +636,8 @@ def _find_drift(stops: Stops, radius: float) -> Drift:
     if low > 1.0 - ALIKE and high < 1.0 + ALIKE:
         return NO_DRIFT
     fraction = float((ratios * fractions)[counts].max())
-    return Drift(min(low, 1.0), max(high, 1.0), max(fraction, 1.0))
+    return Drift(
+        least=min(low, 1.0),
+        greatest=max(high, 1.0),
+        share=max(fraction, 1.0),
+    )

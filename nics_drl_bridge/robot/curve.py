@@ -54,7 +54,8 @@ class InputCurve(Schema):
         """Returns the effects (...) of commands (...)."""
         command = np.asarray(command, np.float64)
         clipped = np.clip(command, min(self.least, 0.0), max(self.most, 0.0))
-        effect = np.sign(clipped) * np.maximum(np.abs(clipped) - self.dead, 0.0)
+        effect: Array = np.sign(clipped)
+        effect = effect * np.maximum(np.abs(clipped) - self.dead, 0.0)
         return np.where(effect < 0.0, self.back * effect, effect)
 
     def invert(self, effect: ArrayLike) -> Array:
@@ -80,7 +81,9 @@ def ends(least: float, most: float, name: str = "") -> str:
 
 
 def apply_curves(
-    command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...]
+    command: ArrayLike,
+    names: Sequence[str],
+    curves: tuple[InputCurve, ...],
 ) -> Array:
     """Returns the commands in effect (..., C) of commands with C names."""
     values = np.array(command, dtype=np.float64)

@@ -256,7 +256,11 @@ def _move_by_series(
 
 @kernel
 def _compute_chord(
-    vx: float, vy: float, sinc: float, cosc: float, dt: float
+    vx: float,
+    vy: float,
+    sinc: float,
+    cosc: float,
+    dt: float,
 ) -> tuple[float, float]:
     """Returns the chord of an arc, ahead and left [m], by sin(t) / t and (1 - cos(t)) / t."""
     return (sinc * vx - cosc * vy) * dt, (cosc * vx + sinc * vy) * dt

@@ -469,7 +469,8 @@ def _find_state_places(spec: RobotSpec) -> tuple[int, int]:
 
 
 def _read_actuators(
-    parameters: dict[str, float], parts: tuple[str, ...]
+    parameters: dict[str, float],
+    parts: tuple[str, ...],
 ) -> tuple[Array, Array]:
     """Returns lags and rate limits of actuators; each has one or the other."""
     lag = np.ones(len(parts))

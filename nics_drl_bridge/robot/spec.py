@@ -183,7 +183,8 @@ class RobotSpec(Schema):
 
     @model_serializer(mode="wrap")
     def _drop_none(
-        self, dump: pydantic.SerializerFunctionWrapHandler
+        self,
+        dump: pydantic.SerializerFunctionWrapHandler,
     ) -> dict[str, Any]:
         # Models and policies are identified by their content: an empty key must not change it.
         data: dict[str, Any] = dump(self)
@@ -437,7 +438,8 @@ def load_robot(name: str | Path) -> RobotSpec:
 
 
 def build_robot(
-    definition: str | Path | Mapping[str, Any], ranges: Ranges | None = None
+    definition: str | Path | Mapping[str, Any],
+    ranges: Ranges | None = None,
 ) -> RobotSpec:
     """Builds a robot from a shipped robot's name, the path of a YAML file, or its content.
 
@@ -471,7 +473,9 @@ def read_definition(definition: str | Path | Mapping[str, Any]) -> dict[str, Any
 
 
 def _fill_from_kind(
-    data: dict[str, Any], ranges: Ranges, source: str
+    data: dict[str, Any],
+    ranges: Ranges,
+    source: str,
 ) -> dict[str, Any]:
     kind = find_kind(str(data["kind"]))
     if kind is None:

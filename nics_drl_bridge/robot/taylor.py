@@ -142,7 +142,10 @@ class TaylorModel:
         return np.asarray(np.maximum(moved - stick, np.minimum(moved + stick, 0.0)))
 
     def step(
-        self, pose: ArrayLike, state: ArrayLike, command: ArrayLike
+        self,
+        pose: ArrayLike,
+        state: ArrayLike,
+        command: ArrayLike,
     ) -> tuple[Array, Array]:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)

@@ -19,7 +19,10 @@ RATIO_RANGE = 1.0  # range of a command without a unit, in both directions
 
 
 def make_command(
-    name: str, unit: str, limit: float, field: str | None = None
+    name: str,
+    unit: str,
+    limit: float,
+    field: str | None = None,
 ) -> dict[str, Any]:
     """Returns a command of a template, with a range of `limit` in both directions."""
     command = {"name": name, "unit": unit, "min": -limit, "max": limit}
@@ -178,7 +181,9 @@ def _is_mappings(parts: Any) -> bool:
 
 
 def _count_matches(
-    commands: Sequence[Part], names: Sequence[Any], given: Sequence[Part]
+    commands: Sequence[Part],
+    names: Sequence[Any],
+    given: Sequence[Part],
 ) -> int:
     """Counts the commands that are given by name or unit."""
     units = [part.get("unit") for part in given]

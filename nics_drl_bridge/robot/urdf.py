@@ -96,7 +96,11 @@ def _add_wheel(robot: Element, parent: str, wheel: Wheel) -> None:
 
 
 def _add_sensor(
-    robot: Element, base: str, frame: str, joint: str, mount: Place
+    robot: Element,
+    base: str,
+    frame: str,
+    joint: str,
+    mount: Place,
 ) -> None:
     link = _add(robot, "link", name=frame)
     _add_visual(link, "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
@@ -142,7 +146,10 @@ def _add_visual(
 
 
 def _add_geometry(
-    parent: Element, size: tuple[float, ...], place: Place, roll: float = 0.0
+    parent: Element,
+    size: tuple[float, ...],
+    place: Place,
+    roll: float = 0.0,
 ) -> None:
     """Adds a box (length, width, height) or a cylinder (radius, length)."""
     _add(
