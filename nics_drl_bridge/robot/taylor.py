@@ -217,7 +217,8 @@ class TaylorModel:
         lines = [curve.equation for curve in self.inputs]
         for d, dof in enumerate(self.dofs):
             terms = [
-                self._describe_term(d, k) for k in np.flatnonzero(self.coefficients[d])
+                self._describe_term(d, int(k))
+                for k in np.flatnonzero(self.coefficients[d])
             ]
             text = " + ".join(terms).replace("+ -", "- ") or "0"
             limits = self.describe_limits(dof)

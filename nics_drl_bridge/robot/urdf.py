@@ -37,9 +37,11 @@ def make_urdf(
         _add_visual(link, "body", disc, (0.0, 0.0, BODY_HEIGHT))
     else:
         drawing = draw_robot(spec)
-        body = drawing.body
-        if not isinstance(body, tuple):
-            body = (body,)
+        body: tuple[float, ...]
+        if isinstance(drawing.body, tuple):
+            body = drawing.body
+        else:
+            body = (drawing.body,)
         place = (drawing.centre[0], 0.0, drawing.centre[1])
         _add_visual(link, "body", (*body, BODY_HEIGHT), place)
         for wheel in drawing.wheels:
