@@ -24,9 +24,8 @@ from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.robot.noise import Latency
 
 LONGEST_ARRAY = 64  # of which each element is listed
-SCENES = re.compile(
-    r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$"
-)  # of no single numbers
+# of no single numbers
+SCENES = re.compile(r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$")
 PART = re.compile(r"[^.\[\]]+")
 STAMPS: dict[str, roles.Stamps] = {
     "": "auto",

@@ -124,11 +124,10 @@ class Candidate(NamedTuple):
 class CommandGuess(NamedTuple):
     """The kind of a robot and its commands, or what they may be."""
 
-    kind: str | None  # None: nothing tells it
+    kind: str | None  # None: nothing says it
     commands: dict[str, Candidate]  # by the robot's names; empty if none is certain
-    candidates: dict[
-        str, Candidate
-    ]  # by the robot's names, for the user to choose from
+    # by the robot's names, for the user to choose from
+    candidates: dict[str, Candidate]
     # True: no command was recorded, the wheels' own motion stands in
     of_wheels: bool = False
 

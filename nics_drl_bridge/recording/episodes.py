@@ -1,4 +1,4 @@
-"""Episodes of a recording that one column tells apart."""
+"""Episodes of a recording that one column distinguishes."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -48,29 +48,30 @@ class EpisodeOfTable(Source):
 
 
 def split_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
-    """Returns the episodes of a table with rows of its own stamps; none of several tables."""
+    """Returns the episodes of a table with rows of its own stamps; empty for several tables."""
     reader = MappedReader(source, mapping)
-    table, which = reader.locate(mapping.episode or 0)
+    table, reference = reader.locate(mapping.episode or 0)
     if len(source.names) > 1 and any(
         name != _find_name(source, table) for name in _list_tables_used(source, mapping)
     ):
         return []
     if table.stamps("") is not None:
         return []  # stamps that come with the rows go on from one episode to the next
-    column = table.column(which)
-    values, first, of = np.unique(column, return_index=True, return_inverse=True)
+    values, first, group = np.unique(
+        table.column(reference), return_index=True, return_inverse=True
+    )
     name = _find_name(source, table)
-    found = []
+    episodes = []
     for k in np.argsort(first):
-        rows = np.flatnonzero(of == k)
+        rows = np.flatnonzero(group == k)
         if len(rows) >= FEWEST_ROWS:
-            found.append(
-                EpisodeOfTable(source, table, name, rows, _format_label(values[k]))
-            )
-    if not found:
-        fault = f"{table.place}: no value of the column {which!r} lasts for {FEWEST_ROWS} rows"
-        raise ConfigError(f"{fault}; name the column that numbers the episodes.")
-    return found
+            label = _format_label(values[k])
+            episodes.append(EpisodeOfTable(source, table, name, rows, label))
+    if not episodes:
+        fault = f"no value of the column {reference!r} lasts for {FEWEST_ROWS} rows"
+        advice = "name the column that numbers the episodes"
+        raise ConfigError(f"{table.place}: {fault}; {advice}.")
+    return episodes
 
 
 def split_by_time(

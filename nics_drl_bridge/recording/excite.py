@@ -32,20 +32,21 @@ CENTRED = 2.0
 MARGIN_M = 0.05
 REACTION_S = 0.2
 TOLERANCE_M = 0.005
-# Turning back uses shares of the greatest commands, as a reserve for a robot that turns worse.
+# Turning back uses fractions of the maximum commands, as a reserve for a robot that turns worse.
 TURNING_SPEED = 0.5
 TURNING = 0.8
 WAY_S = (3.0, 20.0)
 WAY_STEP_S = 0.1
-# A path back starts within a share of the circle's radius, or reaches a share of its initial
+# A path back starts within a fraction of the circle's radius, or reaches a fraction of its initial
 # distance from the centre, or turns by half a turn.
 NEAR = 0.25
 NEARER = 0.6
 LOST = 8
 SHORTEST_S = 20.0
 LONGEST_S = 3600.0
-SPREAD = 0.17  # least standard deviation of a command as a share of its range (0.29 if uniform)
-ALIKE = 0.6  # greatest correlation of two commands
+# minimum standard deviation of a command, as a fraction of its range (0.29 if uniform)
+SPREAD = 0.17
+ALIKE = 0.6  # maximum correlation of two commands
 ATTEMPTS = 8
 
 
@@ -57,24 +58,25 @@ class Exploration:
         self._plan = plan
         self._motion = predict_motion(spec)
         self._rng = rng
-        share = np.array(
+        fraction = np.array(
             [1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command]
         )
-        self.low = share * spec.command_low
-        self.high = share * spec.command_high
+        self.low = fraction * spec.command_low
+        self.high = fraction * spec.command_high
         self.rest = np.clip(np.zeros(len(spec.command)), self.low, self.high)
         self._ticks = round(plan.duration / PERIOD_S)
         self._still = round(STILL_S / PERIOD_S)
         self._ramp = round(RAMP_S / PERIOD_S)
         self._visits = np.full((BINS,) * len(spec.command), 1.0 / BINS)
         self._tick = 0
-        self._lost = 0
-        self._turn = 0
+        self._failures = 0
+        self._varied = 0
         self._queue = np.zeros((0, len(spec.command)))
-        self._command, self._state = self.rest, np.zeros(self._motion.size)
+        self._command = self.rest
+        self._state = np.zeros(self._motion.size)
         self.pose: Array = np.zeros(3)
         self._before = self.pose
-        self._seen = False
+        self._has_observed = False
         fastest = np.hypot(*(plan.speed * reach(spec)[:2]))
         self._outermost = plan.bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
@@ -91,7 +93,7 @@ class Exploration:
         """Observes the pose (3,) at the start of the current period, in the start frame."""
         self.pose = geometry.compose(pose, geometry.between(self._before, self.pose))
         self._before = np.asarray(pose, dtype=np.float64)
-        self._seen = True
+        self._has_observed = True
 
     def choose_command(self) -> Array:
         """Returns the command (C,) for the period that begins now."""
@@ -117,7 +119,7 @@ class Exploration:
         while not self.done:
             commands.append(self.choose_command())
             poses.append(self.pose)
-            if self._lost >= LOST:
+            if self._failures >= LOST:
                 return None
         command = np.array(commands)
         plan = self._plan
@@ -131,54 +133,57 @@ class Exploration:
 
     def _is_astray(self) -> bool:
         """True if, from the observed pose, the rest of the segment leads too far out."""
-        if not self._seen or self._tick >= self._ticks - self._still:
+        if not self._has_observed or self._tick >= self._ticks - self._still:
             return False
-        self._seen = False
+        self._has_observed = False
         return bool(
             _compute_distance(self._predict(self._queue[None])[0]).max()
             > self._limit() + MARGIN_M
         )
 
     def _limit(self) -> float:
-        """Returns the greatest allowed distance from the start, at least the present one [m]."""
+        """Returns the largest allowed distance from the start, at least the present one [m]."""
         return max(self.keep_within, float(_compute_distance(self.pose))) + TOLERANCE_M
 
     def _predict(
         self, commands: Array, period: float = PERIOD_S
     ) -> tuple[Array, Array]:
-        many = len(commands)
-        pose = np.repeat(self.pose[None], many, 0)
-        state = np.repeat(self._state[None], many, 0)
+        count = len(commands)
+        pose = np.repeat(self.pose[None], count, 0)
+        state = np.repeat(self._state[None], count, 0)
         return self._motion.predict(pose, state, commands, period)
 
     def _find_cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
-        share = (command - self.low) / (self.high - self.low)
+        fraction = (command - self.low) / (self.high - self.low)
         return tuple(
-            np.moveaxis(np.clip((share * BINS).astype(np.intp), 0, BINS - 1), -1, 0)
+            np.moveaxis(np.clip((fraction * BINS).astype(np.intp), 0, BINS - 1), -1, 0)
         )
 
     def _plan_segment(self) -> Array:
-        left = self._ticks - self._still - self._tick
-        if left <= self._ramp:
+        remaining = self._ticks - self._still - self._tick
+        if remaining <= self._ramp:
             return np.asarray(
-                self._interpolate_commands(self.rest[None], left + self._still)[0]
+                self._interpolate_commands(self.rest[None], remaining + self._still)[0]
             )
         length = round(self._rng.uniform(*SEGMENT_S) / PERIOD_S)
-        length = max(1, min(length, left - self._ramp))
-        for alone in (True, False) if self._rng.random() < ALONE else (False,):
+        length = max(1, min(length, remaining - self._ramp))
+        choices = [False]
+        if self._rng.random() < ALONE:
+            choices = [True, False]
+        for alone in choices:
             segment = self._choose_best(self._draw_levels(alone), length)
             if segment is not None:
-                self._lost = 0
+                self._failures = 0
                 return segment
-        self._lost += 1
+        self._failures += 1
         return self._return_to_circle(length)
 
     def _draw_levels(self, alone: bool) -> Array:
         size = (CANDIDATES, len(self.low))
         fresh = self._rng.uniform(self.low, self.high, size)
         changed = self._rng.random(size) < (0.0 if alone else REDRAWN)
-        changed[:, self._turn % size[1]] = True
-        self._turn += 1
+        changed[:, self._varied % size[1]] = True
+        self._varied += 1
         return np.where(changed, fresh, self._command)
 
     def _choose_best(self, levels: Array, length: int) -> Array | None:
@@ -195,15 +200,17 @@ class Exploration:
         )
         score = familiar + CENTRED * nearest
         best = int(np.argmin(score))
-        return np.asarray(commands[allowed[best]]) if np.isfinite(score[best]) else None
+        if not np.isfinite(score[best]):
+            return None
+        return np.asarray(commands[allowed[best]])
 
     def _interpolate_commands(self, levels: Array, length: int) -> Array:
         """Returns commands (K, T, C) that go smoothly from the present one to levels (K, C)."""
-        share = (
+        fraction = (
             1.0 - np.cos(np.pi * np.minimum(np.arange(1, length + 1) / self._ramp, 1.0))
         ) / 2.0
         return np.asarray(
-            self._command + share[None, :, None] * (levels - self._command)[:, None]
+            self._command + fraction[None, :, None] * (levels - self._command)[:, None]
         )
 
     def _list_ways_back(self, factor: Array) -> Array:
@@ -221,14 +228,14 @@ class Exploration:
         return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
 
     def _measure_way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
-        """Returns the least distance from the centre, over the radius, of ways back; maybe inf."""
-        many = len(self._ways)
-        start = np.repeat(pose, many, 0), np.repeat(state, many, 0)
+        """Returns how near to the centre ways back lead, over the radius; inf: nowhere."""
+        count = len(self._ways)
+        start = np.repeat(pose, count, 0), np.repeat(state, count, 0)
         poses, _ = self._motion.predict(
             *start, np.tile(self._ways, (len(pose), 1, 1)), WAY_STEP_S
         )
         away = _compute_distance(poses)
-        inside = away.max(axis=1) <= limit
+        is_inside = away.max(axis=1) <= limit
         turned = (
             np.abs(np.unwrap(poses[..., 2], axis=1) - poses[:, :1, 2]).max(axis=1)
             >= np.pi
@@ -236,10 +243,10 @@ class Exploration:
         back = (away.min(axis=1) < NEARER * away[:, 0]) | (
             away[:, 0] < NEAR * self._outermost
         )
-        useful = (inside & (turned | back)).reshape(len(pose), many).any(axis=1)
+        useful = (is_inside & (turned | back)).reshape(len(pose), count).any(axis=1)
         reached = (
-            np.where(inside, away.min(axis=1), np.inf)
-            .reshape(len(pose), many)
+            np.where(is_inside, away.min(axis=1), np.inf)
+            .reshape(len(pose), count)
             .min(axis=1)
         )
         return np.where(useful, reached / self._outermost, np.inf)
@@ -277,7 +284,7 @@ class Pattern:
 
     @property
     def box(self) -> Array:
-        """Least and greatest x and y (2, 2) that the robot's body reaches [m]."""
+        """Minimum and maximum x and y (2, 2) that the robot's body reaches [m]."""
         place = self.pose[:, :2]
         return np.array(
             [place.min(axis=0) - self.footprint, place.max(axis=0) + self.footprint]
@@ -318,9 +325,8 @@ class ExpectedMotion:
     """Expected motion of a robot."""
 
     size: int  # S, of the state
-    respond: Callable[
-        [Array, Array, float], Array
-    ]  # state, command, time held [s] -> state
+    # state, command, time held [s] -> state
+    respond: Callable[[Array, Array, float], Array]
     twist: Callable[[Array, Array], Array]  # state, command -> body twist
 
     def predict(
@@ -370,7 +376,7 @@ class DrivePlan:
     # radius of the circle around the start that contains the whole robot [m]
     bound: float = 2.0
     duration: float = 60.0  # [s]
-    speed: float = 1.0  # share of the greatest speeds and rates to use
+    speed: float = 1.0  # fraction of the maximum speeds and rates to use
     seed: int = 0  # of the pattern
 
     def __post_init__(self) -> None:
@@ -387,17 +393,17 @@ class DrivePlan:
 
     def begin(self) -> Exploration:
         """Returns the previewed drive, at its start; raises ConfigError as `preview` does."""
-        return self._start_attempt(self._found[0])
+        return self._start_attempt(self._accepted[0])
 
     def preview(self) -> Pattern:
         """Returns the pattern by the expected motion; ConfigError if the circle is too small."""
-        return self._found[1]
+        return self._accepted[1]
 
     def _start_attempt(self, number: int) -> Exploration:
         return Exploration(self, np.random.default_rng([self.seed, number]))
 
     @cached_property
-    def _found(self) -> tuple[int, Pattern]:
+    def _accepted(self) -> tuple[int, Pattern]:
         """Number and pattern of the first attempt that varies all commands within the circle."""
         for number in range(ATTEMPTS):
             drive = self._start_attempt(number)

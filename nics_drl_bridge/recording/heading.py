@@ -31,11 +31,11 @@ UNLIKE_BLOCKS = 2.0
 DRIFTS = 4.0  # standard errors of its slope beyond which a bias drifts
 DRIFT_SPAN_S = 20.0  # a drift of the bias shows only between rests so far apart
 LEAST_TURN_RAD = 1.0  # sum of all turns, below which a drive does not show a scale
-ALIKE = 0.7  # least correlation of two sources that measure the same motion
+ALIKE = 0.7  # minimum correlation of two sources that measure the same motion
 PLAUSIBLE_SCALES = (0.33, 5.0)  # of odometry's turns, relative to those of the gyro
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
 LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
-GYRO_SCALE_STD = 0.015  # of the scale of a usual gyro, as a share
+GYRO_SCALE_STD = 0.015  # of the scale of a usual gyro, as a fraction
 CLEARLY = 3.0  # standard errors
 
 
@@ -130,7 +130,7 @@ def turn_by_gyro(
 ) -> tuple[Array, float]:
     """Returns poses (T, 3) of the same wheels' displacements along the heading of the gyro.
 
-    And the share of the time for which there was a gyro; for the rest, the wheels turn the robot.
+    Also returns the fraction of the time with a gyro; otherwise the wheels turn the robot.
     """
     gyro_turn, covered = _integrate_gyro(
         t, gyro_t, yaw_rate - turning.compute_bias(gyro_t)
@@ -148,8 +148,8 @@ def turn_by_gyro(
     turned = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     span = np.diff(t)
     driven = span < LONGEST_PAUSE_S  # between two recordings there is no drive
-    share = span[covered & driven].sum() / max(float(span[driven].sum()), 1e-9)
-    return turned, float(share)
+    driven_s = max(float(span[driven].sum()), 1e-9)
+    return turned, float(span[covered & driven].sum()) / driven_s
 
 
 @dataclass(frozen=True)
@@ -208,9 +208,8 @@ def _estimate_bias(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     rest_s = float(blocks.span[rest].sum())
     usual = float(np.median(rate))
     scatter = 1.4826 * float(np.median(np.abs(rate - usual)))
-    near = np.abs(rate - usual) <= max(
-        5.0 * scatter, 1e-3
-    )  # not where somebody turned it
+    # not where somebody turned it
+    near = np.abs(rate - usual) <= max(5.0 * scatter, 1e-3)
     rate = rate[near]
     when = when[near]
     middle = float(when.mean())
@@ -265,14 +264,16 @@ def _estimate_scale(
 
 def _compute_rms(blocks: _Blocks, rate: Array, window_s: float) -> float:
     """Returns the root mean square of turns at rates (n,) over windows [rad]."""
-    each = rate * blocks.span
+    turn = rate * blocks.span
     count = max(1, round(window_s / BLOCK_S))
-    if len(each) < count:
+    if len(turn) < count:
         return np.nan
-    total = np.concatenate([[0.0], np.cumsum(each)])
+    total = np.concatenate([[0.0], np.cumsum(turn)])
     sums = total[count:] - total[:-count]
     # Windows across a gap would compare less time than they say.
     end = blocks.middle + 0.5 * blocks.span
     begin = blocks.middle - 0.5 * blocks.span
-    whole = end[count - 1 :] - begin[: len(sums)] < 1.5 * window_s
-    return float(np.sqrt(np.mean(sums[whole] ** 2))) if whole.any() else np.nan
+    is_whole = end[count - 1 :] - begin[: len(sums)] < 1.5 * window_s
+    if not is_whole.any():
+        return np.nan
+    return float(np.sqrt(np.mean(sums[is_whole] ** 2)))

@@ -7,11 +7,12 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 
 AXES = "xyz"
+# an acceleration at rest [m/s^2]; others have gravity removed, or are none
 GRAVITY = (
     7.0,
     13.0,
-)  # an acceleration at rest [m/s^2]; others have gravity removed, or are none
-UPRIGHT = 0.85  # least share of gravity along the axis that points up
+)
+UPRIGHT = 0.85  # minimum fraction of gravity along the axis that points up
 # messages over which the acceleration is averaged while a robot drives
 REMEMBERED = 200
 

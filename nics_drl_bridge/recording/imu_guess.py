@@ -66,7 +66,7 @@ def _find_in_messages(
 
 
 def _find_message_axis(table: TableSurvey) -> UpAxis:
-    """Returns the axis of an IMU's messages that points up; z if they tell no acceleration."""
+    """Returns the axis of an IMU's messages that points up; z without accelerations."""
     names = [f"linear_acceleration.{axis}" for axis in AXES]
     if not all(name in table.data for name in names):
         return UpAxis()

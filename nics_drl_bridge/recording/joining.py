@@ -16,7 +16,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import STREAMS, Episode, Recording, Stream
 
-LEARNT_SHARE = 2.0 / 3.0  # of each recording
+LEARNT_SHARE = 2.0 / 3.0  # fraction of each recording
 # between two episodes: longer than any prediction and any search for a delay
 APART_S = 30.0
 LEAD_S = 2.0  # of commands before an episode, for states to follow them
@@ -58,12 +58,10 @@ def split_at(
     ends = [*starts[1:], np.inf]
     parts = []
     for start, end, name in zip(starts, ends, names, strict=True):
-        pose = recording.pose
-        own = replace(
-            recording, pose=pose.rows((pose.t >= start) & (pose.t < end)), source=name
-        )
-        if len(own.pose.t) > 1:
-            parts.append(own)
+        t = recording.pose.t
+        pose = recording.pose.rows((t >= start) & (t < end))
+        if len(pose.t) > 1:
+            parts.append(replace(recording, pose=pose, source=name))
     if len(parts) > 1:
         return replace(join(parts), source=recording.source)
     return recording
@@ -140,18 +138,14 @@ def _place_parts(
             streams[name].append(replace(stream, t=stream.t + shift))
         episodes.append(Episode(part.source, start, part.end_s + shift))
         start = part.end_s + shift + APART_S
-    made: dict[str, Any] = {
-        name: _append_streams(name, parts) for name, parts in streams.items()
-    }
+    joined: dict[str, Any] = dict.fromkeys(STREAMS)
+    for name, parts in streams.items():
+        joined[name] = _append_streams(name, parts)
     sources = list(dict.fromkeys(part.source for part in (*learnt, *held_out)))
     until = episodes[len(learnt) - 1].end_s
-    without: dict[str, Any] = dict.fromkeys(
-        name for name in STREAMS if name not in shared
-    )
     return replace(
         recordings[0],
-        **without,
-        **made,
+        **joined,
         source=", ".join(dict.fromkeys(each.source for each in recordings)),
         repairs=(
             *_describe_join(sources, bool(held_out)),
@@ -189,7 +183,9 @@ def _cut_commands(command: Stream, part: _Part) -> Stream:
     t = np.maximum(rows.t, lead)
     t = np.append(t[0] - SETTLE_S, t)
     values = np.concatenate([rows.values[:1], rows.values])
-    sigma = None if rows.sigma is None else np.concatenate([rows.sigma[:1], rows.sigma])
+    sigma = rows.sigma
+    if sigma is not None:
+        sigma = np.concatenate([sigma[:1], sigma])
     return replace(rows, t=t, values=values, sigma=sigma)
 
 
@@ -201,10 +197,12 @@ def _move_pose(pose: Stream, first: Array, place: Array) -> Stream:
     values = geometry.compose(place, geometry.between(first, pose.values))
     if pose.sigma is None:
         return replace(pose, values=values)
-    c = np.cos(place[2] - first[2])
-    s = np.sin(place[2] - first[2])
+    cosine = np.cos(place[2] - first[2])
+    sine = np.sin(place[2] - first[2])
     x, y, heading = pose.sigma.T
-    sigma = np.stack([np.hypot(c * x, s * y), np.hypot(s * x, c * y), heading], axis=1)
+    moved_x = np.hypot(cosine * x, sine * y)
+    moved_y = np.hypot(sine * x, cosine * y)
+    sigma = np.stack([moved_x, moved_y, heading], axis=1)
     return replace(pose, values=values, sigma=sigma)
 
 
@@ -215,9 +213,10 @@ def _append_streams(name: str, parts: Sequence[Stream]) -> Stream:
             raise RecordingError(
                 f"{name}: two episodes overlap in time; this is a fault of ours."
             )
-    known = all(part.sigma is not None for part in parts)
+    sigma = None
     sigmas = [part.sigma for part in parts if part.sigma is not None]
-    sigma = np.concatenate(sigmas) if known else None
+    if len(sigmas) == len(parts):
+        sigma = np.concatenate(sigmas)
     t = np.concatenate([part.t for part in parts])
     values = np.concatenate([part.values for part in parts])
     return Stream(t, values, parts[0].clock, sigma)
@@ -228,22 +227,21 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
         names = ", ".join(sources)
     else:
         names = f"{sources[0]} to {sources[-1]}"
-    held = "the last third of each was held out of the first fit"
+    split = "all were learnt from, as they are too short to hold a part out"
     if is_split:
-        held = held
-    else:
-        held = "all were learnt from, as they are too short to hold a part out"
-    return (
-        f"{len(sources)} drives were joined ({names}): {held}; no prediction crosses over.",
-    )
+        split = "the last third of each was held out of the first fit"
+    joined = f"{len(sources)} drives were joined ({names})"
+    return (f"{joined}: {split}; no prediction crosses over.",)
 
 
 def _collect_repairs(
     recordings: Sequence[Recording], shared: Sequence[str]
 ) -> tuple[str, ...]:
-    lost = {name for each in recordings for name in each.streams} - {*shared}
-    told = [
+    lost = {name for recording in recordings for name in recording.streams} - {*shared}
+    repairs = [
         f"{name} was left out, as not all of the recordings have it."
         for name in sorted(lost)
     ]
-    return (*told, *dict.fromkeys(said for each in recordings for said in each.repairs))
+    for recording in recordings:
+        repairs += recording.repairs
+    return tuple(dict.fromkeys(repairs))

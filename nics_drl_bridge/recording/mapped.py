@@ -43,7 +43,7 @@ from nics_drl_bridge.recording.values import (
 
 QUATERNION_TOLERANCE = 0.05
 MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
-# share of poses whose quaternion is zero: the tracker had lost the body
+# fraction of poses whose quaternion is zero: the tracker had lost the body
 MOST_UNTRACKED = 0.05
 NO_LENGTH = 1e-9
 SHORTEST_S = 1.0

@@ -74,7 +74,7 @@ RATES = {
 
 
 def check_unit(name: str) -> str:
-    """Returns the name of a unit; ValueError tells the nearest known one."""
+    """Returns the name of a unit; ValueError names the nearest known one."""
     if str(name) not in UNITS:
         raise ValueError(f"is no known unit ({suggest(str(name), UNITS)})")
     return str(name)
@@ -82,10 +82,10 @@ def check_unit(name: str) -> str:
 
 def to_si(unit: str, ticks_per_turn: float | None = None) -> UnitOfData:
     """Returns the SI unit and the factor of a unit; ticks are angles if their count is known."""
-    found = UNITS[unit]
-    if found.si in TICKS and ticks_per_turn:
-        return UnitOfData(TICKS[found.si], TURN / ticks_per_turn)
-    return found
+    si = UNITS[unit].si
+    if si in TICKS and ticks_per_turn:
+        return UnitOfData(TICKS[si], TURN / ticks_per_turn)
+    return UNITS[unit]
 
 
 # Words of columns that can't have been sent to a robot: where it is, and how uncertain that is.
@@ -135,12 +135,13 @@ def _check_kind(kinds: tuple[str, ...]) -> Any:
 
 def explain_no_command(column: str) -> str:
     """Says why a column was not sent to the robot, by the words in its name; empty if it may be."""
-    found = NO_COMMANDS & {*split_words(column)}
-    if not found:
+    words = NO_COMMANDS.intersection(split_words(column))
+    if not words:
         return ""
-    is_place = found & PLACES_ON_EARTH
-    what = "where the robot was" if is_place else "how uncertain a measurement is"
-    return f"{column!r} tells {what}, and was not sent to the robot; name a column that was"
+    content = "how uncertain a measurement is"
+    if words & PLACES_ON_EARTH:
+        content = "where the robot was"
+    return f"{column!r} tells {content}, and was not sent to the robot; name a column that was"
 
 
 def may_be_place_on_earth(column: str) -> bool:
@@ -179,20 +180,17 @@ class Time(Schema):
 class Value(Schema):
     """A number in each row: SI value = unit x scale x what stands there + offset."""
 
-    from_: Reference = Field(
-        alias="from"
-    )  # column by name or number, TABLE:COLUMN or /topic:field
+    # column by name or number, TABLE:COLUMN or /topic:field
+    from_: Reference = Field(alias="from")
     unit: str | None = None  # by default that of the stream, or SI
     maximum: float | None = None  # value in SI of a full share
     scale: float = 1.0  # -1 turns the sign
     offset: float = 0.0  # in SI
-    ticks_per_turn: float | None = Field(
-        default=None, gt=0.0
-    )  # of an encoder, makes ticks angles
+    # of an encoder, makes ticks angles
+    ticks_per_turn: float | None = Field(default=None, gt=0.0)
     differentiate: bool | None = None  # by default true for `ticks`, which are counters
-    wrap: float | None = Field(
-        default=None, gt=0.0
-    )  # where a counter overflows; found if left out
+    # where a counter overflows; found if left out
+    wrap: float | None = Field(default=None, gt=0.0)
     # other columns, flags, and the values at which this one counts; `otherwise` stands in its place
     when: dict[str, Condition] = Field(default_factory=dict)
     otherwise: float = 0.0  # in SI, where a flag is not as `when` needs it
@@ -226,9 +224,8 @@ AValue = Annotated[Value, _expand_reference("from")]
 class Measured(Schema):
     """Keys of all streams: table of their columns, stamps, clock."""
 
-    in_: str | None = Field(
-        default=None, alias="in"
-    )  # file or topic of columns that name none
+    # file or topic of columns that name none
+    in_: str | None = Field(default=None, alias="in")
     # stamps; None: those of the whole mapping
     time: Annotated[Time | None, _expand_reference("from")] = None
     # clock of the stamps; two clocks differ by an unknown offset
@@ -314,22 +311,19 @@ class Mapping(Schema):
 
     # a shipped robot's name, a path, or its definition
     robot: str | dict[str, Any] | None = None
-    in_: str | None = Field(
-        default=None, alias="in"
-    )  # file or topic of streams that name none
+    # file or topic of streams that name none
+    in_: str | None = Field(default=None, alias="in")
     # stamps of all streams; None: a bag's own
     time: Annotated[Time | None, _expand_reference("from")] = None
     # clock of all streams; None: `robot`, unless a bag's headers differ
     clock: str | None = None
     # column whose value changes from one episode to the next; None: one drive
     episode: Reference | None = None
-    pose: Annotated[
-        PoseSource, _expand_reference("in")
-    ]  # of the tracked body; a topic alone means its `in`
+    # of the tracked body; a topic alone means its `in`
+    pose: Annotated[PoseSource, _expand_reference("in")]
     command: dict[str, AValue]  # by the names of the robot's commands
-    state: dict[str, AValue] = Field(
-        default_factory=dict
-    )  # measured states, by their names
+    # measured states, by their names
+    state: dict[str, AValue] = Field(default_factory=dict)
     wheels: WheelSource | None = None  # wheel speeds, if they were recorded
     # acceleration and yaw rate, or a second heading, if recorded
     imu: ImuSource | None = None

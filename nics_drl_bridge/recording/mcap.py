@@ -18,14 +18,10 @@ PRIVATE = 0x80  # opcodes from here on are reserved for private records
 PREFIX = 9  # bytes of opcode and length in front of a record
 CHUNK_CRC = 24  # offset of a chunk's checksum in its content
 COMPRESSIONS = ("", "lz4", "zstd")
-INSIDE = (
-    kinds.Schema,
-    kinds.Channel,
-    kinds.Message,
-)  # records that may occur in a chunk
-MOST_UNPACKED = (
-    256 * 2**20
-)  # maximum size of one chunk or message, decompressed [bytes]
+# records that may occur in a chunk
+INSIDE = (kinds.Schema, kinds.Channel, kinds.Message)
+# maximum size of one chunk or message, decompressed [bytes]
+MOST_UNPACKED = 256 * 2**20
 # compression ratio of a file that decompresses to more than that
 MOST_PACKED_SHARE = 1000
 _PART = 2**20
@@ -200,9 +196,8 @@ def _import_zstd() -> Any:
     try:
         return import_module("compression.zstd")
     except ImportError:
-        return import_module(
-            "backports.zstd"
-        )  # a dependency of rosbags before Python 3.14
+        # a dependency of rosbags before Python 3.14
+        return import_module("backports.zstd")
 
 
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:

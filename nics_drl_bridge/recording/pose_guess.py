@@ -60,8 +60,8 @@ OTHER_PLACES = re.compile(
     r"|/(Path|OccupancyGrid|MapMetaData|PoseArray|GridCells|Imu|Joy|LaserScan|MagneticField)$"
 )
 UNIT_LENGTH = 0.01  # by which a quaternion may differ from length 1
-ALONG = 0.9  # share to which columns without names lead along their heading
-CONFIRMED = 0.7  # share to which a place leads along the quaternion that follows it
+ALONG = 0.9  # fraction to which columns without names lead along their heading
+CONFIRMED = 0.7  # fraction to which a place leads along the quaternion that follows it
 NEARLY_A_TURN = 5.5  # [rad] from one row to the next
 PIECES = 30  # of the extent of a path, in which it is compared with a heading
 MOST_COMPARED = 200  # poses, about

@@ -23,10 +23,12 @@ def guess_pose_source(name: str, kind: str = "") -> MeasuredBy:
 
 
 def guess_source_by_names(names: Iterable[str], kind: str = "") -> MeasuredBy:
-    """Returns what measured poses, by all names that belong to them; empty if none tells."""
-    known = [*names]
-    if any(TRACKED.search(name) for name in known):
+    """Returns what measured poses, by all names that belong to them; empty if none says it."""
+    names = [*names]
+    if any(TRACKED.search(name) for name in names):
         return "tracker"
-    if kind == roles.ODOMETRY or any(ODOMETRY.search(name) for name in known):
+    if kind == roles.ODOMETRY or any(ODOMETRY.search(name) for name in names):
         return "odometry"
-    return "tracker" if kind in TRACKERS_TYPES else ""
+    if kind in TRACKERS_TYPES:
+        return "tracker"
+    return ""

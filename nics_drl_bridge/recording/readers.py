@@ -55,12 +55,12 @@ def _load_folder(path: Path, *_: object) -> Recording:
     mapping = load_mapping(file)
     if not (wheels := _holds(path, WHEELS)):
         mapping = mapping.model_copy(update={"wheels": None})
-    for each in (path / name for name in FILES + WHEELS * wheels):
-        if each.stat().st_size > MOST_BYTES:
-            fault = (
-                f"{each}: is larger than {MOST_BYTES // 2**20} MB, which few drives are"
+    for name in FILES + WHEELS * wheels:
+        if (path / name).stat().st_size > MOST_BYTES:
+            size = f"{MOST_BYTES // 2**20} MB, which few drives are"
+            raise RecordingError(
+                f"{path / name}: is larger than {size}; cut it, or give --map {file}."
             )
-            raise RecordingError(f"{fault}; cut it, or give --map {file}.")
     try:
         with open_source(path) as source:
             return replace(read_mapped(source, mapping), variables=())
@@ -100,12 +100,12 @@ def read_recording(
     topics = topics or TopicRoles()
     if mapping is not None and not is_recording(path):
         return _read_by_mapping(path, spec, topics, mapping)
-    found = next((each for each in FORMATS if each.recognises(path)), None)
-    if topics != TopicRoles() and not (found and found.has_topics):
+    file_format = next((known for known in FORMATS if known.recognises(path)), None)
+    if topics != TopicRoles() and not (file_format and file_format.has_topics):
         advice = "leave out --topics and --topic, which are for bags only"
         raise RecordingError(f"{path}: is no bag; {advice}.")
-    if found is not None:
-        return found.read(path, spec, topics)
+    if file_format is not None:
+        return file_format.read(path, spec, topics)
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     names = " nor ".join(each.name for each in FORMATS)
@@ -143,14 +143,14 @@ def _read_by_mapping(
         raise ConfigError(
             "--topics and --topic do not go with --map; name the topics in the map."
         )
-    given = _load_if_path(mapping)
-    with open_source(path, given) as source:
-        recording = read_mapped(source, given)
-    if given.robot is not None:
-        recording = replace(recording, robot=read_definition(given.robot))
+    mapping = _load_if_path(mapping)
+    with open_source(path, mapping) as source:
+        recording = read_mapped(source, mapping)
+    if mapping.robot is not None:
+        recording = replace(recording, robot=read_definition(mapping.robot))
     if spec is None:
         return recording
-    _check_units(given, spec)
+    _check_units(mapping, spec)
     return reorder_variables(recording, spec)
 
 
@@ -184,11 +184,12 @@ def read_robot_and_drive(
 ) -> tuple[RobotSpec, Recording]:
     """Reads a drive with its robot: the named one, else its mapping's or own, or the default."""
     if mapping is not None:
-        given = _load_if_path(mapping)
-        given = given if robot is None else given.model_copy(update={"robot": robot})
-        drive = read_recording(path, None, topics, given)
-        spec = build_mapped_robot(given, drive)
-        _check_units(given, spec)
+        mapping = _load_if_path(mapping)
+        if robot is not None:
+            mapping = mapping.model_copy(update={"robot": robot})
+        drive = read_recording(path, None, topics, mapping)
+        spec = build_mapped_robot(mapping, drive)
+        _check_units(mapping, spec)
         return spec, reorder_variables(drive, spec)
     if not is_recording(path):
         own: str | dict[str, Any] | None = robot
@@ -244,14 +245,14 @@ def build_mapped_robot(
     mapping: Mapping | str | Path, recording: Recording
 ) -> RobotSpec:
     """Returns the robot of a mapping, whose commands reach as far as in its recording."""
-    given = _load_if_path(mapping)
-    if (robot := given.robot or recording.robot) is None:
+    mapping = _load_if_path(mapping)
+    robot = mapping.robot or recording.robot
+    if robot is None:
         raise ConfigError(
             "the mapping names no robot; add `robot:` to it, or give --robot."
         )
-    return _build_with_ranges(
-        robot, recording, recording.variables or tuple(given.command)
-    )
+    variables = recording.variables or tuple(mapping.command)
+    return _build_with_ranges(robot, recording, variables)
 
 
 def _build_with_ranges(

@@ -30,7 +30,7 @@ JITTER = 1e-4
 ROUNDING_S = 1e-6
 
 LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implausible,
-TOO_FAST = 20.0  # and so is a speed of more than this many times the greatest command
+TOO_FAST = 20.0  # and so is a speed of more than this many times the maximum command
 SPEED_OVER_S = 0.5
 SLOWEST_SAMPLING_S = 2.0
 # Acceleration that no wheeled robot reaches for a quarter of the time [m/s^2]: one whose radius is
@@ -127,13 +127,12 @@ class Recording:
     ] = ()  # names of X = [state, command] of the recorded robot, if known
     # its definition as in its YAML file, if a mapping says it
     robot: dict[str, Any] | None = None
-    latency: Latency = field(
-        default_factory=Latency
-    )  # of scan and odometry, if it shows
+    # of scan and odometry, if it shows
+    latency: Latency = field(default_factory=Latency)
     repairs: tuple[
         str, ...
     ] = ()  # a sentence on each thing that reading mended, as of its clocks
-    measured_by: MeasuredBy = ""  # what measured the pose; empty if nothing tells
+    measured_by: MeasuredBy = ""  # what measured the pose; empty if nothing says it
     # How odometry and gyro turned, if the heading is from the gyro or confirmed by it
     gyro: Turning | None = None
     episodes: tuple[Episode, ...] = ()  # in order; empty for a drive in one go

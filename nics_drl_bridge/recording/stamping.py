@@ -31,12 +31,8 @@ MAX_STALL_S = 30.0
 MAX_LATE = 0.01  # fraction of messages that may arrive after one with a later stamp
 # fraction that may lack a stamp at the start: a simulation has no time yet
 MAX_UNSTAMPED = 0.05
-ROBOT_STREAMS = (
-    "command",
-    "state",
-    "wheels",
-    "imu",
-)  # of one computer, and so of one clock
+# of one computer, and so of one clock
+ROBOT_STREAMS = ("command", "state", "wheels", "imu")
 
 SPLIT = (
     ("s", "ns"),
@@ -77,9 +73,8 @@ class TopicData:
 
     topic: str
     receive_ns: Nanoseconds  # (T,) times of receipt
-    header_ns: (
-        Nanoseconds | None
-    )  # (T,) stamps of the headers; None if the type has no header
+    # (T,) stamps of the headers; None if the type has no header
+    header_ns: Nanoseconds | None
     values: Array  # (T, D)
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:

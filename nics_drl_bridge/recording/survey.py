@@ -26,7 +26,7 @@ MOST_COLUMNS = 200  # of a table
 # stamps that would be closer are not in the unit that their name says
 SHORTEST_STEP_S = 1e-4
 LEAST_SCORE = 0.25  # of a column of stamps
-MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
+MOST_BACK = 0.05  # fraction of steps of a column of stamps that may go back
 TIMES = word_set("""
     time times stamp timestamp t s sec secs seconds elapsed ms us ns millis
     micros nanos date datetime
@@ -63,7 +63,7 @@ ENDINGS = {
     "pct": "%",
     "percent": "%",
 }
-# Units as they stand in brackets, `x(m)` or `omega [rad s^-1]`, beside those of a mapping.
+# Units as they stand in brackets, `x(m)` or `omega [rad s^-1]`, in addition to those of a mapping.
 IN_BRACKETS = {
     "meter": "m",
     "meters": "m",

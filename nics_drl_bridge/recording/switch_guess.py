@@ -20,7 +20,7 @@ ON_WORDS = word_set("auto autonomous autonomy enabled on armed active offboard r
 MODES = ENABLING | word_set("mode state status safety switch")
 NO_VALUES = np.zeros(0)
 FASTER = 2.0  # the robot moves so much faster while the switch is on
-FEWEST = 20  # rows of each value of the switch, from which on the motion tells
+FEWEST = 20  # rows of each value of the switch that the motion needs to deny it
 
 
 class Switch(NamedTuple):

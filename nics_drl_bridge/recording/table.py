@@ -23,9 +23,8 @@ class Table:
 
     place: str  # path, and topic, for errors
     names: tuple[str, ...]  # "" for a column without one
-    column: Callable[
-        [str | int], Column
-    ]  # by name, or number from 0; RecordingError: no such
+    # by name, or number from 0; RecordingError: no such
+    column: Callable[[str | int], Column]
     row: Callable[[int], str]  # names a row for errors
     notes: Sequence[str] = ()  # a sentence on each thing that reading mended
     # stamps that come with the rows, and in `values` (T, 1) these rows, if any

@@ -32,7 +32,7 @@ MOST_ROWS = 2_000_000
 LONGEST_ROW = 20_000
 TRIED = 400  # lines from which separator and header are found
 MOST_SAMPLED = 50_000  # rows from which their usual width is found
-MOST_BROKEN = 0.01  # share of rows with another number of fields that are left out
+MOST_BROKEN = 0.01  # fraction of rows with another number of fields that are left out
 COMMENTS = ("#", "//", "%")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -230,11 +230,11 @@ def _split_labels(
         else:
             labelled[label].append(column)
     names = []
-    for label, values in labelled.items():
+    for name, values in labelled.items():
         if len(values) == 1:
-            names.append(label)
+            names.append(name)
         else:
-            names += [f"{label}[{k}]" for k in range(len(values))]
+            names += [f"{name}[{k}]" for k in range(len(values))]
     return list(chain.from_iterable(labelled.values())), names
 
 

@@ -49,7 +49,7 @@ class StampedRows(NamedTuple):
 
     t: Array  # (T,) [s]
     rows: NDArray[np.intp]  # (T,)
-    clock: str  # empty if nothing tells it
+    clock: str  # empty if nothing says it
     total: int  # rows of the table, before those without a stamp were left out
 
 

@@ -36,14 +36,12 @@ Storage = Literal["mcap", "sqlite3"]
 
 NPZ = ".npz"
 START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' clock
-APART_NS = (
-    3600 * NS_PER_S
-)  # by which other clocks lag behind: no delay, to whoever reads them
+# by which other clocks lag behind: no delay, to whoever reads them
+APART_NS = 3600 * NS_PER_S
 FRAMES = ("odom", "base_link")
 NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its text
-CHUNK_BYTES = (
-    1 << 16
-)  # damage costs a whole chunk, since each checksum covers a whole chunk
+# damage costs a whole chunk, since each checksum covers a whole chunk
+CHUNK_BYTES = 1 << 16
 
 
 def check_out(path: str | Path) -> Path:
@@ -62,7 +60,7 @@ def check_out(path: str | Path) -> Path:
 
 
 def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None:
-    """Writes a recording, whole or not at all: `.npz`, which tells its robot, or a rosbag2."""
+    """Writes a recording, whole or not at all: `.npz`, which names its robot, or a rosbag2."""
     if Path(path).suffix == NPZ:
         save_recording(replace(recording, robot=spec.model_dump(mode="json")), path)
     else:
@@ -74,7 +72,7 @@ def write_bag(
 ) -> None:
     """Writes a recording as a bag that `load_bag` reads back; for errors see `open_bag_sink`."""
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
-    # or `/pose` on its own clock or beside odometry.
+    # or `/pose` on its own clock or next to odometry.
     with open_bag_sink(path, storage) as sink:
         messages = _Messages(store := sink.store)
         command = recording.command
