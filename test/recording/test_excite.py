@@ -152,7 +152,7 @@ def test_without_being_watched_such_a_robot_would_leave(monkeypatch):
     really = robot.model_copy(
         update={"parameters": {**robot.parameters, "wheelbase": 0.24}}
     )
-    monkeypatch.setattr(Exploration, "see", lambda *_: None)
+    monkeypatch.setattr(Exploration, "observe", lambda *_: None)
     assert any(
         drive_another(robot, really, np.array([1.1, 1.0]), seed) > 2.0
         for seed in range(3)
