@@ -40,8 +40,8 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
     return np.concatenate([position, heading[..., None]], axis=-1)
 
 
-def between(pose: ArrayLike, other: ArrayLike) -> Array:
-    """Returns the pose `other` as seen from `pose`; `compose(pose, result) == other`, (..., 3)."""
+def between(pose: ArrayLike, target: ArrayLike) -> Array:
+    """Returns the pose `target` as seen from `pose`; `compose(pose, result) == target`."""
     pose = np.asarray(pose, dtype=np.float64)
     target = np.asarray(target, dtype=np.float64)
     position = rotate(target[..., :2] - pose[..., :2], -pose[..., 2])
@@ -136,7 +136,7 @@ def compute_depths(points: Array, corners: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         beyond = to_point[..., 0] - to_point[..., 1] * edge[:, 0] / edge[:, 1]
     crossings = (crosses_height & (beyond < 0.0)).sum(axis=1)
-    return np.where(crossings % 2 == 1, distance, -distance)
+    return np.asarray(np.where(crossings % 2 == 1, distance, -distance))
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Bicycle:
         return np.stack([forward, np.zeros_like(forward), yaw_rate], axis=-1)
 
     def command(self, twist: Array) -> tuple[Array, Array]:
-        """Returns speeds and steering angles (...) of twists (..., 3), or zeros to turn in place."""
+        """Returns speeds and steering angles (...) of twists (..., 3); zeros to turn in place."""
         forward = twist[..., 0]
         # of the front wheel, to the left
         sideways = self.wheelbase * twist[..., 2]
