@@ -357,7 +357,7 @@ def test_a_task_of_ones_own_is_opened_where_the_caller_names_it(trap):
     path = policy_with_a_task(trap, "Trap")
     model = direct_model()
     with pytest.raises(
-        BridgeError, match=r"say --task path/to/file\.py:Trap, or task= in Python"
+        BridgeError, match=r"give --task path/to/file\.py:Trap, or task= in Python"
     ):
         open_policy(str(path), model)
     assert not trap.canary.exists()
@@ -382,8 +382,8 @@ def test_a_run_of_a_task_of_ones_own_is_resumed_where_the_caller_names_it(trap):
     run_of_a_task(trap, place)
     done = nics("train", "--resume", "--out", "run", cwd=trap.folder)
     assert (
-        "is a program, which a file of data may not start; name it yourself"
+        "is a program, which a data file must not start; name it yourself"
         in done.stderr
     )
     done = nics("train", "--resume", "--out", "run", "--task", place, cwd=trap.folder)
-    assert "run: holds no checkpoint of these seeds" in done.stderr
+    assert "run: contains no checkpoint of these seeds" in done.stderr

@@ -158,7 +158,7 @@ def test_a_policy_of_a_task_of_ones_own_is_driven_by_the_file_of_the_task(tmp_pa
     )
     done = nics(*words, cwd=tmp_path)
     assert done.returncode == 2
-    assert "say --task path/to/file.py:Patrol" in done.stderr
+    assert "give --task path/to/file.py:Patrol" in done.stderr
     done = nics(*words, "--task", kind, "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     told = json.loads(
@@ -167,7 +167,7 @@ def test_a_policy_of_a_task_of_ones_own_is_driven_by_the_file_of_the_task(tmp_pa
     assert told["conditions"]["kind"] == kind
     assert len(told["policies"]["patrol.onnx"]["fast"]["each"]) == 1
     done = nics("evaluate", "straight", "--task", kind, "--in", "fast", cwd=tmp_path)
-    assert "policy 'straight' drives the task 'navigation' alone" in done.stderr
+    assert "policy 'straight' only drives the task 'navigation'" in done.stderr
 
 
 @pytest.mark.slow

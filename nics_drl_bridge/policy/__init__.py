@@ -1,1 +1,1 @@
-"""Policies: from observation to action, their training and their evaluation."""
+"""Policies map observations to actions: baselines, planners, policy files, training, evaluation."""

@@ -1,4 +1,4 @@
-"""The contract of a policy file: its training, and the robot that it needs."""
+"""The contract of a policy file: the training behind it, and the robot that it requires."""
 
 import base64
 import dataclasses
@@ -25,34 +25,34 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 FORMAT = "nics_drl_bridge/policy/1"
 SUFFIX = ".onnx"
-MAPPINGS = (".yaml", ".yml")  # suffixes of the mapping of a foreign policy
+MAPPINGS = (".yaml", ".yml")  # suffixes of the files that map a foreign policy
 GOLDEN = 16
 GOLDEN_SEED = 0
-# distance from zero of golden observations, if their limits are wider
+# spread of golden observations around zero where their limits are wider
 GOLDEN_SPREAD = 3.0
-GAP_PERIODS = 5  # control periods without an observation after which a state is reset
+GAP_PERIODS = 5  # control periods without an observation after which the state is reset
 MOST_ENTRIES = 20_000
-CHECKSUM = 8  # hexadecimal digits of a field's checksum, which detects mistakes but is no signature
+# hexadecimal digits of a field's checksum: it detects accidents, not tampering
+CHECKSUM = 8
 Rows = NDArray[np.float32]
 
 
 def shipped() -> Path:
-    """The folder of the policy files that come with the package."""
+    """The folder of the policy files that ship with the package."""
     return share_folder() / "config" / "policies"
 
 
 class TaskEntry(Schema):
     """The task of a policy."""
 
-    name: str = Field(
-        min_length=1
-    )  # as in `env.registry.TASKS`, or the name of a user's class
-    options: dict[str, Any]  # all of its options except `scan` and `sensors`
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")  # over name, options and observation
+    # a name in `env.registry.TASKS`, or the name of a user's class
+    name: str = Field(min_length=1)
+    options: dict[str, Any]  # all options except `scan` and `sensors`
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")  # of name, options and observation
 
 
 class ObservationEntry(Schema):
-    """Input of the network: `scan_parts` that are a scan, then others with their limits."""
+    """Input of the network: `scan_parts` scan elements first, then the others with their limits."""
 
     size: int = Field(ge=1, le=200_000)
     scan_parts: int = Field(ge=0)
@@ -61,58 +61,56 @@ class ObservationEntry(Schema):
 
 
 class StateEntry(Schema):
-    """State of a policy, which its graph takes and gives: `state_in` and `state_out` (n, size)."""
+    """State of a policy: graph input `state_in` and output `state_out`, both (n, size)."""
 
     size: int = Field(ge=1, le=200_000)
-    start: float = Field(ge=-1e6, le=1e6)  # each element when an episode begins
-    longest_gap: float = Field(
-        gt=0.0
-    )  # between two observations [s]; after a longer one: as above
+    # value of each element at the start of an episode
+    start: float = Field(ge=-1e6, le=1e6)
+    # longest time between two observations [s]; a longer gap resets the state
+    longest_gap: float = Field(gt=0.0)
 
 
 class GoldenEntry(Schema):
-    """Sixteen pairs that must be reproduced; float32, little endian, in base 64.
+    """Sixteen input-output pairs that the graph must reproduce; float32, little endian, base64.
 
-    Those of a policy with a state are one episode, from its first step on.
+    For a policy with a state they form one episode, starting at its first step.
     """
 
-    observations: str  # (16, O)
-    actions: str  # (16, C), or (16, 1) discrete
-    commands: str  # (16, C) SI
+    observations: str  # (16, O) observations
+    actions: str  # (16, C) actions, or (16, 1) discrete ones
+    commands: str  # (16, C) commands in SI units
 
     def rows(self, name: str) -> Rows:
-        """One of the arrays as (16, ...). Raises ValueError if it is damaged."""
+        """One of the arrays, as (16, ...). Raises ValueError if it is damaged."""
         data = base64.b64decode(getattr(self, name), validate=True)
         return np.frombuffer(data, "<f4").reshape(GOLDEN, -1)
 
 
 class Contract(Schema):
-    """All that a policy file states about itself and the model that it was trained in."""
+    """Everything a policy file states about itself and the model it was trained in."""
 
     format: Literal["nics_drl_bridge/policy/1"]
     robot: RobotSpec
     lidar: LidarSpec
-    scan: (
-        ScanLayout | None
-    )  # sectors of its observations; None: the beams of exactly this lidar
-    sensors: tuple[AnySensor, ...] = ()  # further ones that it observes
+    # sectors of the observed scan; None: the beams of exactly this lidar
+    scan: ScanLayout | None
+    sensors: tuple[AnySensor, ...] = ()  # further sensors that the policy observes
     task: TaskEntry
     observation: ObservationEntry
-    # None: each action follows from one observation alone
+    # None: the policy has no state
     state: StateEntry | None = None
-    # greatest number of observations in one run; None: any
+    # maximum number of observations per run; None: no maximum
     batch: Literal[1] | None = None
     actions: Literal["continuous", "discrete"]
     control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
-    # time limit of the episodes that it learnt in; older files do not tell it
+    # time limit of the training episodes; older files lack it
     max_episode_steps: int | None = Field(default=None, ge=1)
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
-    provenance: dict[str, Any]  # command, seed and versions of its making
-    graph_sha256: str = Field(
-        pattern="^[0-9a-f]{64}$"
-    )  # of the graph, including the weights
-    golden: GoldenEntry  # pairs that must be reproduced
-    checksums: dict[str, str]  # of each entry above, by its path
+    provenance: dict[str, Any]  # command, seed and versions that produced the file
+    # of the graph, including the weights
+    graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    golden: GoldenEntry  # pairs that the graph must reproduce
+    checksums: dict[str, str]  # checksum of each entry above, by its path
 
     @field_validator("provenance")
     @classmethod
@@ -121,7 +119,7 @@ class Contract(Schema):
             not isinstance(v, str | int | float | bool | None)
             for v in provenance.values()
         ):
-            raise ValueError("must hold words and numbers only")
+            raise ValueError("must contain only text and numbers")
         return provenance
 
 
@@ -135,7 +133,7 @@ def contract_of(
     batch: Literal[1] | None = None,
     max_episode_steps: int | None = None,
 ) -> str:
-    """Writes the contract of a policy as JSON; the state is its size and start value.
+    """Writes the contract of a policy as JSON; `state` is the size and start value of the state.
 
     Raises ConfigError if an entry has a wrong type.
     """
@@ -173,7 +171,7 @@ def contract_of(
 
 
 def golden_observations(task: Task) -> Rows:
-    """Observations (16, O) within the limits of a task's, always the same ones."""
+    """The fixed set of observations (16, O) within the limits of the task's observation space."""
     space = task.observation_space
     low = np.maximum(space.low, -GOLDEN_SPREAD)
     high = np.minimum(space.high, GOLDEN_SPREAD)
@@ -195,7 +193,7 @@ def task_entry(task: Task) -> dict[str, Any]:
 
 
 def observation_entry(task: Task) -> dict[str, Any]:
-    """Observation of a task, as the entries of `ObservationEntry`."""
+    """Observation space of a task as the fields of `ObservationEntry`."""
     space = task.observation_space
     parts = task.scan_parts
     return {
@@ -216,7 +214,7 @@ def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
 
 
 def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields every entry of nested mappings and lists with its path, as `robot.command.0.max`."""
+    """Yields every leaf of nested mappings and lists with its path, like `robot.command.0.max`."""
     if isinstance(data, dict | list) and data:
         for key, value in data.items() if isinstance(data, dict) else enumerate(data):
             yield from leaves(value, f"{path}.{key}" if path else str(key))
@@ -225,7 +223,7 @@ def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def checksums(data: Mapping[str, Any]) -> dict[str, str]:
-    """Checksum of each entry except `checksums`, by path."""
+    """Checksum of each entry by path, leaving out `checksums` itself."""
     known = {name: value for name, value in data.items() if name != "checksums"}
     return {
         path: hash_bytes(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)
@@ -236,14 +234,14 @@ def read_contract(text: str, source: str) -> Contract:
     """Reads and checks the contract of a policy file. Raises PolicyError, which names the field."""
     entries = sum(map(text.count, ",[{"))
     if entries > MOST_ENTRIES:
-        reason = f"has {entries} entries, a contract at most {MOST_ENTRIES}; not read."
+        reason = f"has {entries} entries, more than the {MOST_ENTRIES} of a contract; not read."
         raise PolicyError(source, "metadata", reason)
     try:
         data = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
-        reason = f"is not JSON as `export_policy` writes it ({str(error)[:80]})"
+        reason = f"is not the JSON that `export_policy` writes ({str(error)[:80]})"
         raise PolicyError(
-            source, "metadata", f"{reason}; export the policy anew."
+            source, "metadata", f"{reason}; export the policy again."
         ) from None
     given = data.get("format") if isinstance(data, dict) else None
     if given != FORMAT:
@@ -253,9 +251,9 @@ def read_contract(text: str, source: str) -> Contract:
         contract = validate(data, Contract, source)
     except ConfigError as error:
         reason = str(error).removeprefix(f"{source}: ")
-        # What is missing can't be added to a file that is signed.
+        # A missing field can't be added to a signed file, so the advice is to export again.
         reason = reason.replace(
-            "is missing; add it.", "is missing; export the policy anew."
+            "is missing; add it.", "is missing; export the policy again."
         )
         quoted = reason.split("'")
         key = quoted[1] if len(quoted) > 2 and "key" in quoted[0] else "metadata"
@@ -267,12 +265,12 @@ def read_contract(text: str, source: str) -> Contract:
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(dict(pairs)) != len(pairs):
-        raise ValueError("a key stands twice")
+        raise ValueError("a key occurs twice")
     return dict(pairs)
 
 
 def _no_constant(word: str) -> Any:
-    raise ValueError(f"{word} is no number")
+    raise ValueError(f"{word} is not a number")
 
 
 def _check_unchanged(data: dict[str, Any], source: str) -> None:
@@ -280,7 +278,7 @@ def _check_unchanged(data: dict[str, Any], source: str) -> None:
     then = data["checksums"]
     for path in (*now, *then):
         if now.get(path) != then.get(path):
-            reason = "was changed after the export; take the file as it was exported."
+            reason = "was changed after the export; use the file as exported."
             raise PolicyError(source, path, reason)
 
 
@@ -291,17 +289,17 @@ def _check_agreement(contract: Contract, source: str) -> None:
     name = "lidar.beams" if scan is None else "scan.sectors"
     rest = len(observation.rest_low)
     if observation.scan_parts != parts:
-        reason = f"is {parts}, but observations hold {observation.scan_parts} parts of a scan."
+        reason = (
+            f"is {parts}, but observations have {observation.scan_parts} scan elements."
+        )
         raise PolicyError(source, name, reason)
     if observation.size != parts + rest or len(observation.rest_high) != rest:
-        reason = (
-            f"is {observation.size}, not the {parts} of the scan and {rest} others."
-        )
+        reason = f"is {observation.size}, not {parts} scan elements plus {rest} others."
         raise PolicyError(source, "observation.size", reason)
     seen = observation.model_dump(mode="json")
     if contract.task.sha256 != _task_hash(contract.task.model_dump(), seen):
         raise PolicyError(
-            source, "task.sha256", "does not belong to the task and observation."
+            source, "task.sha256", "does not match the task and observation."
         )
     commands = len(contract.robot.command)
     actions = 1 if contract.actions == "discrete" else commands
@@ -312,7 +310,5 @@ def _check_agreement(contract: Contract, source: str) -> None:
         except ValueError:
             raise PolicyError(source, f"golden.{name}", "is damaged.") from None
         if rows.shape != (GOLDEN, size) or not np.isfinite(rows).all():
-            reason = (
-                f"must be {GOLDEN} rows of {size} finite numbers, not {rows.shape}."
-            )
+            reason = f"must have shape ({GOLDEN}, {size}) and finite numbers, not {rows.shape}."
             raise PolicyError(source, f"golden.{name}", reason)

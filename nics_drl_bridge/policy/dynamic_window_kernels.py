@@ -7,40 +7,40 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.policy import local_map_kernels as kernels
 
-INADMISSIBLE = 500.0  # half the price of a twist that hits before it can be stopped
-MOVING = 0.05  # speed above which a robot has to be stopped [m/s]
+# half the cost of a twist that hits something before the robot can stop
+INADMISSIBLE = 500.0
+MOVING = 0.05  # speed above which stopping takes time [m/s]
 
 
 class LookAhead(NamedTuple):
-    """Parameters of the roll-outs of a robot."""
+    """Parameters of the rollouts of a robot."""
 
-    reach: Array  # (3,) greatest change of a twist in one period
+    reach: Array  # (3,) maximum change of the twist in one period
     period: float  # time step [s]
     steps: int
-    reaction: float  # time until a robot that is told to stop brakes [s]
-    slowness: float  # inverse of the deceleration that follows [s^2/m]
-    lever: float  # by which a turn rate adds to the speed that is braked [m]
-    turn_reaction: (
-        float  # likewise of a turn that brakes apart from the speed, else 0 [s]
-    )
-    turn_slowness: float  # inverse of its deceleration [s^2/rad]
-    far: float  # distance along an axis, beyond which nothing is known [m]
+    reaction: float  # time from a stop command to the start of braking [s]
+    slowness: float  # inverse of the deceleration then [s^2/m]
+    lever: float  # factor that converts a turn rate to the speed it adds to braking [m]
+    # reaction time of a turn that brakes independently of the speed, else 0 [s]
+    turn_reaction: float
+    turn_slowness: float  # inverse of the turn's deceleration [s^2/rad]
+    far: float  # distance along an axis beyond which the map knows nothing [m]
 
 
 class TwistWeights(NamedTuple):
-    """Weights of the cost of a twist."""
+    """Weights of the terms in the cost of a twist."""
 
-    gap: float  # left on the way to the goal [1/m]
-    aim: float  # of the heading, from 0 along that way to 1 the other way
-    clearance: (
-        float  # of the nearest obstacle on the way, from 0 far away to 1 at the margin
-    )
-    time: float  # until a contact
+    gap: float  # weight of the path length left to the goal [1/m]
+    # weight of the heading error, which is 0 towards the goal and 1 away from it
+    aim: float
+    # weight of the nearest obstacle on the path: 0 if far away, 1 at the margin
+    clearance: float
+    time: float  # weight of the time until a contact
 
 
 @kernel(allocates=True)
 def choose_all(out, scans, goals, twists, candidates, ahead, weights, sense):  # type: ignore[no-untyped-def]
-    """Writes for N robots the index of the candidate that `choose` returns into out (N,)."""
+    """Writes the index of the candidate that `choose` picks for each of N robots into out (N,)."""
     for n in range(out.shape[0]):
         around = kernels.look(scans[n], goals[n], *sense)
         out[n] = choose(around, twists[n], candidates, ahead, weights)
@@ -51,7 +51,7 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
     """Returns the index of the cheapest candidate (K, 3), preferring those within the window."""
     best = 0
     least = math.inf
-    # Where braking takes time, a robot that could not stop a period later is told to stop now.
+    # If braking takes time, a robot that could no longer stop one period later must stop now.
     late = ahead.slowness > 0.0 and math.hypot(twist[0], twist[1]) > MOVING
     late = late and cost_of(around, twist, twist, ahead, weights) > INADMISSIBLE
     for k in range(candidates.shape[0]):
@@ -61,7 +61,7 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
             moves |= candidates[k, i] != 0.0
             far |= abs(candidates[k, i] - twist[i]) > ahead.reach[i]
         cost = cost_of(around, candidates[k], twist, ahead, weights)
-        # Where braking takes time a twist is judged from the present one, however far that is.
+        # If braking takes time, a twist is judged from the present one, however different it is.
         cost += 1e6 if far and ahead.slowness == 0.0 else 0.0
         cost += 1e6 if late and moves else 0.0
         if cost < least:
@@ -72,9 +72,9 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
 
 @kernel
 def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-def]
-    """Cost of holding a twist (3,), which is inadmissible if it hits before it can be stopped.
+    """Cost of holding a twist (3,); a twist that hits before the robot can stop is inadmissible.
 
-    A robot whose brakes take time comes from its present twist (3,), which may be faster.
+    Where braking takes time, the robot starts from its present twist (3,), which may be faster.
     """
     period = ahead.period
     steps = ahead.steps
@@ -108,7 +108,7 @@ def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-de
     cost += weights.clearance * (1.0 - min(max(near, 0.0), keep.soft) / keep.soft)
     cost += weights.time * (1.0 - free / steps)
     moves = abs(aimed[0]) + abs(aimed[1]) > 1e-9
-    # The path of an even braking is that of half its time at full speed.
+    # Uniform braking covers as much distance as half its duration at full speed.
     speed = math.hypot(aimed[0], aimed[1])
     pace = speed + ahead.lever * abs(aimed[2])
     faster = 1.0

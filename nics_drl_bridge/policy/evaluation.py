@@ -1,4 +1,4 @@
-"""Evaluation: drives episodes, judges them by the truth, and tallies the results."""
+"""Evaluation: run episodes, judge them by the ground truth, and tally the results."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,20 +21,20 @@ from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import check_seeds
 
 Flags = NDArray[np.bool_]
-Act = Callable[
-    [NDArray[np.float32]], NDArray[Any]
-]  # actions (N, C) for observations (N, O)
+# actions (N, C) for observations (N, O)
+Act = Callable[[NDArray[np.float32]], NDArray[Any]]
 
 # first seed of an evaluation, far from the seeds of any training
 FIRST_SEED = 1_000_000
-DRIFT_M = 0.1  # a robot stops where it believes its goal is; odometry may have drifted by this much
+# allowance for odometry drift: a robot stops where it believes its goal is [m]
+DRIFT_M = 0.1
 ELSEWHERE = "elsewhere"
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Episode:
-    """Record of an episode: `success`, `collision`, `time-out`, or `elsewhere`, by the truth."""
+    """Record of an episode; `result`, by the truth: success, collision, time-out or elsewhere."""
 
     seed: int
     result: str
@@ -43,13 +43,13 @@ class Episode:
     goal: Array  # (2,) [m]
     bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
     reward: float  # sum over the episode
-    believed: str | None = None  # by the robot itself, where `result` is by the truth
-    # of the estimate, gained since the start, where known
+    believed: str | None = None  # the robot's own result; `result` is the truth
+    # uncertainty of the estimate gained since the start, if known
     uncertain: Uncertainty | None = None
 
     @property
     def believed_success(self) -> bool:
-        """True if the robot believed to have arrived without touching anything."""
+        """True if the robot believes it arrived without touching anything."""
         return (self.believed or self.result) == "success"
 
     @property
@@ -90,13 +90,13 @@ def drive(
     on_start: Callable[[], None] = lambda: None,
     touched: Callable[[], bool] | None = None,
 ) -> Episode:
-    """Drives one episode to its end; halts the robot if the policy or a callback raises."""
+    """Runs one episode to its end; halts the robot if the policy or a callback raises."""
     try:
         observation, info = env.reset(seed=seed, options=options)
         on_start()
         begin(policy)
         goal, bodies = info.get("goal"), info["bodies"]
-        if goal is None:  # a task of one's own may not show it
+        if goal is None:  # a user's task may not expose its goal
             goal = env.get_wrapper_attr("scene").goals[0]
         paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
         covariances: list[Array] = []
@@ -119,7 +119,8 @@ def drive(
         if "true_pose" not in info:
             return Episode(seed, believed, *driven, uncertain=uncertain)
         known = info.get("true_collision")
-        if known is None:  # then `touched` tells, or else the robot itself
+        # without the truth, `touched` decides if given, otherwise the robot itself
+        if known is None:
             known = believed == "collision" if touched is None else touched()
         hit = bool(np.any(known))
         there = truly_near(
@@ -129,7 +130,8 @@ def drive(
         true = ELSEWHERE if wrong else believed
         return Episode(seed, "collision" if hit else true, *driven, believed)
     except BaseException:
-        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
+        # the env does not see errors raised by the policy
+        if isinstance(env.unwrapped, BridgeEnv):
             with uninterrupted():
                 env.unwrapped.halt()
         raise
@@ -139,13 +141,13 @@ def _answer(act: Act, observation: NDArray[np.float32], step: int) -> NDArray[An
     action = act(observation)
     if not np.isfinite(action).all():
         raise ConfigError(
-            f"the policy's action in step {step} holds NaN or inf; train it anew."
+            f"the policy's action in step {step} contains NaN or inf; train it again."
         )
     return action
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
-    """True where poses (..., 3) are at goals (..., 2), up to `DRIFT_M`; without goals always."""
+    """True where poses (..., 3) are within `DRIFT_M` of goals (..., 2), or there are none."""
     if not isinstance(task, Navigation):
         return np.ones(np.shape(poses)[:-1], np.bool_)
     gaps = np.hypot(*np.moveaxis(poses[..., :2] - goals, -1, 0))
@@ -159,7 +161,7 @@ def drive_all(
     on_episode: Callable[[Episode], None] = lambda _: None,
     touched: Callable[[], bool] | None = None,
 ) -> list[Episode]:
-    """Drives one episode per seed and calls `on_episode` as each ends."""
+    """Runs one episode per seed and calls `on_episode` as each ends."""
     episodes = []
     for seed in seeds:
         episodes.append(drive(env, policy, seed, touched=touched))
@@ -185,27 +187,27 @@ class Outcomes:
     """Outcomes of E episodes; all arrays are (E,)."""
 
     seeds: NDArray[np.int64]
-    success: Flags  # the goal was truly reached, and nothing touched
+    success: Flags  # the robot truly reached its goal and touched nothing
     collision: Flags  # the robot truly touched something
     steps: NDArray[np.int64]  # control periods
-    length: Array  # of the true path [m]; for a team, the mean over its robots
+    length: Array  # true path length [m]; for a team, the mean over its robots
     reward: Array  # sum over the episode
-    believed: Flags  # by the robot itself, the goal was reached and nothing touched
+    believed: Flags  # the robot believes it reached its goal and touched nothing
 
     @property
     def time_out(self) -> Flags:
-        """Neither success nor collision."""
+        """Flags of episodes with neither success nor collision."""
         return ~(self.success | self.collision)
 
 
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
-    """Drives an episode per seed, to the bit as `BridgeEnv.reset(seed=...)` without estimator.
+    """Runs an episode per seed, bit-identical to `BridgeEnv.reset(seed=...)` without an estimator.
 
-    A policy with a state is given by its method `act`, so that its episodes can begin.
+    Pass the method `act` of a policy with a state, so that its state can be reset.
     """
     width = env.num_envs
     given = check_seeds(seeds)
-    # The last batch is padded with seeds that are driven but not counted.
+    # Seeds that fill up the last batch are run but not counted.
     batches = (
         np.resize(given[k : k + width], width) for k in range(0, len(given), width)
     )
@@ -216,7 +218,7 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
 def _drive_once(
     env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]
 ) -> tuple[Any, ...]:
-    """Drives one episode in each world: the fields of `Outcomes` but seeds, each (N,)."""
+    """Runs one episode in each world; returns the fields of `Outcomes` except seeds, each (N,)."""
     count = env.num_envs
     observation, info = env.reset(seed=list(seeds))
     begin(act)
@@ -250,21 +252,21 @@ def _drive_once(
 
 
 def _robots(info: dict[str, Any], name: str) -> Flags:
-    """Flags (N, M) of an info; (1, 1) False if it has none."""
+    """Flags (N, M) of an entry in `info`; (1, 1) False if the entry is missing."""
     values = np.asarray(info.get(name, [False]), np.bool_)
     return values.reshape(len(values), -1)
 
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A figure, NaN if nothing was observed, with its 95 % interval, infinite for one value."""
+    """A statistic with its 95 % interval: NaN without observations, infinite interval for one."""
 
     value: float
     low: float
     high: float
 
     def text(self, unit: str) -> str:
-        """The figure with its interval, or what of them is known."""
+        """Format the statistic with its interval, or whichever part is known."""
         if math.isnan(self.value):
             return "unknown"
         known = f"{self.value:.2f} {unit}"
@@ -274,7 +276,7 @@ class ConfidenceInterval:
 
 
 def rate(hits: int, trials: int) -> ConfidenceInterval:
-    """A share of trials with Wilson's score interval (1927), valid for few trials too."""
+    """Fraction of trials with Wilson's score interval (1927), which is valid for few trials too."""
     if trials < 1:
         return ConfidenceInterval(math.nan, 0.0, 1.0)
     share = hits / trials
@@ -286,7 +288,7 @@ def rate(hits: int, trials: int) -> ConfidenceInterval:
         / scale
         * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
     )
-    # With no hits, or hits only, rounding must not move the end away from 0 or 1.
+    # If all trials agree, rounding must not move the bound away from 0 or 1.
     low = 0.0 if hits == 0 else middle - half
     return ConfidenceInterval(share, low, 1.0 if hits == trials else middle + half)
 
@@ -304,19 +306,19 @@ def mean(values: ArrayLike) -> ConfidenceInterval:
 
 @dataclass(frozen=True)
 class Summary:
-    """Shares of the episodes; mean path [m] and duration [s] of the successful ones."""
+    """Success rates of episodes; mean path [m] and duration [s] of the successful ones."""
 
     episodes: int
     success: ConfidenceInterval
     collision: ConfidenceInterval
     time_out: ConfidenceInterval
-    believed: ConfidenceInterval  # share that the robot itself believed successful
+    believed: ConfidenceInterval  # fraction that the robot itself believed successful
     length: ConfidenceInterval
     time: ConfidenceInterval
 
     @property
     def shares(self) -> dict[str, ConfidenceInterval]:
-        """The shares by the name of the result."""
+        """Fractions by the name of the result."""
         names = "success", "believed", "collision", "time_out"
         return {name.replace("_", "-"): getattr(self, name) for name in names}
 
@@ -334,14 +336,14 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
 
 @dataclass(frozen=True)
 class Tally(Summary):
-    """Figures of the episodes of one world; `deviation` [m] is the mean distance from the first."""
+    """Statistics of the episodes in one world; `deviation` [m] is the mean from the first world."""
 
-    same: float  # share of the episodes that ended as in the first world
+    same: float  # fraction of episodes that ended as in the first world
     deviation: ConfidenceInterval
     greatest_deviation: float  # maximum over all episodes [m]
 
     def figures(self) -> dict[str, Any]:
-        """The tally as plain data, an interval as a list; non-finite values become null."""
+        """The tally as plain data, with intervals as lists and non-finite values as null."""
         figures: dict[str, Any] = {}
         for name, value in vars(self).items():
             ends = [value]
@@ -355,7 +357,7 @@ class Tally(Summary):
 def tallies(
     runs: Mapping[str, Sequence[Episode]], control_period: float
 ) -> dict[str, Tally]:
-    """Computes the figures of each world, compared with the same seeds in the first."""
+    """Computes the statistics of each world, compared with the same seeds in the first."""
     first = next(iter(runs.values()))
     found = {}
     for place, episodes in runs.items():

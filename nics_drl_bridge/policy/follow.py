@@ -1,4 +1,4 @@
-"""Following a path by a policy that drives to goals: sub-goals on it, progress, and its end."""
+"""Follows a path with a goal-driven policy: sub-goals on the path, progress, and arrival."""
 
 import math
 from dataclasses import dataclass
@@ -10,47 +10,50 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.interface import Array
 
-SPACING = 0.05  # between the points of a path [m]
-WINDOW = 2.0  # of the way ahead, in which the nearest point is looked for [m]
-FARTHEST = 1e6  # greatest coordinate of a path [m]
-LONGEST = 1e5  # greatest length of a path [m]
+SPACING = 0.05  # distance between the sampled points of a path [m]
+WINDOW = 2.0  # path length ahead that is searched for the nearest point [m]
+FARTHEST = 1e6  # maximum coordinate of a path [m]
+LONGEST = 1e5  # maximum length of a path [m]
 
 
 @dataclass(frozen=True)
 class GoalCheck:
-    """When a path counts as followed, as of Nav2's SimpleGoalChecker or PositionGoalChecker."""
+    """When a path counts as followed; cf. Nav2's SimpleGoalChecker and PositionGoalChecker."""
 
     xy_goal_tolerance: float = 0.25  # [m]
-    yaw_goal_tolerance: float = 0.25  # [rad]; robots that steer are not turned
-    stateful: bool = True  # a place that was reached stays so while the robot turns
-    # greatest length of the way that may be left [m]
+    # tolerance of the heading [rad]; ignored for robots that steer
+    yaw_goal_tolerance: float = 0.25
+    # once the position was reached it counts as reached while the robot turns
+    stateful: bool = True
+    # maximum path length that may remain [m]
     path_length_tolerance: float = 1.0
 
 
 @dataclass(frozen=True)
 class ProgressCheck:
-    """When a robot counts as stuck, as of Nav2's SimpleProgressChecker or PoseProgressChecker."""
+    """When a robot counts as stuck; cf. Nav2's SimpleProgressChecker and PoseProgressChecker."""
 
-    required_movement_radius: float = 0.5  # that it has to leave [m]
-    movement_time_allowance: float = 10.0  # within this time [s]
-    required_movement_angle: float = math.inf  # or has to turn by [rad]
+    required_movement_radius: float = 0.5  # distance that the robot must move [m]
+    movement_time_allowance: float = 10.0  # time within which it must do so [s]
+    # turn that counts as progress as well [rad]
+    required_movement_angle: float = math.inf
 
 
 class Place(NamedTuple):
-    """Place of a robot on its path."""
+    """Position of a robot relative to its path."""
 
     ahead: Array  # (2,) sub-goal [m]
-    nearest: int  # index of the nearest pose that the path was given by
-    remaining: float  # length of the way that is left [m]
-    distance: float  # straight to the end [m]
-    left: float  # of the path, negative to its right [m]
-    turned: float  # from the path's direction to the right [rad]
+    nearest: int  # index of the nearest original pose of the path
+    remaining: float  # path length that remains [m]
+    distance: float  # straight-line distance to the end [m]
+    left: float  # offset to the left of the path, negative to its right [m]
+    turned: float  # angle from the robot's heading to the path's direction [rad]
 
 
 class PlannedPath:
-    """A path (P, 3) or (P, 2), and where on it the robot is. Raises ConfigError for none.
+    """A path (P, 3) or (P, 2), and the robot's progress along it. Raises ConfigError if invalid.
 
-    Points that have been passed are not looked at again, so that a path may cross itself.
+    Points already passed are not considered again, so a path may cross itself.
     """
 
     def __init__(self, poses: Array) -> None:
@@ -58,12 +61,12 @@ class PlannedPath:
             raise ConfigError("the path is empty; give one with at least one pose.")
         if not (np.abs(poses) < FARTHEST).all():
             raise ConfigError(
-                "the path has a coordinate that is no number, or out of all reach."
+                "the path has a coordinate that is not a number, or too large."
             )
         along = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
         if along[-1] > LONGEST:
             raise ConfigError(
-                f"the path has {along[-1]:.3g} m, and {LONGEST:g} m are the most."
+                f"the path is {along[-1]:.3g} m long; the maximum is {LONGEST:g} m."
             )
         count = max(1, math.ceil(along[-1] / SPACING)) + 1
         self.end = poses[-1]
@@ -76,13 +79,13 @@ class PlannedPath:
 
     @property
     def length(self) -> float:
-        """Of the whole path [m]."""
+        """Length of the whole path [m]."""
         return float(self._along[-1])
 
     def locate(self, pose: Array, lookahead: float) -> Place:
-        """Returns the place of a robot at a pose (3,); the sub-goal is at most `lookahead` [m] on.
+        """Returns the place of a robot at a pose (3,), and a sub-goal up to `lookahead` [m] ahead.
 
-        It goes on to the nearest point.
+        Advances the progress to the nearest point.
         """
         last = int(
             np.searchsorted(self._along, self._along[self._at] + WINDOW, "right")
@@ -118,7 +121,7 @@ class GoalChecker:
         self._there = False
 
     def turn_left(self, place: Place, pose: Array, end: Array) -> float | None:
-        """Returns the turn that is left [rad], 0 at the goal; None if its place is not reached."""
+        """Returns the remaining turn [rad], 0 at the goal; None before its position is reached."""
         check = self._check
         near = place.distance <= check.xy_goal_tolerance
         here = near and place.remaining <= check.path_length_tolerance
@@ -133,19 +136,20 @@ class GoalChecker:
 
 
 class ProgressChecker:
-    """Judges whether a robot gets on."""
+    """Judges whether a robot makes progress."""
 
     def __init__(self, check: ProgressCheck) -> None:
         self.check = check
         self._base: tuple[float, Array] | None = None
 
     def stuck(self, time_s: float, pose: Array) -> bool:
-        """True if a robot, at a pose (3,) at a time, has not moved enough for too long."""
+        """True if a robot at a pose (3,) has not moved enough for too long."""
         check = self.check
+        # no starting point yet; a start later than now means that the clock was set back
         since, place = self._base or (
             math.inf,
             pose,
-        )  # later than now if the clock was set back
+        )
         moved = math.dist(pose[:2], place[:2]) > check.required_movement_radius
         turned = abs(wrap_angle(pose[2] - place[2])) > check.required_movement_angle
         if time_s < since or moved or turned:

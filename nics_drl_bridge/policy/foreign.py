@@ -1,4 +1,4 @@
-"""Policies of others: a network with a mapping, or a bundle, as a policy file of ours."""
+"""Foreign policies: turns a network with a mapping, or a bundle, into a policy file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from nics_drl_bridge.policy.onnx_session import GraphNeeds, in_turn, open_sessio
 
 @dataclass(frozen=True)
 class Order:
-    """A policy of somebody else: its mapping, its network, and the file that names them."""
+    """A foreign policy: its mapping, its network, and the file that names them."""
 
     mapping: ForeignPolicy
     network: Network
@@ -40,10 +40,10 @@ class Order:
 def load_any(
     path: str | Path, model: SimulatorModel | None = None
 ) -> policy_file.PolicyFile:
-    """Loads a policy file, see `load_policy`, or makes one of the YAML file of a foreign policy.
+    """Loads a policy file, see `load_policy`, or builds one from the YAML file of a foreign policy.
 
-    That is for a robot; None: the one that the mapping names. Raises ConfigError for a wrong
-    mapping, PolicyError for what does not fit together.
+    `model` is the robot to drive; None uses the robot that the mapping names. Raises ConfigError
+    for a wrong mapping, PolicyError for a network that does not fit it.
     """
     if str(path).endswith(MAPPINGS):
         return policy_file.policy_of(
@@ -53,7 +53,7 @@ def load_any(
 
 
 def import_policy(source: str | Path, model: SimulatorModel | None = None) -> bytes:
-    """A policy file of ours of a LEAPP bundle or a mapping; ours again if it was exported.
+    """Converts a LEAPP bundle or a mapping to a policy file; restores what we exported.
 
     Raises ConfigError or PolicyError, which says what can't be expressed.
     """
@@ -65,7 +65,7 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
         return ours
     if model is None:
         raise ConfigError(
-            f"{path}: a bundle of others names no robot; say which with --robot."
+            f"{path}: a foreign bundle names no robot; name one with --robot."
         )
     mapping = validate(leapp_bundle.mapping_of(bundle, model), ForeignPolicy, str(path))
     return _content(Order(mapping, bundle.network, path, bundle.sha256), model)
@@ -74,7 +74,7 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
 def _ordered(path: Path, model: SimulatorModel | None) -> Order:
     data = parse_yaml(read_text(path), str(path))
     if data.get("kind") != "foreign policy":
-        reason = "it is no mapping of a foreign policy, whose first line is `kind: foreign policy`"
+        reason = "is not the mapping of a foreign policy (`kind: foreign policy`)"
         raise ConfigError(f"{path}: {reason}.")
     mapping = validate(data, ForeignPolicy, str(path))
     file = path.parent / mapping.network
@@ -88,13 +88,13 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
         raise PolicyError(str(path), "network", f"{known}, not {mapping.network!r}.")
     try:
         if file.stat().st_size > onnx_graph.SIZE_LIMIT:
-            most = f"{onnx_graph.SIZE_LIMIT // 2**20} MB, as no policy is; not opened."
+            most = f"{onnx_graph.SIZE_LIMIT // 2**20} MB; not opened."
             raise PolicyError(
                 str(path), "network", f"{mapping.network!r} has more than {most}"
             )
         content = file.read_bytes()
     except OSError as error:
-        reason = f"{mapping.network!r} can't be read ({error.strerror}); it is beside the mapping."
+        reason = f"{mapping.network!r} can't be read ({error.strerror}); see its path."
         raise PolicyError(str(path), "network", reason) from None
     rehearsal.rehearse_network(content, str(file))
     network = onnx_graph.parsed(content, str(file))
@@ -107,7 +107,7 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
     source = str(order.path)
     if model is None:
         if mapping.robot is None:
-            fix = "add `robot:`, or say which it drives with --model or --robot."
+            fix = "add `robot:`, or name one with --model or --robot."
             raise ConfigError(f"{source}: names no robot; {fix}")
         model = open_model(mapping.robot)
     period = model.control_period
@@ -138,9 +138,8 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
     content = graph.SerializeToString()
     widths: dict[str, int | None] = {STATE_IN: size} if size else {}
     needs = GraphNeeds(widths, batch=1, graph_sha256="", start=0.0 if size else None)
-    rehearsal.rehearse_graph(
-        content, needs, seen, source
-    )  # before anything of it runs here
+    # the composed graph is as untrusted as the network in it
+    rehearsal.rehearse_graph(content, needs, seen, source)
     onnx_graph.rows_at_once(graph, source, 1)
     session = open_session(content, source)
     names = (onnx_graph.INPUT, STATE_IN)
@@ -158,7 +157,7 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
     rows = in_turn(run if size else lambda one, state: [*run(one), state], seen, start)
     if not all(np.isfinite(part).all() for part in rows):
         reason = (
-            "gives NaN or inf for ordinary observations; check scaling and weights."
+            "returns NaN or inf for ordinary observations; check scaling and weights."
         )
         raise PolicyError(source, "network", reason)
     return {"observations": seen, "actions": rows[0], "commands": rows[1]}

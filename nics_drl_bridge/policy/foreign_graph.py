@@ -1,4 +1,4 @@
-"""Puts a foreign network between the observation of a task and the commands of a robot."""
+"""Connects a foreign network to the observation of a task and the commands of a robot."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,9 @@ from nics_drl_bridge.policy import foreign_mapping, graph_folding, onnx_graph, r
 from nics_drl_bridge.policy.graph_builder import Builder
 from nics_drl_bridge.robot.spec import RobotSpec
 
-THEIRS = "network/"  # before every name of the foreign graph
-OLDEST_OPSET = 8  # from which on the operators used here broadcast
-SLOWEST = 1e-6  # speed below which a steering angle is 0 [m/s]
+THEIRS = "network/"  # prefix of every name in the foreign graph
+OLDEST_OPSET = 8  # first opset in which the operators used here broadcast
+SLOWEST = 1e-6  # speed below which the steering angle is 0 [m/s]
 FIELDS = dict(
     zip(foreign_mapping.TWIST, ("linear.x", "linear.y", "angular.z"), strict=True)
 )
@@ -25,16 +25,15 @@ FIELDS = dict(
 
 @dataclass(frozen=True)
 class Network:
-    """A foreign network, and its states as far as its own files tell them."""
+    """A foreign network, and its states as far as its own files describe them."""
 
     model: Any  # onnx.ModelProto
-    states: Mapping[str, foreign_mapping.ForeignState] = field(
-        default_factory=dict
-    )  # by input
+    # states by input name
+    states: Mapping[str, foreign_mapping.ForeignState] = field(default_factory=dict)
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """Inputs by name, as onnx.ValueInfoProto; weights may be listed among them."""
+        """Inputs by name, as onnx.ValueInfoProto; weights may be among them."""
         held = {tensor.name for tensor in self.model.graph.initializer}
         return {one.name: one for one in self.model.graph.input if one.name not in held}
 
@@ -45,7 +44,7 @@ class Network:
 
 
 class Composer:
-    """Builds the graph of a policy file around a foreign network, for one observation at once."""
+    """Builds the graph of a policy file around a foreign network, for one observation at a time."""
 
     def __init__(
         self,
@@ -60,12 +59,12 @@ class Composer:
         self._source = source
         self._states = {**network.states, **mapping.states}
         self._build = Builder()
-        self._past: dict[str, str] = {}  # rows of the state by what they keep
-        self._next: dict[str, str] = {}  # rows of the state that follows
+        self._past: dict[str, str] = {}  # rows of the current state, by what they store
+        self._next: dict[str, str] = {}  # rows of the next state
         self._check_names()
 
     def compose(self) -> tuple[Any, int]:
-        """Returns the ModelProto, and the size of its state."""
+        """Returns the ModelProto and the size of its state."""
         build = self._build
         theirs = self._theirs()
         sizes = self._state_sizes()
@@ -107,13 +106,12 @@ class Composer:
                 )
         for name in taken:
             if name not in mapping.inputs and name not in self._states:
-                reason = (
-                    "the network takes this input, and nothing says what it is; add it."
-                )
+                reason = "the network has this input, but the mapping does not; add it."
                 raise self._fault(f"inputs.{name}", reason)
             if name in mapping.inputs and name in self._states:
                 raise self._fault(
-                    f"states.{name}", "is an input as well; keep one of them."
+                    f"states.{name}",
+                    "is also listed under inputs; keep one of the two.",
                 )
         commands = mapping.outputs.items()
         named = [
@@ -132,10 +130,10 @@ class Composer:
                 fix = suggest(name, given)
                 raise self._fault(place, f"the network has no output {name!r}; {fix}")
 
-    # Shapes. One observation at once: what was left open in the first place is 1.
+    # Shapes. There is one observation at a time, so an open first dimension is 1.
 
     def _theirs(self) -> Any:
-        """The foreign graph with names of its own, fixed shapes, and inputs that are fed here."""
+        """The foreign graph with prefixed names, fixed shapes, and inputs that are fed here."""
         model = onnx.ModelProto()
         model.CopyFrom(self._network.model)
         versions = [
@@ -143,7 +141,7 @@ class Composer:
         ]
         if not versions or max(versions) < OLDEST_OPSET:
             reason = (
-                f"is {max(versions, default=0)}, needed is {OLDEST_OPSET} or newer."
+                f"is {max(versions, default=0)}; {OLDEST_OPSET} or newer is needed."
             )
             raise self._fault("network.opset", reason)
         for one in model.graph.input:
@@ -159,11 +157,13 @@ class Composer:
             self._made = graph_folding.fold_shapes(model.graph, max(versions))
         except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
             words = " ".join(str(error).split())[:120]
-            raise self._fault("network", f"its shapes do not fit ({words}).") from None
+            raise self._fault(
+                "network", f"its shapes are inconsistent ({words})."
+            ) from None
         return model
 
     def _shape(self, name: str) -> tuple[int, ...]:
-        """The shape of an input; of what it leaves open, the first is 1, another as it must be."""
+        """The shape of an input; an open first dimension is 1, another fits the parts."""
         one = self._network.inputs[name].type.tensor_type
         sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in one.shape.dim]
         if sizes and sizes[0] == 0:
@@ -177,12 +177,12 @@ class Composer:
         if needed is not None and math.prod(sizes) != needed:
             parts = self._mapping.inputs[name].parts
             each = ", ".join(f"{part.of} {self._part_size(part)}" for part in parts)
-            reason = f"the network takes {tuple(sizes)}, and the parts give {needed} ({each})."
+            reason = f"the network takes {tuple(sizes)}, but the parts have {needed} ({each})."
             raise self._fault(f"inputs.{name}", reason)
         return tuple(sizes)
 
     def _given_size(self, name: str) -> int | None:
-        """Number of elements that the parts of an input give; None for a state."""
+        """Number of elements that the parts of an input supply; None for a state."""
         if name not in self._mapping.inputs:
             return None
         return sum(map(self._part_size, self._mapping.inputs[name].parts))
@@ -198,7 +198,7 @@ class Composer:
         return size * part.history
 
     def _output_size(self, name: str) -> int:
-        """Elements of an output; what it leaves open is 1."""
+        """Number of elements of an output, counting open dimensions as 1."""
         if hasattr(self, "_made"):
             sizes: Sequence[int] = self._made[THEIRS + name]
         else:
@@ -209,7 +209,7 @@ class Composer:
         return math.prod(size or 1 for size in sizes)
 
     def _state_sizes(self) -> dict[str, int]:
-        """Number of elements of each thing that the state keeps."""
+        """Number of elements of each entry in the state."""
         sizes = {f"state {name}": math.prod(self._shape(name)) for name in self._states}
         for name, one in self._mapping.inputs.items():
             for k, part in enumerate(one.parts):
@@ -220,9 +220,8 @@ class Composer:
                 if part.history > 1:
                     kept = self._part_size(part) // part.history * (part.history - 1)
                     sizes[f"history {name} {k}"] = kept
-        return (
-            {"begun": 1, **sizes} if sizes else {}
-        )  # begun: 0 in the first step, then 1
+        # "begun" flag: 0 in the first step, then 1
+        return {"begun": 1, **sizes} if sizes else {}
 
     # Inputs.
 
@@ -250,16 +249,18 @@ class Composer:
         for key in ("subtract", "divide"):
             values = getattr(scaled, key)
             if isinstance(values, tuple) and len(values) != size:
-                reason = f"has {len(values)} numbers, where {size} are scaled."
+                reason = f"has {len(values)} numbers, but {size} elements are scaled."
                 raise self._fault(f"{place}.{key}", reason)
 
     def _begun(self, key: str, start: Any, place: str = "") -> str:
-        """Returns the name of what the state keeps, or of its start in the first step."""
+        """Returns the name of a state entry, replaced by its start value in the first step."""
         past = self._past[key]
         if isinstance(start, tuple) and len(start) != (
             size := self._state_sizes()[key]
         ):
-            raise self._fault(place, f"has {len(start)} numbers, the state {size}.")
+            raise self._fault(
+                place, f"has {len(start)} numbers, but the state has {size}."
+            )
         if not np.any(start):
             return past
         return self._build.blend(
@@ -275,9 +276,8 @@ class Composer:
             return row
         key = f"history {name} {k}"
         first = build.join([row] * (part.history - 1))
-        past = build.blend(
-            self._past["begun"], self._past[key], first
-        )  # the oldest first
+        # oldest first
+        past = build.blend(self._past["begun"], self._past[key], first)
         rows = build.join([past, row])
         self._next[key] = build.pick(rows, range(size, size * part.history))
         if part.newest_first:
@@ -288,7 +288,7 @@ class Composer:
         return rows
 
     def _quantity(self, name: str, part: foreign_mapping.InputPart) -> str:
-        """A row of a quantity in SI units."""
+        """A quantity as a row, in SI units."""
         build = self._build
         scan = self._task.scan_parts
         of, _, which = part.of.partition(".")
@@ -311,7 +311,7 @@ class Composer:
             rows = [self._mapping.outputs] if choices is None else choices.commands
             if not all(name in foreign_mapping.TWIST for row in rows for name in row):
                 reason = (
-                    "is known of policies that command forward, left and turn alone."
+                    "is only available to policies that command forward, left and turn."
                 )
                 raise self._fault(f"inputs.{name}", f"{part.of} {reason}")
             return build.pick(self._past["twist"], [foreign_mapping.TWIST.index(which)])
@@ -331,7 +331,7 @@ class Composer:
         made = self._made[THEIRS + name]
         if not all(made):
             reason = (
-                f"gives {name!r} of shape {made}, which can't be known before it runs."
+                f"returns {name!r} of shape {made}, which must be known before it runs."
             )
             raise self._fault("network", reason)
         flat = self._build.add(
@@ -358,7 +358,7 @@ class Composer:
         return self._of_twist(rows, robot)
 
     def _names(self, given: Mapping[str, Any], place: str) -> tuple[str, ...]:
-        """The names of commands among which the given ones are: of a twist, or the robot's own."""
+        """The command names to map, which `given` must match: a twist's, or the robot's own."""
         robot = self._task.robot
         own = tuple(command.name for command in robot.command)
         if all(name in foreign_mapping.TWIST for name in given):
@@ -375,7 +375,7 @@ class Composer:
         for name in own:
             if name not in given and place == "outputs":
                 raise self._fault(
-                    f"{place}.{name}", "is missing; say which output it is."
+                    f"{place}.{name}", "is missing; name the output to use."
                 )
         return own
 
@@ -386,7 +386,7 @@ class Composer:
         for name in ("forward", "turn"):
             if name not in outputs:
                 raise self._fault(
-                    f"outputs.{name}", "is missing; say which output it is."
+                    f"outputs.{name}", "is missing; name the output to use."
                 )
         for name in outputs:
             if FIELDS[name] not in fields:
@@ -399,7 +399,7 @@ class Composer:
             return build.cut(build.constant([[command.add]]), command.clip)
         size = self._output_size(command.of)
         if command.index >= size:
-            reason = f"is {command.index}, but the output {command.of!r} has {size} elements."
+            reason = f"is {command.index}, but the output {command.of!r} has only {size} elements."
             raise self._fault(f"outputs.{name}.index", reason)
         row = build.cut(
             build.pick(self._flat(command.of), [command.index]), command.limits
@@ -407,7 +407,7 @@ class Composer:
         return build.cut(build.affine(row, command.multiply, command.add), command.clip)
 
     def _of_twist(self, twist: Sequence[str], robot: RobotSpec) -> str:
-        """Commands for forward, left and turn; see `geometry.Bicycle.command`."""
+        """Converts forward, left and turn to commands; see `geometry.Bicycle.command`."""
         build = self._build
         rows = dict(zip(FIELDS.values(), twist, strict=True))
         if robot.steers:
@@ -424,7 +424,7 @@ class Composer:
         return build.join([rows[str(command.cmd_vel)] for command in robot.command])
 
     def _chosen(self, choices: foreign_mapping.Choices) -> str:
-        """The command by the greatest element of an output, or by a whole number."""
+        """The command selected by the maximum of an output, or by an integer output."""
         build = self._build
         robot = self._task.robot
         names = self._names(
@@ -441,7 +441,7 @@ class Composer:
             given = build.add("Reshape", THEIRS + choices.of, one)
             given = build.add("Cast", given, to=TensorProto.INT64)
             index = build.add("Clip", given, *ends)
-            # Of a number that chooses nothing the command is NaN, which no robot is sent.
+            # An integer that selects nothing gives a NaN command, which is never sent to a robot.
             beyond = build.add(
                 "Cast", build.add("Sub", given, index), to=TensorProto.FLOAT
             )
@@ -471,7 +471,9 @@ class Composer:
             size = math.prod(self._shape(name))
             made = self._output_size(state.next)
             if size != made:
-                reason = f"{state.next!r} has {made} elements, the state {size}."
+                reason = (
+                    f"{state.next!r} has {made} elements, but the state has {size}."
+                )
                 raise self._fault(f"states.{name}.next", reason)
             self._next[f"state {name}"] = self._flat(state.next)
         for key in self._past:

@@ -1,4 +1,4 @@
-"""The mapping of a foreign policy: meaning of each input and output of somebody else's network."""
+"""The mapping of a foreign policy: the meaning of each input and output of its network."""
 
 from typing import Any, Literal
 
@@ -26,18 +26,19 @@ Quantity = Literal[
     "constant",
 ]
 TWIST = ("forward", "left", "turn")  # [m/s, m/s, rad/s]
-MOST_SCANS = 64  # of a history
+MOST_SCANS = 64  # maximum length of a scan history
 
 
 class Scaled(Schema):
-    """Numbers as a network takes them: cut to `limits`, (x - subtract) / divide, cut to `clip`."""
+    """Scaling of network inputs: clamp to `limits`, (x - subtract) / divide, clamp to `clip`."""
 
-    limits: Limits | None = None  # least and greatest before scaling; None: not cut
-    # subtracted first: one number for all elements, or one for each
+    # minimum and maximum before scaling; None: no clamping
+    limits: Limits | None = None
+    # subtracted first: one number for all elements, or one per element
     subtract: Numbers = 0.0
-    # by which that is divided: one number for all elements, or one for each
+    # divisor after that: one number for all elements, or one per element
     divide: Numbers = 1.0
-    clip: Limits | None = None  # least and greatest after scaling; None: not cut
+    clip: Limits | None = None  # minimum and maximum after scaling; None: no clamping
 
     @field_validator("divide")
     @classmethod
@@ -50,22 +51,21 @@ class Scaled(Schema):
     @classmethod
     def _ordered(cls, limits: Limits | None) -> Limits | None:
         if limits is not None and not limits[0] < limits[1]:
-            raise ValueError("must be [least, greatest]")
+            raise ValueError("must be [minimum, maximum]")
         return limits
 
 
 class InputPart(Scaled):
     """Consecutive elements of an input: one quantity, in SI units unless scaled."""
 
-    of: Quantity  # the quantity; the guide lists them with their units
-    clockwise: bool = False  # order of a scan
-    history: int = Field(
-        default=1, ge=1, le=MOST_SCANS
-    )  # steps of it, this and earlier ones
-    newest_first: bool = False  # order of a history
-    # the network's, whose numbers of the step before are `last.output`
+    of: Quantity  # the quantity; the guide lists all quantities with their units
+    clockwise: bool = False  # reverse the order of a scan
+    # number of time steps, this one and earlier ones
+    history: int = Field(default=1, ge=1, le=MOST_SCANS)
+    newest_first: bool = False  # reverse the order of a history
+    # output of the network whose previous value `last.output` means
     output: str | None = None
-    value: Numbers | None = None  # of a `constant`
+    value: Numbers | None = None  # numbers of a `constant`
 
     @model_validator(mode="after")
     def _complete(self) -> "InputPart":
@@ -81,65 +81,59 @@ class InputPart(Scaled):
 class ForeignInput(Scaled):
     """An input of the network: its parts in order, then scaled as a whole."""
 
-    parts: tuple[InputPart, ...] = Field(
-        min_length=1
-    )  # quantities that fill it, in order
+    # quantities that fill the input, in order
+    parts: tuple[InputPart, ...] = Field(min_length=1)
 
 
 class ForeignState(Schema):
-    """A state of the network, an input that takes an output of the step before."""
+    """A state of the network: an input that receives an output of the previous step."""
 
     next: str  # name of that output
-    start: Numbers = 0.0  # its value when an episode begins
+    start: Numbers = 0.0  # value at the start of an episode
 
 
 class OutputCommand(Schema):
-    """A command by an element of an output: cut to `limits`, x * multiply + add, cut to `clip`."""
+    """A command from an output element: clamp to `limits`, x * multiply + add, clamp to `clip`."""
 
-    of: str | None = None  # the output; None: the command is always `add`
-    index: int = Field(default=0, ge=0)  # which element of the flattened output
-    limits: Limits | None = None  # least and greatest before scaling; None: not cut
+    of: str | None = None  # name of the output; None: the command is always `add`
+    index: int = Field(default=0, ge=0)  # index of the element in the flattened output
+    # minimum and maximum before scaling; None: no clamping
+    limits: Limits | None = None
     multiply: float = 1.0  # factor on the element
-    add: float = 0.0  # added after that, in the unit of the command
-    # least and greatest command; None: the robot's own limits alone
+    add: float = 0.0  # added after multiplying, in the unit of the command
+    # minimum and maximum of the command; None: only the robot's own limits
     clip: Limits | None = None
 
 
 class Choices(Schema):
-    """Commands to choose from: by the greatest number of an output, or by its whole number."""
+    """Commands to choose from: by the maximum of an output, or by its integer value."""
 
-    of: str  # name of the output that chooses
-    commands: tuple[dict[str, float], ...] = Field(
-        min_length=1
-    )  # in order; what a row omits is 0
+    of: str  # name of the output that selects
+    # the commands, in order; a command left out of a row is 0
+    commands: tuple[dict[str, float], ...] = Field(min_length=1)
 
 
 class ForeignPolicy(Schema):
-    """A network of somebody else, and what its inputs and outputs mean.
+    """A foreign network, and the meaning of its inputs and outputs.
 
     Commands are `forward` and `left` [m/s] and `turn` [rad/s], or have the robot's own names.
     """
 
-    kind: Literal["foreign policy"]  # says what the file is
-    network: str = Field(
-        min_length=1
-    )  # an .onnx file or a LEAPP bundle, relative to the mapping
-    # that it drives where none is named: a shipped one or a model
+    kind: Literal["foreign policy"]  # identifies the kind of file
+    # an .onnx file or a LEAPP bundle, relative to the mapping
+    network: str = Field(min_length=1)
+    # robot to drive unless the caller names one: a shipped robot or a model
     robot: str | None = None
-    control_period: float | None = Field(
-        default=None, gt=0.0, le=10.0
-    )  # None: the robot's [s]
+    # time between commands [s]; None: the robot's
+    control_period: float | None = Field(default=None, gt=0.0, le=10.0)
     scan: Any = None  # as in `sectors.layout_of`; None: the beams of the robot's lidar
-    inputs: dict[str, ForeignInput] = Field(
-        min_length=1
-    )  # the network's inputs, by their names
-    states: dict[str, ForeignState] = Field(
-        default_factory=dict
-    )  # its recurrent inputs, by name
-    outputs: dict[str, OutputCommand] = Field(
-        default_factory=dict
-    )  # the commands, by their names
-    # instead of `outputs`: fixed commands, of which it chooses one
+    # the network's inputs, by name
+    inputs: dict[str, ForeignInput] = Field(min_length=1)
+    # the network's recurrent inputs, by name
+    states: dict[str, ForeignState] = Field(default_factory=dict)
+    # the commands, by name
+    outputs: dict[str, OutputCommand] = Field(default_factory=dict)
+    # instead of `outputs`: fixed commands, one of which the network chooses
     choices: Choices | None = None
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Builds an ONNX graph node by node: what stands around a network in a policy file."""
+"""Builds an ONNX graph node by node, around the network in a policy file."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.foreign_mapping import Limits, Scaled
 
-STEP = 1e30  # times which nearly every float32 but 0 is beyond 1
+STEP = 1e30  # factor that lifts nearly every non-zero float32 above 1
 
 
 class Builder:
-    """Nodes and weights of a graph that grows; a name stands for a tensor of one row (1, K)."""
+    """Nodes and weights of a growing graph; each name stands for a tensor of one row (1, K)."""
 
     def __init__(self, prefix: str = "") -> None:
         self._prefix = prefix
@@ -22,7 +22,7 @@ class Builder:
         self.weights: list[Any] = []
 
     def constant(self, values: ArrayLike, kind: Any = np.float32) -> str:
-        """Adds an array."""
+        """Adds an array of weights."""
         name = f"{self._prefix}constant_{len(self.weights)}"
         self.weights.append(
             onnx.numpy_helper.from_array(np.asarray(values, kind), name)
@@ -36,28 +36,28 @@ class Builder:
         return name
 
     def pick(self, row: str, places: Sequence[int]) -> str:
-        """Elements of a row."""
+        """Selects elements of a row."""
         return self.add("Gather", row, self.constant(places, np.int64), axis=1)
 
     def join(self, rows: Sequence[str], name: str = "") -> str:
-        """One row of several."""
+        """Concatenates rows to one."""
         return self.add("Concat", *rows, name=name, axis=1)
 
     def cut(self, row: str, limits: Limits | tuple[Array, Array] | None) -> str:
-        """Elements between a least and a greatest value."""
+        """Clamps the elements of a row between two limits."""
         if limits is None:
             return row
         low, high = map(self.constant, limits)
         return self.add("Min", self.add("Max", row, low), high)
 
     def affine(self, row: str, factor: ArrayLike, offset: ArrayLike) -> str:
-        """Row * factor + offset."""
+        """Computes row * factor + offset."""
         if np.any(np.asarray(factor) != 1.0):
             row = self.add("Mul", row, self.constant(factor))
         return self.add("Add", row, self.constant(offset)) if np.any(offset) else row
 
     def scale(self, row: str, scaled: Scaled) -> str:
-        """See `Scaled`."""
+        """Scales a row as `Scaled` says."""
         row = self.cut(row, scaled.limits)
         if np.any(scaled.subtract):
             row = self.add("Sub", row, self.constant(scaled.subtract))
@@ -66,18 +66,18 @@ class Builder:
         return self.cut(row, scaled.clip)
 
     def blend(self, share: str, row: str, start: str) -> str:
-        """Row where the share (1, 1) is 1, `start` where it is 0."""
+        """Selects the row where `share` (1, 1) is 1, and `start` where it is 0."""
         rest = self.affine(share, -1.0, 1.0)
         kept = self.add("Mul", share, row)
         begun = self.add("Mul", rest, start)
         return self.add("Add", kept, begun)
 
     def is_negative(self, row: str) -> str:
-        """1 where a row is negative, else 0."""
+        """Gives 1 where a row is negative, else 0."""
         return self.cut(self.affine(row, -STEP, 0.0), (0.0, 1.0))
 
     def angle(self, cosine: str, sine: str) -> str:
-        """The angle [rad] of a direction; exact to rounding in all four quadrants."""
+        """Computes the angle [rad] of a direction; exact up to rounding in all four quadrants."""
         across = self.add("Abs", sine)
         along = self.add("Abs", cosine)
         half = self.add("Atan", self.add("Div", across, self.affine(along, 1.0, 1.0)))

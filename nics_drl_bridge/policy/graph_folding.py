@@ -1,4 +1,4 @@
-"""Puts weights in place of what a foreign network computes of the shapes of its own arrays."""
+"""Replaces what a foreign network computes from its own array shapes by constants."""
 
 import math
 from typing import Any
@@ -25,11 +25,11 @@ FOLDED = (
     "Sub",
     "Unsqueeze",
 )
-"""Operators of sizes; none costs more than its inputs and its output, which are small here."""
+"""Operators on sizes; each costs no more than its inputs and output, which are small here."""
 
 
 def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
-    """Folds small whole numbers that are known; returns shapes of outputs, 0 where unknown."""
+    """Folds small integers that are known; returns shapes of outputs, with 0 for unknown sizes."""
     weights = {one.name: one for one in graph.initializer}
     nodes = list(graph.node)
     imports = [helper.make_opsetid("", opset)]
@@ -39,12 +39,12 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
     known = {name: one for name, one in weights.items() if _is_small(types[name])}
     del graph.node[:], graph.initializer[:]
     for node in nodes:
-        node.ClearField("domain")  # "ai.onnx" is the same
+        node.ClearField("domain")  # "ai.onnx" means the same domain
         schema = defs.get_schema(node.op_type, opset)
         given = {name: types[name] for name in node.input if name}
         made = infer_node_outputs(schema, node, given, known, opset_imports=imports)
         if any(len(_shape(one)) > MOST_AXES for one in made.values()):
-            raise ValueError(f"{node.op_type} gives more than {MOST_AXES} dimensions")
+            raise ValueError(f"{node.op_type} returns more than {MOST_AXES} dimensions")
         types |= made
         if (value := _value(node, types, known, opset)) is None:
             graph.node.append(node)
@@ -73,7 +73,7 @@ def _is_small(kind: Any) -> bool:
 
 
 def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) -> Any:
-    """Returns None for what is not small, or is not known before the network runs."""
+    """Returns the value, or None if it is not small or is unknown before the network runs."""
     name = node.output[0]
     given = [known.get(one) for one in node.input if one]
     if node.op_type == "Shape" and all(shape := _shape(types[node.input[0]])):
@@ -85,7 +85,8 @@ def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) 
     if node.op_type == "Div" and any(
         numpy_helper.to_array(one).min() <= 0 for one in given
     ):
-        return None  # by zero, or rounded to another side
+        # division by zero, or a sign for which ONNX and numpy round differently
+        return None
     graph = helper.make_graph([node], "", [], [ValueInfoProto(name=name)], given)
     (value,) = ReferenceEvaluator(graph, opsets={"": opset}).run(None, {})
     return numpy_helper.from_array(np.asarray(value), name)

@@ -1,7 +1,7 @@
-"""Policy files as bundles of LEAPP, Isaac's format of deployment: a network and a YAML file.
+"""Policy files as LEAPP bundles, Isaac's deployment format: a network and a YAML file.
 
-Written without the package `leapp`, which only runs them. The one node takes scan, goal and
-velocities by inputs of their own, gives action and command; a state is a feedback connection.
+Bundles are written without the package `leapp`, which only runs them. The single node has separate
+inputs for scan, goal and velocities, and outputs action and command; a state is fed back.
 """
 
 import base64
@@ -32,9 +32,9 @@ from nics_drl_bridge.policy.graph_builder import Builder
 from nics_drl_bridge.policy.policy_file import PolicyFile
 
 NODE = "policy"
-CONFIG_VERSION = "1.3"  # of the format
-OURS = "leapp/"  # before the names of nodes and weights that an export adds
-TAKEN = "nics_drl_bridge_observation"  # metadata: the input that an export replaces
+CONFIG_VERSION = "1.3"  # version of the format
+OURS = "leapp/"  # prefix of the nodes and weights that an export adds
+TAKEN = "nics_drl_bridge_observation"  # metadata key: the input that an export replaces
 VELOCITIES = ("x", "y", "z")
 SECTORS = "state/lidar/sectors"
 BEAMS = "state/lidar/beams"
@@ -42,7 +42,7 @@ Data = dict[str, Any]
 
 
 class Piece(NamedTuple):
-    """An input of a bundle, and which of its elements stand in the observation."""
+    """An input of a bundle, and the elements of the observation that it holds."""
 
     name: str
     width: int
@@ -60,7 +60,7 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
     _split(model, pieces)
     made = model.SerializeToString(deterministic=True)
     if restored(model) != content:
-        reason = "was not written by `export_policy`, so that it could not be restored."
+        reason = "was not written by `export_policy`, so it could not be restored."
         raise PolicyError(str(policy.path), "file", reason)
     network = f"{NODE}.onnx"
     start_values = f"{place.resolve().name}_initial_values.safetensors"
@@ -79,7 +79,7 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
 
 
 def _pieces(policy: PolicyFile) -> list[Piece]:
-    """Inputs of a bundle in the order of the observation."""
+    """Inputs of a bundle, in the order of the observation."""
     contract = policy.contract
     parts = contract.observation.scan_parts
     rest = len(contract.observation.rest_low)
@@ -88,7 +88,7 @@ def _pieces(policy: PolicyFile) -> list[Piece]:
     seen: Data = {"kind": BEAMS, "lidar": lidar.model_dump(mode="json")}
     if layout is not None:
         seen = {"kind": SECTORS, "scan": layout.model_dump(mode="json")}
-    seen["unit"] = "share of range_max; 1 free, 0 too close or unknown"
+    seen["unit"] = "fraction of range_max; 1 free, 0 too close or unknown"
     pieces = [Piece("scan", parts, tuple(range(parts)), seen)]
     if contract.task.name != "navigation":
         low = contract.observation.rest_low
@@ -123,7 +123,7 @@ def _pieces(policy: PolicyFile) -> list[Piece]:
 
 
 def _split(model: Any, pieces: Iterable[Piece]) -> None:
-    """Replaces the observation of a graph by inputs that it is joined of."""
+    """Replaces the observation input of a graph by separate inputs and a concatenation."""
     build = Builder(OURS)
     batch = model.graph.input[0].type.tensor_type.shape.dim[0]
     entry = model.metadata_props.add()
@@ -153,9 +153,9 @@ def _split(model: Any, pieces: Iterable[Piece]) -> None:
 
 
 def restored(model: Any) -> bytes | None:
-    """The policy file of which an export made a ModelProto, bit for bit; None if it was no export.
+    """Restores the exact policy file from an exported ModelProto; None if we did not export it.
 
-    Whether it is whole is told by its own seal.
+    The seal in the file itself shows whether it is intact.
     """
     found = [entry for entry in model.metadata_props if entry.key == TAKEN]
     if len(found) != 1:
@@ -224,7 +224,7 @@ def _described(
 
 
 def _outputs(contract: Contract) -> list[Data]:
-    """The action, and the command that it means, in the robot's units."""
+    """The action, and the resulting command in the robot's units."""
     commands = contract.robot.command
     limits = [[command.min, command.max] for command in commands]
     discrete = contract.actions == "discrete"
@@ -255,7 +255,7 @@ def _tensor(name: str, shape: list[int], dtype: str = "float32", **facts: Any) -
 
 
 def _safetensors(name: str, array: NDArray[np.float32]) -> bytes:
-    """An array in the format of safetensors: length of the head, JSON head, numbers."""
+    """Encodes an array in the safetensors format: header length, JSON header, numbers."""
     facts = {
         "dtype": "F32",
         "shape": list(array.shape),

@@ -1,4 +1,4 @@
-"""Reads bundles of LEAPP, ours and others': joins their networks, and derives what they mean."""
+"""Reads LEAPP bundles, ours and foreign: joins their networks, and derives what they mean."""
 
 import json
 import math
@@ -21,7 +21,7 @@ from nics_drl_bridge.policy.foreign_graph import Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignState
 from nics_drl_bridge.policy.leapp import BEAMS, SECTORS, Data, restored
 
-ZERO = "constant"  # of what a robot in the plane does not have
+ZERO = "constant"  # quantity for what a planar robot does not have
 LINEAR = {"x": "velocity.forward", "y": "velocity.left", "z": ZERO}
 ANGULAR = {"x": ZERO, "y": ZERO, "z": "velocity.turn"}
 BOTH = {f"linear.{k}": v for k, v in LINEAR.items()}
@@ -30,7 +30,7 @@ GOAL = {
     f"goal.{name}": f"goal.{name}"
     for name in ("distance", "bearing", "cosine", "sine", "x", "y")
 }
-SEEN = {  # meaning of elements by kind and name; without names they are in this order
+SEEN = {  # meaning of elements by kind and name; unnamed elements are in this order
     "state/body/linear_velocity": LINEAR,
     "state/body/angular_velocity": ANGULAR,
     "state/body/velocity": BOTH,
@@ -38,16 +38,16 @@ SEEN = {  # meaning of elements by kind and name; without names they are in this
     "command/goal": GOAL,
     "command/body/pose": {"x": "goal.x", "y": "goal.y", "z": ZERO},
 }
-DONE = {  # the same of outputs
+DONE = {  # likewise for outputs
     "target/body/linear_velocity": LINEAR,
     "target/body/angular_velocity": ANGULAR,
     "target/body/velocity": BOTH,
 }
-MAPPING = "say what it is in a mapping of your own (docs/foreign_policies.md)"
+MAPPING = "describe it in your own mapping (docs/foreign_policies.md)"
 
 
 class Open(BaseModel):
-    """Base of the entries of a bundle, to which everyone may add."""
+    """Base of the entries of a bundle; unknown keys are allowed."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -62,7 +62,7 @@ class Tensor(Open):
 
     @property
     def names(self) -> list[str]:
-        """Names of its elements, or none."""
+        """Names of the elements; empty if there are none."""
         given = self.element_names
         while isinstance(given, list) and given and isinstance(given[-1], list):
             given = given[-1]
@@ -86,7 +86,7 @@ class Node(Open):
 
 
 class Pipeline(Open):
-    """Connections of nodes, as `node/output: [node/input]`, and what comes from outside."""
+    """Connections of nodes, as `node/output: [node/input]`, and the external inputs and outputs."""
 
     inputs: dict[str, list[str]]
     outputs: dict[str, list[str]]
@@ -105,36 +105,36 @@ class Description(Open):
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle that was read; names are those of inputs and outputs, with their node if shared."""
+    """A bundle as read; names are those of inputs and outputs, with their node if ambiguous."""
 
     path: Path  # of the YAML file
     description: Description
     models: dict[str, Any]  # onnx.ModelProto of each node
-    sha256: str  # of all of them
+    sha256: str  # of all networks together
 
     @cached_property
     def ours(self) -> bytes | None:
-        """The policy file that was exported as this bundle, or None if it was none of ours."""
+        """The policy file exported as this bundle; None if the bundle is foreign."""
         models = list(self.models.values())
         return restored(models[0]) if len(models) == 1 else None
 
     @cached_property
     def network(self) -> Network:
-        """Its networks as one. Raises PolicyError if they do not fit together."""
+        """The networks joined to one. Raises PolicyError if they do not fit together."""
         return Network(_merged(self), self._states())
 
     @cached_property
     def inputs(self) -> dict[str, Tensor]:
-        """Entries of the inputs from outside."""
+        """Entries of the external inputs."""
         return self._entries("inputs", self.description.pipeline.inputs)
 
     @cached_property
     def outputs(self) -> dict[str, Tensor]:
-        """Entries of the outputs."""
+        """Entries of the external outputs."""
         return self._entries("outputs", self.description.pipeline.outputs)
 
     def name_of(self, end: str) -> str:
-        """The name of `node/output` or `node/input` in the network of all nodes."""
+        """The name of `node/output` or `node/input` in the joined network."""
         pipeline = self.description.pipeline
         ends = [
             f"{node}/{name}"
@@ -183,7 +183,7 @@ class Bundle:
         }
 
     def _initial(self, name: str) -> dict[str, tuple[float, ...]]:
-        """Arrays of a file of safetensors, flat, by `node/input`."""
+        """Arrays of a safetensors file, flattened, by `node/input`."""
         data = _read(self, name, "pipeline.initial_values")
         try:
             (size,) = struct.unpack_from("<Q", data)
@@ -198,31 +198,33 @@ class Bundle:
                     )
                     found[key] = tuple(values.astype(float).tolist())
         except (struct.error, ValueError, KeyError, TypeError, AttributeError):
-            reason = f"{name!r} is no file of safetensors with numbers; export the bundle anew."
+            reason = (
+                f"{name!r} is not a valid safetensors file; export the bundle again."
+            )
             raise self.fault("pipeline.initial_values", reason) from None
         return found
 
     def fault(self, place: str, reason: str) -> PolicyError:
-        """The error for a place in the YAML file."""
+        """Makes the error for a place in the YAML file."""
         return PolicyError(str(self.path), place, reason)
 
 
 def description_of(place: Path) -> Path | None:
-    """The YAML file of a bundle, by it or by its folder; None for another YAML file.
+    """The YAML file of a bundle, given the file or its folder; None for another YAML file.
 
-    Raises PolicyError if a folder holds none or several, ConfigError if it can't be read.
+    Raises PolicyError if a folder holds none or several, ConfigError if the file can't be read.
     """
     if place.is_file() and place.suffix not in (".yaml", ".yml"):
-        reason = (
-            "is no YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
-        )
+        reason = "is not a YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
         raise PolicyError(str(place), "file", reason)
     files = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
     found = [
         file for file in files if "models" in parse_yaml(read_text(file), str(file))
     ]
     if place.is_dir() and len(found) != 1:
-        reason = f"holds {len(found)} descriptions of a bundle; give the path of a YAML file."
+        reason = (
+            f"contains {len(found)} bundle descriptions; give the path of a YAML file."
+        )
         raise PolicyError(str(place), "file", reason)
     return found[0] if found else None
 
@@ -239,12 +241,16 @@ def read_bundle(path: Path) -> Bundle:
         place = f"models.{name}.parameters"
         given = node.parameters
         if given.backend != "onnx":
-            reason = f"is {given.backend!r}, which is never opened here; export it with 'onnx'."
+            reason = (
+                f"is {given.backend!r}, which is not supported; export it with 'onnx'."
+            )
             raise bundle.fault(f"{place}.backend", reason)
         data = _read(bundle, given.model_path, f"{place}.model_path")
         digests.append(hash_bytes(data))
         if digests[-1] != given.sha256sum:
-            reason = f"does not fit {given.model_path!r}, which was changed or damaged."
+            reason = (
+                f"does not match {given.model_path!r}, which was changed or damaged."
+            )
             raise bundle.fault(f"{place}.sha256sum", reason)
         file = str(path.parent / given.model_path)
         rehearsal.rehearse_network(data, file)
@@ -254,7 +260,7 @@ def read_bundle(path: Path) -> Bundle:
 
 
 def _read(bundle: Bundle, name: str, place: str) -> bytes:
-    """A file of a bundle, which lies in its folder."""
+    """Reads a file of a bundle, which must lie in the bundle's folder."""
     folder = bundle.path.parent.resolve()
     file = (folder / name).resolve()
     if not file.is_relative_to(folder):
@@ -262,7 +268,7 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
     try:
         if file.stat().st_size > onnx_graph.SIZE_LIMIT:
             most = onnx_graph.SIZE_LIMIT // 2**20
-            raise bundle.fault(place, f"{name!r} has more than {most} MB; not opened.")
+            raise bundle.fault(place, f"{name!r} is larger than {most} MB; not opened.")
         return file.read_bytes()
     except OSError as error:
         raise bundle.fault(
@@ -271,7 +277,7 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
 
 
 def _merged(bundle: Bundle) -> Any:
-    """One graph of all nodes in their order: connections are nodes that copy."""
+    """Joins all nodes in order to one graph, turning connections into copying nodes."""
     description = bundle.description
     pipeline = bundle.description.pipeline
     graph = onnx.GraphProto(name="bundle")
@@ -298,7 +304,7 @@ def _merged(bundle: Bundle) -> Any:
                 own.name = source = bundle.name_of(one.name)
                 graph.input.append(own)
             elif (source := source_of.get(one.name, "")) not in ready:
-                reason = f"nothing before the node gives {one.name!r}; connect it."
+                reason = f"no earlier node supplies {one.name!r}; connect it."
                 raise bundle.fault("pipeline.data_flow", reason)
             if source != one.name:
                 graph.node.append(
@@ -315,14 +321,16 @@ def _merged(bundle: Bundle) -> Any:
         }
         newest = max(newest, model.ir_version)
     if len(opsets) != 1:
-        reason = f"have opsets {sorted(opsets)}; export them with the same one."
+        reason = f"have opsets {sorted(opsets)}; export all networks with the same one."
         raise bundle.fault("models", reason)
     given = {
         f"{node}/{name}" for node, names in pipeline.outputs.items() for name in names
     }
     for end in sorted(given | pipeline.feedback_flow.keys()):
         if end not in infos:
-            raise bundle.fault("pipeline.outputs", f"no network gives {end!r}.")
+            raise bundle.fault(
+                "pipeline.outputs", f"no network has the output {end!r}."
+            )
         infos[end].name = bundle.name_of(end)
         graph.output.append(infos[end])
         if infos[end].name != end:
@@ -334,13 +342,13 @@ def _merged(bundle: Bundle) -> Any:
     )
 
 
-# What a bundle of others means, as far as it says so.
+# The meaning of a foreign bundle, as far as the bundle states it.
 
 
 def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
-    """The mapping of a bundle by the kinds and names of its elements, as `ForeignPolicy` has it.
+    """Derives the `ForeignPolicy` mapping of a bundle from the kinds and names of its elements.
 
-    Raises PolicyError for an input whose meaning is not told.
+    Raises PolicyError for an input whose meaning is not stated.
     """
     frequency = bundle.description.pipeline.configs.get("frequency")
     if isinstance(frequency, int | float) and frequency > 0:
@@ -370,7 +378,7 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
         kinds = ", ".join(
             f"{name!r} of kind {one.kind!r}" for name, one in bundle.outputs.items()
         )
-        reason = f"{kinds}: none is told to be the robot's velocity; {MAPPING}."
+        reason = f"{kinds}: none is marked as the robot's velocity; {MAPPING}."
         raise bundle.fault("pipeline.outputs", reason)
     return data
 
@@ -387,13 +395,12 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
     meanings = SEEN.get(kind, {})
     names = entry.names
-    if (
-        not names and len(meanings) == size and "pose" not in kind
-    ):  # that may have a heading
+    # that may have a heading
+    if not names and len(meanings) == size and "pose" not in kind:
         names = list(meanings)
     if not names or len(names) != size or not all(one in meanings for one in names):
         told = f"kind {entry.kind!r}" + (f" with elements {names}" if names else "")
-        reason = f"{told} is not known as scan, goal or velocity of a robot; {MAPPING}."
+        reason = f"{told} is not a known scan, goal or velocity of a robot; {MAPPING}."
         raise bundle.fault(f"pipeline.inputs.{name}", reason)
     zero = {"of": ZERO, "value": 0.0}
     return [zero if meanings[one] == ZERO else {"of": meanings[one]} for one in names]

@@ -1,4 +1,4 @@
-"""Footprint, rays and memory from which `local_map_kernels` map a scan for planners."""
+"""Footprint, rays and scratch memory with which `local_map_kernels` map a scan for planners."""
 
 import math
 
@@ -11,11 +11,11 @@ from nics_drl_bridge.policy import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec
 
 CELL_M = 0.05  # side of the cells of distances
-MOST_M = 4.0  # greatest reach of a map
+MOST_M = 4.0  # maximum extent of a map to each side [m]
 FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
-"""Lattice of the discs, depth from which they cover all, and space of points on the border."""
-MOST_POINTS = 5000  # of a lattice; that of a footprint with more of them is coarser
-ROWS = 64  # of distances between points that are computed at a time
+"""Lattice of the discs, depth from which they cover everything, spacing of border points [m]."""
+MOST_POINTS = 5000  # maximum number of lattice points; beyond it the lattice is coarser
+ROWS = 64  # rows of distances between points that are computed at a time
 
 
 def rays_of(task: Navigation) -> kernels.ScanRays:
@@ -54,9 +54,9 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
 
 
 def _cover(lattice: Array, depth: Array) -> list[Array]:
-    """Returns discs (3,) around points (N, 2) that cover all that are deep within a footprint.
+    """Returns discs (3,) at points (N, 2) that cover all points deep within a footprint.
 
-    Each of them covers the most points that were left; the radius of a disc is its depth (N,).
+    Greedy: each disc covers the maximum number of remaining points; its radius is its depth (N,).
     """
     left = depth > DEEP_M
     covered = _count_covered(lattice, depth, lattice[left])
@@ -71,7 +71,7 @@ def _cover(lattice: Array, depth: Array) -> list[Array]:
 
 
 def _count_covered(centres: Array, radii: Array, points: Array) -> NDArray[np.int64]:
-    """Returns how many points (M, 2) lie within each disc (N,)."""
+    """Returns the number of points (M, 2) within each disc (N,)."""
     count = np.zeros(len(centres), np.int64)
     for first in range(0, len(points), ROWS):
         x, y = (points[first : first + ROWS, None] - centres).transpose(2, 0, 1)
@@ -85,7 +85,7 @@ def scratch_of(
     clearance: kernels.Clearance,
     half: float,
 ) -> kernels.MapScratch:
-    """Memory for maps of scans of P parts that reach `half` [m] to each side, `MOST_M` at most."""
+    """Allocates maps for scans of P parts that extend `half` [m] to each side, `MOST_M` at most."""
     coarse = 2 * math.ceil(min(half, MOST_M) / (kernels.COARSE * CELL_M))
     distances = np.zeros((kernels.COARSE * coarse, kernels.COARSE * coarse), np.float32)
     ways, prices = np.zeros((2, coarse, coarse), np.float32)

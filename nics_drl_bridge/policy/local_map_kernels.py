@@ -1,6 +1,6 @@
-"""Compiled map of what one scan shows: distances to it, and the way left to the goal around it.
+"""Compiled map of a single scan: distance to obstacles, and path length around them to the goal.
 
-A planner makes it anew at each step, in `base_link`, and forgets it. What was not seen counts as
+A planner builds it in `base_link` at each step and then discards it. Unobserved space counts as
 free. Shapes: P parts of a scan, G cells along a side of the map, D discs of an outline.
 """
 
@@ -15,18 +15,19 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.guide_kernels import sweep
 
 Grid = NDArray[np.float32]
-ARRIVED_M = 0.15  # at which a robot is at its goal: nothing behind it matters
-APART_M = 0.02  # hits nearer to the one before are left out
-COARSE = 2  # cells of distances along a side of a cell of ways
+# distance at which a robot has arrived: nothing behind the goal matters
+ARRIVED_M = 0.15
+APART_M = 0.02  # hits closer than this to the previous one are left out
+COARSE = 2  # cells of `distances` along a side of a cell of `ways`
 BLOCKED, NEAR = 30.0, 3.0
-"""Price of a metre where the robot can't stand, and of one beside that, less the usual 1."""
-AHEAD_M = 0.3  # at which a heading is judged
+"""Cost of a metre where the robot can't stand, and next to such cells, minus the usual 1."""
+AHEAD_M = 0.3  # distance ahead at which a heading is judged
 ROUNDS, SETTLED_M = 6, 0.02
-"""Greatest number of rounds of sweeps, and change of a way by which one may be the last [m]."""
+"""Maximum number of sweep rounds, and change of a path length that counts as converged [m]."""
 
 
 class ScanRays(NamedTuple):
-    """Rays of a scan in `base_link`; a share of 1 stands for `range_max`."""
+    """Rays of a scan in `base_link`; a fraction of 1 stands for `range_max`."""
 
     directions: Array  # (P, 2) unit vectors
     origin: Array  # (2,) [m]
@@ -34,40 +35,41 @@ class ScanRays(NamedTuple):
 
 
 class FootprintDiscs(NamedTuple):
-    """Footprint of a robot in `base_link`, as discs within it that leave hardly anything out."""
+    """Footprint of a robot in `base_link`, as inner discs that leave hardly anything uncovered."""
 
     discs: Array  # (D, 3) x, y, radius [m]
-    centre: Array  # (2,) of a circle around [m]
-    inner: float  # radius of the greatest disc [m]
-    outer: float  # of the circle around [m]
+    centre: Array  # (2,) of the bounding circle [m]
+    inner: float  # radius of the largest disc [m]
+    outer: float  # radius of the bounding circle [m]
 
 
 class LocalMap(NamedTuple):
-    """Square map around `base_link`, its first index along y."""
+    """Square map around `base_link`; the first index runs along y."""
 
-    distances: Grid  # (G, G) to the nearest hit, at most `reach` [m]
-    ways: Grid  # (G / COARSE, G / COARSE) to the goal, at a price near obstacles [m]
+    distances: Grid  # (G, G) distance to the nearest hit, at most `reach` [m]
+    # (G / COARSE, G / COARSE) path length to the goal, weighted near obstacles [m]
+    ways: Grid
     cell: float  # side of a cell of `distances` [m]
-    reach: float  # [m]
+    reach: float  # maximum of `distances` [m]
 
 
 class Clearance(NamedTuple):
-    """Distances to be kept between an outline and all hits."""
+    """Clearance to keep between an outline and all hits."""
 
-    margin: float  # below which it counts as a touch [m]
-    soft: float  # beyond that, within which it costs [m]
+    margin: float  # clearance below which it counts as a contact [m]
+    soft: float  # additional clearance within which a cost applies [m]
 
 
 class MapScratch(NamedTuple):
-    """Memory of a map in the making."""
+    """Scratch memory for building a map."""
 
     hits: Array  # (P, 2) [m]
     map: LocalMap
-    prices: Grid  # as `ways`
+    prices: Grid  # like `ways`
 
 
 class Situation(NamedTuple):
-    """The map, the goal, and the robot that is to keep clear."""
+    """The map, the goal, and the robot that has to keep clear of obstacles."""
 
     map: LocalMap
     goal: Array  # (2,) [m]
@@ -77,7 +79,7 @@ class Situation(NamedTuple):
 
 @kernel(allocates=True)
 def look(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-untyped-def]
-    """Maps a scan of range shares (P,) around a robot whose goal (2,) is in `base_link` [m]."""
+    """Maps a scan of range fractions (P,) around a robot whose goal (2,) is in `base_link` [m]."""
     count = hits_of(scratch.hits, shares, rays)
     put_distances(scratch.map, scratch.hits[:count])
     around = Situation(scratch.map, goal, outline, clearance)
@@ -87,9 +89,9 @@ def look(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-un
 
 @kernel
 def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
-    """Writes a scan's end points, by range shares (P,), into hits (P, 2) [m]; returns the count.
+    """Writes a scan's end points, by range fractions (P,), into hits (P, 2) [m]; returns the count.
 
-    Shares of 0 are left out: they are unknown, or too near to tell from the robot itself.
+    Fractions of 0 are left out: unknown, or too close to distinguish from the robot itself.
     """
     count = 0
     for p in range(shares.shape[0]):
@@ -140,14 +142,14 @@ def put_distances(seen, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def _span(middle, reach, cell, size):  # type: ignore[no-untyped-def]
-    """Returns the first and the last but one of the cells within `reach` of a place [m]."""
+    """Returns the first and one past the last of the cells within `reach` of a coordinate [m]."""
     low = min(max(int((middle - reach) / cell), 0), size)
     return low, max(min(int((middle + reach) / cell) + 1, size), low)
 
 
 @kernel
 def value_at(grid, cell, x, y, outside):  # type: ignore[no-untyped-def]
-    """Returns a value of a grid at a point, bilinear between the centres of cells."""
+    """Returns the value of a grid at a point, bilinear between cell centres."""
     size = grid.shape[0]
     u = x / cell + 0.5 * size - 0.5
     v = y / cell + 0.5 * size - 0.5
@@ -158,7 +160,7 @@ def value_at(grid, cell, x, y, outside):  # type: ignore[no-untyped-def]
 
 @kernel(inline=True)
 def between(grid, u, v):  # type: ignore[no-untyped-def]
-    """Returns a value of a grid at a place in cells, column u and row v, which lies within it."""
+    """Returns the value of a grid at column u and row v (in cells), which lie within it."""
     j = np.uint32(np.int32(u))
     i = np.uint32(np.int32(v))
     u = np.float32(u) - np.float32(j)
@@ -171,9 +173,9 @@ def between(grid, u, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def put_ways(around, prices):  # type: ignore[no-untyped-def]
-    """Writes the ways of a map to the goal, with prices (G / COARSE, G / COARSE) as scratch.
+    """Writes the path lengths of a map to the goal; prices (G / COARSE, G / COARSE) are scratch.
 
-    They solve the eikonal equation by fast sweeping (Zhao 2005); beyond the map they are straight.
+    Solves the eikonal equation by fast sweeping (Zhao 2005); beyond the map, paths are straight.
     """
     seen = around.map
     goal = around.goal
@@ -206,7 +208,7 @@ def put_ways(around, prices):  # type: ignore[no-untyped-def]
 
 @kernel
 def way_at(x, y, around):  # type: ignore[no-untyped-def]
-    """Returns the way from a point to the goal [m]."""
+    """Returns the path length from a point to the goal [m]."""
     gap = math.hypot(around.goal[0] - x, around.goal[1] - y)
     seen = around.map
     way = value_at(seen.ways, COARSE * seen.cell, x, y, gap)
@@ -215,9 +217,9 @@ def way_at(x, y, around):  # type: ignore[no-untyped-def]
 
 @kernel
 def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
-    """Returns how far the robot is from all hits at a pose [m], with its heading's cosine and sine.
+    """Returns the clearance at a pose [m]; c and s are the cosine and sine of its heading.
 
-    It is below 0 if it overlaps; far away it is what is certain.
+    Negative where the footprint overlaps a hit; far away, it is a lower bound.
     """
     seen = around.map
     outline = around.outline
@@ -232,7 +234,7 @@ def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
     middle = 0.5 * grid.shape[0] - 0.5
     per_cell = 1.0 / seen.cell
     if max(abs(at_x), abs(at_y)) + outline.outer > (middle - 1.0) * seen.cell:
-        return away - outline.inner  # at the border of the map
+        return away - outline.inner  # off the map
     u = middle + x * per_cell
     v = middle + y * per_cell
     c = c * per_cell
@@ -248,12 +250,12 @@ def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
 
 @kernel
 def astray(x, y, c, s, way, around):  # type: ignore[no-untyped-def]
-    """Returns by how much a heading misses the way to the goal: 0 along it, 1 the other way."""
+    """Returns how far a heading misses the path to the goal: 0 along it, 1 away from it."""
     ahead = way_at(x + AHEAD_M * c, y + AHEAD_M * s, around)
     return min(max(0.5 + 0.5 * (ahead - way) / AHEAD_M, 0.0), 1.0)
 
 
 @kernel
 def touching(around):  # type: ignore[no-untyped-def]
-    """Returns the room below which the robot touches something [m]; nearer already, only away."""
+    """Returns the clearance that counts as a contact [m]; lower if the robot is in one already."""
     return min(around.clearance.margin, room_at(0.0, 0.0, 1.0, 0.0, around) - 1e-3)

@@ -30,30 +30,32 @@ from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
-SETTLED_S = 3.0  # after which a held command has led to its state
-FINEST = 0.25  # share of a lag that a step of the roll-outs may take
-FEWEST = 8  # robots of a thread
+SETTLED_S = 3.0  # time after which a held command has led to its steady state
+FINEST = 0.25  # maximum rollout step as a fraction of a lag
+FEWEST = 8  # minimum number of robots per thread
 CLEARANCE = Clearance(margin=0.08, soft=0.4)
 WORTH = kernels.Worth(near=4.0, early=0.3, change=0.02, astray=0.2)
 
 
 @dataclass(frozen=True)
 class Mppi:
-    """Plans by sampled roll-outs in the robot's model, with its true outline, without a map.
+    """Planner that samples rollouts in the robot's model, with its true outline and without a map.
 
-    Its model is a textbook's where none is given; ConfigError for a robot without either.
+    Without a model it uses a textbook one; ConfigError if there is none for the robot.
     """
 
     task: Navigation
     model: SimulatorModel | None = None
-    samples: int = 256  # roll-outs of each round
+    samples: int = 256  # rollouts of each round
     horizon: float = 2.0  # [s]
-    knots: int = 4  # actions along a roll-out, linear in between
+    knots: int = 4  # actions along a rollout, interpolated linearly
+    # standard deviation of the noise in the rounds after the first
     spreads: tuple[float, ...] = (
         0.4,
         0.2,
-    )  # of the noise in the rounds after the first
-    temperature: float = 0.05  # of the weights of roll-outs, as a way [m]
+    )
+    # temperature of the rollout weights, as a path length [m]
+    temperature: float = 0.05
     clearance: Clearance = CLEARANCE
     worth: kernels.Worth = WORTH
     seed: int = 0
@@ -62,7 +64,7 @@ class Mppi:
         _ = self._halt
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """See `Policy`."""
+        """Plan the actions; see `Policy`."""
         given = self._seen(observation)
         out = np.empty((len(given[0]), len(self.task.robot.command)))
         self._plan(out, *given)
@@ -70,7 +72,7 @@ class Mppi:
         return actions[0] if observation.ndim == 1 else actions
 
     def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
-        """Scans (N, P) in shares, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
+        """Scans (N, P) as fractions, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
         parts = self.task.scan_parts
         rows = np.atleast_2d(observation).astype(np.float64)
         goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
@@ -79,7 +81,7 @@ class Mppi:
         return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
 
     def _plan(self, *arrays: Array) -> None:
-        """Plans for the rows of arrays (N, ...) on all cores, each with its own memory."""
+        """Plans for the rows of arrays (N, ...) on all cores, each core with its own memory."""
         count = max(1, min(os.cpu_count() or 1, len(arrays[0]) // FEWEST))
         cuts = np.linspace(0, len(arrays[0]), count + 1).astype(int).tolist()
 
@@ -99,7 +101,7 @@ class Mppi:
 
     @cached_property
     def _free(self) -> list[tuple[MapScratch, kernels.RollOuts]]:
-        return []  # memory that no thread uses now
+        return []  # memory that no thread is using
 
     def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
         robot, (_, outline, clearance) = self.task.robot, self._sense
@@ -153,7 +155,7 @@ class Mppi:
 
     @cached_property
     def _top_twists(self) -> Array:
-        """Twists (K, 3) to which the ends of the commands lead."""
+        """Twists (K, 3) to which the extreme commands lead."""
         robot = self.task.robot
         ends = np.array(list(product(*zip(*self.task.command_limits, strict=True))))
         if robot.takes_cmd_vel:
@@ -164,7 +166,7 @@ class Mppi:
 
     @cached_property
     def _halt(self) -> kernels.Halt:
-        """The stop that follows on a roll-out; none where half a roll-out is long enough for it."""
+        """The stop at the end of a rollout; none if half a rollout is long enough to stop in."""
         robot = self.task.robot
         angles = np.array([each.unit == "rad" for each in robot.command])
         braking = find_braking(robot, self._kinematics, *self.task.command_limits)
@@ -178,7 +180,7 @@ class Mppi:
 
     @property
     def _reach(self) -> float:
-        """Way of a roll-out at full speed, and of the stop that follows on it [m]."""
+        """Distance covered by a rollout at full speed and the stop that follows [m]."""
         fastest = np.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
         braking = find_braking(
             self.task.robot, self._kinematics, *self.task.command_limits
@@ -231,7 +233,7 @@ class Mppi:
 
 
 def _settled(model: TaylorModel, high: Array) -> Array:
-    """Returns the state (S, C) to which each command leads, per unit of it."""
+    """Returns the steady state (S, C) per unit of each command."""
     given = np.diag(0.5 * high)
     pose = np.zeros((len(high), 3))
     state = np.zeros((len(high), model.state_size))

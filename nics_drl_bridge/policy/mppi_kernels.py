@@ -1,7 +1,7 @@
 """Compiled model-predictive path integral control (Williams and others 2017).
 
-Roll-outs in the model of the robot, K at a time, over H periods. Commands are actions in [-1, 1] at
-`knots` along the way, linear in between. Shapes: N robots, S states, C commands, Q knots.
+Simulates K rollouts at a time in the robot's model, over H periods. Commands are actions in
+[-1, 1] at `knots`, interpolated linearly. Shapes: N robots, S states, C commands, Q knots.
 """
 
 import math
@@ -16,57 +16,58 @@ from nics_drl_bridge.policy import local_map_kernels as maps
 from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, apply_curve, rates, run
 
-HIT = 1e3  # cost of a touch at once; later ones cost less
-# offers are drawn over this much of the range and cut: many are at its ends
+HIT = 1e3  # cost of an immediate contact; later ones cost less
+# proposals are drawn over this multiple of the range and clamped, so many lie at its ends
 BEYOND = 1.3
-# over the commands, to find those that a twist follows
+# passes over the commands when fitting them to a twist
 PASSES = 12
 EASE = 1e-6
 
 
 class Plant(NamedTuple):
-    """The model of a robot, for K roll-outs at a time."""
+    """The model of a robot, for K rollouts at a time."""
 
-    terms: Terms  # with coefficients (T, K)
-    single: Terms  # with coefficients (T,)
+    terms: Terms  # with coefficients (T, K), one column per rollout
+    single: Terms  # with coefficients (T,), for one robot
     series: Array
     dt: float  # [s]
-    substeps: int  # in a period
-    latency: float  # until a command has an effect [s]
-    settled: Array  # (S, C) state by the command that is held
-    low: Array  # (C,) of the commands
+    substeps: int  # integration steps per period
+    latency: float  # time until a command takes effect [s]
+    settled: Array  # (S, C) steady state per unit of a held command
+    low: Array  # (C,) minimum of each command
     high: Array
 
 
 class Halt(NamedTuple):
-    """A stop that follows on a command."""
+    """A stop that ends a rollout."""
 
-    holds: NDArray[
-        np.bool_
-    ]  # (C,) True for commands that are held while the robot stops
-    rest: Array  # (C,) of the others
-    most: int  # periods that it may take
-    far: float  # distance along an axis, beyond which nothing is known [m]
+    # (C,) True for commands that are held while the robot stops
+    holds: NDArray[np.bool_]
+    rest: Array  # (C,) value of the other commands
+    most: int  # maximum number of periods for the stop
+    far: float  # distance along an axis beyond which the map knows nothing [m]
 
 
 class Sampling(NamedTuple):
-    """The roll-outs of a plan."""
+    """The rollouts of a plan."""
 
-    offers: Array  # (K, Q, C) actions of the first round
-    noise: Array  # (K, Q, C) standard normal, added to the best in the others
-    spreads: Array  # (R,) of the noise in these rounds
-    between: Array  # (H, Q) shares of the knots in the action of each period
-    temperature: float  # of the weights, as a cost
-    halt: Halt  # that follows on each roll-out
+    offers: Array  # (K, Q, C) proposed actions of the first round
+    # (K, Q, C) standard normal noise, added to the best actions in later rounds
+    noise: Array
+    spreads: Array  # (R,) standard deviation of the noise in these rounds
+    between: Array  # (H, Q) weights of the knots in the action of each period
+    temperature: float  # temperature of the weights, in units of cost
+    halt: Halt  # the stop at the end of each rollout
 
 
 class Worth(NamedTuple):
-    """Weights of the cost of a roll-out."""
+    """Weights of the terms in the cost of a rollout."""
 
-    near: float  # of a whole roll-out at the margin [m]
-    early: float  # share of the mean way to the goal, the rest is that of the end
-    change: float  # of the square of a change of action from knot to knot [m]
-    astray: float  # of a heading at the end that leads away from the goal [m]
+    near: float  # weight of driving a whole rollout at the margin [m]
+    # weight of the mean path length to the goal; its final value has the rest of 1
+    early: float
+    change: float  # weight of the squared change of action from knot to knot [m]
+    astray: float  # weight of a final heading that leads away from the goal [m]
 
 
 class RollOuts(NamedTuple):
@@ -77,13 +78,14 @@ class RollOuts(NamedTuple):
     dq: Array  # (3 + S, K)
     actions: Array  # (K, Q, C)
     nominal: Array  # (Q, C)
-    held: Array  # (C,) command that is followed
+    held: Array  # (C,) command behind the present twist
     one: Array  # (S + C + 1,)
     rate: Array  # (3 + S,)
     start: Array  # (3,)
     cost: Array  # (K,)
     way: Array  # (K,)
-    ended: NDArray[np.int64]  # (K,) period of a touch or an arrival, below 0 for none
+    # (K,) period of a contact or an arrival, negative if neither
+    ended: NDArray[np.int64]
 
 
 @kernel(allocates=True)
@@ -94,9 +96,8 @@ def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
             for c in range(offers.shape[2]):
                 i = (k * offers.shape[1] + q) * offers.shape[2] + c
                 drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
-                held = (
-                    k < offers.shape[0] // 2 and q > 0
-                )  # half of them hold one action
+                # half of the proposals hold one action
+                held = k < offers.shape[0] // 2 and q > 0
                 offers[k, q, c] = (
                     offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
                 )
@@ -107,7 +108,7 @@ def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def plan_all(out, scans, goals, twists, sense, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
-    """Writes the actions (N, C) of N robots, by scans (N, P), goals (N, 2), twists (N, 3)."""
+    """Writes the actions (N, C) of N robots from scans (N, P), goals (N, 2) and twists (N, 3)."""
     for n in range(out.shape[0]):
         around = maps.look(scans[n], goals[n], *sense)
         _plan(out[n], twists[n], around, plant, sampling, worth, lanes)
@@ -115,10 +116,10 @@ def plan_all(out, scans, goals, twists, sense, plant, sampling, worth, lanes):  
 
 @kernel(allocates=True)
 def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
-    """Writes the action (C,) that begins the plan.
+    """Writes the first action (C,) of the plan.
 
-    The first round offers actions of the whole range, and the cheapest takes the place of the plan
-    of the step before: so nothing is remembered, and an action follows from what is seen alone.
+    Instead of warm-starting from the previous plan, the first round proposes actions from the whole
+    range. The planner therefore has no memory: an action depends on the observation alone.
     """
     _wait(twist, plant, lanes)
     lanes.actions[:] = sampling.offers
@@ -139,7 +140,7 @@ def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no
 
 @kernel
 def _wait(twist, plant, lanes):  # type: ignore[no-untyped-def]
-    """Writes where a robot of a twist (3,) is once commands have an effect, and its state there."""
+    """Writes pose and state of a robot with a twist (3,) at the time when commands take effect."""
     follow(twist, plant, lanes)
     lanes.start[:] = 0.0
     if plant.latency > 0.0:
@@ -148,7 +149,7 @@ def _wait(twist, plant, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _average(best, temperature, lanes):  # type: ignore[no-untyped-def]
-    """Makes the mean of the actions, weighted by their costs, the nominal ones."""
+    """Replaces the nominal actions by the cost-weighted mean of the sampled ones."""
     lanes.nominal[:] = 0.0
     total = 0.0
     for k in range(lanes.cost.shape[0]):
@@ -164,9 +165,9 @@ def _average(best, temperature, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
-    """Writes the command that a twist (3,) follows when it is held, and the state it has led to.
+    """Writes the held command that leads to a twist (3,), and the state that it has led to.
 
-    By coordinate descent on the squared difference.
+    Coordinate descent on the squared difference.
     """
     held = lanes.held
     x = lanes.one
@@ -201,7 +202,7 @@ def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
-    """Writes the state to which a command (C,) leads, and its effect, into `one`."""
+    """Writes the steady state of a command (C,), and its effect, into `one`."""
     states, count = plant.settled.shape
     x = lanes.one
     for s in range(states):
@@ -215,7 +216,7 @@ def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
-    """Rolls out the actions of all lanes; writes their costs and returns the cheapest."""
+    """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
     _begin(around, plant, worth, lanes)
     states = plant.settled.shape[0]
     periods = sampling.between.shape[0]
@@ -254,7 +255,7 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
 
 @kernel
 def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
-    """Stops all lanes at the end of their roll-outs, and adds what a touch costs meanwhile."""
+    """Stops all lanes at the end of their rollouts, and adds the cost of contacts on the way."""
     states = plant.settled.shape[0]
     for t in range(halt.most):
         for c in range(plant.low.shape[0]):
@@ -283,7 +284,7 @@ def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
-    """Puts all lanes at the start, with the cost of how their actions change."""
+    """Initialises all lanes at the start, with the cost of changing actions between knots."""
     states, count = plant.settled.shape
     _put(lanes, states)
     for k in range(lanes.cost.shape[0]):
@@ -303,7 +304,7 @@ def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _put(lanes, states):  # type: ignore[no-untyped-def]
-    """Puts all lanes at the start."""
+    """Initialises all lanes at the start."""
     x = lanes.start[0]
     y = lanes.start[1]
     heading = lanes.start[2]
@@ -319,7 +320,7 @@ def _put(lanes, states):  # type: ignore[no-untyped-def]
 
 @kernel
 def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyped-def]
-    """Adds what period t of lane k costs."""
+    """Adds the cost of period t in lane k."""
     x = lanes.pose[0, k]
     y = lanes.pose[1, k]
     c = lanes.pose[2, k]

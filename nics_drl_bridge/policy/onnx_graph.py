@@ -1,4 +1,4 @@
-"""Checks of a policy file's graph before anything of it runs: raw size, form, operators, work."""
+"""Checks a policy file's graph before any of it runs: raw size, form, operators, work."""
 
 import itertools
 import math
@@ -16,34 +16,35 @@ from nics_drl_bridge.files import hash_bytes
 KEY = "nics_drl_bridge"  # key of the metadata entry with the contract
 SEAL = "sha256"  # key of the metadata entry at the file's end: the checksum of everything before it
 SIZE_LIMIT = 32 * 2**20
-MOST_PARTS = 50_000  # maximum number of fields of all messages; each array of weights is one part
+# maximum number of fields in all messages; each weight array counts as one
+MOST_PARTS = 50_000
 MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six levels
-MOST_PACKED = 2**20  # maximum size of packed integers in one part, as a shape [bytes]
+# maximum size of packed integers in one field, such as a shape [bytes]
+MOST_PACKED = 2**20
 MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozens
 MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
-CONTRACT_LIMIT = (
-    4 * 2**20
-)  # maximum size of the contract [bytes], mostly golden observations
+# maximum size of the contract [bytes], mostly golden observations
+CONTRACT_LIMIT = 4 * 2**20
 MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
-# multiplications, or numbers read and written, for one observation
+# maximum number of multiplications, or of numbers read and written, per observation
 MOST_WORK = 20_000_000
-MOST_AT_ONCE = (
-    64 * MOST_NUMBERS
-)  # of all nodes' outputs in one run: at most 256 MB of float32
-ROWS = 16  # observations for which the sizes are computed, as many as there are golden ones
+# maximum of all nodes' outputs in one run: 256 MB of float32
+MOST_AT_ONCE = 64 * MOST_NUMBERS
+# number of observations for which sizes are computed, equal to the golden ones
+ROWS = 16
 # maximum length of an integer array that may be a shape, an axis or an index
 SMALL = 1024
 GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
-MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
+# maximum number of axes that all nodes together may add; each slows inference
+MOST_AXES = 256
 INPUT = "observation"
 ACTION = "action"
 COMMAND = "command"
-# of a policy with a state
+# graph ends of a policy with a state
 STATE_IN = "state_in"
 STATE_OUT = "state_out"
-RECURRENT = frozenset(
-    {"GRU", "LSTM", "RNN"}
-)  # over sequences whose length the graph tells
+# recurrent operators over sequences whose length the graph fixes
+RECURRENT = frozenset({"GRU", "LSTM", "RNN"})
 OPERATORS = RECURRENT | frozenset(
     {
         "Abs",
@@ -108,34 +109,32 @@ OPERATORS = RECURRENT | frozenset(
         "Unsqueeze",
     }
 )
-"""Operators of networks: no loops, branches, random draws or data-dependent sizes."""
+"""Operators of networks: no loops, branches, random numbers or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
 INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
-NUMBERS = (
-    FLOATS | INTEGERS | {TensorProto.BOOL}
-)  # types as large in memory as in the file
-DIVIDING = frozenset(
-    {"Div", "ReduceMean"}
-)  # of integers by zero, or minimum by -1: a crash
+# types as large in memory as in the file
+NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}
+# integer division by zero, or of the minimum by -1, crashes the process
+DIVIDING = frozenset({"Div", "ReduceMean"})
 OTHER_FORMATS = (
-    (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"),
+    (b"PK", "a zip archive, written by Stable-Baselines3 and torch"),
     (b"\x80", "a pickle"),
     (b"\x93NUMPY", "a numpy array"),
     (b"\x89HDF", "an HDF5 file"),
     (b"\x1f\x8b", "a gzip file"),
 )
-"""First bytes of files that trainers write and that are never opened here."""
-# types of a field on the wire
+"""First bytes of trainers' files, which are never opened here."""
+# wire types of fields
 _VARINT = 0
 _BYTES = 2
-_FIXED = {1: 8, 5: 4}  # other types, and their sizes [bytes]
+_FIXED = {1: 8, 5: 4}  # fixed-size wire types and their sizes [bytes]
 _LONGEST_VARINT = 10
 Shape = tuple[int, ...]
-Fault = tuple[str, str]  # faulty field, and the reason
+Fault = tuple[str, str]  # faulty field and the reason
 
 
 def parse(data: bytes, source: str) -> Any:
-    """Parses and checks a policy file's ModelProto; PolicyError if it is not one to be run."""
+    """Parses and checks a policy file's ModelProto. Raises PolicyError if it must not be run."""
     model = parsed(data, source)
     metadata(model, source)
     check_graph(model, source)
@@ -143,22 +142,22 @@ def parse(data: bytes, source: str) -> Any:
 
 
 def parsed(data: bytes, source: str) -> Any:
-    """Parses a ModelProto, of anyone, and checks its form alone. Raises PolicyError."""
+    """Parses any ModelProto and checks only its form. Raises PolicyError."""
     _check_form(data, source)
     try:
         model = onnx.load_model_from_string(data)
         if not model.HasField("graph"):
             raise ValueError
     except (DecodeError, ValueError, TypeError):
-        raise _no_policy(source, "is no ONNX model, or is cut off") from None
+        raise _no_policy(source, "is not an ONNX model, or is truncated") from None
     return model
 
 
 def _check_form(data: bytes, source: str) -> None:
-    """Raises PolicyError for another format, and for bytes that are no message of a few parts."""
+    """Raises PolicyError for another format, or for bytes that are not a message of few fields."""
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
-            reason = f"is {kind}, which is never opened; export the policy with `export_policy`."
+            reason = f"is {kind}, which is not a policy; export the policy with `export_policy`."
             raise PolicyError(source, "file", reason)
     try:
         check_wire(data)
@@ -167,13 +166,11 @@ def _check_form(data: bytes, source: str) -> None:
 
 
 def _no_policy(source: str, what: str) -> PolicyError:
-    return PolicyError(
-        source, "file", f"{what}, which no policy is; export or copy it again."
-    )
+    return PolicyError(source, "file", f"{what}; export or copy it again.")
 
 
 def metadata_in(data: bytes, source: str) -> str:
-    """The text of the contract in a file, of which nothing else is parsed. Raises PolicyError."""
+    """The text of the contract in a file, without parsing the rest. Raises PolicyError."""
     _check_form(data, source)
     bare = onnx.ModelProto()
     field = onnx.ModelProto.DESCRIPTOR.fields_by_name["metadata_props"]
@@ -189,24 +186,28 @@ def metadata_in(data: bytes, source: str) -> str:
             try:
                 bare.metadata_props.add().ParseFromString(bytes(view[start:end]))
             except DecodeError:
-                raise _no_policy(source, "is no ONNX model, or is cut off") from None
+                raise _no_policy(
+                    source, "is not an ONNX model, or is truncated"
+                ) from None
         has_graph |= number == onnx.ModelProto.GRAPH_FIELD_NUMBER
         start = end
     if not has_graph:
-        raise _no_policy(source, "is no ONNX model, or is cut off")
+        raise _no_policy(source, "is not an ONNX model, or is truncated")
     return metadata(bare, source)
 
 
 def metadata(model: Any, source: str) -> str:
-    """The text of the contract. Raises PolicyError unless there is exactly one."""
+    """The text of the contract. Raises PolicyError unless the model has exactly one."""
     found = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if len(found) != 1:
         reason = (
-            f"{len(found)} contracts in it; only files of `export_policy` are policies."
+            f"has {len(found)} contracts; only files of `export_policy` are policies."
         )
         raise PolicyError(source, "metadata", reason)
     if len(found[0]) > CONTRACT_LIMIT:
-        reason = f"has {len(found[0])} characters, a contract at most {CONTRACT_LIMIT}; not read."
+        reason = (
+            f"has {len(found[0])} characters, more than {CONTRACT_LIMIT}; not read."
+        )
         raise PolicyError(source, "metadata", reason)
     return str(found[0])
 
@@ -220,7 +221,7 @@ def graph_hash(model: Any) -> str:
 
 
 def sealed(data: bytes) -> bytes:
-    """Appends a model's checksum as another metadata entry, as messages may be concatenated."""
+    """Appends a model's checksum as a metadata entry; serialised messages may be concatenated."""
     end = onnx.ModelProto()
     entry = end.metadata_props.add()
     entry.key, entry.value = SEAL, hash_bytes(data)
@@ -228,19 +229,19 @@ def sealed(data: bytes) -> bytes:
 
 
 def check_seal(data: bytes, source: str) -> None:
-    """Raises PolicyError unless a file is bit-identical to what was written."""
+    """Raises PolicyError unless a file is bit-identical to the one that was written."""
     size = len(sealed(b""))
     if data != sealed(data[:-size]):
-        reason = "does not fit the file, which was changed or damaged; copy or export it again."
+        reason = "does not match the file, which was changed or damaged; copy or export it again."
         raise PolicyError(source, SEAL, reason)
 
 
 class WireError(ValueError):
-    """The bytes are no message, or one that is too large once parsed."""
+    """Bytes that are not a message, or whose message would be too large once parsed."""
 
 
 def check_wire(data: bytes) -> None:
-    """Raises WireError unless the bytes are of a ModelProto with few parts and little nesting."""
+    """Raises WireError unless the bytes are a ModelProto with few fields and little nesting."""
     view = memoryview(data)
     parts = 0
     ahead: list[tuple[int, int, Any, int]] = [
@@ -253,13 +254,13 @@ def check_wire(data: bytes) -> None:
         while start < end:
             parts += 1
             if parts > MOST_PARTS:
-                raise WireError(f"has more than {MOST_PARTS} parts")
+                raise WireError(f"has more than {MOST_PARTS} fields")
             key, start = _varint(view, start, end)
             size, start = _size_of(view, start, end, key & 7)
             begin = start
             start = start + size
             if start > end:
-                raise WireError("is cut off")
+                raise WireError("is truncated")
             field = kind.fields_by_number.get(key >> 3)
             if field is None or key & 7 != _BYTES:
                 continue
@@ -272,8 +273,10 @@ def check_wire(data: bytes) -> None:
                 field.TYPE_UINT32,
                 field.TYPE_ENUM,
             ):
-                # Numbers of variable length grow when they are parsed.
-                raise WireError(f"has {size} bytes of {field.name!r}, not weights")
+                # Variable-length numbers take more memory once parsed.
+                raise WireError(
+                    f"has {size} bytes of {field.name!r}, which are not weights"
+                )
 
 
 def _size_of(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int]:
@@ -282,7 +285,7 @@ def _size_of(view: memoryview, start: int, end: int, wire: int) -> tuple[int, in
     if wire == _VARINT:
         return _varint(view, start, end)[1] - start, start
     if wire not in _FIXED:
-        raise WireError("is no ONNX model")
+        raise WireError("is not an ONNX model")
     return _FIXED[wire], start
 
 
@@ -292,11 +295,11 @@ def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
         value |= (view[start + k] & 0x7F) << (7 * k)
         if view[start + k] < 0x80:
             return value, start + k + 1
-    raise WireError("is no ONNX model, or is cut off")
+    raise WireError("is not an ONNX model, or is truncated")
 
 
 def check_graph(model: Any, source: str) -> None:
-    """Raises PolicyError for a graph that is not self-contained, or has other operators."""
+    """Raises PolicyError for a graph that is not self-contained or uses other operators."""
     for field, reason in itertools.chain(
         _graph_faults(model), _weight_faults(model.graph)
     ):
@@ -304,7 +307,7 @@ def check_graph(model: Any, source: str) -> None:
     try:
         onnx.checker.check_model(model)
     except (onnx.checker.ValidationError, ValueError) as error:
-        reason = f"is no valid ONNX graph ({_shown(error)})."
+        reason = f"is not a valid ONNX graph ({_shown(error)})."
         raise PolicyError(source, "graph", reason) from None
 
 
@@ -315,14 +318,12 @@ def _shown(error: Exception) -> str:
 def _graph_faults(model: Any) -> Iterator[Fault]:
     graph = model.graph
     if len(graph.node) > MOST_NODES:
-        reason = (
-            f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run."
-        )
+        reason = f"has {len(graph.node)} operators, more than {MOST_NODES}; not run."
         yield "graph.node", reason
     for tensor in _tensors(graph):
         name = f"weights.{tensor.name}"
         if tensor.data_type not in NUMBERS or len(tensor.dims) > MOST_DIMENSIONS:
-            reason = f"is no array of numbers with at most {MOST_DIMENSIONS} dimensions; not run."
+            reason = f"is not a numeric array of at most {MOST_DIMENSIONS} dimensions; not run."
             yield name, reason
         location = next(
             (entry.value for entry in tensor.external_data if entry.key), ""
@@ -331,14 +332,14 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
             fix = "export with `external_data=False`, or `onnx.save(onnx.load(FILE), FILE)`"
             yield (
                 name,
-                f"refers to another file ({location!r}); a policy holds its weights: {fix}.",
+                f"refers to another file ({location!r}); a policy contains its weights: {fix}.",
             )
     if (
         len(model.functions)
         or len(model.training_info)
         or len(graph.sparse_initializer)
     ):
-        yield "graph", "holds functions, training or sparse weights; remove."
+        yield "graph", "contains functions, training or sparse weights; remove them."
     for node in graph.node:
         if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
@@ -348,9 +349,9 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
             yield "graph.node", reason
         for a in node.attribute:
             if a.HasField("g") or len(a.graphs):
-                yield "graph.node", f"{node.op_type} holds a graph of its own."
+                yield "graph.node", f"{node.op_type} contains a subgraph."
             if a.HasField("sparse_tensor") or len(a.sparse_tensors):
-                yield "graph.node", f"{node.op_type} holds sparse weights."
+                yield "graph.node", f"{node.op_type} contains sparse weights."
     yield from _setting_faults(graph)
 
 
@@ -359,9 +360,9 @@ def _weight_faults(graph: Any) -> Iterator[Fault]:
         try:
             values = onnx.numpy_helper.to_array(tensor)
         except (ValueError, TypeError, KeyError, RuntimeError):
-            yield f"weights.{tensor.name}", "is damaged; export the policy anew."
+            yield f"weights.{tensor.name}", "is damaged; export the policy again."
         if values.dtype.kind == "f" and not np.isfinite(values).all():
-            yield f"weights.{tensor.name}", "holds NaN or inf; train anew."
+            yield f"weights.{tensor.name}", "contains NaN or inf; train again."
     for attribute in _attributes(graph):
         if not all(map(math.isfinite, [attribute.f, *attribute.floats])):
             yield f"graph.node.{attribute.name}", "is NaN or inf."
@@ -382,14 +383,14 @@ def _tensors(graph: Any) -> Iterator[Any]:
 def check_ends(
     model: Any, widths: dict[str, int | None], source: str, batch: int | None = None
 ) -> None:
-    """Raises PolicyError unless inputs and outputs have their widths; None: integers (n,).
+    """Raises PolicyError unless inputs and outputs have these widths; None: integers (n,).
 
-    Their first dimension is the number of observations; None: any.
+    Their first dimension is the number of observations, `batch`; None: any number.
     """
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in weights]
     if STATE_IN not in widths and STATE_IN in [one.name for one in inputs]:
-        reason = "is missing, although the graph takes one; export the policy anew."
+        reason = "is missing, although the graph needs one; export the policy again."
         raise PolicyError(source, "state", reason)
     for kind, ends, known in (
         ("inputs", inputs, [INPUT, STATE_IN]),
@@ -397,7 +398,7 @@ def check_ends(
     ):
         names = [name for name in known if name in widths]
         if [end.name for end in ends] != names:
-            reason = f"are {[end.name for end in ends]}, not {names}; export the policy anew."
+            reason = f"are {[end.name for end in ends]}, not {names}; export the policy again."
             raise PolicyError(source, f"graph.{kind}", reason)
     for end in (*inputs, *model.graph.output):
         tensor = end.type.tensor_type
@@ -410,13 +411,13 @@ def check_ends(
         if tensor.elem_type != kind or sizes != wanted:
             name = TensorProto.DataType.Name(tensor.elem_type)
             reason = (
-                f"is {name} of shape {sizes}, where {wanted} is needed; export anew."
+                f"is {name} of shape {sizes}, but {wanted} is needed; export again."
             )
             raise PolicyError(source, f"graph.{end.name}", reason)
 
 
 def rows_at_once(model: Any, source: str, batch: int | None = None) -> int:
-    """Number of observations for one run, at most `batch`.
+    """Computes the number of observations per run, at most `batch`.
 
     Raises PolicyError if a size is unknown or far too large.
     """
@@ -431,26 +432,28 @@ def rows_at_once(model: Any, source: str, batch: int | None = None) -> int:
         needs = (
             f"needs {numbers / rows:.3g} numbers and {work / rows:.3g} multiplications"
         )
-        limits = f"for an observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}"
+        limits = (
+            f"per observation; a policy may have {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}"
+        )
         raise PolicyError(source, "graph", f"{needs} {limits}; not run.")
     if batch is not None:
         return batch
     more_numbers, more_work = _costs(model, 2 * ROWS, source)
     if more_numbers > 2 * numbers or more_work > 2 * work:
-        reason = "grows faster than the number of its observations; not run."
+        reason = "grows faster than the number of observations; not run."
         raise PolicyError(source, "graph", reason)
     return max(1, ROWS * MOST_AT_ONCE // max(numbers, 1))
 
 
 def _setting_faults(graph: Any) -> Iterator[Fault]:
-    """Huge kernels, and arrays of thousands of dimensions, which take inference too long."""
+    """Yields huge kernels and arrays of thousands of dimensions, which slow inference down."""
     lengths = {tensor.name: math.prod(tensor.dims) for tensor in graph.initializer}
     for node in graph.node:
         for attribute in node.attribute:
             if node.op_type != "Slice" and any(
                 abs(n) > GREATEST_SETTING for n in attribute.ints
             ):
-                reason = f"of {node.op_type} is beyond {GREATEST_SETTING}; not run."
+                reason = f"of {node.op_type} exceeds {GREATEST_SETTING}; not run."
                 yield f"graph.node.{attribute.name}", reason
         if node.op_type == "Constant":
             given = (max(len(a.ints), math.prod(a.t.dims)) for a in node.attribute)
@@ -462,19 +465,19 @@ def _setting_faults(graph: Any) -> Iterator[Fault]:
             added += max(named + [len(a.ints) for a in node.attribute], default=0)
     if added > MOST_AXES:
         reason = (
-            f"reshapes to {added} dimensions in all, a policy to {MOST_AXES}; not run."
+            f"reshapes to {added} dimensions, more than {MOST_AXES} in total; not run."
         )
         yield "graph.node", reason
 
 
 def _integer_faults(model: Any, rows: int, source: str) -> Iterator[Fault]:
-    """Integers that are divided, or that grow while shapes are inferred."""
+    """Yields integers that are divided, or that grow while shapes are inferred."""
     kinds, shapes = _sizes(model, rows, source, values=False)
     for node in model.graph.node:
         if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
             yield (
                 "graph.node",
-                f"{node.op_type} of whole numbers may end the process; use float32.",
+                f"{node.op_type} of integers may crash the process; use float32.",
             )
         if (
             node.op_type in ("Concat", "Gather")
@@ -482,7 +485,9 @@ def _integer_faults(model: Any, rows: int, source: str) -> Iterator[Fault]:
         ):
             size = math.prod(shapes.get(node.output[0], (0,)))
             if size > SMALL * rows:
-                reason = f"of {size} whole numbers is no shape and no index; not run."
+                reason = (
+                    f"of {size} integers is too large for a shape or an index; not run."
+                )
                 yield "graph.node", f"{node.op_type} {reason}"
 
 
@@ -491,14 +496,11 @@ def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
     numbers = work = 0
     for node in model.graph.node:
         try:
-            given = [
-                shapes[name] for name in node.input if name
-            ]  # without those that are omitted
+            # without optional inputs that are left out
+            given = [shapes[name] for name in node.input if name]
             made = [shapes[name] for name in node.output if name]
         except KeyError:
-            reason = (
-                f"the size of what {node.op_type} gives can't be known before it runs."
-            )
+            reason = f"the output size of {node.op_type} can't be known before it runs."
             raise PolicyError(source, "graph.node", reason) from None
         buffer, multiplied = _work(node, given, made)
         numbers += sum(map(math.prod, made)) + buffer
@@ -507,7 +509,7 @@ def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
 
 
 def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
-    """Numbers that the runtime allocates in addition to the output, and multiplications."""
+    """Counts the numbers that the runtime allocates besides the output, and the multiplications."""
     settings = {attribute.name: attribute for attribute in node.attribute}
     if node.op_type in ("MatMul", "Gemm"):
         turned = (
@@ -520,12 +522,11 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
         return math.prod(made[0][2:]) * kernel * max(groups, 1), math.prod(
             made[0]
         ) * kernel
-    if (
-        node.op_type in RECURRENT
-    ):  # given: a sequence (T, n, I), weights (D, G H, I), (D, G H, H)
+    # inputs: a sequence (T, n, I), weights (D, G H, I) and (D, G H, H)
+    if node.op_type in RECURRENT:
         steps = math.prod(given[0][:2])
         return steps * math.prod(given[1][:2]), steps * sum(map(math.prod, given[1:3]))
-    if "kernel_shape" in settings:  # of a pool
+    if "kernel_shape" in settings:  # pooling
         return 0, math.prod(made[0]) * int(math.prod(settings["kernel_shape"].ints))
     return 0, 0
 
@@ -533,7 +534,7 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
 def _sizes(
     model: Any, rows: int, source: str, values: bool
 ) -> tuple[dict[str, int], dict[str, Shape]]:
-    """Type and known shape of every tensor for `rows` observations; also by integers' `values`."""
+    """Type and known shape of every tensor for `rows` observations; `values` uses integers, too."""
     bare = _without_weights(model, rows)
     try:
         graph = onnx.shape_inference.infer_shapes(
@@ -541,7 +542,7 @@ def _sizes(
         ).graph
     except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
         raise PolicyError(
-            source, "graph", f"its shapes do not fit ({_shown(error)})."
+            source, "graph", f"its shapes are inconsistent ({_shown(error)})."
         ) from None
     kinds = {tensor.name: tensor.data_type for tensor in graph.initializer}
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
@@ -574,14 +575,14 @@ def _without_weights(model: Any, rows: int) -> Any:
     for value in (one for one in model.graph.input if one.name not in held):
         graph.input.append(value)
         graph.input[-1].type.tensor_type.shape.dim[0].dim_value = rows
-    for value in model.graph.output:  # their shapes are to be inferred, not trusted
+    for value in model.graph.output:  # output shapes are to be inferred, not trusted
         kind = value.type.tensor_type.elem_type
         graph.output.append(onnx.helper.make_tensor_value_info(value.name, kind, None))
     return bare
 
 
 def _add_tensor(graph: Any, tensor: Any, name: str) -> None:
-    """Adds a small integer array, which may be a shape, as it is; of others only the shape."""
+    """Adds a small integer array, possibly a shape, with its values; of others only the shape."""
     if math.prod(tensor.dims) <= SMALL and tensor.data_type in INTEGERS:
         graph.initializer.append(tensor)
         graph.initializer[-1].name = name

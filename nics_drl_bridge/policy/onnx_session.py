@@ -1,4 +1,4 @@
-"""Opens the graph of a policy in onnxruntime, after all checks; imports little, for `rehearsal`."""
+"""Opens a policy's graph in onnxruntime after all checks; imports little, for `rehearsal`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,32 +15,31 @@ Rows = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class GraphNeeds:
-    """What a policy file says about its graph, as plain data."""
+    """What a policy file states about its graph, as plain data."""
 
-    widths: dict[
-        str, int | None
-    ]  # of inputs and outputs; None: whole numbers, one for each row
-    batch: int | None  # greatest number of observations in one run; None: any
+    # widths of inputs and outputs; None: integers, one per row
+    widths: dict[str, int | None]
+    batch: int | None  # maximum number of observations per run; None: no maximum
     graph_sha256: str
-    # of each element of the state; None: the policy has no state
+    # start value of each element of the state; None: the policy has no state
     start: float | None = None
 
 
 def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> int:
-    """Checks the graph of a policy file before anything of it runs. Raises PolicyError.
+    """Checks the graph of a policy file before any of it runs. Raises PolicyError.
 
-    Returns the number of observations for one run.
+    Returns the number of observations per run.
     """
     model = onnx_graph.parse(data, source)
     onnx_graph.check_ends(model, needs.widths, source, needs.batch)
     if onnx_graph.graph_hash(model) != needs.graph_sha256:
-        reason = "does not belong to the graph, which was changed after the export."
+        reason = "does not match the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
     return onnx_graph.rows_at_once(model, source, needs.batch)
 
 
 def open_session(data: bytes, source: str) -> Any:
-    """An onnxruntime session on one thread; ConfigError without it, PolicyError by the graph."""
+    """Opens an onnxruntime session on one thread. Raises ConfigError without it, or PolicyError."""
     try:
         import onnxruntime
     except ImportError:
@@ -61,7 +60,7 @@ def open_session(data: bytes, source: str) -> Any:
 
 
 def cannot_run(source: str, error: Exception) -> PolicyError:
-    """The error for a graph that the runtime refuses."""
+    """Makes the error for a graph that the runtime refuses."""
     words = " ".join(str(error).split())[:120]
     return PolicyError(source, "graph", f"onnxruntime can't run it ({words}).")
 
@@ -69,7 +68,7 @@ def cannot_run(source: str, error: Exception) -> PolicyError:
 def in_turn(
     run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, start: Rows | None
 ) -> list[NDArray[Any]]:
-    """Actions and commands for observations (T, O): of an episode if there is a state (S,)."""
+    """Computes actions and commands for observations (T, O), in sequence given a state (S,)."""
     if start is None:
         return list(run(seen))
     state = start[None]
@@ -81,7 +80,7 @@ def in_turn(
 
 
 def run_once(session: Any, needs: GraphNeeds, seen: Rows, source: str) -> None:
-    """Runs observations (T, O), of an episode if there is a state. Raises PolicyError."""
+    """Runs observations (T, O), as one episode if there is a state. Raises PolicyError."""
     start = None
     if needs.start is not None:
         start = np.full(needs.widths[onnx_graph.STATE_IN] or 1, needs.start, np.float32)

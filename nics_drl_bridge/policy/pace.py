@@ -1,4 +1,4 @@
-"""Time limit of an episode, and what a reward or discount per step means to a slower robot."""
+"""Time limits of episodes, and per-step rewards and discounts adapted to slower robots."""
 
 import math
 from collections.abc import Iterable
@@ -15,20 +15,20 @@ from nics_drl_bridge.robot.kinds import has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-OWN_TASK = "navigation"  # for which there are settings for robots of one's own
-LEAST_S = 30.0  # least time limit [s]
-ROOM = 1.8  # of the time on the straight line: for ways around, turns, and being slow at times
+OWN_TASK = "navigation"  # task for which user-defined robots inherit settings
+LEAST_S = 30.0  # minimum time limit [s]
+ROOM = 1.8  # factor on the straight-line time, for detours, turns and slow stretches
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Pace of a robot in worlds: least and greatest distance from start to goal, and its speed."""
+    """Pace of a robot in its worlds: range of start-to-goal distances, and maximum speed."""
 
-    world: str  # that of the greatest distance
-    near: float  # least distance in any world [m]
-    far: float  # greatest distance [m]
-    speed: float  # greatest speed of the robot; inf if it is not known [m/s]
-    period: float  # between commands [s]
+    world: str  # world with the maximum distance
+    near: float  # minimum distance in any world [m]
+    far: float  # maximum distance [m]
+    speed: float  # maximum speed of the robot; inf if unknown [m/s]
+    period: float  # time between commands [s]
 
     @property
     def steps(self) -> int:
@@ -38,13 +38,13 @@ class Pace:
         )
 
     def shortfall(self, steps: int) -> str | None:
-        """A sentence if a goal can't be reached in time; ConfigError if none can."""
+        """A sentence if some goals can't be reached in time; ConfigError if no goal can."""
         limit = steps * self.period
         if self.far <= limit * self.speed:
             return None
         reason = (
-            f"world {self.world!r}: a goal may lie {self.far:g} m away, which takes "
-            f"{self.far / self.speed:.0f} s at {self.speed:g} m/s, and an episode ends after "
+            f"world {self.world!r}: a goal may be {self.far:g} m away, which takes "
+            f"{self.far / self.speed:.0f} s at {self.speed:g} m/s, but an episode ends after "
             f"{limit:g} s; set max_episode_steps to {self.steps}."
         )
         if self.near > limit * self.speed:
@@ -55,7 +55,7 @@ class Pace:
 def pace_of(
     model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None = None
 ) -> Pace:
-    """The pace of a robot, at most of a top speed [m/s], in worlds."""
+    """The pace of a robot in worlds; `top` limits its speed [m/s]."""
     members = [member for world in worlds for member in world.members]
     far, name = max(
         (min(one.goal_distance[1], math.dist(one.extent[:2], one.extent[2:])), one.name)
@@ -72,7 +72,7 @@ def pace_of(
 
 
 def top_speed(robot: RobotSpec) -> float:
-    """Greatest speed along one axis of a robot [m/s]; inf if neither kind nor commands tell."""
+    """Maximum speed of a robot along one axis [m/s]; inf if neither kind nor commands limit it."""
     if has_textbook(robot):
         return float(reach(robot)[:2].max())
     told = [
@@ -82,21 +82,21 @@ def top_speed(robot: RobotSpec) -> float:
 
 
 def kin(robot: RobotSpec) -> str:
-    """Name of the shipped robot whose motion a robot's is like."""
+    """Name of the shipped robot that moves most like a robot."""
     if robot.steers:
         return "ackermann"
     return "mecanum" if robot.moves_sideways else "differential"
 
 
 class Fitted(NamedTuple):
-    """Settings of a training that fit robot and worlds, and a sentence for each thing adapted."""
+    """Training settings that fit robot and worlds, with a sentence per adaptation."""
 
     settings: recordings.TrainingSettings
     told: tuple[str, ...]
 
 
 def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted:
-    """Settings of a training as `chosen_settings`; a robot without own ones gets those of its kin.
+    """Loads settings as `chosen_settings`; a robot without its own gets those of the nearest one.
 
     Raises ConfigError, and ModelError if there is no such robot.
     """
@@ -106,7 +106,7 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     own = f"{task}_{robot}" in shipped
     if name is None and robot is not None and not own and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"
-        told.append(f"settings {name!r}, as the robot {robot!r} has none of its own")
+        told.append(f"settings {name!r}because the robot {robot!r} has none of its own")
     settings = recordings.chosen_settings(task, name, changes)
     inherited = (
         name in shipped and recordings.load_training(str(name)).robot != settings.robot
@@ -118,10 +118,10 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
 def fitted(
     settings: recordings.TrainingSettings, model: SimulatorModel, inherited: bool
 ) -> Fitted:
-    """Settings with a time limit for robot and worlds, unless they have one; ConfigError if short.
+    """Adds a time limit for robot and worlds if there is none. Raises ConfigError if too short.
 
-    Those inherited from another robot get its lidar's layout of a scan, and a time reward and a
-    discount that come to the same over an episode.
+    Settings inherited from another robot also get its lidar's scan layout, and a time reward and
+    discount that amount to the same over an episode.
     """
     options = dict(settings.task_options)
     told = list[str]()
@@ -136,7 +136,7 @@ def fitted(
         )
         far = LAYOUTS["around"].range_max
         told.append(
-            f"the lidar {lidar.name!r} does not see {far:g} m all around: scan: {scan}"
+            f"the lidar {lidar.name!r} does not cover {far:g} m all around: scan: {scan}"
         )
     if (
         "max_episode_steps" not in settings.model_fields_set
@@ -160,7 +160,7 @@ def _stretched(
     factor: float,
     told: list[str],
 ) -> dict[str, Any]:
-    """Returns the changes for episodes longer by a factor; those of `options` are made in place."""
+    """Returns the changes for episodes longer by a factor; changes `options` in place."""
     if reward := options.get("time_reward"):
         options["time_reward"] = round(reward / factor, 6)
         told.append(f"time_reward {options['time_reward']:g}, was {reward:g}")

@@ -1,28 +1,28 @@
-"""Pacing of a policy's actions, and inferences that take too long; times on a steady clock [s]."""
+"""Pacing of a policy's actions, and detection of slow inference; times on a steady clock [s]."""
 
 from enum import Enum
 
 
 class ActionPace:
-    """Allows at most one action per period, as soon as there are data to act on; 0 acts on all."""
+    """Allows at most one action per period, as soon as there are data; a period of 0 allows all."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._due_s = -float("inf")
 
     def due(self, now_s: float) -> bool:
-        """True if it is time to act."""
+        """True if an action is due."""
         return now_s >= self._due_s
 
     def acted(self, now_s: float) -> None:
         """Records the start of an action."""
-        # Due times are a period apart: jitter of the data makes it neither faster nor slower.
+        # Due times are a period apart, so jitter of the data does not change the average rate.
         late = now_s - self._due_s > 0.5 * self._period_s
         self._due_s = (now_s if late else self._due_s) + self._period_s
 
 
 class Answer(Enum):
-    """Fate of a command."""
+    """What to do with a command."""
 
     SEND = "send"
     DROP = "drop"
@@ -30,7 +30,7 @@ class Answer(Enum):
 
 
 class Deadline:
-    """Judges the duration of each inference; after `patience` late ones in a row it says stop."""
+    """Judges each inference time; after `patience` late ones in a row the verdict is to stop."""
 
     def __init__(self, limit_s: float, patience: int) -> None:
         self._limit_s = limit_s
@@ -39,7 +39,7 @@ class Deadline:
         self.longest_s = 0.0
 
     def judge(self, taken_s: float) -> Answer:
-        """Decides on a command whose inference took `taken_s`."""
+        """Decides what to do with a command whose inference took `taken_s`."""
         self.longest_s = max(self.longest_s, taken_s)
         if taken_s <= self._limit_s:
             self.answered += 1

@@ -1,4 +1,4 @@
-"""Policies by name: baselines that any trained policy must beat, a planner, and policy files."""
+"""Policies by name: baselines that any trained policy must beat, planners, and policy files."""
 
 import itertools
 import math
@@ -39,17 +39,18 @@ if TYPE_CHECKING:
     from nics_drl_bridge.policy.policy_file import PolicyFile
 
 
-CLEARANCE = Clearance(
-    margin=0.1, soft=0.4
-)  # of the dynamic window, whose twists are few
-FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
-SETTLED_S = 5.0  # after which a held command has led to its twist
-LEAST_REACH = 1e-3  # of a component of the twist that no command moves [m/s, rad/s]
-CREEP = 0.3  # share of the speed for a robot that can't turn on the spot and has its goal behind
+# of the dynamic window, whose twists are few
+CLEARANCE = Clearance(margin=0.1, soft=0.4)
+FULL_TURN_RAD = 0.8  # bearing of the goal above which a robot turns at full rate
+SETTLED_S = 5.0  # time after which a held command has led to its steady twist
+# minimum of a twist component that counts as controllable [m/s, rad/s]
+LEAST_REACH = 1e-3
+# fraction of the speed while a robot that can't turn in place has its goal behind it
+CREEP = 0.3
 
 
 def _grid(robot: RobotSpec) -> Array:
-    """Returns commands (K, C) over the whole range of each, with rest."""
+    """Returns a grid of commands (K, C) over the full range of each, including rest."""
     counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
     axes = [
         np.unique(
@@ -65,10 +66,10 @@ def _grid(robot: RobotSpec) -> Array:
 
 
 def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) -> Array:
-    """Returns the body twists (K, 3) to which commands (K, C) lead when they are held.
+    """Returns the steady body twists (K, 3) of held commands (K, C).
 
-    By the model of a robot that is not driven by `cmd_vel`: its kind may know them roughly alone;
-    and if its motors bend commands, of which its kind knows nothing.
+    Uses the model if the robot does not take `cmd_vel`, because its kind is then only approximate,
+    or if its motors distort commands, which its kind does not describe.
     """
     if model is None or (task.robot.takes_cmd_vel and model.kinematics.is_plain):
         return compute_steady_twist(task.robot, commands)
@@ -85,7 +86,7 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
 
 
 def actions_of(task: Navigation, commands: Array) -> NDArray[np.float32]:
-    """Returns the continuous actions (..., C) that give commands (..., C), cut to [-1, 1]."""
+    """Returns the continuous actions (..., C) for commands (..., C), clamped to [-1, 1]."""
     low, high = task.command_limits
     return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0).astype(
         np.float32
@@ -97,11 +98,11 @@ class StraightToGoal:
     """Turns to the goal and drives there, ignoring obstacles; ConfigError: see `command_for`."""
 
     task: Navigation
-    # tells the twists of a robot whose kind does not
+    # gives the twists of a robot whose kind does not define them
     model: SimulatorModel | None = None
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """See `Policy`."""
+        """Choose the action; see `Policy`."""
         robot = self.task.robot
         first = self.task.scan_parts + 1
         cosine, sine = np.moveaxis(
@@ -117,7 +118,7 @@ class StraightToGoal:
         return actions_of(self.task, wanted)
 
     def _command(self, shares: Array) -> Array:
-        """Returns commands (..., C) for shares (..., 3) of the greatest twist."""
+        """Returns commands (..., C) for fractions (..., 3) of the maximum twist."""
         robot = self.task.robot
         if has_textbook(robot):
             return find_command(robot, shares * self._reach)
@@ -151,7 +152,7 @@ class RandomActions:
     seed: int = 0
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """See `Policy`."""
+        """Draw the action; see `Policy`."""
         shape = (*observation.shape[:-1], len(self.task.robot.command))
         return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
 
@@ -164,26 +165,27 @@ class RandomActions:
 class DynamicWindow:
     """The dynamic-window approach (Fox, Burgard, Thrun 1997); ConfigError: see `steady_twist`.
 
-    Towards the goal it takes the shortest way around what is seen (Brock, Khatib 1999).
+    The path length to the goal leads around visible obstacles (Brock, Khatib 1999).
     """
 
     task: Navigation
     clearance: Clearance = CLEARANCE
-    period: float = 0.1  # between commands [s]
-    steps: int = 10  # of the look-ahead, each a period and a half long
+    period: float = 0.1  # time between commands [s]
+    steps: int = 10  # steps of the look-ahead, each 1.5 periods long
+    # see `TwistWeights`
     weights: tuple[float, float, float, float] = (
         1.0,
         0.6,
         0.3,
         1.5,
-    )  # see `TwistWeights`
-    model: SimulatorModel | None = None  # tells the twists of a robot without `cmd_vel`
+    )
+    model: SimulatorModel | None = None  # gives the twists of a robot without `cmd_vel`
 
     def __post_init__(self) -> None:
         _ = self._search
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """See `Policy`."""
+        """Choose the action; see `Policy`."""
         parts = self.task.scan_parts
         seen = np.atleast_2d(observation).astype(np.float64)
         goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
@@ -211,15 +213,14 @@ class DynamicWindow:
         steps = [
             np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T
         ]
-        reach = (
-            np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6
-        )  # one step at least
+        # at least one step
+        reach = np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6
         if self.model is None:
             late = 0.0
         else:
             late = max(0.0, self.model.calibration.command_latency_s)
-        # A twist is held for a period and looked at a period later; then the robot reacts. Its
-        # reaction is known no finer than the steps of its model.
+        # A twist is held for a period and judged a period later; then the robot reacts. This
+        # reaction time is known only to the step of the robot's model.
         held = 2.0 * self.period + late
         reaction = held + round(braking.reaction_s, 2)
         turn_reaction = 0.0
@@ -232,9 +233,8 @@ class DynamicWindow:
         needed = math.ceil((reaction + slowest) / step)
         far = math.inf
         count = self.steps
-        if (
-            needed > count
-        ):  # it looks ahead for as long as the robot needs, on ground that it sees
+        # looks ahead for as long as the robot needs to stop, over ground that it sees
+        if needed > count:
             count = needed
             fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
             far = min(fastest * step * count, self.task.sight.range_max, MOST_M)
@@ -283,7 +283,7 @@ POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
 
 
 def shipped_policies() -> list[str]:
-    """Names of the policy files that come with the package."""
+    """Names of the policy files that ship with the package."""
     return sorted(file.stem for file in shipped().glob(f"*{SUFFIX}"))
 
 
@@ -307,12 +307,13 @@ def is_policy_file(name: str) -> bool:
 def make_policy(
     name: str, task: Navigation, model: SimulatorModel | None = None
 ) -> Policy:
-    """Makes a policy by name, or the path of a file. Raises ConfigError, PolicyError."""
+    """Makes a policy from a name or the path of a file. Raises ConfigError, PolicyError."""
     if not is_policy_file(name):
         return POLICIES[name](task, model)
+    # the others need no onnxruntime
     from nics_drl_bridge.policy.foreign import (
         load_any,
-    )  # the others need no onnxruntime
+    )
 
     policy = load_any(name, model)
     policy.check_fits(model, task)
@@ -322,30 +323,28 @@ def make_policy(
 def open_policy(
     name: str, model: SimulatorModel, kind: str | None = None
 ) -> tuple[Policy, Navigation]:
-    """Opens a policy and its task: navigation, or one of a `kind`.
+    """Opens a policy and its task: navigation, or the task class `kind`.
 
-    A kind is path/to/file.py:ClassName. Raises ConfigError, and PolicyError for another task.
+    `kind` is path/to/file.py:ClassName. Raises ConfigError, and PolicyError for another task.
     """
     if not is_policy_file(name):
         if kind is not None:
-            reason = "drives the task 'navigation' alone; leave it out, or --task"
+            reason = "only drives the task 'navigation'; use another policy, or leave out --task"
             raise ConfigError(f"policy {name!r} {reason}.")
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task, model), task
     from nics_drl_bridge.policy.foreign import load_any
 
     policy = load_any(name, model)
-    found: Any = policy.make_task(model, kind)  # of a kind it is any task
+    found: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
     if kind is None and not isinstance(found, Navigation):
-        reason = (
-            f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
-        )
+        reason = f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven."
         raise PolicyError(name, "task.name", reason)
     return _acting(policy), found
 
 
 def _acting(policy: "PolicyFile") -> Policy:
-    """The policy of a file, which keeps its state if it has one."""
+    """The policy of a file, wrapped to keep its state if it has one."""
     kept = policy.contract.state
     if kept is None:
         return policy

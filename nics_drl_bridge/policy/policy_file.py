@@ -1,4 +1,4 @@
-"""Policy files: one `.onnx` with network, normaliser, commands and contract; never unpickled."""
+"""Policy files: one `.onnx` with network, normaliser, commands and contract; never a pickle."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -45,7 +45,7 @@ class PolicyFile:
         self._rows_at_once = rows_at_once
 
     def act(self, observation: Rows) -> NDArray[Any]:
-        """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n of them for (n, O)."""
+        """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n actions for (n, O)."""
         return self.run(observation)[0]
 
     def command(self, observation: Rows) -> Rows:
@@ -58,19 +58,19 @@ class PolicyFile:
         return action, following
 
     def run(self, observation: Rows, state: Rows | None = None) -> list[NDArray[Any]]:
-        """Returns action and command for (O,) or (n, O), and the next state for one (S,), (n, S).
+        """Returns action, command and next state (S,) or (n, S) for (O,) or (n, O).
 
-        Raises PolicyError if a shape does not fit, or a state is missing; see `make_policy`.
+        Raises PolicyError for a wrong shape or a missing state; see `make_policy`.
         """
         given = np.asarray(observation, np.float32)
         size = self.contract.observation.size
         kept = self.contract.state
         if given.ndim not in (1, 2) or given.shape[-1] != size:
-            reason = f"is {size}, but was given observations {given.shape}; use its own task."
+            reason = f"is {size}, but observations are {given.shape}; use the policy's own task."
             raise PolicyError(str(self.path), "observation.size", reason)
         wanted = None if kept is None else (*given.shape[:-1], kept.size)
         if wanted != (None if state is None else np.shape(state)):
-            reason = f"must be given as {wanted}, not {None if state is None else np.shape(state)}"
+            reason = f"must have shape {wanted}, not {None if state is None else np.shape(state)}"
             raise PolicyError(
                 str(self.path), "state", f"{reason}; `make_policy` keeps it."
             )
@@ -117,9 +117,7 @@ class PolicyFile:
         name = self.contract.task.name
         if kind is None and name not in TASKS:
             place = f"path/to/file.py:{name if name.isidentifier() else 'ClassName'}"
-            reason = (
-                f"{name!r} is no shipped task; say --task {place}, or task= in Python."
-            )
+            reason = f"{name!r} is not a shipped task; give --task {place}, or task= in Python."
             raise PolicyError(str(self.path), "task.name", reason)
         self.check_fits(model)
         task = make_task(kind or name, model, self.task_options)
@@ -129,7 +127,7 @@ class PolicyFile:
     def check_fits(
         self, model: SimulatorModel | None, task: Task | None = None
     ) -> None:
-        """Raises PolicyError, with the field, unless the policy fits a robot and a task."""
+        """Raises PolicyError, naming the field, unless the policy fits a robot and a task."""
         if model is not None:
             self._check_robot(model.robot, model.lidar)
             known = {
@@ -163,14 +161,14 @@ class PolicyFile:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
                 reason = (
-                    f"sees more than this lidar does: {str(error).partition(';')[0]}"
+                    f"needs more than this lidar sees: {str(error).partition(';')[0]}"
                 )
-                fix = "use another lidar, or a policy that was trained for this one"
+                fix = "use another lidar, or a policy trained for this one"
                 raise PolicyError(str(self.path), "scan", f"{reason}; {fix}.") from None
         self._compare(theirs)
 
     def _compare(self, theirs: Mapping[str, Any]) -> None:
-        """Raises PolicyError for the first of some entries that differs from the contract's."""
+        """Raises PolicyError for the first entry that differs from the contract's."""
         for name, entry in theirs.items():
             only: Any = {name: set(entry) if isinstance(entry, dict) else True}
             ours = dict(leaves(self.contract.model_dump(mode="json", include=only)))
@@ -180,12 +178,12 @@ class PolicyFile:
                     reason = (
                         f"is {ours.get(path)!r}, but the robot's is {other.get(path)!r}"
                     )
-                    reason += "; use a policy that was trained so."
+                    reason += "; use a policy trained for that."
                     raise PolicyError(str(self.path), path, reason)
 
 
 def load_policy(path: str | Path) -> PolicyFile:
-    """Loads a policy file, by path or shipped name, with all checks; PolicyError has the field."""
+    """Loads and checks a policy file, by path or shipped name; PolicyError names the field."""
     check_path("policy", path)
     file = Path(path)
     suffix = contracts.SUFFIX
@@ -204,16 +202,14 @@ def load_policy(path: str | Path) -> PolicyFile:
         limit = onnx_graph.SIZE_LIMIT
         if not file.is_file():
             raise PolicyError(
-                source, "file", "is no file; give the path of an .onnx file."
+                source, "file", "is not a file; give the path of an .onnx file."
             )
         if size > limit:
-            sizes = f"is {size / 2**20:.0f} MB, a policy is at most {limit // 2**20} MB"
+            sizes = f"is {size / 2**20:.0f} MB, more than the {limit // 2**20} MB of a policy"
             raise PolicyError(source, "file", f"{sizes}; not opened.")
         data = file.read_bytes()
     except FileNotFoundError:
-        raise PolicyError(
-            source, "file", "there is no such file; check the path."
-        ) from None
+        raise PolicyError(source, "file", "does not exist; check the path.") from None
     except OSError as error:
         raise PolicyError(
             source, "file", f"can't be read ({error.strerror})."
@@ -225,14 +221,12 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     """Makes a policy from a file's content; see `load_policy`."""
     source = str(path)
     contract = contracts.read_contract(onnx_graph.metadata_in(data, source), source)
-    onnx_graph.check_seal(
-        data, source
-    )  # what was changed since has a reason above, if it is known
+    # last, because the checks above give a more specific reason for a changed file
+    onnx_graph.check_seal(data, source)
     needs = _needs_of(contract)
     seen = contract.golden.rows("observations")
-    if (
-        path.parent != contracts.shipped()
-    ):  # these are part of the package, as its code is
+    # shipped policies are as trusted as the package's code
+    if path.parent != contracts.shipped():
         rehearsal.rehearse_policy(data, needs, seen, source)
     rows = check_policy_graph(data, needs, source)
     policy = PolicyFile(path, contract, open_session(data, source), rows)
@@ -263,13 +257,13 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
     for name, rows in found.items():
         gap = np.abs(rows - golden.rows(name)).max()
         if not gap <= GOLDEN_TOLERANCE:
-            reason = f"differ by {gap:.3g} from what the graph gives here; not used."
+            reason = f"differ by {gap:.3g} from the graph's outputs on this machine; not used."
             raise PolicyError(source, f"golden.{name}", reason)
     robot = policy.contract.robot
     beyond = (command < robot.command_low - GOLDEN_TOLERANCE).any()
     if beyond or (command > robot.command_high + GOLDEN_TOLERANCE).any():
         raise PolicyError(
-            source, "robot.command", "the graph gives commands beyond its limits."
+            source, "robot.command", "the graph returns commands beyond these limits."
         )
 
 

@@ -1,9 +1,9 @@
-"""Opens a policy's network in a process of its own first, which has little memory and time.
+"""Opens a policy's network first in a separate process with little memory and time.
 
-What it costs to parse a graph, to infer its shapes and to prepare it is known only by doing it:
-a few hundred kilobytes can ask for gigabytes. So what comes from a file is done once where it can
-do no harm, and done here only if that went well. A file is remembered by its content, so that it
-costs a fraction of a second once in a process.
+The cost of parsing a graph, inferring its shapes and preparing it is only known by doing so: a
+few hundred kilobytes can ask for gigabytes. So foreign content is first opened where it can do no
+harm, and opened here only if that went well. Files are remembered by their content, so each costs
+a fraction of a second once per process.
 """
 
 import base64
@@ -28,39 +28,39 @@ from nics_drl_bridge.policy.onnx_session import (
     run_once,
 )
 
-MEMORY = 512 * 2**20  # beyond what the libraries use [bytes]
-# the same for each byte of the file: a network is held several times
+MEMORY = 512 * 2**20  # limit beyond what the libraries use [bytes]
+# additional limit per byte of the file: a network is held several times
 MEMORY_OF_SIZE = 8
-CPU_S = 10  # time of a processor; a network of 32 MB takes a tenth of it here
-WALL_S = 60.0  # on a computer that is busy with other things
+CPU_S = 10  # limit of processor time; a network of 32 MB needs a tenth of it
+WALL_S = 60.0  # limit of wall time, generous for a busy computer
 MOST_REMEMBERED = 10_000
 EXIT_MEMORY = 3
 _CODE = "import sys; sys.path[:] = {path!r}; import {module} as one; one.main()"
-_remembered: dict[str, None] = {}  # digests of what went well, oldest first
+_remembered: dict[str, None] = {}  # digests of what opened well, oldest first
 
 
 def rehearse_policy(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
-    """Opens a policy file elsewhere, and runs observations (T, O). Raises PolicyError."""
+    """Opens a policy file in another process and runs observations (T, O). Raises PolicyError."""
     _rehearse("policy", data, source, needs=_plain(needs), seen=_text(seen))
 
 
 def rehearse_network(data: bytes, source: str) -> None:
-    """Parses and checks somebody else's network elsewhere. Raises PolicyError."""
+    """Parses and checks a foreign network in another process. Raises PolicyError."""
     _rehearse("network", data, source)
 
 
 def rehearse_folding(data: bytes, opset: int, source: str) -> None:
-    """Folds the shapes of somebody else's network elsewhere. Raises PolicyError."""
+    """Folds the shapes of a foreign network in another process. Raises PolicyError."""
     _rehearse("folding", data, source, opset=opset)
 
 
 def rehearse_graph(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
-    """Opens and runs a graph that was composed around a network elsewhere. Raises PolicyError."""
+    """Opens and runs a graph composed around a foreign network elsewhere. Raises PolicyError."""
     _rehearse("graph", data, source, needs=_plain(needs), seen=_text(seen))
 
 
 def remember(data: bytes) -> None:
-    """Takes a policy file for rehearsed: this process made its graph, or rehearsed it before."""
+    """Marks a policy file as rehearsed: this process made its graph, or rehearsed its parts."""
     _remembered[_digest_of("policy", data)] = None
     if len(_remembered) > MOST_REMEMBERED:
         del _remembered[next(iter(_remembered))]
@@ -82,8 +82,8 @@ def _rehearse(step: str, data: bytes, source: str, **told: Any) -> None:
 
 
 def _answer_of(request: bytes) -> tuple[str, str] | None:
-    """The field and the reason for which another process refused a request; None if it did not."""
-    # The same modules as here: `python -c` alone would look for them in the working folder.
+    """The field and the reason why the other process refused a request; None if it accepted."""
+    # Pass on the import path: `python -c` alone would also look in the working folder.
     code = _CODE.format(path=sys.path, module=__name__)
     single = dict.fromkeys(
         ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
@@ -104,18 +104,16 @@ def _answer_of(request: bytes) -> tuple[str, str] | None:
     if done.returncode == 0:
         answer = json.loads(done.stdout)
         return None if answer is None else (str(answer[0]), str(answer[1]))
-    if (
-        done.returncode == EXIT_MEMORY or done.returncode < 0
-    ):  # of a signal: out of time, a crash
+    # negative: ended by a signal, out of time or crashed
+    if done.returncode == EXIT_MEMORY or done.returncode < 0:
         most = f"{MEMORY // 2**20} MB of memory or {CPU_S} s"
         return (
             "graph",
-            f"takes more than {most} to open, which no policy does; not opened.",
+            f"takes more than {most} to open, and no policy does; not opened.",
         )
-    last = (
-        done.stderr.decode(errors="replace").strip().splitlines()
-        or ["nothing was said"]
-    )[-1]
+    last = (done.stderr.decode(errors="replace").strip().splitlines() or ["no output"])[
+        -1
+    ]
     return "file", f"the process that opens it first failed ({last}); not opened."
 
 
@@ -132,7 +130,7 @@ def _text(seen: Rows) -> list[Any]:
 
 
 def main() -> None:
-    """Does what standard input asks for within the limits, and says what was wrong, or null."""
+    """Does what standard input requests, within the limits; prints the fault, or null."""
     import onnxruntime  # noqa: F401 - before the limits: what the libraries take is not counted
 
     request = sys.stdin.buffer.read()
@@ -153,7 +151,7 @@ def main() -> None:
         answer = error.field, error.reason
     sys.stdout.write(json.dumps(answer))
     sys.stdout.flush()
-    os._exit(0)  # nothing of a session is worth the time to take it apart
+    os._exit(0)  # skip the teardown of the session, which takes time for nothing
 
 
 def _do(told: dict[str, Any], data: bytes) -> None:
@@ -185,7 +183,7 @@ def _do(told: dict[str, Any], data: bytes) -> None:
 
 
 def _limit(memory: int) -> None:
-    """Limits what this process may take from now on; where the system can't, time alone is."""
+    """Limits the resources of this process; where the system can't, only the time limit applies."""
     try:
         import resource
     except ImportError:  # Windows
@@ -194,7 +192,7 @@ def _limit(memory: int) -> None:
     cpu_s = math.ceil(used.ru_utime + used.ru_stime) + CPU_S
     resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    if sys.platform == "linux":  # others do not heed it
+    if sys.platform == "linux":  # other systems ignore it
         with open("/proc/self/statm", encoding="ascii") as file:
             pages = int(file.read().split()[0])
         most = pages * resource.getpagesize() + memory

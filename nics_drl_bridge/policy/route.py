@@ -1,4 +1,4 @@
-"""Shortest ways on a map, for a robot that is taken for a disc: Dijkstra's search over cells."""
+"""Shortest paths on a map for a disc-shaped robot: Dijkstra's search over cells."""
 
 import math
 
@@ -11,26 +11,26 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
 
-CELL = 0.1  # least side of a cell [m]
-COMFORT = 0.4  # distance from obstacles up to which a way is longer than it is [m]
-DEARER = 3.0  # by at most this share
+CELL = 0.1  # minimum side of a cell [m]
+COMFORT = 0.4  # distance from obstacles below which a path costs more [m]
+DEARER = 3.0  # maximum additional cost, as a fraction of the length
 STEPS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, math.sqrt(2.0)), (1, -1, math.sqrt(2.0)))
 
 
 def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Array:
-    """Returns a way (P, 2) from start to goal (2,) [m] that keeps a radius [m] to what is occupied.
+    """Returns a path (P, 2) from start to goal (2,) [m] that stays a radius [m] off occupied cells.
 
-    It keeps more where there is room. Unknown cells count as free. Raises ConfigError for a start
-    or goal off the map, and if there is no way.
+    It stays further away where there is space. Unknown cells are free. Raises ConfigError for a
+    start or goal off the map, and if there is no path.
     """
     coarse = _coarse(grid, max(1, math.ceil(CELL / grid.resolution - 1e-6)))
     room = coarse.distance_field
     ends = [tuple(coarse.world_to_cell(each).tolist()) for each in (start, goal)]
     for name, cell in zip(("start", "goal"), ends, strict=True):
         if not all(0 <= i < n for i, n in zip(cell, room.shape, strict=True)):
-            raise ConfigError(f"the {name} of the way is off the map; give one on it.")
+            raise ConfigError(f"the {name} of the path is off the map; give one on it.")
     passable = room > radius
-    for cell in ends:  # the robot stands there, or is asked to
+    for cell in ends:  # free by assumption: the robot stands there, or is asked to
         passable[cell] = True
     dear = 1.0 + DEARER * np.clip(1.0 - (room - radius) / COMFORT, 0.0, 1.0)
     number = np.arange(room.size).reshape(room.shape)
@@ -49,10 +49,8 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     begin, end = (int(number[cell]) for cell in ends)
     far, before = dijkstra(graph, directed=False, indices=end, return_predecessors=True)
     if not np.isfinite(far[begin]):
-        reason = (
-            f"for a robot of radius {radius:g} m there is no way to the goal on the map"
-        )
-        raise ConfigError(f"{reason}; give a goal in the space that it reaches.")
+        reason = f"for a robot of radius {radius:g} m there is no path to the goal on the map"
+        raise ConfigError(f"{reason}; give a goal that it can reach.")
     cells = [begin]
     while cells[-1] != end:
         cells.append(int(before[cells[-1]]))
@@ -65,7 +63,7 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
 
 
 def _coarse(grid: GridMap, parts: int) -> GridMap:
-    """Returns the map with cells several times as large, occupied if a part of them is."""
+    """Returns the map with cells `parts` times as large, occupied if any part of them is."""
     rows, columns = (math.ceil(count / parts) * parts for count in grid.cells.shape)
     cells = np.full((rows, columns), FREE, np.int8)
     cells[: grid.cells.shape[0], : grid.cells.shape[1]] = np.where(

@@ -19,29 +19,29 @@ from nics_drl_bridge.policy.stateful import resume
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import read_robot_command
 
-JITTER = 0.25  # permitted earliness of a scan, in control periods
-HELD_S = 1.0  # age from which a command no longer applies to the robot
-DEAD_BAND = 0.05  # commands below this share of their maximum have no sign
+JITTER = 0.25  # how early a scan may be, in control periods
+HELD_S = 1.0  # age at which a command no longer applies to the robot
+DEAD_BAND = 0.05  # commands below this fraction of their maximum have no sign
 PERCENTILES = (50, 90, 99)
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """A policy compared with a drive, at the T times at which it would have acted."""
+    """A policy compared with a recorded drive, at the T times when it would have acted."""
 
-    names: tuple[str, ...]  # (C) of the commands
+    names: tuple[str, ...]  # (C,) of the commands
     units: tuple[str, ...]
-    time: Array  # (T,) since the first [s]
-    pose: Array  # (T, 3) estimated, in `map`
-    goal: Array  # (T, 2) given to the policy [m]
+    time: Array  # (T,) since the first of these times [s]
+    pose: Array  # (T, 3) estimated poses in `map`
+    goal: Array  # (T, 2) goals given to the policy [m]
     policy: Array  # (T, C) commands of the policy
     driven: Array  # (T, C) recorded commands
     scale: Array  # (C,) maximum magnitude of each command
     skipped: Mapping[str, int]  # reason -> number of times that were not compared
-    resets: int = 0  # gaps after which the policy's state began anew
+    resets: int = 0  # gaps after which the policy's state was reset
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """Mean of policy minus drive by command; its magnitude; the share of opposite signs."""
+        """Per command: mean of policy minus drive, its magnitude, fraction of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
             one = self.policy[:, c]
@@ -90,15 +90,15 @@ def shadow(
     messages = read_messages(path, topics, model.gyro)
     for role in (SCAN, CMD_VEL):
         if role not in messages:
-            reason = (
-                f"has no {role}, which a policy is compared by; say which topic it is"
+            reason = f"has no {role}, which the comparison needs; name its topic"
+            raise RecordingError(
+                f"{path}: {reason}, for example --topic {role}=/car/{role}."
             )
-            raise RecordingError(f"{path}: {reason}, as in --topic {role}=/car/{role}.")
     playback = Playback(model, POSE in messages, any_lidar=True)
     moments = _moments(playback, messages, model)
     if not moments:
         raise RecordingError(
-            f"{path}: no scan with an odometry could be used; see nics bag info."
+            f"{path}: no scan with matching odometry; see nics bag info."
         )
     goals = _goals(moments, goal, ahead_s)
     return _answered(moments, goals, policy, replace(model, lidar=playback.lidar))
@@ -160,9 +160,8 @@ def _answered(
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
         verdict = task.judge(moment.view, memory := {"goal": goal})
-        if not (
-            verdict.touched or verdict.reached
-        ):  # its state needs what is not compared, too
+        # its state needs the observations that are not compared, too
+        if not (verdict.touched or verdict.reached):
             resets += bool(resume(policy, moment.stamp_ns * S_PER_NS))
             command = task.command(policy.act(task.observation(moment.view, memory)))
         if moment.driven is None:

@@ -1,4 +1,4 @@
-"""A policy, and the state that one may keep from step to step of an episode."""
+"""A policy, and the state that it may keep during an episode."""
 
 import math
 from collections.abc import Callable
@@ -22,19 +22,19 @@ class Policy(Protocol):
 
 
 class Stateful:
-    """Acts with a state that it keeps from step to step of an episode, a row for each world."""
+    """Policy that keeps a state from step to step of an episode, one row per world."""
 
     def __init__(
         self, step: Step, size: int, start: float, longest_gap: float = math.inf
     ) -> None:
         self._step = step
         self._start = np.full(size, start, np.float32)
-        self._longest_gap = longest_gap  # between two observations [s]
+        self._longest_gap = longest_gap  # longest gap between two observations [s]
         self._state: Rows | None = None
-        self._time = math.inf  # of the last observation [s]
+        self._time = math.inf  # time of the last observation [s]
 
     def reset(self, worlds: NDArray[np.bool_] | None = None) -> None:
-        """Begins an episode, in some worlds (N,) or in all of them."""
+        """Resets the state for a new episode, in some worlds (N,) or in all of them."""
         if worlds is None or self._state is None:
             self._state = None
             self._time = math.inf
@@ -42,30 +42,32 @@ class Stateful:
             self._state[worlds] = self._start
 
     def resume(self, time_s: float) -> str:
-        """Resets after a gap before an observation of this time [s]; a sentence says so, or ''."""
+        """Resets the state if an observation at this time [s] follows a gap; returns why, or ''."""
         gap = time_s - self._time
         self._time = time_s
         if gap <= self._longest_gap:
             return ""
         self.reset()
         self._time = time_s
-        limit = f"the {self._longest_gap:g} s after which the policy's state is no longer valid"
-        return f"nothing was observed for {gap:.3g} s, longer than {limit}; it begins anew."
+        limit = f"the {self._longest_gap:g} s for which the policy's state stays valid"
+        return (
+            f"no observation for {gap:.3g} s, longer than {limit}; the state was reset."
+        )
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """See `Policy`. Raises ConfigError for another number of worlds than before."""
+        """Choose the action; see `Policy`. Raises ConfigError if the number of worlds changed."""
         lead = observation.shape[:-1]
         if self._state is None:
             self._state = np.tile(self._start, (*lead, 1))
         if self._state.shape[:-1] != lead:
-            given = f"a state of {self._state.shape[:-1]} worlds was given observations of {lead}"
+            given = f"the state is of {self._state.shape[:-1]} worlds, the observations of {lead}"
             raise ConfigError(f"{given}; reset the policy when episodes begin.")
         action, self._state = self._step(observation, self._state)
         return action
 
 
 def begin(policy: Any, *worlds: Any) -> None:
-    """Tells a policy, or whose method `act` this is, that episodes begin; see `Stateful.reset`."""
+    """Resets a policy, or the owner of a method `act`, if it is stateful; see `Stateful.reset`."""
     reset = getattr(getattr(policy, "__self__", policy), "reset", None)
     if reset is not None:
         reset(*worlds)

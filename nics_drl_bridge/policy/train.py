@@ -49,11 +49,10 @@ LOCK = ".lock"
 EVALUATION = "evaluation.json"
 POLICY = "policy.onnx"
 SEEDS = 2**40
-MOST_WEIGHT = 80.0  # whose exponential, a spread of actions, is just finite
-TRIED = 8  # worlds, and steps in each
-GREATEST_SEED = (
-    2**32 - 1
-)  # of numpy's global generator, from which Stable-Baselines3 draws
+MOST_WEIGHT = 80.0  # largest log standard deviation whose exponential is finite
+TRIED = 8  # worlds, and steps in each, of the trial run of a task
+# range of seeds of numpy's global generator, from which Stable-Baselines3 draws
+GREATEST_SEED = 2**32 - 1
 Tell = checkpoints.Tell
 
 
@@ -61,10 +60,10 @@ Tell = checkpoints.Tell
 class Trained:
     """A finished training."""
 
-    algorithm: BaseAlgorithm | Actor  # with its policy, or the acting part alone
+    algorithm: BaseAlgorithm | Actor  # with its policy, or only the actor
     steps: int  # environment steps of all worlds together
-    wall_s: float  # time that this process spent on it [s]
-    stepping_s: float  # part of it in the simulator [s]
+    wall_s: float  # wall time of this process [s]
+    stepping_s: float  # part of it spent in the simulator [s]
 
 
 def train(
@@ -77,7 +76,7 @@ def train(
 ) -> Trained:
     """Trains a policy, resumed bit-identically from `folder`. Raises ConfigError if it can't.
 
-    `on_env` gets the worlds before the first step, as to be called by their `on_step`.
+    `on_env` gets the worlds before the first step, for example to set their `on_step`.
     """
     begin = time.perf_counter()
     path = folder / CHECKPOINT
@@ -90,9 +89,8 @@ def train(
         rng = np.random.default_rng(seed)
         env.seed(int(rng.integers(SEEDS)))
         training = engine(settings, env, seed, algorithms.observed(env, rng))
-        env.seed(
-            int(rng.integers(SEEDS))
-        )  # replaces the algorithm's, near those of other runs
+        # overrides the algorithm's seeds, which would overlap those of other runs
+        env.seed(int(rng.integers(SEEDS)))
     else:
         check_same(content["about"], about, path)
         size = int(np.prod(env.observation_space.shape))
@@ -101,7 +99,8 @@ def train(
     busy = env.stepping_s
 
     def save() -> None:
-        refuse_diverged(training)  # before it would replace a checkpoint that goes on
+        # check before replacing a checkpoint that can still be resumed
+        refuse_diverged(training)
         checkpoints.save_checkpoint(path, training.state() | stop.state(), env, about)
 
     if training.steps < settings.steps and not stop.over:
@@ -120,11 +119,11 @@ def train(
 
 
 def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) -> None:
-    """Raises ConfigError if the weights of a training are not within a bound."""
+    """Raises ConfigError if a weight of the training is not finite or exceeds a bound."""
     if not all(
         bool((part.abs() < bound).all()) for part in training.networks.parameters()
     ):
-        fault = f"after {training.steps} steps its weights are beyond all bounds"
+        fault = f"after {training.steps} steps its weights are too large or not finite"
         raise ConfigError(f"the training diverged: {fault}; lower its learning_rate.")
 
 
@@ -133,7 +132,7 @@ def make_train_env(
     model: SimulatorModel | None = None,
     scenes: Mapping[str, AnyWorld] | None = None,
 ) -> TrainVecEnv:
-    """Makes the worlds of the settings in one env; model and worlds may already be open."""
+    """Makes the worlds of the settings in one env; model and worlds may already be loaded."""
     model = model or open_model(settings.robot, settings.lidar)
     if margin := settings.teaching.margin:
         model = replace(model, robot=model.robot.grow_footprint(margin))
@@ -173,27 +172,29 @@ def _restore(
         TypeError,
         ValueError,
     ) as error:
-        reason = f"does not hold what a training needs ({shorten(str(error), 120)})"
-        raise ConfigError(f"{path}: {reason}; train anew.") from None
+        reason = f"is not the checkpoint of a training ({shorten(str(error), 120)})"
+        raise ConfigError(f"{path}: {reason}; train again.") from None
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
-    """Raises ConfigError unless a checkpoint has the settings and seed of a training."""
+    """Raises ConfigError unless a checkpoint has the settings and seed of the training."""
     if (
         not isinstance(old, dict)
         or not isinstance(old.get("settings"), dict)
         or "seed" not in old
     ):
-        raise ConfigError(f"{path}: does not say of which training it is; train anew.")
+        raise ConfigError(
+            f"{path}: does not say which training it belongs to; train again."
+        )
     for key, value in new["settings"].items():
         if (then := old["settings"].get(key)) != value:
             reason = f"was trained with {key} {then!r}, not {value!r}"
             raise ConfigError(
-                f"{path}: {reason}; resume it so, or train anew in another folder."
+                f"{path}: {reason}; resume with the same settings, or train in another folder."
             )
     if old["seed"] != new["seed"]:
         raise ConfigError(
-            f"{path}: is of seed {old['seed']}, not {new['seed']}; name that one."
+            f"{path}: has seed {old['seed']}, not {new['seed']}; name that seed."
         )
 
 
@@ -204,7 +205,7 @@ def evaluate(
     episodes: int,
     model: SimulatorModel | None = None,
 ) -> Outcomes:
-    """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
+    """Runs the episodes of the evaluation protocol in a world with an algorithm's policy."""
     env = _env_of(
         settings, world, episodes, model or open_model(settings.robot, settings.lidar)
     )
@@ -214,7 +215,7 @@ def evaluate(
 
 
 def _stop_of(settings: TrainingSettings) -> Stop:
-    """The early stop of a training, with worlds of its own."""
+    """Makes the early stop of a training, with its own worlds."""
     if (given := settings.stop) is None:
         return Stop(None, {})
     model = open_model(settings.robot, settings.lidar)
@@ -228,7 +229,7 @@ def _stop_of(settings: TrainingSettings) -> Stop:
 def _env_of(
     settings: TrainingSettings, world: str, episodes: int, model: SimulatorModel
 ) -> BridgeVectorEnv:
-    """Copies of a world for an evaluation, one for each episode; without any teaching."""
+    """Copies of a world for an evaluation, one per episode, without teaching."""
     return BridgeVectorEnv(
         episodes,
         model,
@@ -240,14 +241,13 @@ def _env_of(
     )
 
 
-Learn = Callable[
-    [TrainingSettings, int, Path, Tell, bool], Trained
-]  # a function like `train`
+# a function like `train`
+Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
 
 
 @dataclass(frozen=True)
 class SeedResult:
-    """A finished training with its seed, and its policy's evaluation by world."""
+    """A finished training of one seed, and the evaluation of its policy by world."""
 
     seed: int
     trained: Trained
@@ -256,11 +256,10 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class TrainOrder:
-    """An order for a training run."""
+    """A request for a training run."""
 
-    settings: (
-        TrainingSettings  # what to learn; for a resumed run its own, see `settings_of`
-    )
+    # what to learn; for a resumed run its saved settings, see `settings_of`
+    settings: TrainingSettings
     seeds: Sequence[int]
     out: Path  # folder of the run; each seed gets one below it
     episodes: int  # number of episodes of the evaluation in each world
@@ -275,16 +274,15 @@ def run(
     learn: Learn = train,
     evaluating: Callable[[str], None] = lambda _: None,
 ) -> list[SeedResult]:
-    """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
+    """Trains and evaluates seed after seed. Raises ConfigError if a run exists, or none does."""
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings = order.settings
     model = open_model(order.settings.robot, order.settings.lidar)
     trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
     algorithms.check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)
-    for _ in range(
-        TRIED
-    ):  # a task that gives no numbers is refused before a folder is begun
+    # refuses a task that returns no finite numbers before creating a folder
+    for _ in range(TRIED):
         trial.step(trial.action_space.sample())
     del trial
     results = []
@@ -323,14 +321,13 @@ def _alone(out: Path) -> Iterator[None]:
             try:
                 yield
             except ConfigError:
-                if not known and not seeds_of(
-                    out
-                ):  # settings of no training bar no others
+                # unreadable settings block no other training
+                if not known and not seeds_of(out):
                     (out / SETTINGS).unlink(missing_ok=True)
                 raise
     except filelock.Timeout:
-        fix = "wait for its end, or choose another --out"
-        raise ConfigError(f"{out}: another training is at work there; {fix}.") from None
+        fix = "wait until it ends, or choose another --out"
+        raise ConfigError(f"{out}: another training is running there; {fix}.") from None
 
 
 def export(
@@ -349,9 +346,8 @@ def export(
         "steps": result.trained.steps,
         **rates,
     }
-    if settings.robot not in list_shipped(
-        "robots"
-    ):  # where an evaluation finds the robot
+    # the path relative to which an evaluation finds the robot
+    if settings.robot not in list_shipped("robots"):
         provenance["model"] = str(Path(settings.robot).resolve())
     limit = settings.max_episode_steps
     export_policy(result.trained.algorithm, task, model, path, None, provenance, limit)
@@ -362,11 +358,11 @@ def _check(
 ) -> None:
     check_seeds(seeds, GREATEST_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
-        raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
+        raise ConfigError(f"seeds {list(seeds)}: give one or more, without duplicates.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
     if begun and not resumed:
         fix = "add --resume, or choose another --out."
-        raise ConfigError(f"{out}: holds checkpoints of these seeds; {fix}")
+        raise ConfigError(f"{out}: contains checkpoints of these seeds; {fix}")
     own_task = settings.task if is_code(settings.task) else None
     if (
         (out / SETTINGS).is_file()
@@ -374,15 +370,15 @@ def _check(
         and settings_of(out, own_task) != settings
     ):
         fix = "choose another --out, or remove it."
-        raise ConfigError(f"{out}: holds a run with other settings; {fix}")
+        raise ConfigError(f"{out}: contains a run with other settings; {fix}")
     if resumed and not begun:
         found = seeds_of(out)
         fix = f"name one of {found} with --seeds" if found else "leave out --resume"
-        raise ConfigError(f"{out}: holds no checkpoint of these seeds; {fix}.")
+        raise ConfigError(f"{out}: contains no checkpoint of these seeds; {fix}.")
 
 
 def seeds_of(out: Path) -> list[int]:
-    """Returns the seeds whose training was begun in the folder of a run."""
+    """Returns the seeds whose training has begun in the folder of a run."""
     begun = (
         path.parent.name.removeprefix("seed_")
         for path in out.glob(f"seed_*/{CHECKPOINT}")
@@ -393,17 +389,17 @@ def seeds_of(out: Path) -> list[int]:
 def settings_of(out: Path, task: str | None = None) -> TrainingSettings:
     """Reads the settings of an existing run. Raises ConfigError if there is none.
 
-    A run of a task of the user's own needs that `task` again: its folder never starts a program.
+    If the run trains a user's task, `task` must name it again: a folder never starts a program.
     """
     if not (out / SETTINGS).is_file():
         raise ConfigError(
-            f"{out}: holds no {SETTINGS}; name the folder of a run with --out."
+            f"{out}: contains no {SETTINGS}; name the folder of a run with --out."
         )
     return read_settings(out / SETTINGS, task)
 
 
 def line_of(summary: Summary) -> str:
-    """Formats a summary as text, every figure with its 95 % interval."""
+    """Formats a summary as text, with the 95 % interval of every figure."""
     rates = ", ".join(
         f"{name} {100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
         for name, share in summary.shares.items()

@@ -1,4 +1,4 @@
-"""PPO and SAC of Stable-Baselines3, and the layers of networks that all engines share."""
+"""PPO and SAC of Stable-Baselines3, and the network layers that all engines share."""
 
 from __future__ import annotations
 
@@ -29,20 +29,22 @@ from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch, tensors
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
+LEAST_RATE = 0.02  # fraction of PPO's learning rate that is left at the end
 LEAST_STD = 0.05
 LIMIT = 5.0
-NEAR = 0.1  # share of the range that counts as half of it, see `bend`
-LEAST_SHARE = 0.25  # of the span of an observation, or of its mean if that is less
+NEAR = 0.1  # fraction of the range that is mapped to one half, see `bend`
+# minimum deviation as a fraction of the span of an observation, or of its mean if smaller
+LEAST_SHARE = 0.25
 OBSERVED_STEPS = 32
 OBSERVED_WORLDS = 256
 GAIN = 2.0**0.5
-# initial gain of an actor's last layer: all its actions are near zero
+# initial gain of an actor's last layer, which puts all its actions near zero
 ACTION_GAIN = 0.01
+# rollouts or episodes between two TensorBoard entries
 LOG_EVERY = {
     "ppo": 1,
     "sac": 1000,
-}  # roll-outs or episodes between two entries of TensorBoard
+}
 COUNTERS = (
     "num_timesteps",
     "_n_updates",
@@ -61,16 +63,18 @@ REPLAYED = (
 
 
 def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
-    """Raises ConfigError if the algorithm does not suit the task, or the task is of a team."""
+    """Raises ConfigError if the algorithm does not suit the task, or the task is for a team."""
     if env.robots > 1:
-        fix = "train a task of one, or its agents by a learner of your own (docs/environments.md)"
-        raise ConfigError(f"task {settings.task!r}: is of {env.robots} robots; {fix}.")
+        fix = (
+            "train a single-robot task, or use your own learner (docs/environments.md)"
+        )
+        raise ConfigError(f"task {settings.task!r}: has {env.robots} robots; {fix}.")
     continuous = isinstance(env.single_action_space, gymnasium.spaces.Box)
     if settings.algorithm == "sac" and not continuous:
         raise ConfigError("algorithm 'sac' needs continuous actions; use 'ppo'.")
     size = settings.ppo.rollout * settings.num_envs
     if settings.algorithm == "ppo" and settings.ppo.batch > size:
-        batch = f"ppo.batch {settings.ppo.batch}: is more than the {size} transitions of a rollout"
+        batch = f"ppo.batch {settings.ppo.batch}: exceeds the {size} transitions of a rollout"
         raise ConfigError(f"{batch}; lower it, or raise ppo.rollout or worlds.")
 
 
@@ -89,15 +93,15 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
 
 
 class Normaliser(BaseFeaturesExtractor):
-    """First layer of actor and critic: (bent - mean) / std (O,), cut at +-5; not trained.
+    """First layer of actor and critic: (bent - mean) / std (O,), clamped to +-5; not trained.
 
-    Observations from 0 to 1 are bent, see `bend`, as shares of a range are the more telling the
-    nearer a thing is; the others are not.
+    Observations from 0 to 1 are bent, see `bend`, because small fractions of a range matter most;
+    the others are not.
     """
 
     mean: torch.Tensor
     std: torch.Tensor
-    shares: torch.Tensor  # (O,) 1 for those from 0 to 1, else 0
+    shares: torch.Tensor  # (O,) 1 for observations from 0 to 1, else 0
 
     def __init__(self, space: gymnasium.spaces.Box, mean: Array, std: Array) -> None:
         super().__init__(space, features_dim=int(np.prod(space.shape)))
@@ -113,15 +117,15 @@ class Normaliser(BaseFeaturesExtractor):
 
 
 def shares_of(space: gymnasium.spaces.Box) -> NDArray[np.float32]:
-    """1 for the observations (O,) of a space that lie between 0 and 1, else 0."""
+    """Gives 1 for the observations (O,) of a space that lie between 0 and 1, else 0."""
     shares: NDArray[np.bool_] = (space.low == 0.0) & (space.high == 1.0)
     return shares.astype(np.float32)
 
 
 def bend(observations: Any, shares: Any) -> Any:
-    """Bends shares x to (1 + k) x / (k + x), from 0 to 1 again, where k = `NEAR` becomes a half.
+    """Maps fractions x to (1 + k) x / (k + x), again from 0 to 1; k = `NEAR` maps to about 1/2.
 
-    Observations are (N, O); `shares` (O,) are 1 for those to be bent, and 0 for the others.
+    Observations are (N, O); `shares` (O,) is 1 for those to be bent, and 0 for the others.
     """
     grown = 1.0 + NEAR * shares
     least = 1.0 + (NEAR - 1.0) * shares
@@ -131,12 +135,12 @@ def bend(observations: Any, shares: Any) -> Any:
 def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
     """Mean and standard deviation (O,) of bent observations under random actions.
 
-    The deviation is at least 0.05, and a quarter of the span, or of the mean if that is less.
+    The deviation is at least 0.05, and a quarter of the span or of the mean, whichever is smaller.
     """
     some = slice(None, None, max(1, env.num_envs // OBSERVED_WORLDS))
     seen = [np.array(env.reset()[some])]
     for k in range(OBSERVED_STEPS):
-        if k % 8 == 0:  # else a robot with inertia would stay in place
+        if k % 8 == 0:  # hold each action, or a robot with inertia would hardly move
             space: Any = env.action_space
             if isinstance(space, gymnasium.spaces.Discrete):
                 actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
@@ -148,7 +152,7 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
     rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
     rows = bend(rows, shares_of(env.observation_space))
     mean = rows.mean(axis=0)
-    # What is seen later may differ by more than what is seen near the starts.
+    # Later observations may vary more than those near the starts.
     span = np.minimum(
         env.observation_space.high - env.observation_space.low, np.abs(mean)
     )
@@ -179,7 +183,7 @@ class Actor(torch.nn.Module):
         self.layers = layers_of(widths, ACTION_GAIN, activation)
 
     def forward(self, observations: torch.Tensor) -> Any:
-        """Parameters of the distribution of actions: its mode if continuous, else logits."""
+        """Parameters of the action distribution: the mode if continuous, else logits."""
         return self.layers(self.normaliser(observations))
 
     def best(self, observations: torch.Tensor) -> torch.Tensor:
@@ -193,7 +197,7 @@ def layers_of(
     gain: float,
     activation: type[torch.nn.Module] = torch.nn.Tanh,
 ) -> torch.nn.Sequential:
-    """Linear layers, initialised as in Stable-Baselines3, the last by gain."""
+    """Linear layers, initialised as in Stable-Baselines3, the last one with `gain`."""
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
         layers += [torch.nn.Linear(ins, outs), activation()]
@@ -205,7 +209,7 @@ def layers_of(
 
 
 class Sb3Training:
-    """A training by an algorithm of Stable-Baselines3; `normaliser` is mean and deviation (O,)."""
+    """A training with a Stable-Baselines3 algorithm; `normaliser` is mean and deviation (O,)."""
 
     def __init__(
         self,
@@ -221,7 +225,7 @@ class Sb3Training:
 
     @property
     def steps(self) -> int:
-        """Environment steps of all worlds together, so far."""
+        """Environment steps done in all worlds together."""
         return int(self.policy.num_timesteps)
 
     def learn(self, watch: Watch, logger: Logger) -> None:
@@ -232,7 +236,7 @@ class Sb3Training:
         self.policy.learn(left, companion, self._log_every, reset_num_timesteps=False)
 
     def state(self) -> dict[str, Any]:
-        """All that changes, for a checkpoint."""
+        """Everything that changes, for a checkpoint."""
         algorithm = self.policy
         replay: dict[str, Any] = {}
         if isinstance(algorithm, OffPolicyAlgorithm):
@@ -241,7 +245,7 @@ class Sb3Training:
             replay = {"pos": buffer.pos, "full": buffer.full, **tensors(rows)}
         return {
             "parameters": algorithm.get_parameters(),
-            "variables": {  # other than the networks: the temperature of SAC
+            "variables": {  # besides the networks: the temperature of SAC
                 name: getattr(algorithm, name).detach().clone()
                 for name in algorithm._get_torch_save_params()[1]
             },
@@ -253,7 +257,7 @@ class Sb3Training:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continues with the state of another, made with the same arguments."""
+        """Continues from the state of another training made with the same arguments."""
         algorithm = self.policy
         algorithm.set_parameters(state["parameters"], exact_match=True)
         for name, value in state["variables"].items():
@@ -350,7 +354,7 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
 
 
 class Companion(BaseCallback):
-    """Callback by which Stable-Baselines3 calls a watch in each step and roll-out."""
+    """Callback that makes Stable-Baselines3 call a watch in each step and rollout."""
 
     def __init__(self, watch: Watch, act: Act) -> None:
         super().__init__()
@@ -371,9 +375,8 @@ class Companion(BaseCallback):
             self._watch.collisions.append(
                 bool(self.locals["infos"][n].get("collision", False))
             )
-        if (
-            self._ends
-        ):  # Stable-Baselines3 can't be ended before the first step of a roll-out
+        # Stable-Baselines3 can't stop before the first step of a rollout
+        if self._ends:
             self._on_rollout_end()
         return not self._ends
 

@@ -1,4 +1,4 @@
-"""Checkpoints of a training, all that it needs to continue bit-identically; none is deployed."""
+"""Training checkpoints, with all that bit-identical resumption needs; they are never deployed."""
 
 import io
 import json
@@ -25,13 +25,13 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 FORMAT = "nics_drl_bridge/checkpoint/3"
-MOST_BYTES = 4 * 2**30  # maximum size of a file, which contains all of SAC's buffer
+MOST_BYTES = 4 * 2**30  # maximum size of a file, which includes all of SAC's buffer
 
 
 def save_checkpoint(
     path: Path, state: dict[str, Any], env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
-    """Writes a checkpoint between two roll-outs; `about` identifies the training."""
+    """Writes a checkpoint between two rollouts; `about` identifies the training."""
     content = {"format": FORMAT, "about": json.dumps(about), "state": state}
     write_content(
         path, content | {"envs": [tensors(snapshot(one)) for one in env.envs]}
@@ -46,10 +46,10 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
-    """Reads a checkpoint of a format; ConfigError if it is missing, damaged, or another kind."""
+    """Reads a checkpoint of a format. Raises ConfigError if missing, damaged or another."""
     if not path.is_file():
         raise ConfigError(
-            f"{path}: no such checkpoint; leave out --resume to begin anew."
+            f"{path}: no such checkpoint; leave out --resume to start again."
         )
     try:
         size = path.stat().st_size
@@ -59,17 +59,17 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
             check_sealed(file)
             with zipfile.ZipFile(file) as archive:
                 if any(member.compress_type for member in archive.infolist()):
-                    raise ValueError("torch packs nothing")
+                    raise ValueError("torch never compresses")
             file.seek(0)
-            # weights_only blocks whatever else a pickle could do; before torch 2.6 it had gaps.
+            # weights_only blocks what else a pickle could do; torch before 2.6 had gaps there.
             content: Any = torch.load(file, map_location="cpu", weights_only=True)
         _check_tensors(content, size)
         found = str(content["format"])
         read = {**content, "about": json.loads(content["about"])}
     except Exception:  # noqa: BLE001 - a damaged file breaks torch in any way
-        reason = "is no checkpoint of a training, or a damaged one"
+        reason = "is not a training checkpoint, or is damaged"
         raise ConfigError(
-            f"{path}: {reason}; leave out --resume to begin anew."
+            f"{path}: {reason}; leave out --resume to start again."
         ) from None
     if found != kind:
         raise ConfigError(
@@ -91,7 +91,7 @@ def _check_tensors(content: Any, size: int) -> None:
 
 
 def restore_envs(content: dict[str, Any], env: TrainVecEnv) -> None:
-    """Puts the worlds of a checkpoint into an env made with the same arguments."""
+    """Restores the worlds of a checkpoint into an env made with the same arguments."""
     for one, state in zip(env.envs, content["envs"], strict=True):
         restore(one, {name: value.numpy() for name, value in state.items()})
 
@@ -104,7 +104,7 @@ def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
     }
 
 
-RECENT = 1000  # number of episodes over which the progress reports its rates
+RECENT = 1000  # number of recent episodes over which the progress reports rates
 TOLD_S = 0.2  # minimum time between two reports of the progress [s]
 
 
@@ -115,17 +115,17 @@ class Progress:
     seed: int
     steps: int  # environment steps done
     total: int
-    success: float  # shares of the last 1000 episodes; NaN before the first has ended
+    # fractions over the last 1000 episodes; NaN before the first has ended
+    success: float
     collision: float
-    steps_per_s: float  # since this process began or resumed it
-    env_share: float  # share of the wall time that went to the simulator
-    held_out: float = (
-        math.nan
-    )  # least success of a world in the latest evaluation of `stop`
+    steps_per_s: float  # since this process started or resumed the training
+    env_share: float  # fraction of the wall time spent in the simulator
+    # minimum success over the worlds in the latest evaluation of `stop`
+    held_out: float = math.nan
 
     @property
     def line(self) -> str:
-        """Success, as far as any is known, and speed, for people."""
+        """Formats success, if known, and speed for people."""
         unknown = math.isnan(self.success)
         if unknown:
             known = "no episode has ended yet"
@@ -139,7 +139,7 @@ Tell = Callable[[Progress], None]
 
 
 class Watch:
-    """Follows a training: tells its progress, and saves it now and then, between two roll-outs."""
+    """Follows a training: reports its progress, and saves it at intervals, between two rollouts."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class Watch:
         self.collisions: deque[bool] = deque(maxlen=RECENT)  # of the last episodes
 
     def begin(self, steps: int) -> None:
-        """Starts the clock of a training that has already done some steps."""
+        """Starts the clock of a training that has already done `steps`."""
         self._begin = self._told = time.perf_counter()
         self._busy = self._env.stepping_s
         self._first = self._saved = steps
@@ -172,7 +172,7 @@ class Watch:
             self._saved = steps
 
     def ends(self, steps: int, act: Act, logger: Logger) -> bool:
-        """Drives held-out episodes if it is time to; True if the training is to end by them."""
+        """Evaluates on held-out episodes if it is time to; True if the training should end."""
         if self._stop.judge(steps, act):
             for world, share in self._stop.shares.items():
                 logger.record(f"held_out/{world}", share)
@@ -180,7 +180,7 @@ class Watch:
         return self._stop.over
 
     def report(self, steps: int, successes: Sequence[bool], logger: Logger) -> bool:
-        """Tells and logs the progress if it is time to; True if it was."""
+        """Reports and logs the progress if it is time to; True if it did."""
         now = time.perf_counter()
         if now - self._told < TOLD_S and steps < self._total and not self._stop.over:
             return False
@@ -207,11 +207,11 @@ class Watch:
 
 Arrays = dict[str, NDArray[Any]]
 MEMORY, DRAWN = "memory.", "drawn."
-"""Prefixes of the arrays whose names depend on the running episodes."""
+"""Prefixes of the arrays whose names depend on the current episodes."""
 
 
 def snapshot(env: BridgeVectorEnv) -> Arrays:
-    """Copies all that changes in a vector env, from which `restore` continues bit-identically."""
+    """Copies everything that changes in a vector env, for a bit-identical `restore`."""
     found = dict(env.changing)
     found |= {MEMORY + name: rows for name, rows in env.memory.items()}
     found |= {DRAWN + name: rows for name, rows in env.simulator.drawn.items()}
@@ -219,7 +219,7 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
 
 
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
-    """Puts a snapshot into a vector env; ConfigError if its worlds, robots or task are others."""
+    """Restores a snapshot into a vector env; ConfigError for other worlds, robots or tasks."""
     parts: dict[str, Arrays] = {"": {}, MEMORY: {}, DRAWN: {}}
     for name, rows in state.items():
         prefix = next((p for p in (MEMORY, DRAWN) if name.startswith(p)), "")
@@ -229,8 +229,8 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
     for name in sorted(given.keys() | targets.keys()):
         was, now = (_kind(rows.get(name)) for rows in (given, targets))
         if was != now:
-            reason = f"{name!r} is {was}, this env's is {now}"
-            advice = "make the env with the arguments that it had"
+            reason = f"{name!r} is {was}, but this env's is {now}"
+            advice = "make the env with the original arguments"
             raise ConfigError(f"state of a vector env: {reason}; {advice}.")
     for name, target in targets.items():
         target[...] = given[name]  # in place: the compiled steps refer to these arrays

@@ -1,4 +1,4 @@
-"""From a trained network to a policy file: normaliser, network and commands in one graph."""
+"""Exports a trained network to a policy file: normaliser, network and commands in one graph."""
 
 import io
 import warnings
@@ -34,7 +34,7 @@ OPSET = 17
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
-    """The graph of a policy file; Stable-Baselines3's recipe omits clipping, scale, normaliser."""
+    """Graph of a policy file; Stable-Baselines3's own recipe omits clipping, scale, normaliser."""
 
     def __init__(
         self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None
@@ -54,7 +54,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 
     @property
     def state(self) -> tuple[int, float] | None:
-        """Size and start value of the actor's state, if it has one."""
+        """Size and start value of the actor's state; None without a state."""
         size = getattr(self.actor, "state_size", 0)
         start = getattr(self.actor, "state_start", 0.0)
         return (int(size), float(start)) if size else None
@@ -62,9 +62,9 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
     def forward(
         self, observation: torch.Tensor, *state: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, for observations (n, O).
+        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI units; observations (n, O).
 
-        An actor with a state takes one (n, S) in addition, and gives the next.
+        An actor with a state also takes one (n, S), and returns the next.
         """
         seen = observation
         if self.limit is not None:
@@ -83,10 +83,10 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 
 
 def actor_of(model: Any) -> torch.nn.Module:
-    """Returns the acting part of a PPO, A2C or SAC, or module like `Actor`, else ConfigError.
+    """Returns the actor of a PPO, A2C or SAC, or a module like `Actor`, else ConfigError.
 
-    A module with a state takes it (n, S) after the observations, and returns the next one too.
-    Its attribute `state_size` is S; `state_start` is what each element begins with, 0 without it.
+    A module with a state takes it (n, S) after the observations, and also returns the next one. Its
+    attribute `state_size` is S; `state_start` is the initial value of each element, 0 by default.
     """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
@@ -95,7 +95,7 @@ def actor_of(model: Any) -> torch.nn.Module:
             policy.pi_features_extractor, latent, policy.action_net
         )
     if hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
-        actor = policy.actor  # its mode is the tanh of the mean
+        actor = policy.actor  # the mode is the tanh of the mean
         parts = actor.features_extractor, actor.latent_pi, actor.mu, torch.nn.Tanh()
         return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
@@ -113,7 +113,7 @@ def export_policy(
     provenance: Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
 ) -> policy_file.PolicyFile:
-    """Writes a trained model as a policy file, and loads it as a robot would.
+    """Exports a trained model as a policy file, and loads it as a robot would.
 
     The normaliser is mean (O,), deviation (O,) and limit, or None. Raises ConfigError if the model
     can't be exported, PolicyError if the file does not reproduce its outputs.
@@ -121,7 +121,7 @@ def export_policy(
     file = Path(path)
     if file.suffix != SUFFIX:
         raise ConfigError(
-            f"{file}: a policy file ends with {SUFFIX!r}; change the name."
+            f"{file}: a policy file's name ends with {SUFFIX!r}; change it."
         )
     deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
     graph = _graph(deployed, task)
@@ -138,7 +138,7 @@ def export_policy(
     )
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
-    rehearsal.remember(data)  # the network is one of this process
+    rehearsal.remember(data)  # safe: this process made the network
     policy = policy_file.policy_of(data, file)
     write_bytes(file, data)
     return policy
@@ -178,7 +178,7 @@ def _graph(deployed: Deployed, task: Task) -> Any:
         inputs = [*inputs, onnx_graph.STATE_IN]
         outputs = [*outputs, onnx_graph.STATE_OUT]
     with warnings.catch_warnings():
-        # This exporter is deprecated; the new one takes several times longer.
+        # This exporter is deprecated; the new one takes several times as long.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             deployed,

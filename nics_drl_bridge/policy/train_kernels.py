@@ -1,7 +1,7 @@
 """Compiled inner loops of the lean engine: the gradients of PPO's loss.
 
-The loss is that of Stable-Baselines3. These free the interpreter's lock, for which autograd's
-many small steps would contend with the thread that collects. Shapes: n transitions, O
+The loss is that of Stable-Baselines3. The kernels release the interpreter's lock, for which
+autograd's many small steps would compete with the collecting thread. Shapes: n transitions, O
 observations, C outputs of the actor, W weights of a network.
 """
 
@@ -14,26 +14,28 @@ from nics_drl_bridge.kernels import kernel
 
 ONE = np.float32(1.0)
 NONE = np.float32(0.0)
-LOG_NORM = np.float32(0.5 * np.log(2.0 * np.pi))  # of the normal distribution
+# constant term of the normal distribution's log density
+LOG_NORM = np.float32(0.5 * np.log(2.0 * np.pi))
 
 
 class Net(NamedTuple):
-    """Linear layers with ReLU in between, and memory for the rows of a batch."""
+    """Linear layers with ReLU in between, and scratch memory for a batch."""
 
-    weights: NDArray[
-        np.float32
-    ]  # (W,) layer after layer: (outs, ins), and biases (outs,)
+    # (W,) layer after layer: weights (outs, ins), then biases (outs,)
+    weights: NDArray[np.float32]
     gradients: NDArray[np.float32]  # (W,)
-    widths: NDArray[np.int64]  # (L + 1,) inputs, and outputs of each layer
-    kept: NDArray[np.float32]  # (L, at least n times the widest) outputs of each layer
-    spare: NDArray[np.float32]  # (2, as many) gradients of outputs
+    # (L + 1,) number of inputs, then of the outputs of each layer
+    widths: NDArray[np.int64]
+    # (L, at least n times the maximum width) outputs of each layer
+    kept: NDArray[np.float32]
+    spare: NDArray[np.float32]  # (2, same size) gradients of outputs
 
 
 class Batch(NamedTuple):
     """Transitions to learn from, see `train_rollout.Transitions`."""
 
     seen: NDArray[np.float32]  # (n, O)
-    actions: NDArray[np.float32]  # (n, C), or (n, 1) numbers of discrete ones
+    actions: NDArray[np.float32]  # (n, C), or (n, 1) indices of discrete ones
     log_probs: NDArray[np.float32]  # (n,)
     advantages: NDArray[np.float32]  # (n,)
     returns: NDArray[np.float32]  # (n,)
@@ -41,7 +43,7 @@ class Batch(NamedTuple):
 
 @kernel(allocates=True)
 def forward(net, seen):  # type: ignore[no-untyped-def]
-    """Outputs (n, C) of a network for inputs (n, O); those of all layers are kept."""
+    """Outputs (n, C) of a network for inputs (n, O); keeps the outputs of all layers."""
     n = seen.shape[0]
     at = 0
     rows = seen
@@ -63,9 +65,9 @@ def forward(net, seen):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
-    """Writes the gradients of weights, by those (n, C) of the outputs, after `forward`.
+    """Writes the gradients of the weights, given those (n, C) of the outputs; follows `forward`.
 
-    `gradient` is the first of the spare arrays.
+    `gradient` must be the first of the spare arrays.
     """
     n = seen.shape[0]
     at = net.weights.shape[0]
@@ -90,7 +92,7 @@ def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
-    """Writes the gradients of the critic; returns its part of the loss, with a weight."""
+    """Writes the gradients of the critic; returns its weighted term of the loss."""
     values = forward(net, batch.seen)
     n = values.shape[0]
     out = net.spare[0, :n].reshape(n, 1)
@@ -106,9 +108,9 @@ def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore[no-untyped-def]
-    """Writes the gradients of the actor, and those (C,) of `log_std`; returns its part of the loss.
+    """Writes the gradients of actor and `log_std` (C,); returns their term of the loss.
 
-    Of discrete actions, `log_std` has none.
+    With discrete actions, `log_std` has no gradient.
     """
     raw = forward(net, batch.seen)
     gains = batch.advantages
@@ -149,7 +151,7 @@ def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore
 
 @kernel(allocates=True)
 def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
-    """Logarithm of the density of an action (C,), and entropy; `parts` are its deviations (C,)."""
+    """Log density of an action (C,), and entropy; writes the deviations (C,) into `parts`."""
     log_prob = mixed = NONE
     for j in range(raw.shape[0]):
         parts[j] = (action[j] - raw[j]) * np.exp(-log_std[j])
@@ -160,7 +162,7 @@ def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _probability(parts, raw, action):  # type: ignore[no-untyped-def]
-    """Logarithm of the probability of an action, and entropy; `parts` are those of all (C,)."""
+    """Log probability of an action, and entropy; writes the probabilities (C,) into `parts`."""
     greatest = raw.max()
     total = NONE
     mixed = NONE

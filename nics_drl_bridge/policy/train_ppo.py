@@ -1,10 +1,10 @@
-"""The lean engine: PPO that drives the worlds on one core while it learns on another.
+"""The lean engine: PPO that collects on one core while it learns on another.
 
-Proximal policy optimisation (Schulman and others 2017) with the loss of Stable-Baselines3. What is
-learnt from was driven with weights one update older. PPO's ratio accounts for that, as the
-probabilities with which the actions were drawn are kept. Driving and learning meet after each
-rollout, so that the bits do not depend on which of them is faster. As soon as all is driven, actor
-and critic are learnt on a core each.
+Proximal policy optimisation (Schulman and others 2017) with the loss of Stable-Baselines3. The
+learner's data were collected with weights one update older; PPO's ratio accounts for that, because
+the probabilities at the time of drawing are kept. Collecting and learning synchronise after each
+rollout, so results do not depend on which of them is faster. Once everything is collected, actor
+and critic are trained on one core each.
 """
 
 import copy
@@ -28,15 +28,15 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.threads import one_blas_thread, run_parts
 
-Ended = list[tuple[bool, bool]]  # success and collision of episodes
-# of the loss, and of the norm of its gradient
+Ended = list[tuple[bool, bool]]  # (success, collision) of ended episodes
+# weight of the value loss, and maximum norm of the gradient
 VALUE_WEIGHT = 0.5
 GRADIENT_LIMIT = 0.5
 ADAM_EPSILON = 1e-5
 
 
 class Networks(torch.nn.Module):
-    """Actor and critic of normalised observations, and the spread of continuous actions."""
+    """Actor and critic on normalised observations, and the spread of continuous actions."""
 
     def __init__(
         self, actor: train_algorithms.Actor, hidden: tuple[int, ...], log_std: float
@@ -52,13 +52,13 @@ class Networks(torch.nn.Module):
         )
 
     def draw(self, raw: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Draws actions (n, C) or (n,), by the outputs of the actor (n, C)."""
+        """Draws actions (n, C) or (n,), given the outputs (n, C) of the actor."""
         if self.actor.discrete:
             return torch.multinomial(raw.softmax(1), 1, generator=generator).squeeze(1)
         return torch.normal(raw, self.log_std.exp().expand_as(raw), generator=generator)
 
     def log_probs(self, raw: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Logarithm of the probability, or its density, (n,) of actions (n, C) or (n,)."""
+        """Log probability, or log density, (n,) of actions (n, C) or (n,)."""
         if self.actor.discrete:
             return raw.log_softmax(1).gather(1, actions[:, None]).squeeze(1)
         apart = (actions - raw) * torch.exp(-self.log_std)
@@ -66,9 +66,9 @@ class Networks(torch.nn.Module):
 
 
 def flattened(networks: Networks) -> torch.nn.Parameter:
-    """One vector of all weights, of which those of the networks become views; gradients likewise.
+    """Moves all weights into one vector, with the networks' weights as views; gradients likewise.
 
-    An optimiser goes through one vector in a fifth of the time that it takes for many arrays.
+    An optimiser step over one vector takes a fifth of the time it takes over many arrays.
     """
     every = list(networks.parameters())
     flat = torch.nn.Parameter(torch.nn.utils.parameters_to_vector(every).detach())
@@ -84,7 +84,7 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
 
 
 def net_of(layers: torch.nn.Sequential, rows: int) -> Net:
-    """The layers of one of `flattened` networks for the kernels, with memory for so many rows."""
+    """The layers of one of the `flattened` networks for the kernels, with memory for `rows`."""
     every = list(layers.parameters())
     whole = (sum(one.numel() for one in every),)
     weights, gradients = (
@@ -107,7 +107,7 @@ def advantages_of(
 ) -> torch.Tensor:
     """Generalised advantage estimates (T, N) (Schulman and others 2016); `decay` is lambda.
 
-    They follow from rewards (T, N), values (T + 1, N), and ends of episodes (T, N), which are 1.
+    Inputs: rewards (T, N), values (T + 1, N), and `done` (T, N), which is 1 at ends of episodes.
     """
     going = 1.0 - done
     errors = rewards + discount * going * values[1:] - values[:-1]
@@ -118,7 +118,7 @@ def advantages_of(
 
 
 class Learner:
-    """Moves the weights by gradients of the loss."""
+    """Updates the weights by gradients of the loss."""
 
     def __init__(
         self,
@@ -134,16 +134,16 @@ class Learner:
         self._nets = [
             net_of(p, ppo.batch) for p in (networks.actor.layers, networks.critic)
         ]
-        self.core_is_free = threading.Event()  # no thread collects meanwhile
+        self.core_is_free = threading.Event()  # set once no thread collects any more
 
     def judge(self, driven: Driven) -> Transitions:
-        """Advantages and returns of a rollout, by the present critic."""
+        """Advantages and returns of a rollout, by the current critic."""
         networks = self.networks
         ppo = self.ppo
         with torch.no_grad():
             values = networks.critic(driven.seen).squeeze(-1)
             rewards = driven.rewards.clone()
-            # What would have come after the time limits:
+            # Bootstrap where a time limit truncated the episode:
             rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(
                 driven.final
             ).squeeze(-1)
@@ -160,7 +160,7 @@ class Learner:
         return Transitions(*(each.flatten(0, 1) for each in rows))
 
     def learn(self, rollout: Transitions, rate: float) -> float:
-        """Learns from a rollout with a learning rate; returns the loss of the last batch."""
+        """Learns from a rollout at a learning rate; returns the loss of the last batch."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         for _ in range(self.ppo.epochs):
@@ -191,7 +191,7 @@ class Learner:
 
 
 class Collector:
-    """Drives the worlds with a copy of the networks."""
+    """Steps the worlds with a copy of the networks."""
 
     def __init__(
         self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int
@@ -203,7 +203,7 @@ class Collector:
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
 
     def collect(self) -> tuple[Driven, Ended]:
-        """Drives all worlds for the steps of a rollout."""
+        """Steps all worlds through a rollout."""
         steps = self.ppo.rollout
         worlds = self.env.num_envs
         networks = self.networks
@@ -274,13 +274,13 @@ class LeanPpo:
         self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
         self.policy = actor
         self._settings = settings
-        self.steps = 0  # of all worlds together, learnt from so far
-        self._rollout: Driven | None = None  # the next one to learn from
+        self.steps = 0  # steps of all worlds together that have been learnt from
+        self._rollout: Driven | None = None  # the next rollout to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
 
     @one_blas_thread
     def learn(self, watch: Watch, logger: Logger) -> None:
-        """Learns until all steps are done, or the watch ends it."""
+        """Learns until all steps are done, or the watch ends the training."""
         watch.begin(self.steps)
         if self._rollout is None:
             self.collector.last = self.collector.env.reset()
@@ -296,7 +296,7 @@ class LeanPpo:
                 logger.dump(self.steps)
 
     def _advance(self, rollout: Driven, watch: Watch) -> float:
-        """Learns from a rollout, with the next one collected meanwhile."""
+        """Learns from a rollout while the next one is collected."""
         left = 1.0 - self.steps / self._total
         rate = self._ppo.learning_rate * max(left, train_algorithms.LEAST_RATE)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
@@ -316,7 +316,7 @@ class LeanPpo:
         return float(loss)
 
     def _collect(self) -> tuple[Driven, Ended]:
-        torch.set_num_threads(self._settings.threads)  # which is of each thread
+        torch.set_num_threads(self._settings.threads)  # a setting of each thread
         try:
             return self.collector.collect()
         finally:
@@ -328,7 +328,7 @@ class LeanPpo:
         watch.collisions.extend(collision for _, collision in ended)
 
     def state(self) -> dict[str, Any]:
-        """All that changes, for a checkpoint."""
+        """Everything that changes, for a checkpoint."""
         return {
             "weights": self.networks.state_dict(),
             "optimiser": self.learner.optimiser.state_dict(),
@@ -342,7 +342,7 @@ class LeanPpo:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continues with the state of another, made with the same arguments."""
+        """Continues from the state of another training made with the same arguments."""
         self.networks.load_state_dict(state["weights"])
         self.learner.optimiser.load_state_dict(state["optimiser"])
         self.steps = state["steps"]

@@ -9,19 +9,19 @@ import torch
 
 
 class Driven(NamedTuple):
-    """A rollout as it was driven: T steps of N worlds."""
+    """A rollout as collected: T steps of N worlds."""
 
     seen: torch.Tensor  # (T + 1, N, O) normalised observations
     actions: torch.Tensor  # (T, N, C), or (T, N) discrete
     log_probs: torch.Tensor  # (T, N) of the actions when they were drawn
     rewards: torch.Tensor  # (T, N)
-    done: torch.Tensor  # (T, N) ends of episodes, which are 1
-    cut: torch.Tensor  # (K,) t N + n of those that a time limit ended
-    final: torch.Tensor  # (K, O) what was seen there at last
+    done: torch.Tensor  # (T, N) 1 at ends of episodes
+    cut: torch.Tensor  # (K,) indices t N + n of the truncated episodes
+    final: torch.Tensor  # (K, O) last observations of these
 
 
 class Transitions(NamedTuple):
-    """R transitions, T steps of N worlds, step after step."""
+    """R transitions: T steps of N worlds, in the order of the steps."""
 
     seen: torch.Tensor  # (R, O) normalised observations
     actions: torch.Tensor  # (R, C), or (R,) discrete
@@ -30,6 +30,6 @@ class Transitions(NamedTuple):
     returns: torch.Tensor  # (R,) targets of the critic
 
     def batches(self, size: int, generator: torch.Generator) -> Iterator[Transitions]:
-        """Parts of `size` transitions in random order; the last may have fewer."""
+        """Yields batches of `size` transitions in random order; the last may be smaller."""
         for rows in torch.randperm(len(self.seen), generator=generator).split(size):
             yield Transitions(*(each[rows] for each in self))

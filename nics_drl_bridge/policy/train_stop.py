@@ -1,8 +1,8 @@
-"""Early stop: a training ends once success in held-out episodes has stood twice in a row.
+"""Early stop: ends a training once held-out success passes the threshold twice in a row.
 
-Each evaluation has episodes of its own, so that chance in one says nothing about the next: a true
-success of 95 % shows as 97 % of 200 episodes about once in eight times, in two evaluations in a row
-once in sixty. The weights that are kept are those of the second one.
+Each evaluation has its own episodes, so luck in one says nothing about the next: a true success
+rate of 95 % shows as 97 % of 200 episodes about once in eight evaluations, but in two consecutive
+ones about once in sixty. The weights of the second one are kept.
 """
 
 from collections.abc import Mapping
@@ -12,18 +12,17 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import Act, drive_worlds
 from nics_drl_bridge.policy.training_settings import StopSettings
 
-HELD_OUT_SEED = (
-    2**41
-)  # first of the episodes, beyond those of trainings and of the protocol
+# first seed of these episodes, beyond those of trainings and of the protocol
+HELD_OUT_SEED = 2**41
 IN_A_ROW = 2
 
 
 class Stop:
-    """Decides when a training ends early; without settings it never does.
+    """Decides when a training ends early; without settings, never.
 
     Args:
         given: the settings.
-        envs: by the name of their worlds, with as many copies as an evaluation has episodes.
+        envs: by world name, each with as many copies as an evaluation has episodes.
     """
 
     def __init__(
@@ -32,21 +31,22 @@ class Stop:
         self._given = given
         self._envs = envs
         self._due = 0  # number of the latest evaluation
-        self._reached = 0  # reached in a row
-        self.shares: dict[str, float] = {}  # success by world in the latest evaluation
+        self._reached = 0  # consecutive evaluations that passed
+        # success rate by world in the latest evaluation
+        self.shares: dict[str, float] = {}
 
     @property
     def over(self) -> bool:
-        """True if the training is to end."""
+        """True if the training should end."""
         return self._reached >= IN_A_ROW
 
     @property
     def least(self) -> float:
-        """Least success of a world in the latest evaluation; NaN before the first."""
+        """Minimum success over the worlds in the latest evaluation; NaN before the first."""
         return min(self.shares.values(), default=float("nan"))
 
     def judge(self, steps: int, act: Act) -> bool:
-        """Evaluates the policy `act` if it is time to, after so many steps; True if it was."""
+        """Evaluates the policy `act` if it is time to after `steps`; True if it did."""
         given = self._given
         if given is None or steps // given.every <= self._due:
             return False
@@ -63,13 +63,13 @@ class Stop:
         return True
 
     def state(self) -> dict[str, Any]:
-        """All that changes, for a checkpoint."""
+        """Everything that changes, for a checkpoint."""
         return {
             "stop": {"due": self._due, "reached": self._reached, "shares": self.shares}
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continues with the state of another; with one of before there was any, as if new."""
+        """Continues from another state, or afresh if the checkpoint is older than this feature."""
         if known := state.get("stop"):
             self._due = known["due"]
             self._reached = known["reached"]

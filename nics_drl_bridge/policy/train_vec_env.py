@@ -1,4 +1,4 @@
-"""The vector env as Stable-Baselines3's VecEnv, without a copy for each world."""
+"""The vector env as Stable-Baselines3's VecEnv, without copying each world."""
 
 import itertools
 import time
@@ -21,7 +21,7 @@ Observation = NDArray[np.float32]
 
 
 class TrainVecEnv(VecEnv):
-    """Feeds SB3 from `BridgeVectorEnv`s (`SameStep`, `copy=True`); else ConfigError."""
+    """Adapts `BridgeVectorEnv`s (`SameStep`, `copy=True`) to SB3. Raises ConfigError for others."""
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:
         for env in envs:
@@ -35,8 +35,8 @@ class TrainVecEnv(VecEnv):
         spaces = [env.single_observation_space for env in envs]
         for space in spaces:
             if space != spaces[0]:
-                shown = f"{spaces[0]} and {space}; give them one robot, lidar and task."
-                raise ConfigError(f"vector envs that are fed together show {shown}")
+                shown = f"{spaces[0]} and {space}; use the same robot, lidar and task."
+                raise ConfigError(f"the combined vector envs have the spaces {shown}")
         self.envs = envs
         edges = np.cumsum([0, *(env.num_envs for env in envs)])
         self._rows = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
@@ -52,7 +52,7 @@ class TrainVecEnv(VecEnv):
         self.on_step: Callable[[], None] | None = None
 
     def reset(self) -> Observation:
-        """Begins an episode in every world, with the seeds given to `seed`."""
+        """Starts an episode in every world, with the seeds given to `seed`."""
         shown = []
         for env, rows in zip(self.envs, self._rows, strict=True):
             given = self._seeds[rows]
@@ -63,7 +63,7 @@ class TrainVecEnv(VecEnv):
         return _together(shown)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Stores the actions of the next step."""
+        """Stores the actions for the next step."""
         self._actions = actions
 
     def step_wait(
@@ -89,7 +89,7 @@ class TrainVecEnv(VecEnv):
     def _step_env(
         self, env: BridgeVectorEnv, rows: slice
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_]]:
-        """Steps one of the envs and fills the infos of its worlds that ended."""
+        """Steps one of the envs and fills in the infos of its ended worlds."""
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
         if over := np.flatnonzero(done).tolist():
@@ -108,7 +108,7 @@ class TrainVecEnv(VecEnv):
         return observation, reward, done
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the vector env of each world."""
+        """Reads an attribute of each world's vector env."""
         every = [
             getattr(env, attr_name) for env in self.envs for _ in range(env.num_envs)
         ]
@@ -139,11 +139,11 @@ class TrainVecEnv(VecEnv):
         wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]],
         indices: Any = None,
     ) -> list[bool]:
-        """False for every world."""
+        """Always False: no world is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """A picture of every world."""
+        """Draws every world."""
         return [
             picture
             for env in self.envs
@@ -157,5 +157,5 @@ class TrainVecEnv(VecEnv):
 
 
 def _together(parts: list[NDArray[Any]]) -> NDArray[Any]:
-    """Concatenates the rows of several envs; those of one are returned unchanged."""
+    """Concatenates the rows of several envs; a single env's rows are returned unchanged."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)

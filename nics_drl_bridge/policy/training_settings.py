@@ -23,87 +23,81 @@ Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS = 16
 MOST_WIDE = 8_192
-MOST_KEPT = 2**26  # stored transitions: of a roll-out in all worlds, or of SAC's buffer
+MOST_KEPT = 2**26  # stored transitions: of a rollout in all worlds, or of SAC's buffer
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
     """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
 
-    The engine `lean` learns on one core while it collects on another; `sb3` is Stable-Baselines3.
+    The engine `lean` learns on one core while it collects on another; `sb3` is Stable-Baselines3's.
     """
 
     engine: Literal["lean", "sb3"] = "lean"  # implementation, see above
-    learning_rate: float = Field(
-        default=1e-3, gt=0.0
-    )  # at the start; falls linearly to a fiftieth
+    # at the start; falls linearly to a fiftieth
+    learning_rate: float = Field(default=1e-3, gt=0.0)
     rollout: Count = 32  # steps in each world between two updates
     batch: Count = 2048  # transitions of one gradient step
-    epochs: Count = 5  # passes of an update through the roll-outs
+    epochs: Count = 5  # passes through the rollout in each update
     discount: Share = 0.98  # gamma, per step
     gae_lambda: Share = 0.95  # lambda of generalised advantage estimation
     clip: float = Field(default=0.2, gt=0.0)  # range of the probability ratio around 1
-    entropy: float = Field(
-        default=0.0, ge=0.0
-    )  # weight of the entropy bonus; more explores more
-    log_std: float = -0.5  # of the actions at the start
+    # weight of the entropy bonus; a higher weight means more exploration
+    entropy: float = Field(default=0.0, ge=0.0)
+    log_std: float = -0.5  # initial log standard deviation of the actions
 
 
 class SacSettings(Schema):
     """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3."""
 
-    learning_rate: float = Field(default=1e-3, gt=0.0)  # of all networks, constant
-    buffer: Count = 300_000  # transitions that are stored of all worlds together
+    learning_rate: float = Field(default=1e-3, gt=0.0)  # for all networks, constant
+    buffer: Count = 300_000  # number of stored transitions, over all worlds
     batch: Count = 512  # transitions of one gradient step
     updates: Count = 8  # gradient steps after each step of the worlds
     begin_after: Count = 5_000  # transitions of random actions before the first update
     discount: Share = 0.98  # gamma, per step
-    soft_update: Share = 0.01  # by which each gradient step moves the target critics
+    # fraction by which each gradient step moves the target critics
+    soft_update: Share = 0.01
 
 
 class StopSettings(Schema):
-    """An early end, as soon as held-out success has stood in two evaluations in a row."""
+    """Early stop, once held-out success has passed the threshold in two consecutive evaluations."""
 
-    success: Share  # least share of the episodes in each world
+    success: Share  # minimum success rate in each world
     every: Count = 200_000  # environment steps between two evaluations
-    episodes: int = Field(
-        default=200, ge=1, le=10_000
-    )  # in each world, others each time
+    # number of episodes in each world, different ones each time
+    episodes: int = Field(default=200, ge=1, le=10_000)
 
 
 class TrainingSettings(Schema):
-    """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
+    """A training, as in `config/training/*.yaml`; `worlds` maps names or files to copies."""
 
-    # a shipped task's name; `path/to/file.py:ClassName` if the caller names the same, as `--task`
+    # a shipped task, or `path/to/file.py:ClassName` if the caller also names it, as with `--task`
     task: str = "navigation"
-    task_options: dict[str, Any] = Field(
-        default_factory=dict
-    )  # arguments of the task's class
-    robot: str = DEFAULT_ROBOT  # name of a shipped robot, or the folder of a model
-    lidar: str | None = None  # a shipped one or a file, instead of the model's own
-    worlds: dict[str, Count] = Field(
-        default={"circles": 256}, min_length=1
-    )  # copies of each world
-    # quantities drawn in each episode: a shipped one or a file
+    # arguments of the task's class
+    task_options: dict[str, Any] = Field(default_factory=dict)
+    robot: str = DEFAULT_ROBOT  # a shipped robot, or the folder of a model
+    lidar: str | None = None  # a shipped lidar or a file, instead of the model's own
+    # number of copies of each world
+    worlds: dict[str, Count] = Field(default={"circles": 256}, min_length=1)
+    # quantities drawn in each episode: a shipped set or a file
     randomisation: str | None = None
-    teaching: Teaching = (
-        Teaching()
-    )  # rewards by what only the simulator knows, and repetition
-    # environment steps of all worlds together, at most with `stop`
+    # rewards from the simulator's ground truth, and repeated episodes
+    teaching: Teaching = Teaching()
+    # environment steps over all worlds; a maximum if `stop` is set
     steps: Count = 1_000_000
-    stop: StopSettings | None = None  # early end; None: after all steps
-    # time limit of an episode [steps]; left out, `nics train` makes it 30 s, or 1.8 times what the
-    # longest straight way to a goal of the worlds takes at top speed, if that is more
+    stop: StopSettings | None = None  # early stop; None: train for all steps
+    # time limit of an episode [steps]; by default `nics train` sets 30 s, or 1.8 times what the
+    # longest straight path to a goal in the worlds takes at top speed, if that is longer
     max_episode_steps: Count = 300
-    # learning algorithm; its settings are under its name
+    # learning algorithm; its settings are in the section of its name
     algorithm: Literal["ppo", "sac"] = "ppo"
-    # sizes of the hidden layers, in actor and critic alike
+    # sizes of the hidden layers, the same for actor and critic
     hidden: tuple[Width, ...] = Field(
         default=(64, 64), min_length=1, max_length=MOST_LAYERS
     )
-    threads: Annotated[int, Field(ge=1, le=1024)] = (
-        1  # of PyTorch; results depend on it slightly
-    )
+    # threads of PyTorch; results depend slightly on it
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()  # used if `algorithm` is `ppo`
     sac: SacSettings = SacSettings()  # used if `algorithm` is `sac`
@@ -113,18 +107,22 @@ class TrainingSettings(Schema):
     def _named(cls, options: dict[str, Any]) -> dict[str, Any]:
         if taken := sorted({"robot", "lidar"} & set(options)):
             raise ValueError(
-                f"task_options can't hold {taken[0]!r}, which the model gives"
+                f"task_options can't hold {taken[0]!r}, which the model defines"
             )
         return options
 
     @model_validator(mode="after")
     def _holdable(self) -> TrainingSettings:
         if self.num_envs > MOST_WORLDS:
-            raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
+            raise ValueError(
+                f"all worlds together may have at most {MOST_WORLDS} copies"
+            )
         rows = self.num_envs * self.ppo.rollout
         kept = rows if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
-            kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"
+            kept_by = (
+                f"{self.algorithm} would keep {kept} transitions, more than {MOST_KEPT}"
+            )
             raise ValueError(
                 f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer"
             )
@@ -138,43 +136,43 @@ class TrainingSettings(Schema):
 
     @property
     def lean(self) -> bool:
-        """True if the lean engine learns."""
+        """True if the lean engine is used."""
         return self.algorithm == "ppo" and self.ppo.engine == "lean"
 
     @property
     def num_envs(self) -> int:
-        """N, number of worlds of all kinds together."""
+        """N, the total number of worlds."""
         return sum(self.worlds.values())
 
 
 def load_training(name: str | Path, task: str | None = None) -> TrainingSettings:
     """Loads settings by the name of a shipped file, or by path. Raises ConfigError.
 
-    A task of the user's own is a program. A file may tell which one it is for, but only a `task`
-    that the caller names is run: it takes the place of the file's.
+    A user's task is a program. A file may say which one it is for, but only a `task` named by the
+    caller is run; it replaces the file's.
     """
     return read_settings(find_config(name, "training"), task)
 
 
 def read_settings(path: Path, task: str | None = None) -> TrainingSettings:
-    """Reads settings from a file, with the caller's own task if it names one; see above."""
+    """Reads settings from a file, with the caller's own task if given; see `load_training`."""
     settings = load_yaml(path, TrainingSettings)
     if is_code(settings.task) and not (task is not None and is_code(task)):
-        reason = "is a program, which a file of data may not start"
+        reason = "is a program, which a data file must not start"
         fix = "name it yourself: --task path/to/file.py:ClassName, or task= in Python"
         raise ConfigError(f"{path}: key 'task' {settings.task!r}: {reason}; {fix}.")
     return settings if task is None else settings.model_copy(update={"task": task})
 
 
 def is_code(task: str) -> bool:
-    """True for a task of a user's own, `path/to/file.py:ClassName`, or a file without its class."""
+    """True for a user's task, `path/to/file.py:ClassName`, or a file without its class."""
     return ":" in task or task.endswith(".py")
 
 
 def chosen_settings(
     task: str, name: str | None, changes: dict[str, Any]
 ) -> TrainingSettings:
-    """Settings by name or file, else those shipped for task and robot, with changes by the user."""
+    """Loads settings by name or file, else the shipped ones for task and robot; applies changes."""
     robot = str(changes.get("robot", DEFAULT_ROBOT))
     if name is None and f"{task}_{robot}" not in list_shipped("training"):
         base = TrainingSettings(task=task, robot=robot)
@@ -187,7 +185,7 @@ def chosen_settings(
         given = changed.get("algorithm", base.algorithm)
         if engine == "lean" and given != "ppo":
             raise ConfigError(
-                f"--engine lean learns with ppo, not {given!r}; leave it out."
+                f"--engine lean requires ppo, not {given!r}; leave it out."
             )
         changed["ppo"] = changed.get("ppo", {}) | {"engine": engine}
     return validate(changed, TrainingSettings, "training settings")

@@ -117,7 +117,7 @@ MISTAKES = {
     "explain stop.jsonl": "stop.jsonl: is no JSON, line by line",
     "doctor nothing": "nothing",
     "bag info nothing": "nothing",
-    "policy import text.txt --robot differential --out p.bin": "a policy file ends with '.onnx'",
+    "policy import text.txt --robot differential --out p.bin": "name ends with '.onnx'; change",
     "world draw clutter --out clutter.jpg": "must end in .png",
     "drive --robot differential --out m --recording d.csv": "must end in .npz",
     # Places that are taken, or can't be written to.
@@ -151,8 +151,8 @@ MISTAKES = {
     "bag replay bag --rate nan": "--rate.*(must be a finite number|Input should be)",
     "world import house.world --start 0 nan 0": "--start nan: must be a finite number",
     # What a policy sees, and where results go.
-    "evaluate differential --lidar hokuyo_ust_10lx --in fast": "sees more than this lidar does: .* "
-    "in base_link, the scan layout needs .*; use another lidar, or a policy that was trained for",
+    "evaluate differential --lidar hokuyo_ust_10lx --in fast": "needs more than this lidar "
+    "sees: .* in base_link, the scan layout needs .*; use another lidar, or a policy trained for",
     "evaluate straight --in fast --out text.txt": "text.txt is a file, not a folder",
 }
 MODULES = {

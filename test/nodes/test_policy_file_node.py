@@ -386,5 +386,5 @@ def test_after_a_gap_it_begins_anew_and_says_so_once(stateful, remembering, mode
     assert before == pytest.approx(wanted, abs=1e-4)
     assert after == pytest.approx(wanted, abs=1e-4)
     log = node.log.read_text(encoding="utf-8")
-    assert log.count("it begins anew") == 1
-    assert "nothing was observed for 2.5 s, longer than the 0.5 s" in log
+    assert log.count("the state was reset") == 1
+    assert "no observation for 2.5 s, longer than the 0.5 s" in log

@@ -55,10 +55,10 @@ def test_a_path_that_comes_back_is_followed_to_its_turn_first():
     [
         (np.zeros((0, 3)), "empty"),
         (np.full((2, 3), math.nan), "no number"),
-        (np.full((2, 3), 1e9), "no number, or out of all reach"),
+        (np.full((2, 3), 1e9), "not a number, or too large"),
         (
             np.array([(0.0, 0.0), (2e5, 0.0)]),
-            r"has 2e\+05 m, and 100000 m are the most",
+            r"is 2e\+05 m long; the maximum is 100000 m",
         ),
     ],
 )

@@ -75,7 +75,7 @@ def test_a_whole_number_that_chooses_nothing_is_no_command(tmp_path, robot, limi
     write_bytes(
         tmp_path / "net.onnx", foreign_nets.chooser(*limits).SerializeToString()
     )
-    with pytest.raises(PolicyError, match="gives NaN or inf"):
+    with pytest.raises(PolicyError, match="returns NaN or inf"):
         open_policy(str(path), robot)
 
 
@@ -337,7 +337,7 @@ SPOILT = {
     ),
     "wrong shape": (
         changed("scan", {"sectors": 20, "range_max": FAR}),
-        "the network takes (1, 1, 24), and the parts give 20 (scan 20)",
+        "the network takes (1, 1, 24), but the parts have 20 (scan 20)",
     ),
     "unknown output": (changed("outputs/turn/of", "acton"), "did you mean 'action'?"),
     "missing output": (changed("outputs/turn", None), "'outputs.turn': is missing"),
@@ -350,12 +350,15 @@ SPOILT = {
     "divide": (changed("inputs/scan/divide", 0.0), "must not be 0"),
     "numbers": (
         changed("inputs/scan/divide", [1.0, 2.0]),
-        "has 2 numbers, where 24 are scaled",
+        "has 2 numbers, but 24 elements are scaled",
     ),
     "limits": (changed("inputs/scan/limits", [1.0, 0.0]), "must be [least, greatest]"),
     "constant": (changed("inputs/goal/parts/0/value", 1.0), "has no `value:`"),
     "period": (changed("control_period", 0.2), "is 0.2 s, but the robot's is 0.1 s"),
-    "state": (changed("states", {"goal": {"next": "action"}}), "is an input as well"),
+    "state": (
+        changed("states", {"goal": {"next": "action"}}),
+        "is also listed under inputs",
+    ),
     "range": (changed("scan", {"sectors": SECTORS, "range_max": 50.0}), "sees farther"),
     "both": (
         changed("choices", {"of": "action", "commands": [{}]}),
@@ -382,7 +385,7 @@ def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(
     path = write(tmp_path, "three")
     whole = foreign_nets.three()
     for node, words in (
-        (onnx.helper.make_node("Log", ["bent"], ["left"]), "gives NaN or inf"),
+        (onnx.helper.make_node("Log", ["bent"], ["left"]), "returns NaN or inf"),
         (onnx.helper.make_node("Tanh", ["bent"], ["left"], domain="evil"), "evil.Tanh"),
     ):
         spoilt = onnx.ModelProto()

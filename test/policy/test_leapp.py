@@ -119,7 +119,7 @@ def test_nics_policy_exports_and_imports_what_is_shipped(tmp_path):
     done = nics("policy", "import", "bundle", "-o", "back.pt", cwd=tmp_path)
     assert done.returncode == 2
     (sentence,) = done.stderr.splitlines()
-    assert "a policy file ends with '.onnx'" in sentence
+    assert "a policy file's name ends with '.onnx'" in sentence
 
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path):
@@ -412,7 +412,7 @@ REFUSED = {
     ),
     "backend": (
         lambda data, _: data["models"]["policy"]["parameters"].update(backend="jit"),
-        "is 'jit', which is never opened here; export it with 'onnx'",
+        "is 'jit', which is not supported; export it with 'onnx'",
     ),
     "damaged": (
         lambda data, _: data["models"]["policy"]["parameters"].update(
@@ -434,11 +434,11 @@ REFUSED = {
     ),
     "not connected": (
         lambda data, _: data["pipeline"].update(data_flow={}),
-        "nothing before the node gives 'policy/features'",
+        "no earlier node supplies 'policy/features'",
     ),
     "no such node": (
         lambda data, _: data["pipeline"].update(outputs={"polici": ["speed"]}),
-        "no network gives 'polici/speed'",
+        "no network has the output 'polici/speed'",
     ),
     "frequency": (
         lambda data, _: data["pipeline"]["configs"].update(frequency=50.0),
@@ -446,7 +446,7 @@ REFUSED = {
     ),
     "initial values": (
         lambda data, _: data["pipeline"].update(initial_values="policy.onnx"),
-        "is no file of safetensors",
+        "is not a valid safetensors file",
     ),
     "pipeline": (lambda data, _: data.pop("pipeline"), "'pipeline' is missing"),
 }

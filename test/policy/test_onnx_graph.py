@@ -163,8 +163,8 @@ def whole_numbers(proto):
 
 
 REFUSED = {
-    "division of whole numbers": (divided, "graph.node", "may end the process"),
-    "dimensions": (dimensions, "graph.node", "6000 dimensions in all"),
+    "division of whole numbers": (divided, "graph.node", "may crash the process"),
+    "dimensions": (dimensions, "graph.node", "6000 dimensions, more than"),
     "whole numbers": (whole_numbers, "graph.node", "is no shape"),
     "concatenations": (concats, "graph", "numbers"),
     "a square": (outer, "graph", "grows faster"),
@@ -313,8 +313,8 @@ BAD = {
     "millions of operators": (many, f"more than {MOST_PARTS} parts"),
     "a graph in a graph in a graph": (deep, f"more than {MOST_NESTED} levels"),
     "a million sizes": (packed, "'dims'"),
-    "a group": (lambda: b"\x0b\x0c", "no ONNX model"),
-    "an endless number": (lambda: b"\x08" + b"\xff" * 11, "no ONNX model"),
+    "a group": (lambda: b"\x0b\x0c", "not an ONNX model"),
+    "an endless number": (lambda: b"\x08" + b"\xff" * 11, "not an ONNX model"),
     "cut off": (lambda: field(GRAPH, b"abc")[:-1], "cut off"),
 }
 

@@ -60,7 +60,7 @@ def test_the_field_bounds_the_way_where_the_distance_of_goals_does_not(model):
 def test_a_goal_that_cant_be_reached_in_time_is_told_and_none_at_all_is_refused(model):
     pace = pace_of(slow(model), [load_worlds("doorway")])
     told = pace.shortfall(300)
-    assert "'doorway': a goal may lie 7 m away, which takes 32 s at 0.22 m/s" in told
+    assert "'doorway': a goal may be 7 m away, which takes 32 s at 0.22 m/s" in told
     assert "set max_episode_steps to 573" in told
     with pytest.raises(
         ConfigError, match=r"no goal can be reached in time: .* ends after 5 s"

@@ -266,7 +266,7 @@ def test_after_a_gap_a_state_begins_anew_and_one_sentence_says_so():
         acted.append(float(policy.act(seen)))
     assert acted == [1, 2, 3, 1, 2]
     assert [bool(one) for one in told] == [False, False, False, True, False]
-    assert told[3].startswith("nothing was observed for 0.6 s, longer than the 0.5 s")
+    assert told[3].startswith("no observation for 0.6 s, longer than the 0.5 s")
     policy.reset()
     assert resume(policy, 99.0) == ""  # an episode begins, so there was no gap
 

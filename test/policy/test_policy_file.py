@@ -361,7 +361,7 @@ def test_a_pickle_in_disguise_is_never_opened(tmp_path):
 
     path = tmp_path / "trap.onnx"
     path.write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(PolicyError, match="a pickle, which is never opened"):
+    with pytest.raises(PolicyError, match="a pickle, which is not a policy"):
         load_policy(path)
     assert not (tmp_path / "sprung").exists()
 
@@ -415,8 +415,8 @@ def forgetful(proto):
 
 
 REFUSED_STATES = {
-    "none": (stateless, "state", "is missing, although the graph takes one"),
-    "no shape": (shapeless, "state.size", "is missing; export the policy anew"),
+    "none": (stateless, "state", "is missing, although the graph needs one"),
+    "no shape": (shapeless, "state.size", "is missing; export the policy again"),
     "a list": (
         changed(["state"], [6, 0.0], True),
         "state",

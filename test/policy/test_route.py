@@ -27,12 +27,12 @@ def test_a_way_leads_through_doors_and_touches_nothing(room):
 
 
 def test_a_robot_that_fits_through_no_door_gets_one_sentence(room):
-    with pytest.raises(ConfigError, match="there is no way to the goal on the map"):
+    with pytest.raises(ConfigError, match="there is no path to the goal on the map"):
         route(room, START, GOAL, 0.9)
 
 
 @pytest.mark.parametrize("name", ["start", "goal"])
 def test_an_end_off_the_map_is_told(room, name):
     ends = {"start": START, "goal": GOAL, name: (50.0, 0.0)}
-    with pytest.raises(ConfigError, match=f"the {name} of the way is off the map"):
+    with pytest.raises(ConfigError, match=f"the {name} of the path is off the map"):
         route(room, ends["start"], ends["goal"], RADIUS)

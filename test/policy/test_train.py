@@ -206,7 +206,7 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
     train(settings(steps=128), 0, tmp_path)
     with pytest.raises(ConfigError, match=r"was trained with hidden \[16\], not \[8\]"):
         train(settings(steps=128, hidden=[8]), 0, tmp_path, resumed=True)
-    with pytest.raises(ConfigError, match="is of seed 0, not 4"):
+    with pytest.raises(ConfigError, match="has seed 0, not 4"):
         train(settings(steps=128), 4, tmp_path, resumed=True)
     path = tmp_path / CHECKPOINT
     whole = path.read_bytes()
@@ -215,7 +215,7 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
     for damaged in (whole[:-500], bytes(flipped), whole[:-71]):
         path.write_bytes(damaged)
         with pytest.raises(
-            ConfigError, match="is no checkpoint of a training, or a damaged one"
+            ConfigError, match="is not a training checkpoint, or is damaged"
         ):
             read_checkpoint(path)
 
@@ -229,7 +229,7 @@ def test_a_checkpoint_that_would_run_code_is_refused(tmp_path):
     content = io.BytesIO()
     torch.save({"format": FORMAT, "about": Harmful()}, content)
     path.write_bytes(seal(content.getvalue()))
-    with pytest.raises(ConfigError, match="is no checkpoint"):
+    with pytest.raises(ConfigError, match="is not a training checkpoint"):
         read_checkpoint(path)
     assert not (tmp_path / "harm").exists()
 
@@ -263,7 +263,7 @@ def test_a_checkpoint_that_holds_something_else_is_refused(tmp_path, name):
     torch.save(BAD_CONTENTS[name], content)
     path = tmp_path / CHECKPOINT
     path.write_bytes(seal(content.getvalue()))
-    with pytest.raises(ConfigError, match="is no checkpoint"):
+    with pytest.raises(ConfigError, match="is not a training checkpoint"):
         read_checkpoint(path)
 
 
@@ -274,7 +274,7 @@ def test_a_packed_checkpoint_is_refused_unread(tmp_path):
         archive.writestr("archive/data.pkl", bytes(100_000_000))
     path = tmp_path / CHECKPOINT
     path.write_bytes(seal(content.getvalue()))
-    with pytest.raises(ConfigError, match="is no checkpoint"):
+    with pytest.raises(ConfigError, match="is not a training checkpoint"):
         read_checkpoint(path)
 
 

@@ -90,7 +90,7 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
     )
     refused = nics("--settings", settings, "--seeds", 3, "--out", out)
     assert refused.exit_code == 2
-    assert "holds checkpoints of these seeds; add --resume" in refused.output
+    assert "contains checkpoints of these seeds; add --resume" in refused.output
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         (["--engine", "rai"], "unknown engine 'rai'; did you mean 'ray'"),
         (
             ["--engine", "lean", "--algorithm", "sac"],
-            "--engine lean learns with ppo, not 'sac'",
+            "--engine lean requires ppo, not 'sac'",
         ),
         (
             ["--resume", "--engine", "lean", "--out", "x"],
@@ -212,7 +212,7 @@ def test_a_task_of_a_team_is_refused_before_a_folder_is_begun(tmp_path, monkeypa
     done = nics("--task", "cooperative_reaching", "--steps", 64, "--out", "run")
     assert done.exit_code == 2
     assert (
-        "task 'cooperative_reaching': is of 3 robots; train a task of one,"
+        "task 'cooperative_reaching': has 3 robots; train a single-robot task,"
         in done.output
     )
     assert not (tmp_path / "run").exists()
@@ -256,7 +256,10 @@ def test_a_training_that_diverges_says_so_and_leaves_no_broken_checkpoint(
     )
     assert done.exit_code == 2
     assert "nics: the training diverged: after" in done.output
-    assert "its weights are beyond all bounds; lower its learning_rate." in done.output
+    assert (
+        "its weights are too large or not finite; lower its learning_rate."
+        in done.output
+    )
     assert not list(out.rglob("checkpoint.pt"))
 
 
@@ -267,7 +270,7 @@ def test_a_training_beside_another_in_one_folder_is_refused(tmp_path, settings):
     with filelock.FileLock(out / ".lock"):
         done = nics("--settings", settings, "--out", out)
     assert done.exit_code == 2
-    assert "another training is at work there; wait for its end" in " ".join(
+    assert "another training is running there; wait until it ends" in " ".join(
         done.output.split()
     )
     assert nics("--settings", settings, "--episodes", 2, "--out", out).exit_code == 0

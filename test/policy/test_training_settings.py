@@ -89,7 +89,7 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
         ),
         (
             "task_options: {robot: x}",
-            r"task_options can't hold 'robot', which the model gives",
+            r"task_options can't hold 'robot', which the model defines",
         ),
     ],
 )
