@@ -69,8 +69,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     ## Starting State
 
     The seed fixes obstacles, start poses, goals and noise; the robots stand still. `reset` takes
-    `options={"start": (x, y, heading), "goal": (x, y)}` to override them, and any other name of
-    the task's memory.
+    `options={"start": (x, y, heading), "goal": (x, y)}` to override them, or any other entry of the
+    task's memory by name.
 
     ## Episode End
 
@@ -84,7 +84,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             `facts`, see `env.sim_backend.CompletedBackend`.
         model: a SimulatorModel, its folder, or a shipped robot's name; else `DEFAULT_ROBOT`. The
             keyword `robot` means the same.
-        world: a World, its YAML file, the name of a shipped one, or a list of these: a set.
+        world: a World, its YAML file, the name of a shipped one, or a list of these (a world set).
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
         estimator: True puts the robot's middleware (cache and EKF) between the simulator and the
@@ -135,7 +135,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.memory: Memory = {}
         self.scene: Scene | None = None
         self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
-        self._view: RobotView | None = None  # always a batch of one, as tasks expect
+        self._view: RobotView | None = None  # always a batch of one, which tasks expect
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
@@ -144,7 +144,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._episode = -1
         self._rehearsed = False
         self._picture: Any = None
-        # Of the last step, for pictures, and the number of steps in the episode.
+        # From the last step, for pictures; and the number of steps in the episode.
         self._command = self._rest
         self._facts = dict[str, Any]()
         self._steps = 0
@@ -166,7 +166,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see Gymnasium. ConfigError for a wrong seed or option."""
+        """Starts an episode; see Gymnasium. Raises ConfigError for a wrong seed or option."""
         guard.check_reset(seed, options)
         super().reset(seed=seed)
         if seed is not None or self._episode < 0:
@@ -211,13 +211,13 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return observation.reshape(-1), self._info(self._view, facts)
 
     def _rehearse(self, episodes: Episodes) -> None:
-        """Runs the task once without a step: it may compile for seconds, and the robot be real."""
+        """Runs the task once before moving: compiling takes too long while a robot drives."""
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
         sensed = unread(self.model.sensors, 1, self.robots)
         starts = episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.begun(episodes)
-        with suppress(ConfigError):  # of a view that no step gives
+        with suppress(ConfigError):  # the view is made up, so the task may refuse it
             self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
 
@@ -229,7 +229,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self.advance(action)
         values = {name: term.tolist() for name, term in terms.items()}
-        # In the order of the vector env's sum.
+        # Summed in the vector env's order, for the same bits.
         each = [reduce(add, own, 0.0) for own in zip(*values.values(), strict=True)]
         alone = self.robots == 1
         info["reward_terms"] = (
@@ -250,9 +250,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def advance(
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
-        """Advances one period: observations (M, O), reward terms (M,) by name, and `info`.
+        """Advances one period; returns observations (M, O), reward terms (M,) by name, and `info`.
 
-        `ended` (M,) robots of a team get the command nearest to zero and no further reward.
+        Robots of a team that have `ended` (M,) get the command nearest to zero and no more reward.
         """
         before = self._view
         if before is None:
@@ -283,7 +283,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return out[0], terms, self._info(view, facts)
 
     def halt(self) -> None:
-        """Stops the robot until the next reset; any exception has done so already."""
+        """Stops the robot until the next reset; any exception has already done so."""
         self._view = None
         self._backend.halt()
 
@@ -327,12 +327,13 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             return extensions.load("viewers", "human")(
                 self.model, self.world, RENDER_FPS
             )
-        from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
+        # imported here because it loads matplotlib
+        from nics_drl_bridge.env.rendering import WorldPicture
 
         return WorldPicture(self.model, self.world)
 
     def snapshot(self) -> Snapshot:
-        """All that a picture of the world shows now. Raises ResetNeeded before an episode."""
+        """The current state of the world for a picture. Raises ResetNeeded before an episode."""
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         facts = self._backend.facts()
@@ -368,7 +369,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
 
 def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
-    """Raises ConfigError for a mode that the env does not support."""
+    """Raises ConfigError for a render mode that the env does not support."""
     known = metadata["render_modes"]
     if mode is not None and mode not in known:
         name = mode if isinstance(mode, str) else ""

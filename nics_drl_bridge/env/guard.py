@@ -1,4 +1,4 @@
-"""Guard around an env's methods: any exception stops the robot; checks of what a caller gives."""
+"""Guards around an env's methods: any exception stops the robot, and arguments are checked."""
 
 import contextlib
 import signal
@@ -56,7 +56,7 @@ def refused_after_close(
     def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         if self._closed:
             call = f"{method.__name__}() after close()"
-            raise ClosedEnvError(f"{call}: the env is closed; make another one.")
+            raise ClosedEnvError(f"{call}: the env is closed; make a new one.")
         return method(self, *args, **kwargs)
 
     return guarded
@@ -64,9 +64,9 @@ def refused_after_close(
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Defers Ctrl-C to the end of the block, so that stopping a robot is not interrupted."""
+    """Defers Ctrl-C to the end of the block, so it can't interrupt the stopping of a robot."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread is interrupted
+        yield  # other threads are never interrupted
         return
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
@@ -79,21 +79,21 @@ def uninterrupted() -> Iterator[None]:
 
 
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
-    """Raises ConfigError for a wrong seed, of all worlds or one each, or wrong options."""
+    """Raises ConfigError for a wrong seed (one for all worlds, or one each), or wrong options."""
     several = isinstance(seed, list | tuple | np.ndarray)
     given = [one for one in (seed if several else [seed]) if one is not None]
     check_seeds(given, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
     if options is not None and not isinstance(options, Mapping):
-        needed = "must be a dict, as {'start': (x, y, heading)}, or None."
+        needed = "must be a dict such as {'start': (x, y, heading)}, or None."
         raise ConfigError(f"reset options of type {type(options).__name__}: {needed}")
 
 
 def override(
     memory: dict[str, NDArray[Any]], options: Mapping[str, Any] | None, *of_env: str
 ) -> None:
-    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name.
+    """Writes values of `reset(options=...)` into all rows of the memory arrays they name.
 
-    Options `of_env` are the env's own, also where a task remembers something by the same name.
+    Options `of_env` are the env's own, even if a task's memory has an entry of the same name.
     """
     for name, value in (options or {}).items():
         if name in of_env:
@@ -107,7 +107,7 @@ def override(
 
 
 def give(rows: NDArray[Any], name: str, value: Any) -> None:
-    """Writes the value of an option of `reset(options=...)` into rows (n, ...)."""
+    """Writes the value of a `reset(options=...)` entry into rows (n, ...)."""
     try:
         given = np.asarray(value)
     except ValueError:  # a ragged list
@@ -115,7 +115,7 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
     option = f"reset option {name!r}, {value!r}"
     fits = given.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
     if not fits or given.dtype.kind not in "fiub":
-        shape = f"{rows.shape[1:]}, or of its last dimensions"
+        shape = f"{rows.shape[1:]}, or its last dimensions"
         raise ConfigError(f"{option}: must be numbers of shape {shape}.")
     rows[...] = given
     if not np.isfinite(rows).all():
@@ -131,7 +131,7 @@ def check_places(
 ) -> None:
     """Raises ConfigError for starts of a footprint, or goals, (n, ..., 2 or 3) off the field.
 
-    Or in a wall; and for starts where an obstacle stands in the scenes of all n episodes.
+    The same applies in a wall, and to starts on an obstacle in the scenes of the n episodes.
     """
     free = not radius
     for scene, rows in zip(scenes, places, strict=True):
@@ -145,7 +145,7 @@ def check_places(
             _on(x, y, radius, body, shapes) for (x, y), body in pairs
         )
     if not free and len(places):
-        fix = "move it, or take another seed"
+        fix = "move it, or use another seed"
         raise ConfigError(
             f"reset option {option!r}: {at.tolist()} is on an obstacle; {fix}."
         )
@@ -154,11 +154,11 @@ def check_places(
 def _on(
     x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]
 ) -> bool:
-    """True if a disc is on a body."""
+    """True if a disc overlaps a body."""
     (dx, dy), (c, s), reach = (x, y) - body[:2], body[[COS, SIN]], body[RADIUS]
     if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
         return False
-    shape = shapes[int(body[SHAPE]) % len(shapes)]  # in one of some sizes
+    shape = shapes[int(body[SHAPE]) % len(shapes)]  # a shape comes in several sizes
     corners = shape.outline * (reach / shape.radius)
     at = (c * dx + s * dy, c * dy - s * dx)
     return (
@@ -182,18 +182,21 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
         raise gymnasium.error.InvalidAction(f"{name} of shape {given.shape}: {needed}")
     if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
         if given.dtype.char not in "fd":
-            given = given.astype(np.float64)  # the kernels are compiled for these two
+            # the kernels are compiled only for float32 and float64
+            given = given.astype(np.float64)
         if not kernels.finite(given.reshape(1, -1)):
-            raise gymnasium.error.InvalidAction(f"{name} {given!r}: holds NaN or inf.")
+            raise gymnasium.error.InvalidAction(
+                f"{name} {given!r}: contains NaN or inf."
+            )
     elif not space.contains(given):
         raise gymnasium.error.InvalidAction(f"{name} {given!r}: is not in {space}.")
     return given
 
 
 def check_command(command: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Returns a task's command as an array. Raises ConfigError unless finite, of this shape."""
+    """Returns a task's command as an array. Raises ConfigError unless finite and of this shape."""
     made = np.asarray(command, np.float64)
     if made.shape != shape or not kernels.finite(made.reshape(1, -1)):
-        needed = f"must be finite, of shape {shape}; look at its `command`."
+        needed = f"must be finite and of shape {shape}; check its `command`."
         raise ConfigError(f"the task's command {made!r:.80}: {needed}")
     return made

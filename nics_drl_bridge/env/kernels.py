@@ -1,8 +1,8 @@
 """Compiled inner loops of the tasks: actions, observations, and the navigation task.
 
-The batched loops call a scalar function per robot, bearings included: numpy's vectorised functions
-round the remainder of a batch differently from its body. Shapes: R robots of any worlds, B beams, C
-commands, P parts of a scan in an observation.
+The batched loops call a scalar function per robot, for bearings as well: numpy's vectorised
+functions round the remainder of a batch differently from its body. Shapes: R robots in all
+worlds, B beams, C commands, P parts of a scan in an observation.
 """
 
 import math
@@ -15,35 +15,37 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
-# Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
+# Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation.
 LIMIT = 1000.0
 ONE = np.float32(1.0).view(np.int32)
-BLOCK = 64  # Beams that are looked at together
-FURTHEST = np.float32(0.04)  # What a beam may say for or against a contact, at most [m]
+BLOCK = 64  # number of beams checked together
+# maximum contribution of a beam for or against a contact [m]
+FURTHEST = np.float32(0.04)
 
 
 class ScanScale(NamedTuple):
     """Conversion of a scan to parts of an observation, and to contacts."""
 
-    per_metre: np.float32  # 1 / the range that a share of 1 stands for [1/m], float32
-    leaves: NDArray[
-        np.float32
-    ]  # (B,) float32 range at which each beam leaves the footprint [m]
-    beside: int  # number of beams on either side that a contact is judged from, too
-    sectors: int  # number of sectors that are observed; 0 if the beams themselves are
+    # 1 / the range that a fraction of 1 stands for [1/m], float32
+    per_metre: np.float32
+    # (B,) float32 range at which each beam leaves the footprint [m]
+    leaves: NDArray[np.float32]
+    # number of neighbouring beams on either side that a contact is judged by, too
+    beside: int
+    sectors: int  # number of observed sectors; 0 if beams are observed
     plan: SectorPlan  # mapping of beams to sectors
 
 
 @kernel(allocates=True)
 def episode_seeds(seeds, numbers, out):  # type: ignore[no-untyped-def]
-    """Seeds (n,) of the episodes with these numbers (n,) in envs with these seeds (n,)."""
+    """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
     for i in range(seeds.shape[0]):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
 @kernel(allocates=True)
 def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
-    """Scales actions (R, C), cut to [-1, 1], to commands (R, C) between their limits (C,)."""
+    """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
     for i in range(out.shape[0]):
         for c in range(out.shape[1]):
             share = (min(max(float(actions[i, c]), -1.0), 1.0) + 1.0) / 2.0
@@ -62,7 +64,7 @@ def finite(values):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
-    """Writes a scan (B,) as shares (P,), 1 no return, 0 too close; True if it shows a contact."""
+    """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; True if it shows a contact."""
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
         for s in range(shares.shape[0]):
@@ -80,15 +82,15 @@ def _share(value, scale):  # type: ignore[no-untyped-def]
     # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
     share = value * scale.per_metre
     share = share if share > np.float32(0.0) else np.float32(0.0)
-    # As whole numbers, in the same order: of two limits to a float LLVM makes masks.
+    # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
     return np.int32(min(np.float32(share).view(np.int32), ONE)).view(np.float32)
 
 
 @kernel(allocates=True)
 def contact(ranges, scale):  # type: ignore[no-untyped-def]
-    """True if a beam of a scan (B,) and the mean of those beside it end within the footprint.
+    """True if a beam of a scan (B,) and the mean of its neighbours end within the footprint.
 
-    A beam alone may do so by its noise: of hundreds one nearly always errs by three deviations.
+    A single beam is too noisy: among hundreds, one nearly always errs by three standard deviations.
     """
     count = ranges.shape[0]
     for begin in range(0, count, BLOCK):
@@ -110,21 +112,21 @@ def _gap(b, ranges, scale):  # type: ignore[no-untyped-def]
         max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])
     ):
         beyond = ranges[k] - scale.leaves[k]
-        if beyond == beyond:  # else unknown
+        if beyond == beyond:  # False for NaN (unknown)
             gap += min(max(beyond, -FURTHEST), FURTHEST)
     return gap
 
 
 @kernel(allocates=True)
 def looks(shares, touched, ranges, scale):  # type: ignore[no-untyped-def]
-    """Applies `look` to the scans (R, B) of R robots; touched (R,) is its result."""
+    """Applies `look` to the scans (R, B) of R robots; writes its results to touched (R,)."""
     for i in range(ranges.shape[0]):
         touched[i] = look(shares[i], ranges[i], scale)
 
 
 @kernel(allocates=True)
 def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
-    """Distance [m] to a point dx, dy away, and cosine and sine of its bearing at a heading."""
+    """Distance [m] to a point at (dx, dy), and cosine and sine of its bearing from a heading."""
     distance = math.sqrt(dx * dx + dy * dy)
     if distance == 0.0:
         return 0.0, 1.0, 0.0
@@ -139,7 +141,7 @@ def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
 def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
     """Writes the observations (R, P + 6) of `navigation.Navigation`, and its `GoalProgress`.
 
-    The flags (R, 3) are reached, touched, and succeeded.
+    The columns of flags (R, 3) are reached, touched, and succeeded.
     """
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
@@ -161,7 +163,7 @@ def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, ra
 
 @kernel(allocates=True)
 def bearings(out, ways, headings):  # type: ignore[no-untyped-def]
-    """Writes `bearing` (R, 3) of points that are `ways` (R, 2) away, at headings (R,)."""
+    """Writes `bearing` (R, 3) of points at displacements `ways` (R, 2) from headings (R,)."""
     for r in range(out.shape[0]):
         distance, out[r, 1], out[r, 2] = bearing(ways[r, 0], ways[r, 1], headings[r])
         out[r, 0] = min(distance, LIMIT)

@@ -17,10 +17,11 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 
+# arguments of `gymnasium.make`
 GYMNASIUM_ARGUMENTS = (
     "max_episode_steps",
     "disable_env_checker",
-)  # of `gymnasium.make`
+)
 
 
 def make(
@@ -44,10 +45,10 @@ def make_vec(
     first: object = task
     if isinstance(first, int) and not isinstance(first, bool):
         raise ConfigError(
-            f"make_vec: task={first}: the task comes first; give num_envs={first}."
+            f"make_vec: task={first}: the first argument is the task; give num_envs={first}."
         )
     if "vectorization_mode" in arguments:
         mode = format_value(arguments["vectorization_mode"])
-        reason = "one process steps all worlds together; leave it out, threads=2 uses two cores"
+        reason = "one process steps all worlds together; leave it out; threads=2 uses two cores"
         raise ConfigError(f"make_vec: vectorization_mode={mode}: {reason}.")
     return BridgeVectorEnv(num_envs, task=task, **arguments)

@@ -36,21 +36,21 @@ class Navigation(Task):
 
     ## Observation Space
 
-    `Box((B + 6,), float32)`, B beams, counter-clockwise, or sectors if `scan` says so:
+    `Box((B + 6,), float32)` for B beams, counter-clockwise, or sectors if `scan` says so:
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
-    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 0 to B - 1 | range as a fraction of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
     | B | distance to the goal | 0 | 1000 | m |
     | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
     | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
     | B + 5 | estimated turn rate | -1000 | 1000 | rad/s |
-    | B + 6 on | shares of the further `sensors`, if there are any | 0 | 1 | - |
+    | B + 6 on | fractions of the further `sensors`, if there are any | 0 | 1 | - |
 
     ## Action Space
 
     `Box(-1, 1, (C,), float32)`: each command between its limits; or `Discrete(7)`, the paper's
-    drives (`task.DRIVES`; 9 for a robot that moves sideways).
+    motion commands (`task.DRIVES`; 9 for a robot that moves sideways).
 
     ## Rewards
 
@@ -63,8 +63,8 @@ class Navigation(Task):
 
     ## Episode End
 
-    The goal is nearer than 0.3 m, or something touches the footprint, both judged from the robot's
-    own estimate and scan. A contact at the goal is no success.
+    The robot is within 0.3 m of the goal, or something touches its footprint; both are judged from
+    the robot's own estimate and scan. A contact at the goal is not a success.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -103,7 +103,7 @@ class Navigation(Task):
     def judge(
         self, view: RobotView, memory: Memory, before: RobotView | None = None
     ) -> GoalProgress:
-        """Judges which robots are at their goals, and which touch something."""
+        """Determines which robots are at their goals, and which touch something."""
         out = np.empty(
             (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
         )
@@ -112,7 +112,7 @@ class Navigation(Task):
     def reward(
         self, before: RobotView, after: RobotView, memory: Memory
     ) -> dict[str, Array]:
-        """The terms (...,) of the reward for a step; their sum is the reward."""
+        """The terms (...,) of the reward for a step, whose sum is the reward."""
         return self._terms(self.judge(after, memory, before))
 
     def end(self, view: RobotView, memory: Memory) -> Flags:

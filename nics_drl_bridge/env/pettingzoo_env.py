@@ -29,7 +29,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     ## Description
 
-    The agents are `robot_0` to `robot_<M - 1>`; the numbers are those of `BridgeEnv` with the
+    The agents are `robot_0` to `robot_<M - 1>`; all values equal those of `BridgeEnv` with the
     same arguments. An agent whose episode is over leaves `agents`; its robot stops and becomes
     another obstacle.
 
@@ -41,7 +41,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     ## Arguments
 
-    Those of `BridgeEnv`, and `max_episode_steps`, after which an episode is truncated.
+    Those of `BridgeEnv`, plus `max_episode_steps`, after which an episode is truncated.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own declaration
@@ -78,7 +78,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.possible_agents = [f"robot_{m}" for m in range(self.env.robots)]
         self.agents: list[str] = []
         of = self.env.task
-        # One space for each agent: a space has its own random generator.
+        # One space per agent, because each space has its own random generator.
         agents = self.possible_agents
         self.observation_spaces = {
             name: deepcopy(of.observation_space) for name in agents
@@ -97,10 +97,9 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
-        """Begins an episode with all agents; see PettingZoo."""
-        if isinstance(
-            options, dict
-        ):  # PettingZoo's checker resets with an option "options"
+        """Starts an episode with all agents; see PettingZoo."""
+        # PettingZoo's checker resets with an option "options"
+        if isinstance(options, dict):
             options = {
                 name: value for name, value in options.items() if name != "options"
             }
@@ -125,15 +124,15 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
         given: object = actions
         if not isinstance(given, dict):
-            needed = "must be a dict of an action for each agent"
+            needed = "must be a dict with an action per agent"
             raise ConfigError(f"actions of type {type(given).__name__}: {needed}.")
         if missing := sorted(set(self.agents) - set(actions)):
             raise ConfigError(
-                f"no action for {', '.join(missing)}; each agent that is left acts."
+                f"no action for {', '.join(missing)}; each remaining agent must act."
             )
         space = self.env.task.action_space
         rest: Any = np.zeros(space.shape or (), space.dtype)
-        # The env stops the robots that left, whatever their action.
+        # The env stops the robots of agents that left, so their action does not matter.
         joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
         if self.env.robots == 1:
             action = joint[0]
@@ -158,11 +157,11 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         return seen, rewards, ended, cut, infos
 
     def halt(self) -> None:
-        """Stops every robot until the next reset. Any exception has done so already."""
+        """Stops every robot until the next reset. Any exception has already done so."""
         self.env.halt()
 
     def _of(self, value: Any, m: int) -> Any:
-        """Robot m's row of a fact, or of each in a dict; a fact of the world unchanged."""
+        """Robot m's row of a fact, or of each fact in a dict; a fact of the world unchanged."""
         if isinstance(value, dict):
             of_world = ("goal", "bodies")
             return {

@@ -1,4 +1,4 @@
-"""Tasks by name or by the path of a user's file; the ids of environments, for Gymnasium."""
+"""Tasks by name or by the path of a user's file; ids of environments, for Gymnasium."""
 
 from collections.abc import Iterable
 from inspect import Parameter, signature
@@ -15,7 +15,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.lidar.sensor import Sensor
 
-TASKS = {  # module and class of each
+TASKS = {  # name -> module and class
     "navigation": "nics_drl_bridge.env.navigation:Navigation",
     "cooperative_reaching": "nics_drl_bridge.env.teams:CooperativeReaching",
     "pursuit_evasion": "nics_drl_bridge.env.teams:PursuitEvasion",
@@ -30,7 +30,7 @@ def make_task(
     """Makes a task for the robot of a model. Raises ConfigError if it does not fit.
 
     `task` is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
-    Task. Options are arguments of the class; `scan` as in `sectors.layout_of`; `sensors` are names.
+    Task. Options are arguments of the class: `scan` as in `sectors.layout_of`, `sensors` as names.
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
@@ -66,11 +66,11 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
 
 
 def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
-    """Returns a task's class; ConfigError if there is none, or it does not take the options."""
+    """Returns a task's class. Raises ConfigError if there is none, or it lacks an option."""
     found = task if isinstance(task, type) else _class_of(task)
     if not issubclass(found, Task):
         raise ConfigError(
-            f"task {found.__name__}: is no subclass of env.task.Task; derive it."
+            f"task {found.__name__}: is not a subclass of env.task.Task; derive it."
         )
     known = signature(found).parameters
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
@@ -89,12 +89,12 @@ def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) 
     name = type(task).__name__
     if options:
         raise ConfigError(
-            f"task {name} is already made; give {sorted(options)} to it, not beside."
+            f"task {name} already exists; set {sorted(options)} when making it."
         )
     if task.robot != model.robot or task.lidar != model.lidar:
         raise ConfigError(
-            f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
-            f"model of {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
+            f"task {name} is for the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
+            f"model is {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
             "model.lidar."
         )
     return task
@@ -137,20 +137,20 @@ def _tasks_in(module: Any) -> list[str]:
 
 
 def _missing_class(file: Path) -> str:
-    """Says what to give instead of a file without the name of a class in it."""
+    """What to give instead of a file without a class name."""
     if not file.is_file():
-        return "no such file; give path/to/file.py:ClassName."
+        return "the file does not exist; give path/to/file.py:ClassName."
     tasks = _tasks_in(extensions.load_module(str(file), "task"))
     if not tasks:
         return NO_TASK
-    return f"name the class in it, as {file}:{tasks[0]}."
+    return f"name its class, for example {file}:{tasks[0]}."
 
 
 NAVIGATION = "NicsBridge/Navigation-v0"
 COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
 PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
 TASK = "NicsBridge/Task-v0"
-ENVIRONMENTS = {  # id -> arguments that define it
+ENVIRONMENTS = {  # id -> arguments that define the environment
     NAVIGATION: {"task": "navigation"},
     COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
     PURSUIT_EVASION: {"task": "pursuit_evasion"},
@@ -160,7 +160,7 @@ MAX_EPISODE_STEPS = 300
 
 
 def register_envs() -> None:
-    """Registers every environment; importing this module does so too."""
+    """Registers every environment; importing this module also does so."""
     for name, arguments in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(

@@ -23,7 +23,7 @@ from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
 SIZE_IN = 5.0
 DPI = 100
 MARGIN = 0.05
-LEAST_SIDE_IN = 1.0  # of the picture of a long and narrow world
+LEAST_SIDE_IN = 1.0  # minimum side of a picture, for long and narrow worlds
 WALL = DARK
 STANDING = OTHER
 SCAN = VERMILION
@@ -31,7 +31,7 @@ ROBOTS = tuple(colour for colour in SERIES if colour != SCAN)
 
 
 class WorldPicture:
-    """Picture of a world, redrawn for each shot."""
+    """Picture of a world, redrawn for each snapshot."""
 
     def __init__(self, model: SimulatorModel, world: AnyWorld) -> None:
         self._model = model
@@ -47,7 +47,7 @@ class WorldPicture:
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def draw(self, shot: Snapshot, trails: Sequence[Array] = ()) -> NDArray[np.uint8]:
-        """Returns the pixels (H, W, 3) of a shot, with the ways (T, 2) that its robots came."""
+        """Returns the pixels (H, W, 3) of a snapshot, with its robots' paths (T, 2) so far."""
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
@@ -92,7 +92,7 @@ def draw_robot(
     zorder: float,
     **look: Any,
 ) -> None:
-    """Draws a robot that is round, or has an outline (V, 2) [m], and a line to its front."""
+    """Draws a round robot, or one with an outline (V, 2) [m], and a line to its front."""
     if outline is None:
         axes.add_patch(Disc((pose[0], pose[1]), radius, zorder=zorder, **look))
     else:

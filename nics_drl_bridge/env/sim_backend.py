@@ -1,4 +1,4 @@
-"""Backends of an env: the fast simulator in this process, those by name, and user-defined ones."""
+"""Backends of an env: the fast simulator in this process, registered ones, user-defined ones."""
 
 import math
 from inspect import signature
@@ -27,7 +27,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 
 def _sent(pose: Array) -> Array:
-    """Returns a pose (3,) as it comes out of a message, whose quaternion rounds the heading."""
+    """Returns a pose (3,) as decoded from a message, whose quaternion rounds the heading."""
     z = math.sin(float(pose[2]) / 2.0)
     w = math.cos(float(pose[2]) / 2.0)
     return np.array([pose[0], pose[1], math.atan2(2.0 * (w * z), 1.0 - 2.0 * (z * z))])
@@ -36,10 +36,10 @@ def _sent(pose: Array) -> Array:
 class SimBackend:
     """One world of the fast simulator, in this process.
 
-    With `estimator`, each robot's scan and odometry pass through its middleware as in the nodes, so
-    that this backend and the one over DDS give the same numbers. Without, the pose is that of the
-    odometry: bit-identical to a world of the vector env, and several times faster. Views and
-    commands have a leading (M,) if M > 1 `robots`; `simulation` are arguments of the FastSimulator.
+    With `estimator`, each robot's scan and odometry pass its middleware, as in the nodes, so that
+    this backend and the DDS backend return the same numbers. Without it, the pose is that of the
+    odometry: bit-identical to a world of the vector env, and several times as fast. Views and
+    commands have a leading (M,) for M > 1 `robots`; `simulation` is passed to the FastSimulator.
     """
 
     @check_arguments("backend 'sim'", FastSimulator, without=("worlds",))
@@ -66,7 +66,7 @@ class SimBackend:
         self._now_ns = 0
 
     def reset(self, start: Start) -> RobotView:
-        """Begins the episode of a seed; see `interface.Backend`."""
+        """Starts the episode of a seed; see `interface.Backend`."""
         robots = self.simulator.data.pose.shape[1]
         self.simulator.reset([start.seed], starts=start.pose.reshape(1, robots, 3))
         self._now_ns = 0
@@ -80,9 +80,8 @@ class SimBackend:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
         if self._middlewares:
-            command = self._robot.pass_through_cmd_vel(
-                command
-            )  # as over ROS 2: both round alike
+            # rounded like a message, so that both backends agree
+            command = self._robot.pass_through_cmd_vel(command)
         commands = command.reshape(data.pose.shape[1], -1)
         for middleware, one in zip(self._middlewares, commands, strict=False):
             middleware.command(self._now_ns, one)
@@ -90,7 +89,7 @@ class SimBackend:
         self._now_ns += self._period_ns
         told = {"stamp_ns": self._now_ns, **self._truth()}
         view = self._measure()
-        if self._middlewares:  # as of this view
+        if self._middlewares:  # at the time of this view
             every = np.array(
                 [each.estimator.covariance[:3, :3] for each in self._middlewares]
             )
@@ -98,7 +97,7 @@ class SimBackend:
         return view, told
 
     def facts(self) -> BackendFacts:
-        """Returns the truth, the obstacles and the draws; see `interface.Backend`."""
+        """Returns the truth, the obstacles and the drawn values; see `interface.Backend`."""
         simulator = self.simulator
         known: BackendFacts = {
             **self._truth(),
@@ -157,24 +156,24 @@ class SimBackend:
 
 
 class CompletedBackend:
-    """Wraps a user's backend without `halt`, for which it steps by `still`, or without `facts`."""
+    """Adds `halt` (by stepping with `still`) and `facts` to a user's backend that lacks them."""
 
     def __init__(self, backend: Any, still: Array) -> None:
         self._backend = backend
         self._still = still
         self._moved = False
         self._known = BackendFacts()
-        for name in ("halt", "facts"):  # the backend's own, if it has one
+        for name in ("halt", "facts"):  # the backend's own method, if it has one
             if callable(method := getattr(backend, name, None)):
                 setattr(self, name, method)
 
     def reset(self, start: Start) -> RobotView:
-        """Calls the backend's."""
+        """Resets the backend."""
         self._known = {}
         return self._backend.reset(start)  # type: ignore[no-any-return]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Calls the backend's."""
+        """Steps the backend."""
         self._moved = True
         view, facts = self._backend.step(command)
         if "true_pose" in facts:
@@ -182,13 +181,13 @@ class CompletedBackend:
         return view, facts
 
     def halt(self) -> None:
-        """Steps at a standstill if there was a step since the last halt."""
+        """Steps with the standstill command if there was a step since the last halt."""
         if self._moved:
             self._backend.step(self._still.copy())
             self._moved = False
 
     def facts(self) -> BackendFacts:
-        """Returns the true pose of the last step if that had it."""
+        """Returns the true pose of the last step, if the backend returned one."""
         return self._known
 
     def close(self) -> None:
@@ -198,7 +197,7 @@ class CompletedBackend:
 
 
 def completed(backend: Any, still: Array) -> Backend:
-    """Returns a backend with all methods. Raises ConfigError if it is none."""
+    """Returns a backend with all methods. Raises ConfigError if the object is not a backend."""
     if isinstance(backend, Backend):
         return backend
     needed = ("reset", "step", "close")
@@ -216,19 +215,15 @@ def completed(backend: Any, still: Array) -> Backend:
 def make_backend(
     name: str, model: SimulatorModel, world: AnyWorld, **options: Any
 ) -> Any:
-    """Makes a backend by the name under which it is registered, see `extensions`."""
+    """Makes a backend by its registered name, see `extensions`."""
     make = extensions.load("backends", name)
     try:
         signature(make).bind(model, world, **options)
     except TypeError as error:
-        raise ConfigError(
-            f"backend {name!r}: {error}; look at its arguments."
-        ) from None
+        raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None
     try:
         return make(model, world, **options)
-    except TypeError as error:  # of what such a function passes on
+    except TypeError as error:  # raised further inside, for arguments that it passes on
         if not any(f"argument '{name}'" in str(error) for name in options):
             raise
-        raise ConfigError(
-            f"backend {name!r}: {error}; look at its arguments."
-        ) from None
+        raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None

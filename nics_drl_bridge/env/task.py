@@ -1,4 +1,4 @@
-"""Task: the job of a robot, written once for one robot over ROS 2 and thousands in arrays."""
+"""Task: what a robot does, written once for one robot over ROS 2 and thousands in arrays."""
 
 import math
 from abc import ABC, abstractmethod
@@ -37,27 +37,26 @@ DRIVES = (
     (-1, 0, -1),
 )
 """Stop; ahead, to the left, to the right; and back: signs of linear.x, linear.y, angular.z, as in
-the authors' code (efc-robot/MultiVehicleEnv). What can't reverse stays, and turns if it can."""
-SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
+the authors' code (efc-robot/MultiVehicleEnv). A robot that can't reverse only turns, if it can."""
+SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # two more for a robot that moves sideways
 PARTS = ("update", "observation", "judge", "reward", "end", "info")
-"""Methods of a step; a class that overrides one is stepped by all, not in one pass of its base."""
-CONTACT_ANGLE = math.radians(4.0)  # 2 cm of what is 0.3 m away
+"""Methods of a step; if a class overrides one, its base's one-pass step is not used."""
+CONTACT_ANGLE = math.radians(4.0)  # 2 cm at a distance of 0.3 m
 
 
 @dataclass(frozen=True)
 class Episodes:
     """Episodes at their start, in n worlds with M robots."""
 
-    seeds: NDArray[
-        np.int64
-    ]  # (n,); all draws must follow from them, by `random_kernels.uniform`
+    # (n,) seeds, the only source of randomness, used with `random_kernels.uniform`
+    seeds: NDArray[np.int64]
     starts: Array  # (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`
     goals: Array  # (n, M, 2) free points that the world drew, one per robot [m]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a step: terms of the reward, whose sum it is, ended robots, facts for `info`."""
+    """Outcome of a step: reward terms, whose sum is the reward; ended robots; facts for `info`."""
 
     terms: dict[str, Array]
     ended: Flags
@@ -66,7 +65,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Sight:
-    """Directions (P,) [rad] and origin (2,) [m] of the scan parts, range of a share of 1 [m]."""
+    """Directions (P,) [rad] and origin (2,) [m] of the scan parts, range of a fraction of 1 [m]."""
 
     angles: Array
     origin: Array
@@ -84,25 +83,25 @@ class Task(ABC):
     `bearing` and `distance` instead of numpy's trigonometric functions.
     """
 
-    # True if a method uses `before.ranges`; otherwise these may be the new ones, without a copy
+    # True if a method uses `before.ranges`; if False they may be the new ranges, which saves a copy
     keeps_last_scan: ClassVar[bool] = True
-    # True if it observes the further `sensors`
+    # True if the task observes the further `sensors`
     observes_sensors: ClassVar[bool] = False
-    shown: ClassVar[
-        tuple[str, ...]
-    ] = ()  # names of memory arrays that `info` always contains
+    # names of memory arrays that `info` always contains
+    shown: ClassVar[tuple[str, ...]] = ()
 
-    robot: RobotSpec  # gives commands, their limits, and the footprint
-    lidar: LidarSpec  # gives the scan
-    # a Box, or `discrete`: the paper's drives, see `DRIVES`
+    robot: RobotSpec  # commands, their limits, and the footprint
+    lidar: LidarSpec  # lidar of the scan
+    # a Box, or `discrete`: the paper's motion commands, see `DRIVES`
     actions: Actions = "continuous"
-    # returns this close to the footprint count as a contact [m], in the mean of `CONTACT_ANGLE`
+    # returns this close to the footprint count as a contact [m], averaged over `CONTACT_ANGLE`
     contact_margin: float = 0.02
-    # of commands in m/s, where the robot's limits are wider [m/s]
+    # limit of commands in m/s, if the robot's own limits are higher [m/s]
     top_speed: float | None = None
-    # sectors instead of beams, to mean the same for any lidar; contact is judged from the beams
+    # sectors instead of beams, the same for any lidar; contacts are judged from the beams
     scan: ScanLayout | None = None
-    sensors: tuple[Sensor, ...] = ()  # further ones, whose shares end each observation
+    # further sensors, whose fractions end each observation
+    sensors: tuple[Sensor, ...] = ()
 
     def __init_subclass__(cls, **given: Any) -> None:
         super().__init_subclass__(**given)
@@ -115,9 +114,7 @@ class Task(ABC):
     def __post_init__(self) -> None:
         if self.actions not in ("continuous", "discrete"):
             known = suggest(str(self.actions), ("continuous", "discrete"))
-            raise ConfigError(
-                f"task option actions={self.actions!r}: no such actions; {known}"
-            )
+            raise ConfigError(f"task option actions={self.actions!r}: unknown; {known}")
         if self.top_speed is not None and not self.top_speed > 0.0:
             raise ConfigError(
                 f"task option top_speed={self.top_speed!r}: must be above 0 m/s."
@@ -125,12 +122,12 @@ class Task(ABC):
         if self.sensors and not self.observes_sensors:
             name = type(self).__name__
             raise ConfigError(
-                f"task option sensors: {name} observes no further sensors."
+                f"task option sensors: {name} does not observe further sensors."
             )
-        _ = self.plan  # a lidar that can't fill the layout is refused here
+        _ = self.plan  # refuses a lidar that can't fill the layout
 
     def check_above_zero(self, option: str, metres: float) -> None:
-        """Raises ConfigError for an option that is a length and not above 0 m."""
+        """Raises ConfigError unless the length option is above 0 m."""
         if not metres > 0.0:
             raise ConfigError(f"task option {option}={metres!r}: must be above 0 m.")
 
@@ -153,7 +150,7 @@ class Task(ABC):
 
     @abstractmethod
     def reset(self, episodes: Episodes) -> Memory:
-        """Returns the memory of episodes that begin; the env takes ownership of the arrays."""
+        """Returns the memory of starting episodes; the env takes ownership of the arrays."""
 
     @abstractmethod
     def observation(self, view: RobotView, memory: Memory) -> Observation:
@@ -167,17 +164,17 @@ class Task(ABC):
 
     @abstractmethod
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Returns True where a robot's episode is over, (...). A team ends with its last robot."""
+        """Returns True where a robot's episode is over, (...); a team ends with its last robot."""
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Returns facts for `info`; an evaluation reads `is_success` and `collision`."""
         return {}
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:  # noqa: B027
-        """Updates the memory after a step, in place, before anything is computed from it."""
+        """Updates the memory in place after a step, before anything is computed from it."""
 
     def command(self, action: ArrayLike) -> Array:
-        """Returns the command (..., C) of a discrete action, or one (..., C) cut to [-1, 1]."""
+        """Returns the command (..., C) of a discrete action, or one (..., C) clamped to [-1, 1]."""
         if self.actions == "discrete":
             return np.asarray(self.discrete_commands[np.asarray(action)])
         given = np.ascontiguousarray(action)
@@ -185,7 +182,7 @@ class Task(ABC):
         rows = given.reshape(-1, given.shape[-1])
         low, high = self.command_limits
         kernels.commands(out.reshape(rows.shape), rows, low, high)
-        # What a vehicle can't do is not to be learnt: a car by turn rates does not steer at rest.
+        # Do not teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
         return (
             self.robot.pass_through_cmd_vel(out) if self.robot.takes_turn_rate else out
         )
@@ -193,14 +190,14 @@ class Task(ABC):
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
-        """Returns the outcome of a step and writes the observation, maybe in one pass."""
+        """Returns the outcome of a step and writes the observation, possibly in one pass."""
         given = dict(memory)
         self.update(before, after, memory)
         if memory.keys() != given.keys():
             raise self._wrong(
-                f"memory {sorted(memory)}", f"must keep {sorted(given)} of `reset`"
+                f"memory {sorted(memory)}", f"must keep {sorted(given)} from `reset`"
             )
-        # What is bound anew goes into the rows, which are an env's; one may be another of before.
+        # Copy rebound arrays into the env's rows, all read first, because they may be aliases.
         anew = {
             n: np.array(memory[n]) for n, rows in given.items() if memory[n] is not rows
         }
@@ -209,9 +206,9 @@ class Task(ABC):
             if new.shape != rows.shape or not np.can_cast(
                 new.dtype, rows.dtype, "same_kind"
             ):
-                like = f"must stay {rows.dtype} of {rows.shape} in `update`"
+                like = f"must stay {rows.dtype} of shape {rows.shape} in `update`"
                 raise self._wrong(
-                    f"memory {name!r}", f"{like}, not {new.dtype} of {new.shape}"
+                    f"memory {name!r}", f"{like}, not {new.dtype} of shape {new.shape}"
                 )
             rows[...] = new
         out[...] = self.valid("observation", self.observation(after, memory), out.shape)
@@ -229,7 +226,7 @@ class Task(ABC):
         if np.asarray(ended).dtype != np.bool_:
             kind = np.asarray(ended).dtype
             raise self._wrong(
-                "end", f"must be True or False for each robot, and is {kind}"
+                "end", f"must be True or False for each robot, not {kind}"
             )
         return Outcome(terms, ended, info)
 
@@ -238,7 +235,7 @@ class Task(ABC):
         memory = self.reset(episodes)
         if not isinstance(memory, dict) or not memory.keys() >= set(self.shown):
             raise self._wrong(
-                "reset", f"must give a dictionary of arrays, with {[*self.shown]}"
+                "reset", f"must return a dictionary of arrays with {[*self.shown]}"
             )
         lead = episodes.starts.shape[:2]
         for name, rows in memory.items():
@@ -251,22 +248,22 @@ class Task(ABC):
         if not isinstance(given, np.ndarray) or given.shape[: len(lead)] != lead:
             fault = f"must be an array whose shape begins with {lead}"
             raise self._wrong(
-                what, f"{fault}, and is {type(given).__name__} of {np.shape(given)}"
+                what, f"{fault}, not {type(given).__name__} of shape {np.shape(given)}"
             )
 
     def _wrong(self, what: str, fault: str) -> ConfigError:
         return ConfigError(f"task {type(self).__name__}: its {what} {fault}.")
 
     def valid(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
-        """Returns what a method gave. Raises ConfigError if it is not finite, or of this shape."""
+        """Returns a user's result. Raises ConfigError unless it is finite and of this shape."""
         if np.shape(given) != shape or not _finite(given):
-            fault = f"must be finite, of shape {shape}, and is {given!r:.80} of {np.shape(given)}"
+            fault = f"must be finite, of shape {shape}, not {given!r:.80} of {np.shape(given)}"
             raise self._wrong(what, fault)
         return given
 
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:
-        """Commands (C,) of the least and of the greatest action."""
+        """Commands (C,) of the minimum and of the maximum action."""
         low = self.robot.command_low
         high = self.robot.command_high
         if self.top_speed is None:
@@ -283,7 +280,7 @@ class Task(ABC):
     # Building blocks of tasks.
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
-        """Space of a scan in shares (P), parts with these limits, and shares of `sensors` (Q)."""
+        """Space of scan fractions (P), parts with these limits, and fractions of `sensors` (Q)."""
         parts = self.scan_parts
         further = sum(sensor.parts for sensor in self.sensors)
         low = np.asarray(low, np.float32)
@@ -299,7 +296,7 @@ class Task(ABC):
         )
 
     def free_share(self, ranges: NDArray[np.float32]) -> Observation:
-        """Returns ranges (..., B) as shares of the maximum (..., P): 1 free, 0 close or unknown."""
+        """Returns ranges (..., B) as fractions (..., P): 1 free, 0 too close or unknown."""
         return self._look(ranges)[0]
 
     def touches(self, ranges: NDArray[np.float32]) -> Flags:
@@ -317,7 +314,7 @@ class Task(ABC):
         return shares, touched
 
     def sensor_shares(self, view: RobotView) -> Observation:
-        """Returns the shares (..., Q) of `sensors`, in their order."""
+        """Returns the fractions (..., Q) of `sensors`, in their order."""
         shares = [sensor.shares(view.sensed[sensor.name]) for sensor in self.sensors]
         return np.concatenate(shares, axis=-1)
 
@@ -338,7 +335,7 @@ class Task(ABC):
 
     @cached_property
     def plan(self) -> SectorPlan:
-        """Mapping of the lidar's beams to the sectors of `scan`; without it, one of no sectors."""
+        """Mapping of the lidar's beams to the sectors of `scan`; without it, no sectors."""
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 
     @cached_property
@@ -352,7 +349,7 @@ class Task(ABC):
 
 
 def _finite(given: Any) -> bool:
-    """True if all that a method gave are finite numbers."""
+    """True if all entries are finite numbers."""
     values = np.asarray(given)
     return values.dtype.kind in "fiub" and bool(np.isfinite(values).all())
 
@@ -373,7 +370,7 @@ def discrete_commands(robot: RobotSpec) -> Array:
 
 
 def still(robot: RobotSpec) -> Array:
-    """(C,) the command nearest to zero, which stops a robot."""
+    """Returns the command (C,) nearest to zero, which stops a robot."""
     nearest_zero: Array = np.clip(0.0, robot.command_low, robot.command_high)
     return nearest_zero
 
@@ -410,7 +407,7 @@ def distance(pose: ArrayLike, points: ArrayLike) -> Array:
 
 
 def limited(twist: Array) -> Array:
-    """Cuts a twist (..., 3) at `kernels.LIMIT`, so that observations stay in their space."""
+    """Clamps a twist (..., 3) to +-`kernels.LIMIT`, so that observations stay in their space."""
     return np.minimum(np.maximum(twist, -LIMIT), LIMIT)
 
 
@@ -425,7 +422,7 @@ def total(values: Array) -> Array:
 def contact_ranges(
     robot: RobotSpec, lidar: LidarSpec, margin: float
 ) -> NDArray[np.float32]:
-    """Ranges (B,) at which each beam leaves the footprint and a margin [m]; else -inf."""
+    """Ranges (B,) at which beams leave the footprint plus a margin [m]; -inf if they never do."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -441,10 +438,10 @@ def contact_ranges(
 
 
 def _leaves_outline(ray: Array, corners: Array) -> Array:
-    """(B,) distances at which rays (B, 2) from the origin last cross an outline (V, 2)."""
+    """Distances (B,) at which rays (B, 2) from the origin last cross an outline (V, 2)."""
     edge = np.roll(corners, -1, axis=0) - corners
     turned = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
-    steep = ray @ turned.T  # (B, V) of each ray and side
+    steep = ray @ turned.T  # (B, V) for each ray and side
     with np.errstate(divide="ignore", invalid="ignore"):
         away = np.sum(corners * turned, axis=-1) / steep
         where = (away[..., None] * ray[:, None] - corners) * edge

@@ -1,4 +1,4 @@
-"""Teaching beside the task: rewards by the truth, and failed episodes again."""
+"""Teaching in addition to the task: rewards from the ground truth, and repeated failed episodes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,15 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 
 
 class Teaching(Schema):
-    """Rewards by what only the simulator knows, and repetition; nothing by default."""
+    """Rewards from what only the simulator knows, and repeated episodes; off by default."""
 
-    # reward of a contact that the task misses, which ends the episode
+    # reward for a contact that the task does not detect; such a contact ends the episode
     contact: float | None = None
-    # reward of each metre by which the way around obstacles gets shorter
+    # reward per metre by which the path to the goal around obstacles gets shorter
     path: float = 0.0
-    retries: int = Field(
-        default=0, ge=0, le=1000
-    )  # times that a failed episode is driven again
-    # by which robots are larger all around while they learn [m], to keep away from what stands
+    # maximum number of repetitions of a failed episode
+    retries: int = Field(default=0, ge=0, le=1000)
+    # margin by which robots are larger while they learn [m], to keep away from obstacles
     margin: float = Field(default=0.0, ge=0.0, le=1.0)
 
 
@@ -33,12 +32,10 @@ class Teacher:
         self._given = given
         self._data = simulator.data
         self._guide: Guide | None = None
-        self._left = np.zeros(
-            simulator.data.pose.shape[:2]
-        )  # (N, M) lengths of the ways [m]
-        self._tries = np.zeros(
-            len(self._left), np.int64
-        )  # (N,) of the running episode again
+        # (N, M) remaining path lengths [m]
+        self._left = np.zeros(simulator.data.pose.shape[:2])
+        # (N,) repetitions so far of the current episode
+        self._tries = np.zeros(len(self._left), np.int64)
         if given.path:
             footprint = footprint_shape(simulator.model.robot)
             self._guide = Guide(simulator.sampler, footprint, len(self._left))
@@ -52,13 +49,13 @@ class Teacher:
         return known
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
-        """Begins episodes of some worlds (n,) in scenes, where the robots now are."""
+        """Starts episodes in some worlds (n,) with scenes that contain the robots."""
         if self._guide is not None:
             self._guide.begin(worlds, scenes)
             self._left[worlds] = self._guide.lengths(worlds, self._data)
 
     def judge(self, part: slice, outcome: Outcome) -> Outcome:
-        """An outcome of a part of the worlds, with these rewards besides."""
+        """Adds the teaching rewards to the outcome of a part of the worlds."""
         terms = outcome.terms
         ended = outcome.ended
         info = outcome.info
@@ -76,7 +73,7 @@ class Teacher:
     def again(
         self, over: NDArray[np.bool_], success: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Chooses the worlds (N,) that begin the episode which is over again."""
+        """Chooses the worlds (N,) that repeat the episode that has just ended."""
         again: NDArray[np.bool_] = over & ~success & (self._tries < self._given.retries)
         self._tries[over] = np.where(again, self._tries + 1, 0)[over]
         return again

@@ -16,7 +16,7 @@ from nics_drl_bridge.interface import Array, RobotView
 
 
 def pairs(pose: Array, points: Array) -> tuple[Array, Array]:
-    """Pairs each robot (..., M, 3) with each point (..., P, 2): broadcast to (..., M, P)."""
+    """Pairs each robot (..., M, 3) with each point (..., P, 2), broadcast to (..., M, P)."""
     return pose[..., None, :], points[..., None, :, :]
 
 
@@ -31,16 +31,16 @@ def others(of_all: Array) -> Array:
 
 @dataclass(frozen=True)
 class CooperativeReaching(Task):
-    """M robots have to reach M goals; a goal counts for all as soon as one robot was there.
+    """M robots have to reach M goals; a goal counts for all once any robot has reached it.
 
     ## Observation Space
 
-    Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams or sectors. The robots share
+    Per robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)` for B beams or sectors. The robots share
     their positions.
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
-    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 0 to B - 1 | range as a fraction of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
     | 4 for each goal | distance | 0 | 1000 | m |
     | | cosine, sine of the bearing | -1 | 1 | - |
     | | 1 if it has been reached | 0 | 1 | - |
@@ -50,7 +50,7 @@ class CooperativeReaching(Task):
 
     ## Action Space
 
-    Of one robot as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
+    Per robot, as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
 
     ## Rewards
 
@@ -64,8 +64,8 @@ class CooperativeReaching(Task):
 
     ## Episode End
 
-    For a robot when it touches something; it then stands still as another obstacle. For all
-    when the last goal is reached: a robot is within `goal_radius` [m] of it.
+    For a robot when it touches something; it then stands still as another obstacle. For all robots
+    when the last goal is reached, which means that a robot is within `goal_radius` [m] of it.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -104,7 +104,7 @@ class CooperativeReaching(Task):
         return {"goal": goals, "reached": none, "newly": none.copy()}
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
-        """Marks the goals that a robot is at."""
+        """Marks the goals that a robot has reached."""
         there = (
             task.distance(*pairs(after.pose, memory["goal"])) < self.goal_radius
         ).any(axis=-2)
@@ -131,13 +131,13 @@ class CooperativeReaching(Task):
     def reward(
         self, before: RobotView, after: RobotView, memory: Memory
     ) -> dict[str, Array]:
-        """The terms (..., M)."""
+        """Reward terms (..., M)."""
         lead = after.pose.shape[:-1]
         ways = (
             task.distance(*pairs(view.pose, memory["goal"])) for view in (before, after)
         )
         gaps = [way.min(axis=-2) for way in ways]
-        # A goal just reached still pays its last approach.
+        # A goal reached in this step still earns its last approach.
         approach = np.where(
             ~memory["reached"] | memory["newly"], gaps[0] - gaps[1], 0.0
         )
@@ -158,7 +158,7 @@ class CooperativeReaching(Task):
         )
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Success of the team, contacts, and the goals that have been reached (..., M)."""
+        """Success of the team, contacts, and the goals reached so far (..., M)."""
         return {
             "is_success": np.full(
                 view.pose.shape[:-1], memory["reached"].all(-1, keepdims=True)
@@ -176,29 +176,29 @@ class PursuitEvasion(Task):
 
     ## Observation Space
 
-    Of one robot, `Box((B + 5 (M - 1) + 1 + 3,), float32)`, B beams or sectors. Every robot knows
+    Per robot, `Box((B + 5 (M - 1) + 1 + 3,), float32)` for B beams or sectors. Every robot knows
     the positions of all others.
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
-    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 0 to B - 1 | range as a fraction of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
     | 5 for each other robot, in order | distance | 0 | 1000 | m |
     | | cosine, sine of the bearing | -1 | 1 | - |
-    | | 1 if it is on the same side | 0 | 1 | - |
-    | | 1 if it is out: caught, or touched something | 0 | 1 | - |
-    | then 1 | 1 if the robot itself pursues | 0 | 1 | - |
+    | | 1 if it is on the same team | 0 | 1 | - |
+    | | 1 if it is out: caught, or in contact with something | 0 | 1 | - |
+    | then 1 | 1 if the robot itself is a pursuer | 0 | 1 | - |
     | the last 3 | estimated velocity forward, left; turn rate | -1000 | 1000 | m/s, rad/s |
 
     ## Action Space
 
-    Of one robot as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
+    Per robot, as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
 
     ## Rewards
 
     `pursuit`: for a pursuer, 1 per metre of approach to the nearest evader that is not out; for an
     evader, 1 per metre gained on the nearest pursuer. `capture`: 10 for every pursuer for each
     evader that is caught, -10 for that evader. `time`: -0.01 per step for a pursuer, 0.01 for an
-    evader. `collision`: -10 for a robot that touches something otherwise. To train one side, use
+    evader. `collision`: -10 for a robot that touches something else. To train one side, use
     that side's rewards, from `info["reward_terms"]` or from the PettingZoo env; the reward of the
     Gymnasium env is the sum over all robots.
 
@@ -209,7 +209,7 @@ class PursuitEvasion(Task):
     ## Episode End
 
     For an evader when the free space between it and a pursuer is below `capture_gap` [m]; for any
-    robot when it touches something otherwise; it then stands still as another obstacle. For all
+    robot when it touches something else, after which it stands still as another obstacle. For all
     when all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
     """
 
@@ -228,7 +228,7 @@ class PursuitEvasion(Task):
         self.check_above_zero("capture_gap", self.capture_gap)
         if min(self.pursuers, self.evaders) < 1:
             given = f"pursuers={self.pursuers}, evaders={self.evaders}"
-            raise ConfigError(f"task options {given}: at least 1 each.")
+            raise ConfigError(f"task options {given}: need at least 1 each.")
 
     @property
     def robots(self) -> int:
@@ -264,7 +264,7 @@ class PursuitEvasion(Task):
         memory["out"] |= caught | self._collided(after, memory)
 
     def _gaps(self, view: RobotView, memory: Memory) -> Array:
-        """(..., M) [m] to the nearest robot of the other side that is not out; inf without one."""
+        """Distances (..., M) [m] to the nearest active robot of the other side; inf if none."""
         between = task.distance(*pairs(view.pose, view.pose[..., :2]))
         foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
         return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
@@ -289,8 +289,8 @@ class PursuitEvasion(Task):
     def reward(
         self, before: RobotView, after: RobotView, memory: Memory
     ) -> dict[str, Array]:
-        """The terms (..., M)."""
-        # Evaders caught in this step still count for this step.
+        """Reward terms (..., M)."""
+        # Evaders caught in this step still count in this step.
         known = {**memory, "out": memory["out"] & ~memory["newly"]}
         gap = [self._gaps(view, known) for view in (before, after)]
         free = np.isfinite(gap[0]) & np.isfinite(gap[1])
@@ -313,7 +313,7 @@ class PursuitEvasion(Task):
         return np.asarray(self.touches(view.ranges) & ~memory["newly"])
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Returns the robots that are out; all of them when one side has none left."""
+        """Returns the robots that are out; all robots once a side has none left."""
         out = memory["out"]
         over = [
             out[..., side].all(-1, keepdims=True)

@@ -38,11 +38,10 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Facts = Mapping[
-    str, Any
-]  # name -> array whose first dimension is the world, or such a mapping
+# name -> array whose first dimension is the world, or such a mapping
+Facts = Mapping[str, Any]
 Rows = slice | NDArray[np.intp] | Flags
-LARGE = 2**20  # Size from which zeros come fresh from the operating system [bytes]
+LARGE = 2**20  # size above which zeros come fresh from the operating system [bytes]
 MODES = {
     mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
 }
@@ -56,7 +55,7 @@ class BridgeVectorEnv(
     ## Description
 
     Task, spaces, rewards and ends are those of `BridgeEnv` with `backend="sim"`, and so are the
-    numbers: world i of `reset(seed=s)` is bit-identical to the single env of `reset(seed=s + i)`,
+    results: world i of `reset(seed=s)` is bit-identical to the single env of `reset(seed=s + i)`,
     in later episodes too, for any `num_envs` and number of threads.
 
     ## Spaces, Rewards, Starting State, Episode End
@@ -70,13 +69,13 @@ class BridgeVectorEnv(
 
     `num_envs` is N; `model` (or `robot`), `world`, `task`, `task_options` are those of `BridgeEnv`.
     An episode is truncated after `max_episode_steps`. `autoreset_mode` is `NextStep` (an ended
-    world is reset in the next step, whose action it ignores) or `SameStep` (at once; the last
-    observation is in `info["final_obs"]`). With `copy` the caller may keep what
-    `step` returns; False reuses the array of the observation in the next step. `render_mode` is
+    world is reset in the next step, which ignores its action) or `SameStep` (at once; the last
+    observation is in `info["final_obs"]`). With `copy=True` the caller may keep what
+    `step` returns; with False the next step reuses the observation array. `render_mode` is
     `rgb_array`, of every world, or None. Further arguments are those of the FastSimulator:
-    `renderer` (`baked` by default, or `exact`), `threads`, on which the numbers do not depend, and
-    `randomisation`, see `BridgeEnv`. Raises ConfigError, ModelError for an unknown name or a wrong
-    file.
+    `renderer` (`baked` by default, or `exact`), `threads`, which does not affect the results, and
+    `randomisation`, see `BridgeEnv`. Raises ConfigError or ModelError for an unknown name or a
+    wrong file.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
@@ -153,11 +152,11 @@ class BridgeVectorEnv(
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
-        # False after an exception too, which leaves worlds between two steps
+        # also False after an exception, which leaves worlds between two steps
         self.ready = False
 
     def teach(self, given: Teaching) -> None:
-        """Adds rewards beside the task's from the next reset on, and retries in `SameStep`."""
+        """Adds teaching rewards from the next reset on, and repetitions in `SameStep`."""
         self._teacher = Teacher(given, self.simulator)
 
     @property
@@ -184,19 +183,19 @@ class BridgeVectorEnv(
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode in every world; world i takes its seeds from `seed + i`."""
+        """Starts an episode in every world; world i takes its seeds from `seed + i`."""
         guard.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = chosen_worlds(options, self.num_envs)
         if not (self.ready or chosen.all()):
             raise gymnasium.error.ResetNeeded(
-                "call reset() of all worlds before one of some."
+                "reset all worlds before you reset some of them."
             )
         seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
         self.ready = False
         self._first[fresh] = seeds[fresh]
         self._episode[fresh] = -1
-        if not chosen.all():  # the others keep their observation
+        if not chosen.all():  # the other worlds keep their observation
             self._out[...] = self.task.observation(self._view(slice(None)), self.memory)
         self._begin(np.flatnonzero(chosen), self._out, options)
         infos = masked(self._known() | self._beginnings(), chosen, True)
@@ -261,7 +260,7 @@ class BridgeVectorEnv(
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
-        """One control period in every world; see Gymnasium."""
+        """Advances every world by one control period; see Gymnasium."""
         if not self.ready:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = guard.check_action(actions, self.action_space, "actions").reshape(
@@ -269,7 +268,7 @@ class BridgeVectorEnv(
         )
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
-        begun = self._over.copy()  # these ignore their action and are reset
+        begun = self._over.copy()  # these worlds ignore their action and are reset
         run = self.simulator.run_parts
         outcome = joined(run(lambda part: self._advance(part, given[part], out, begun)))
         terminated = self.ended.all(axis=1) & ~begun
@@ -333,12 +332,11 @@ class BridgeVectorEnv(
         facts: dict[str, Any],
         infos: dict[str, Any],
     ) -> None:
-        """SAME_STEP: resets the worlds that ended; `infos` gets their last observation and info."""
+        """Resets ended worlds in `SameStep`; `infos` gets their last observation and info."""
         if over.any():
             shown = np.full(self.num_envs, None, dtype=object)
-            for n in np.flatnonzero(
-                over
-            ):  # only those that ended: each needs its own object
+            # only ended worlds, because each needs its own object
+            for n in np.flatnonzero(over):
                 shown[n] = flat(out)[n].copy()
             infos |= masked({"final_obs": shown}, over)
             infos |= masked({"final_info": self._known() | facts}, over, True)
@@ -358,7 +356,7 @@ class BridgeVectorEnv(
         if not begun.all():
             infos |= masked(facts, ~begun, some)
 
-    # Facts as arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
+    # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
     def _known(self) -> dict[str, Any]:
         shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
@@ -391,7 +389,8 @@ class BridgeVectorEnv(
         if self.render_mode is None:
             return None
         if not self._pictures:
-            from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
+            # imported here because it loads matplotlib
+            from nics_drl_bridge.env.rendering import WorldPicture
 
             self._pictures = [
                 WorldPicture(self.model, self.world) for _ in range(self.num_envs)
@@ -401,7 +400,7 @@ class BridgeVectorEnv(
         )
 
     def snapshot(self, n: int) -> Snapshot:
-        """All that a picture of world n shows now; `step` does not change its arrays."""
+        """The current state of world n for a picture; `step` does not change its arrays."""
         data = self.simulator.data
         bodies = self.simulator.obstacles_of(np.array([n]))[0]
         goals = goals_of(
@@ -450,10 +449,10 @@ def named_seeds(
     unnamed: Flags,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], Flags]:
-    """Seeds (N,) that a reset gives to worlds, and a mask (N,) of those that begin anew with them.
+    """Seeds (N,) that a reset gives to worlds, and a mask (N,) of those that restart with them.
 
-    The seed is that of the first world, or of each (None keeps its present one), or None for all.
-    For `chosen` worlds that are `unnamed`, as they never had a seed, one is drawn if none is given.
+    The seed is that of the first world, or one per world (None keeps its present one), or None for
+    all. For `chosen` worlds that are `unnamed`, having never had a seed, one is drawn if needed.
     """
     count = len(chosen)
     if isinstance(seed, Sequence | np.ndarray):
@@ -471,13 +470,13 @@ def named_seeds(
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Returns zeros; of many, those that are never written take neither time nor memory.
+    """Returns zeros; pages of large arrays that are never written cost neither time nor memory.
 
-    `numpy.zeros` is as good until the C library keeps such memory to use it again: it then writes
-    all of it, which for many obstacles took a fifth of a step.
+    `numpy.zeros` is as good until the C library reuses such memory: it then writes all of it, which
+    for many obstacles took a fifth of a step.
     """
     size = math.prod(shape) * dtype.itemsize
-    if size < LARGE or not hasattr(mmap, "MAP_PRIVATE"):  # as on Windows
+    if size < LARGE or not hasattr(mmap, "MAP_PRIVATE"):  # Windows
         return np.zeros(shape, dtype)
     fresh = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
@@ -486,7 +485,7 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
-    """Pairs facts (N, ...) with masks `_name` (N,), as Gymnasium; zero elsewhere if `alone`."""
+    """Pairs facts (N, ...) with masks `_name` (N,), like Gymnasium; zero elsewhere if `alone`."""
     paired: dict[str, Any] = {}
     gone = ~mask
     most = 2 * np.count_nonzero(mask) > len(mask)

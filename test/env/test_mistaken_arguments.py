@@ -141,7 +141,9 @@ def test_every_env_takes_either_word_for_its_robot(make: Maker, word: str) -> No
 def test_make_and_make_vec_take_the_task_first() -> None:
     assert nics_drl_bridge.make("pursuit_evasion").unwrapped.robots == 3
     assert nics_drl_bridge.make_vec("pursuit_evasion", 2).num_envs == 2
-    with pytest.raises(BridgeError, match="the task comes first; give num_envs=8"):
+    with pytest.raises(
+        BridgeError, match="the first argument is the task; give num_envs=8"
+    ):
         nics_drl_bridge.make_vec(8)
 
 
@@ -197,8 +199,8 @@ class ObservesTooLittle(Navigation):
 @pytest.mark.parametrize(
     ("task", "sentence"),
     [
-        (EndsByFloats, "its end must be True or False for each robot, and is float64"),
-        (ResetsToAnArray, "its reset must give a dictionary of arrays"),
+        (EndsByFloats, "its end must be True or False for each robot, not float64"),
+        (ResetsToAnArray, "its reset must return a dictionary of arrays"),
         (RewardsByText, "its reward term 'progress' must be finite"),
         (ObservesTooLittle, "its observation must be finite, of shape"),
     ],
@@ -223,9 +225,9 @@ def test_a_task_that_returns_what_no_task_may_is_told_which_method(
         (
             "from nics_drl_bridge.env.navigation import Navigation\nclass Mine(Navigation): pass",
             "",
-            "name the class in it, as .*:Mine",
+            "name its class, for example .*:Mine",
         ),
-        (None, "", "no such file; give path/to/file.py:ClassName"),
+        (None, "", "the file does not exist; give path/to/file.py:ClassName"),
     ],
 )
 def test_a_file_without_a_task_is_told(

@@ -108,7 +108,7 @@ def test_the_own_tasks_terms_stand_in_info_and_sum_to_the_reward():
             None,
             "make it with model.robot and model.lidar",
         ),
-        (Navigation(DIRECT, lidar()), {"goal_radius": 1.0}, "is already made"),
+        (Navigation(DIRECT, lidar()), {"goal_radius": 1.0}, "already exists"),
     ],
 )
 def test_a_wrong_task_gives_one_sentence(task, options, sentence):
@@ -458,14 +458,14 @@ def test_a_memory_that_update_shifts_holds_what_was_there(make):
         (
             "reset",
             lambda rows: {"goal": rows},
-            "reset must give a dictionary of arrays, with",
+            "reset must return a dictionary of arrays with",
         ),
         (
             "reset",
             lambda rows: {"count": rows[:, 0]},
             "memory 'count', which is shown, must be",
         ),
-        ("reset", lambda _: None, "reset must give a dictionary of arrays"),
+        ("reset", lambda _: None, "reset must return a dictionary of arrays"),
     ],
 )
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
@@ -501,6 +501,6 @@ def test_a_command_of_no_numbers_is_named_in_a_vector_too():
     env = BridgeVectorEnv(2, direct_model(), field(), Senseless)
     env.reset(seed=0)
     with pytest.raises(
-        ConfigError, match=r"^the task's command .* look at its `command`"
+        ConfigError, match=r"^the task's command .* check its `command`"
     ):
         env.step(np.zeros((2, 3), np.float32))

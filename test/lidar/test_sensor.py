@@ -206,7 +206,7 @@ def test_what_is_no_sensor_is_refused(given, named):
 
 
 def test_a_task_that_observes_no_sensors_refuses_them(model):
-    with pytest.raises(BridgeError, match="observes no further sensors"):
+    with pytest.raises(BridgeError, match="does not observe further sensors"):
         make_task("cooperative_reaching", model, {"sensors": ["rear"]})
     with pytest.raises(ConfigError, match=r"no sensor 'raer'.*rear"):
         make_task("navigation", model, {"sensors": ["raer"]})

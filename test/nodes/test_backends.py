@@ -560,7 +560,7 @@ def test_what_topics_can_not_give_is_refused(model):
     [
         (
             {"domian_id": 3},
-            "backend 'dds': .*argument 'domian_id'; look at its arguments",
+            "backend 'dds': .*argument 'domian_id'; check its arguments",
         ),
         (
             {"namespace": "ant 1"},

@@ -83,12 +83,12 @@ def test_a_task_that_tells_neither_success_nor_collision_is_driven_to_the_end():
 
 def test_an_action_that_is_no_number_is_told_with_its_step(env):
     with pytest.raises(
-        ConfigError, match="the policy's action in step 1 holds NaN or inf"
+        ConfigError, match="the policy's action in step 1 contains NaN or inf"
     ):
         drive(env, Constant(np.nan, 0.0, 0.0), seed=1)
     many = BridgeVectorEnv(2, direct_model(), field())
     with pytest.raises(
-        ConfigError, match="the policy's action in step 1 holds NaN or inf"
+        ConfigError, match="the policy's action in step 1 contains NaN or inf"
     ):
         drive_worlds(many, lambda seen: np.full((len(seen), 3), np.nan), [1, 2])
 

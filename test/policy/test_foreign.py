@@ -98,7 +98,7 @@ def test_an_evaluation_names_a_command_that_is_none_and_keeps_what_was_driven_be
         places=(FAST,),
     )
     with pytest.raises(
-        ConfigError, match="the policy's action in step 1 holds NaN or inf"
+        ConfigError, match="the policy's action in step 1 contains NaN or inf"
     ):
         evaluate(order, lambda _: None, lambda *_: None)
     kept = json.loads((tmp_path / "out" / "evaluation.json").read_text())

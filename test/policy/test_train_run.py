@@ -155,7 +155,7 @@ def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(
         (
             '["goal"])}',
             '["goal"])[0]}',
-            "'near' must be finite, of shape (8, 1), and is array(",
+            "'near' must be finite, of shape (8, 1), not array(",
         ),
         (
             '{"near": -distance(after.pose, memory["goal"])}',
