@@ -1,4 +1,4 @@
-"""Acceptance of a model: one of three words by stated thresholds, and the reasons for it."""
+"""Acceptance of a model: one of three verdicts by stated thresholds, with the reasons."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
-JUDGED_S = 5.0  # horizon of the predictions by which a model is accepted
+JUDGED_S = 5.0  # horizon of the predictions that decide on a model
 
 
 class Verdict(StrEnum):
-    """What a model is fit for."""
+    """What a model is suitable for."""
 
     GOOD = "good"
     WITH_CARE = "usable with care"
@@ -22,29 +22,29 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Limits of a verdict; errors are those of predictions over 5 s on data held out."""
+    """Thresholds of a verdict; errors are those of predictions over 5 s on held-out data."""
 
-    # A policy corrects its course ten times a second. It hardly notices a simulator that strays by
-    # a tenth of the path in 5 s; the usual randomisation of gains and lags covers as much.
-    good_error: float = 0.10  # share of the path
-    # A robot that strays by a quarter of its path in 5 s is another robot: what a policy learns
-    # there does not hold on the real one.
-    worst_error: float = 0.25  # share of the path
-    # 30 s hold six independent predictions of 5 s, so that a sound band of 95 % holds 80 % and
-    # more on single drives.
-    good_coverage: float = 0.80  # share of the ends within the 95 % band
-    # A band that misses half of the ends says nothing about the model's errors: the part that was
-    # held out is another motion than the part that was learnt.
-    worst_coverage: float = 0.50  # share of the ends within the 95 % band
+    # A policy corrects its course ten times a second, so it hardly notices a simulator that strays
+    # by a tenth of the path in 5 s; the usual randomisation of gains and lags covers as much.
+    good_error: float = 0.10  # fraction of the path
+    # A robot that strays by a quarter of its path in 5 s is a different robot: what a policy
+    # learns there does not transfer to the real one.
+    worst_error: float = 0.25  # fraction of the path
+    # 30 s contain six independent predictions of 5 s, so a sound 95 % band covers at least 80 % on
+    # a single drive.
+    good_coverage: float = 0.80  # fraction of the end points within the 95 % band
+    # A band that misses half of the ends says nothing about the model's errors: the held-out part
+    # is a different kind of motion from the training part.
+    worst_coverage: float = 0.50  # fraction of the end points within the 95 % band
     # The noise of a comparison is the standard error of the mean difference between both errors on
-    # the same windows: two models that are nearer to each other can't be ranked by this drive. A
-    # wider margin would write models that are likely worse than a textbook of fewer values.
+    # the same windows: this drive can't rank two models that are closer than that. A wider margin
+    # would accept models that are probably worse than a textbook with fewer parameters.
     standard_errors: float = 1.0
-    # No policy learns otherwise from two simulators that differ by less.
-    alike: float = 0.005  # share of the path
-    # Of what the robot did while its pose was unknown nothing was learnt, and nothing was tested.
-    most_unseen: float = 0.10  # share of the drive
-    # In a shorter gap a robot goes on as before; predictions over 5 s bridge it.
+    # Two simulators that differ by less train the same policy.
+    alike: float = 0.005  # fraction of the path
+    # Motion while the pose was missing was neither learnt nor tested.
+    most_unseen: float = 0.10  # fraction of the drive
+    # Across a shorter gap the motion hardly changes; predictions over 5 s bridge it.
     shortest_unseen_s: float = 1.0
 
 
@@ -64,21 +64,20 @@ class Assessment:
     """A verdict and its reasons."""
 
     verdict: Verdict
-    reasons: tuple[
-        str, ...
-    ]  # a sentence for each threshold that a good model keeps and this not
+    # a sentence for each threshold of a good model that this one misses
+    reasons: tuple[str, ...]
 
 
 def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
-    """Returns the errors after 5 s, or the most that was held out; none if nothing was."""
+    """Returns the errors after 5 s, or at the longest held-out horizon; empty if there is none."""
     return [each for each in judgement if each.horizon_s <= JUDGED_S][-1:]
 
 
 def comparison_noise(difference: Array, start_t: Array, horizon: float) -> float:
     """Returns the noise [m] of a mean difference (W,) between two errors on the same windows.
 
-    That is its standard error, where all windows that start within one `horizon` [s] count as one
-    observation, as they overlap; within one horizon alone, the standard deviation.
+    This is its standard error, counting all windows that start within one `horizon` [s] as one
+    observation, because they overlap; within a single horizon, it is the standard deviation.
     """
     cluster = np.floor((start_t - start_t.min()) / horizon).astype(np.intp)
     count = len(np.unique(cluster))
@@ -92,7 +91,7 @@ def comparison_noise(difference: Array, start_t: Array, horizon: float) -> float
 def compare(
     ours: EndErrors, theirs: EndErrors, noise_m: float | None, path_m: float
 ) -> Outcome:
-    """Ranks a model beside a yardstick, by the noise of the comparison [m]."""
+    """Ranks a model against a yardstick, given the noise of the comparison [m]."""
     tie = max(THRESHOLDS.standard_errors * (noise_m or 0.0), THRESHOLDS.alike * path_m)
     difference = ours.position_m - theirs.position_m
     if not np.isfinite(ours.position_m) or difference > tie:
@@ -111,14 +110,14 @@ def loses_to_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
 
 
 def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
-    """Says which yardsticks a model does not beat after 5 s, or the most that was held out."""
+    """Yields the yardsticks that a model does not beat after 5 s, or at the longest horizon."""
     for at in usual(judgement):
         yield from shortfall_of_textbook(at)
         yield from shortfall_of_twist(at)
 
 
 def shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
-    """Says that predictions are worse than the fitted textbook's; one as good is no shortfall."""
+    """Yields a sentence if predictions are worse than the fitted textbook's; a tie is fine."""
     if at.textbook is None:
         return
     if compare(at.model, at.textbook, at.textbook_noise_m, at.path_m) is Outcome.WORSE:
@@ -126,13 +125,13 @@ def shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
 
 
 def shortfall_of_twist(at: HorizonErrors) -> Iterator[str]:
-    """Says that predictions are no better than those of a robot that keeps its twist."""
+    """Yields a sentence if predictions are no better than those of a constant twist."""
     outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
     finding = _beside("a constant twist", at, at.kept_twist)
     if outcome is Outcome.WORSE:
         yield f"{finding}."
     if outcome is Outcome.ALIKE:
-        yield f"{finding}, too near to be told apart: the commands explain little of this drive."
+        yield f"{finding}, too close to distinguish: the commands explain little of this drive."
 
 
 def _beside(name: str, at: HorizonErrors, errors: EndErrors) -> str:
@@ -142,8 +141,8 @@ def _beside(name: str, at: HorizonErrors, errors: EndErrors) -> str:
 
 
 def relative_error(at: HorizonErrors, radius: float) -> float:
-    """Returns an error as a share of the path, or of a robot's radius [m] if that is longer."""
-    # A robot that turns on the spot has no path.
+    """Returns an error as a fraction of the path, or of the robot's radius [m] if longer."""
+    # A robot that turns in place has no path.
     return at.model.position_m / max(at.path_m, radius, 1e-9)
 
 
@@ -152,7 +151,7 @@ def rate(
 ) -> Assessment:
     """Rates predictions of a robot of a radius [m]; `textbook` if they are those of its textbook.
 
-    Of a model that was never tried on unseen data nothing is known.
+    A model that was never tried on unseen data gets no verdict on its errors.
     """
     judged = usual(judgement)
     if not judged:
@@ -177,12 +176,12 @@ def combined(ratings: Iterable[Assessment]) -> Assessment:
 
 
 def rate_unseen(gap_s: float, duration_s: float) -> Assessment:
-    """Rates the time without a pose [s] beside the duration of a drive [s]."""
+    """Rates the time without a pose [s] relative to the duration of a drive [s]."""
     share = gap_s / max(duration_s, 1e-9)
     if share <= THRESHOLDS.most_unseen:
         return Assessment(Verdict.GOOD, ())
     finding = f"The pose is missing for {gap_s:.1f} s, {share:.0%} of the drive"
-    limit = f"beyond {THRESHOLDS.most_unseen:.0%} too much of the motion was not seen"
+    limit = f"beyond {THRESHOLDS.most_unseen:.0%} too much of the motion is missing"
     return Assessment(Verdict.WITH_CARE, (f"{finding}: {limit}.",))
 
 
@@ -192,7 +191,7 @@ def _rate_error(at: HorizonErrors, radius: float) -> Assessment:
     if share <= limits.good_error:
         return Assessment(Verdict.GOOD, ())
     if not np.isfinite(share):
-        return Assessment(Verdict.DO_NOT_TRAIN, ("Its predictions run away.",))
+        return Assessment(Verdict.DO_NOT_TRAIN, ("Its predictions diverge.",))
     far = f"After {at.horizon_s:g} s its predictions of unseen data end {share:.1%} of their path"
     if share <= limits.worst_error:
         reason = f"{far} away, those of a good model within {limits.good_error:.0%}."
@@ -222,7 +221,7 @@ def _rate_beside_twist(at: HorizonErrors) -> Assessment:
 
 
 def _rate_beside_standing(at: HorizonErrors, radius: float) -> Assessment:
-    """Rates predictions beside a robot that never moves, which noise alone makes a path of."""
+    """Rates predictions against a robot that never moves, for which noise alone makes up a path."""
     if at.standing is None or at.path_m <= radius:
         return Assessment(Verdict.GOOD, ())
     outcome = compare(at.model, at.standing, at.standing_noise_m, 0.0)

@@ -1,4 +1,4 @@
-"""Textbook terms for inputs that a drive did not move. Opt-in only."""
+"""Textbook terms for inputs that a drive did not move; opt-in only."""
 
 from dataclasses import dataclass, field
 
@@ -17,9 +17,9 @@ DIFFERENCE = 1e-4
 def assume_textbook(
     model: TaylorModel, spec: RobotSpec, unmoved: tuple[str, ...]
 ) -> tuple[TaylorModel, tuple[str, ...]]:
-    """Adds textbook terms for inputs that never moved; ConfigError: the spec names no textbook."""
-    # A fit at a constant input is a section through the whole model: `wz = c speed`, measured at
-    # the steering angle s0, becomes `wz = (c/s0) speed*steering`; at s0 = 0 by the parameters.
+    """Adds textbook terms for inputs that never moved; ConfigError if the spec has no textbook."""
+    # A fit at a constant input is a section through the full model: `wz = c speed`, measured at
+    # the steering angle s0, becomes `wz = (c/s0) speed*steering`; at s0 = 0 parameters are used.
     named = model.named
     rows = {dof: dict(terms) for dof, terms in named.terms.items()}
     point = dict(zip(model.variables, (model.low + model.high) / 2.0, strict=True))
@@ -47,9 +47,9 @@ class _Completion:
     spec: RobotSpec
     book: Textbook
     unmoved: tuple[str, ...]
-    point: dict[str, float]  # middle of the range of each variable
+    point: dict[str, float]  # middle of each variable's range
     rows: dict[str, dict[str, float]]  # coefficients by dof and term, to be completed
-    assumed: list[tuple[str, str]]  # dof and term
+    assumed: list[tuple[str, str]]  # (dof, term) pairs
     notes: list[str] = field(default_factory=list)
 
     def restore_twist(self, i: int) -> None:
@@ -92,7 +92,7 @@ class _Completion:
     def widened(
         self, valid: dict[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
-        """Returns the ranges, as wide as commands reach for parts of the twist that are assumed."""
+        """Returns the ranges, widened to what commands can reach for assumed parts of the twist."""
         told = {dof for dof, _ in self.assumed}
         for variable in self.spec.state:
             if variable.twist and f"d_{variable.name}" in told:
@@ -103,10 +103,10 @@ class _Completion:
 
     @property
     def source(self) -> str:
-        """Says where the parameters of the textbook are from."""
+        """States where the textbook's parameters come from."""
         if not (assumed := ", ".join(self.spec.assumed)):
             return "from the parameters in the robot's YAML file"
-        return f"by default, as the robot's YAML file gives no {assumed}"
+        return f"by default, because the robot's YAML file gives no {assumed}"
 
     def restore_rate(self, i: int) -> None:
         """Makes a state follow the commands that never moved, with its lag (learnt or nominal)."""
@@ -138,7 +138,7 @@ class _Completion:
     def _following(
         self, i: int, row: dict[str, float], rate: float
     ) -> dict[str, float]:
-        """Returns the terms by which a state follows commands, each on its own."""
+        """Returns the terms by which a state follows commands, one per command."""
         commands = self.spec.command
         target = self.book.target
         here = np.array([self.point[c.name] for c in commands])

@@ -1,4 +1,4 @@
-"""Errors of a model on each of the recordings that it was fitted to together."""
+"""Errors of a model on each of the recordings that it was jointly fitted to."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -11,14 +11,15 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 HORIZONS_S = (5.0, 2.0, 1.0, 0.5)
-FEWEST = 5  # windows of each recording
+FEWEST = 5  # minimum number of windows per recording
 SPACING_S = 0.5
-ALONE = 2.5  # times the errors of the others from which on a recording is off alone
-LEAST_SHARE = 0.02  # of the path: smaller errors are no matter
+# ratio to the errors of the other recordings from which one is reported as off
+ALONE = 2.5
+LEAST_SHARE = 0.02  # fraction of the path below which errors are ignored
 
 
 class Alone(str):
-    """A sentence on a recording that is off alone."""
+    """A sentence on a single recording with large errors."""
 
     __slots__ = ()
 
@@ -33,14 +34,14 @@ class ErrorOfRecording(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Error as a share of the path."""
+        """Error as a fraction of the path."""
         return self.position_m / max(self.path_m, 1e-9)
 
 
 def errors_by_recording(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> list[ErrorOfRecording]:
-    """Predicts each recording of a drive, over the longest time that all of them last."""
+    """Predicts each recording of a drive over the longest horizon that fits into all of them."""
     sources = [episode.source for episode in drive.recording.episodes]
     for horizon in HORIZONS_S:
         chosen = open_loop.windows(
@@ -68,7 +69,7 @@ def errors_by_recording(
 def about_recordings(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> Iterator[str]:
-    """Yields a sentence on the errors by recording, and one on each that is off alone."""
+    """Yields a sentence on the errors by recording, and one per recording that alone is off."""
     if not drive.recording.episodes:
         return
     errors = errors_by_recording(model, calibration, drive)

@@ -1,4 +1,4 @@
-"""Calibration: the relations of a drive's streams in time and space, and its alignment by them."""
+"""Calibration: how a drive's streams relate in time and space, and the alignment that follows."""
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated
@@ -21,15 +21,16 @@ from nics_drl_bridge.identify.signals import (
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.curve import LONGEST_DELAY_S, InputCurve, delays
 
-STEP_S = 0.01  # step of the samples where the pose's own step is not usable
+STEP_S = 0.01  # step of the samples if the pose's own step is not usable
 STEP_RANGE_S = (0.002, 0.02)
 SMOOTHING_S = 0.1
 SMOOTHING_BURSTS = 1.5
 UNIFORM = 1e-6
-WHOLE = 1e-6  # a period of so nearly a whole number of steps has one
-SAME_STEP = 1e-3  # share of a step by which rounded stamps may change it
-SHARED = 0.5  # minimum share of rows with common stamps; only then are the other rows dropped
-# rates are unknown between states that are this many median steps apart
+WHOLE = 1e-6  # tolerance within which a period counts as a whole number of steps
+SAME_STEP = 1e-3  # fraction of a step by which rounding of stamps may change it
+# minimum fraction of rows with common stamps for which the other rows are dropped
+SHARED = 0.5
+# rates are unknown between states further apart than this many median steps
 STATE_GAP = 2.5
 
 
@@ -47,25 +48,25 @@ class Response:
 class Calibration:
     """Estimates of a recording's clocks, mounting and noise."""
 
-    clock_offset_s: float = 0.0  # added to the pose's stamps, gives the commands' clock
+    # added to the pose's stamps to give the commands' clock
+    clock_offset_s: float = 0.0
     # from a command's stamp to its effect
     command_latency_s: Annotated[float, Field(le=LONGEST_DELAY_S)] = 0.0
-    # heading of `base_link` minus the heading of the tracked body
+    # heading of `base_link` minus heading of the tracked body
     rotation_rad: float = 0.0
+    # (x, y) of the tracked point in `base_link`
     lever_arm_m: tuple[float, float] = (
         0.0,
         0.0,
-    )  # (x, y) of the tracked point in `base_link`
-    responses: tuple[
-        Response, ...
-    ] = ()  # of the state variables; empty if the state was measured
-    inputs: tuple[
-        InputCurve, ...
-    ] = ()  # of the commands that do not act as they are, or at once
-    limits: dict[str, tuple[float, float]] = field(
-        default_factory=dict
-    )  # of inferred states' rates
-    burst_period_s: NonNegativeFloat = 0.0  # between bursts of poses; 0 without bursts
+    )
+    # of the state variables; empty if the state was measured
+    responses: tuple[Response, ...] = ()
+    # of commands with an input curve or a delay of their own
+    inputs: tuple[InputCurve, ...] = ()
+    # maximum fall and rise of inferred states' rates
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    # time between bursts of poses; 0 without bursts
+    burst_period_s: NonNegativeFloat = 0.0
     # standard deviation of x and y of the pose
     position_noise_m: NonNegativeFloat = 0.0
     heading_noise_rad: NonNegativeFloat = 0.0
@@ -73,14 +74,14 @@ class Calibration:
     wheel_scale: float | None = None
     # yaw rate per unit of right wheel minus left [rad/s]
     turn_scale: float | None = None
-    wheels_swapped: bool | None = None  # left and right interchanged; None if unknown
+    # True if left and right are interchanged; None if unknown
+    wheels_swapped: bool | None = None
     # Standard uncertainty of each estimated value, by the names above.
     uncertainty: dict[str, Annotated[float, AllowInfNan()]] = field(
         default_factory=dict
     )
-    notes: tuple[
-        str, ...
-    ] = ()  # a sentence on each finding, and on what could not be learnt
+    # a sentence on each finding, and on what could not be learnt
+    notes: tuple[str, ...] = ()
 
     @property
     def is_identity(self) -> bool:
@@ -96,14 +97,14 @@ class Calibration:
 
     @property
     def is_exact(self) -> bool:
-        """True if there is nothing to correct, not even noise: a textbook recording."""
+        """True if there is nothing to correct, not even noise, as in a synthetic recording."""
         return (
             self.is_identity and self.position_noise_m == self.heading_noise_rad == 0.0
         )
 
     @property
     def motors(self) -> Motors:
-        """Motors, which hold back states that follow commands, beside delays and lags."""
+        """Motors, which limit states that follow commands, in addition to delays and lags."""
         limits = [self.limits.get(r.state, (-np.inf, np.inf)) for r in self.responses]
         fall, rise = np.array(limits).reshape(-1, 2).T
         dead = {curve.command: curve.dead for curve in self.inputs}
@@ -126,8 +127,8 @@ class Calibration:
 
 
 def align(drive: Drive, calibration: Calibration) -> Samples:
-    """Puts a drive on one time axis, at `base_link`; RecordingError: no overlap in time."""
-    # Without corrections it is used bit for bit; else noisy poses are smoothed by local parabolas.
+    """Resamples a drive on one time axis, at `base_link`; RecordingError without an overlap."""
+    # An exact drive is used bit for bit; noisy poses are smoothed by local parabolas.
     recording = drive.recording
     period = drive.settings.control_period_s
     if (
@@ -156,7 +157,7 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
 
 
 def part_of(period: float, step: float) -> float:
-    """Returns the step nearest to a given one of which a period is a whole number, both in [s]."""
+    """Returns the step nearest to a given one that divides a period evenly, both in [s]."""
     count = period / step
     whole = max(1, round(count))
     return step if abs(count - whole) < WHOLE else period / whole
@@ -198,7 +199,7 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
 def _shared_stamps(
     recording: Recording, period: float
 ) -> tuple[Array, Array, Array, Array] | None:
-    """Returns stamps (T,), poses, states, commands of the rows on one grid, a part of a period."""
+    """Returns stamps (T,), poses, states, commands of rows on a grid that divides a period."""
     pose = recording.pose
     state = recording.state
     command = recording.command
@@ -232,7 +233,7 @@ def _grid(
 ) -> tuple[Array, float]:
     """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock.
 
-    And their step [s], a part of a period [s].
+    Also returns their step [s], which divides a period [s].
     """
     pose = recording.pose.t + calibration.clock_offset_s
     step = float(np.median(np.diff(pose)))
@@ -249,9 +250,9 @@ def _grid(
         last = min(last, recording.state.t[-1])
     count = int(np.floor((last - first) / step + 1e-6))
     if count < MIN_STAMPS:
-        fault = f"commands and poses overlap for {max(last - first, 0.0):.2f} s only"
+        fault = f"commands and poses overlap for only {max(last - first, 0.0):.2f} s"
         raise RecordingError(
-            f"{recording.source}: {fault}; check that they are of one drive."
+            f"{recording.source}: {fault}; check that they are from the same drive."
         )
     return np.asarray(first + step * np.arange(count + 1)), step
 
@@ -259,7 +260,7 @@ def _grid(
 def outside_gaps(
     t: Array, samples: Array, step: float, usual: float = 3.0, least: float = MAX_GAP_S
 ) -> NDArray[np.bool_]:
-    """Selects steps (T,) between samples less than `least` [s] or `usual` median steps apart."""
+    """Selects steps (T,) between samples within `least` [s] or `usual` median steps."""
     after = np.clip(np.searchsorted(samples, t + step / 2.0), 1, len(samples) - 1)
     gap = samples[after] - samples[after - 1]
     return np.asarray(gap < max(least, usual * float(np.median(np.diff(samples)))))

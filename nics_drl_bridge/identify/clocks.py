@@ -1,4 +1,4 @@
-"""Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
+"""Clocks: offset, latency and lags of a drive, each the shift that best explains it by commands."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -23,49 +23,48 @@ from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Target = tuple[
-    Array, Array, Array
-]  # start (n,), end (n,) of intervals, a signal's means (n, K)
-Residual = Callable[
-    [Array], Array
-]  # of a trial delay [s] and maybe the logarithms of lags
-Left = Callable[
-    ..., Array
-]  # residual by lags (S,), delays () or (S,) [s], and maybe motors
+# start (n,), end (n,) of intervals, and a signal's means (n, K)
+Target = tuple[Array, Array, Array]
+# residual as a function of a trial delay [s] and possibly the logarithms of lags
+Residual = Callable[[Array], Array]
+# residual as a function of lags (S,), delays () or (S,) [s], and possibly motors
+Left = Callable[..., Array]
 
 STEP_S = 0.01
-LEAD_S = 2.0  # for the states to forget their initial values
+LEAD_S = 2.0  # lead time in which the states forget their initial values
 STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 5.0
+# steps of the search, in the delay [s] and in log(lag / s)
 BOUNDS = (
     (-0.5, np.log(0.005)),
     (0.5, np.log(2.0)),
-)  # of the delay [s], of log(lag / s)
+)
 MAX_ROWS = 2000
 FEW_ROWS = 1000
 EXACT = 1e-6
 LONG_STEP = 1.5  # a step longer than this many usual steps is a gap
-WHEELS_EXPLAINED = 0.5  # the commands must explain this share of the wheels' variance
+# minimum fraction of the wheels' variance that the commands must explain
+WHEELS_EXPLAINED = 0.5
 # Wheel speeds are assumed to be means over the tick that ends at their stamp, but some drivers
-# report instantaneous ones: a time is uncertain by the spread of a uniform distribution.
+# report instantaneous ones: times are uncertain by the spread of a uniform distribution.
 WITHIN_TICK = 12.0**-0.5
 MIN_TIME_S = 5e-4
-CERTAIN = 3.0  # a correction below this many standard uncertainties is not made
-CLUSTER_S = 2.5  # residuals further apart are independent
+CERTAIN = 3.0  # corrections below this many standard uncertainties are not applied
+CLUSTER_S = 2.5  # residuals further apart count as independent
 NO_LAG_S = 0.005
-# share of a motion's variance, beyond which no delay is believed
+# fraction of unexplained variance above which no delay is believed
 MOST_UNEXPLAINED = 0.5
-# a motion precedes its commands if that takes what is left to this share
+# commands count as late if allowing that reduces the residual to this fraction
 EARLY_WORTH = 0.8
-# The delay is sought in so many parts of a drive, this far around that of the whole. It drifts if
-# it grows by more than the least, and the parts lie on a line to this share of its growth.
+# The delay is sought in this many parts of a drive, this far around that of the whole. It drifts
+# if it grows by more than the minimum, and the parts lie on a line to this fraction of the growth.
 DRIFT_PARTS = 4
 DRIFT_REACH_S = 0.6
 DRIFT_STEP_S = 0.03
 LEAST_DRIFT_S = 0.12
 DRIFT_OFF = 0.25
-MIN_EARLY_S = 0.03  # smaller ones may be a lag of another form
-TOLD_S = 0.005  # a latency that is less certain can't be told from a lag
+MIN_EARLY_S = 0.03  # smaller lead times may be the effect of an imperfect lag
+TOLD_S = 0.005  # a latency less certain than this can't be distinguished from a lag
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class DelayEstimate:
     sigma: float  # standard uncertainty [s]
     lags: Array  # (S,) time constants of the inferred states [s]
     lag_sigma: Array  # (S,) standard uncertainty; NaN where not estimated
-    explained: float  # share of the signal's variance that the response explains
+    explained: float  # fraction of the signal's variance that the response explains
 
 
 def delay_of_response(
@@ -145,10 +144,10 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
 
 
 def some_of(count: int, most: int) -> NDArray[np.intp]:
-    """Returns at most so many of the indices of `count` rows, in order."""
+    """Returns the indices, in order, of at most `most` of `count` rows."""
     if count <= most:
         return np.arange(count)
-    # Golden-section sampling: no stride that commands could share.
+    # Golden-section sampling: a regular stride could coincide with a period of the commands.
     return np.unique((np.arange(most) * 0.6180339887 % 1.0 * count).astype(np.intp))
 
 
@@ -175,7 +174,7 @@ def _search_or_zero(
 def _search(
     residual: Residual, centers: tuple[float, ...], lags: Array
 ) -> DelayEstimate:
-    """Finds the delay on ever finer grids, then refines it together with the lags' logarithms."""
+    """Finds the delay on successively finer grids, then refines it together with the log lags."""
     around = np.array(centers)
     log_lags = np.log(lags)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
@@ -209,17 +208,18 @@ class TimingEstimate:
 
     offset: float  # [s]
     latency: float  # [s]
-    sigma: dict[str, float]  # of each estimated value, by its name in `Calibration`
+    sigma: dict[str, float]  # standard uncertainties by the names in `Calibration`
     lags: Array  # (S,) of the inferred states [s]; empty if the state was measured
     lag_sigma: Array  # (S,) [s]; NaN for a nominal lag
     separated: bool  # True if offset and latency could be separated
-    # by which motion on the commands' clock precedes them: no clock of it [s]
+    # how far motion on the commands' clock precedes the commands, which means another clock [s]
     early: float = 0.0
-    # by which the pose's clock gains on the commands' [s/s]; 0 if none shows
+    # rate at which the pose's clock gains on the commands' [s/s]; 0 if none is found
     drift: float = 0.0
-    # (S,) by which inferred states follow their commands after the latency, beside lags [s]
+    # (S,) delays of inferred states after the latency, in addition to lags [s]
     delays: Array = field(default_factory=lambda: np.zeros(1))
-    motors: Motors | None = None  # of inferred states; None if nothing holds them back
+    # motors of inferred states; None if nothing limits them
+    motors: Motors | None = None
 
 
 def timing_of(drive: Drive) -> TimingEstimate:
@@ -234,7 +234,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
     if state is None and missing:
         fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
         inspect = f"`nics inspect {place} --map my.yaml`"
-        advice = f"begin a mapping, whose robots need none, with {inspect}"
+        advice = f"start a mapping, which needs no `follows:`, with {inspect}"
         advice += (
             ", or record the state too, or add `follows:` to the robot's YAML file"
         )
@@ -266,7 +266,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
 
 
 def _explains(left_over: Left, delay: DelayEstimate) -> bool:
-    """True if a delay explains a motion that no delay leaves unexplained."""
+    """True if a delay explains a motion well enough to be believed."""
     quick = np.minimum(delay.lags, NO_LAG_S)
     at_once = min(
         float((left_over(lags, 0.0) ** 2).mean()) for lags in (delay.lags, quick)
@@ -278,7 +278,7 @@ def _explains(left_over: Left, delay: DelayEstimate) -> bool:
 def _drift(
     command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimate
 ) -> float:
-    """Returns the rate [s/s] at which a delay grows over a drive; 0 if it does not steadily."""
+    """Returns the rate [s/s] at which a delay grows over a drive; 0 unless it grows steadily."""
     start, end, signal = target
     tries = delay.value + np.arange(
         -DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S
@@ -303,7 +303,7 @@ def _drift(
 
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
-    """Returns nominal lags and no latency: nothing was estimated."""
+    """Returns nominal lags and no latency, without any estimation."""
     if drive.recording.state is None:
         lags = signals.nominal_lags(drive.spec)
     else:
@@ -314,7 +314,7 @@ def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
 def _timing_of_two_clocks(
     recording: Recording, spec: RobotSpec, target: Target
 ) -> TimingEstimate:
-    """Estimates offset and latency apart if the wheels follow the commands, else their sum."""
+    """Estimates offset and latency separately if the wheels follow the commands, else their sum."""
     wheels = _wheel_delay(recording, spec)
     lags = None if wheels is None else wheels.lags
     delay = delay_of_response(
@@ -357,12 +357,12 @@ def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
 
 
 def _likely_shifts(recording: Recording) -> tuple[float, ...]:
-    """Returns search centres for the delay of the pose's clock: no shift, or a common start [s]."""
+    """Returns search centres for the delay of the pose's clock [s]: no shift, or a common start."""
     return 0.0, float(recording.pose.t[0] - recording.command.t[0])
 
 
 def _wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
-    """Returns the wheels' delay; None on another clock or if they do not follow the commands."""
+    """Returns the wheels' delay; None if they are on another clock or ignore the commands."""
     wheels = recording.wheels
     if wheels is None or wheels.clock != recording.command.clock:
         return None
@@ -383,7 +383,7 @@ def if_certain(value: float, sigma: float, least: float) -> float:
 def expected_states(
     drive: Drive, twists: TwistIntervals, timing: TimingEstimate
 ) -> Array:
-    """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
+    """Returns the mean state (n, S) over the twists' intervals; inferred ones at a gain of 1."""
     command = drive.recording.command
     state = drive.recording.state
     start, end = twists.on_clock(timing.offset)
@@ -403,7 +403,7 @@ def responses_of(
     timing: TimingEstimate,
     expected: Array | None,
 ) -> tuple[Response, ...]:
-    """Returns the inferred states, of which a speed is scaled by that `expected` (n,) at gain 1."""
+    """Returns the inferred states, with the speed scaled by that `expected` (n,) at gain 1."""
     spec = drive.spec
     if drive.recording.state is not None:
         return ()
@@ -438,7 +438,7 @@ def wheel_means(drive: Drive, calibration: Calibration) -> Array | None:
 
 
 def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
-    """Adds scales of wheel speeds; the left of interchanged wheels is faster in left turns."""
+    """Adds scales of wheel speeds; wheels are swapped if the left one is faster in left turns."""
     wheels = wheel_means(drive, calibration)
     if wheels is None:
         return calibration

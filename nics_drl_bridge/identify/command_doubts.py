@@ -1,4 +1,4 @@
-"""Doubts whether what a mapping calls commands was sent to the robot, by what the fit found."""
+"""Doubts that the mapped commands are what was sent to the robot, based on the fit."""
 
 from collections.abc import Iterator, Sequence
 
@@ -6,16 +6,16 @@ from nics_drl_bridge.identify.acceptance import usual
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.robot.taylor import HorizonErrors
 
-# share of the errors of a constant twist from which on commands hardly help
+# ratio to the errors of a constant twist above which commands hardly help
 HARDLY = 0.8
-LONGEST_S = 1.0  # latencies that are longer,
-EARLIEST_S = -0.2  # or shorter, are implausible
+LONGEST_S = 1.0  # a longer latency is implausible
+EARLIEST_S = -0.2  # a shorter one, too
 
 
 def doubts_of_commands(
     judgement: Sequence[HorizonErrors], calibration: Calibration
 ) -> Iterator[str]:
-    """Yields a sentence if the commands hardly help to predict, or act implausibly late."""
+    """Yields a sentence if the commands hardly help to predict, or take effect implausibly late."""
     for at in usual(tuple(judgement)):
         error = at.model.position_m
         without = at.kept_twist.position_m

@@ -1,4 +1,4 @@
-"""Conclusion of a fit, to be read first: how well it predicts, its gaps, and the next step."""
+"""Conclusion of a fit: how well it predicts, what is missing, and the next step."""
 
 from math import isfinite
 from typing import NamedTuple
@@ -14,25 +14,25 @@ from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.taylor import EndErrors
 
 OF_PATH = " of the path"
-# of a drive; the errors of a longer one have other causes than its length
+# duration of a drive above which errors have other causes than its length
 ENOUGH_S = 60.0
 UNSEEN = "otherwise a policy would rely on motion the model never saw"
 UNTRIED = "The drive was too short to test the model on unseen data."
 
 
 class Conclusion(NamedTuple):
-    """Sentences on a fit."""
+    """Sentences that sum up a fit."""
 
     verdict: Verdict
     accuracy: str
     doubts: tuple[str, ...]  # reasons not to trust it
     gaps: tuple[str, ...]  # what the drive could not teach
-    advice: str  # the next step
-    ready: bool  # false if a policy had better wait for another drive or mapping
+    advice: str  # the recommended next step
+    ready: bool  # False if another drive or mapping should come before a policy
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """All sentences, in the order in which they are to be read."""
+        """All sentences, in reading order."""
         first = f"Verdict: {self.verdict}. {self.accuracy}"
         return (first, *self.doubts, *self.gaps, self.advice)
 
@@ -63,7 +63,7 @@ def conclude(identified: Identified) -> Conclusion:
 
 
 def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -> str:
-    """Returns the next step, by the first condition that does not hold."""
+    """Returns the next step, by the first condition that is not met."""
     duration = identified.drive.duration_s
     if mistaken:
         return "fix the mapping as described above, or the robot's own driver, and generate again"
@@ -72,7 +72,7 @@ def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -
     if not identified.judgement:
         return f"record a longer drive than these {duration:.0f} s, best 60 s, and generate again"
     if strange and identified.verdict is Verdict.WITH_CARE:
-        return "check what looks mistaken above; if it is the robot's own way, train a policy"
+        return "check what looks mistaken above; if the robot really behaves so, train a policy"
     first = ", or first fix the points above" if gaps else ""
     if identified.verdict is Verdict.GOOD:
         return f"train a policy in the simulator{first}"
@@ -84,14 +84,14 @@ def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -
     if duration < ENOUGH_S:
         return f"record another drive, longer than these {duration:.0f} s, and generate again"
     look = "see in report.html where the predicted paths leave the measured ones"
-    return f"{look}, mend the cause or record another drive, and generate again before training"
+    return f"{look}, fix the cause or record another drive, and generate again before training"
 
 
 def accuracy(identified: Identified) -> str:
-    """Says how far off predictions of unseen data are, beside those of the yardsticks."""
+    """Formats how far off predictions of unseen data are, compared with the yardsticks'."""
     for at in usual(identified.judgement):
         if not isfinite(at.model.position_m):
-            return f"On unseen data the predictions run away within {at.horizon_s:g} s."
+            return f"On unseen data the predictions diverge within {at.horizon_s:g} s."
         named = {"a fitted textbook": at.textbook, "constant twist": at.kept_twist}
         ends = {name: end_of(each, at.path_m) for name, each in named.items() if each}
         beside = (f"{name} {end.removesuffix(OF_PATH)}" for name, end in ends.items())
@@ -102,7 +102,7 @@ def accuracy(identified: Identified) -> str:
 
 
 def end_of(errors: EndErrors, path: float) -> str:
-    """Formats an error of position as a share of the path [m], or in metres if there is none."""
+    """Formats a position error as a fraction of the path [m], or in metres without a path."""
     if path > 0.0 and isfinite(errors.position_m):
         share = 100.0 * errors.position_m / path
         return f"{f'{share:.1f}' if share >= 0.1 else '< 0.1'} %{OF_PATH}"

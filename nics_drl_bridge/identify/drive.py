@@ -1,4 +1,4 @@
-"""Drive: a recording of a robot, and whatever several stages derive from it, derived once."""
+"""Drive: a recording of a robot, with cached quantities that several stages derive from it."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,15 +19,16 @@ from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MIN_STAMPS = 20
-# in bursts the mean interval is more than this many times the 30th percentile
+# in bursts, the mean interval exceeds this many times the 30th percentile
 BURSTY = 5.0
-# stamps less than this share of the period apart belong to one burst
+# stamps closer than this fraction of the period belong to one burst
 WITHIN_BURST = 0.25
 UNEVEN = 0.5
-LEAST_WHOLE = 0.1  # share of gap-free stretches from which on only those are used
+# minimum fraction of gap-free stretches for which only those are used
+LEAST_WHOLE = 0.1
 NEGLIGIBLE = 1e-6  # m, rad
 REST_SAMPLES = 12
-REST_DRIFT = 3.0  # standard errors; straight motion shows at least 4
+REST_DRIFT = 3.0  # standard errors at rest; straight motion shows at least 4
 SLOPE_NOISE = 0.05
 MAX_SPAN_S = 0.2
 MAX_GAP_S = 0.25
@@ -39,13 +40,12 @@ class Settings:
 
     order: Order = ORDER  # of the Taylor expansion (Eq. 1), or `auto`
     alpha: Alpha = ALPHA  # of the pruning (Eq. 2), or `auto`
-    train_until_s: float = float(
-        "inf"
-    )  # end of the part to learn from, from the first pose
-    # completes the model by the textbook for inputs that never moved
+    # end of the training part, measured from the first pose
+    train_until_s: float = float("inf")
+    # complete the model by the textbook for inputs that never moved
     assume: bool = False
-    strict: bool = False  # refuses a drive that did not move every input independently
-    control_period_s: float = 0.1  # of which the model's step is to be a part
+    strict: bool = False  # refuse a drive that did not move every input independently
+    control_period_s: float = 0.1  # the model's step must divide this
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Drive:
         return replace(self, recording=recording)
 
     def under(self, settings: Settings) -> "Drive":
-        """Returns the same drive, as far as it is prepared, with other options."""
+        """Returns the same drive, with its cached properties, under other options."""
         same = replace(self, settings=settings)
         vars(same).update(vars(self) | {"settings": settings})
         return same
@@ -85,7 +85,7 @@ class Drive:
 
     @cached_property
     def dated(self) -> Stream:
-        """Poses with the best known time: the newest of each burst, or all."""
+        """Poses whose sample time is best known: the newest of each burst, or all."""
         return self.recording.pose.rows(
             slice(None) if self.bursts is None else self.bursts.newest
         )
@@ -105,12 +105,12 @@ class Drive:
 
     @cached_property
     def pose_noise(self) -> tuple[float, float] | None:
-        """Standard deviations of position [m] and heading [rad]; None if they do not show."""
+        """Standard deviations of position [m] and heading [rad]; None if they can't be measured."""
         return pose_noise(self.recording.pose, self.bursts)
 
     @cached_property
     def twists(self) -> "TwistIntervals":
-        """Twists of the tracked body over spans in which motion stands out of the noise."""
+        """Twists of the tracked body over spans long enough for motion to stand out from noise."""
         t = self.dated.t
         pose = self.dated.values
         stride = 1
@@ -145,12 +145,13 @@ class Drive:
 
 @dataclass(frozen=True)
 class Bursts:
-    """Samples that a driver hands over together, and so with one time of arrival."""
+    """Samples that a driver delivers together and that therefore share one time of arrival."""
 
     period_s: float  # usual time between two bursts
     size: float  # usual number of samples per burst
     of: NDArray[np.intp]  # (T,) burst of each sample
-    newest: NDArray[np.intp]  # (K,) last sample of each burst, the freshest on arrival
+    # (K,) last sample of each burst, the most recent on arrival
+    newest: NDArray[np.intp]
 
 
 def find_bursts(t: Array) -> Bursts | None:
@@ -168,7 +169,7 @@ def find_bursts(t: Array) -> Bursts | None:
 
 
 def spread(t: Array, bursts: Bursts | None) -> Array:
-    """Estimates sample times (T,) from arrivals (T,) [s]: a burst's lie since the one before."""
+    """Estimates sample times (T,) from arrivals (T,) [s], spreading each burst evenly."""
     if bursts is None:
         return t
     count = np.bincount(bursts.of)
@@ -180,9 +181,9 @@ def spread(t: Array, bursts: Bursts | None) -> Array:
 
 
 def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | None:
-    """Returns standard deviations of position [m] and heading [rad] of poses, if known."""
-    # By sixth differences, in which smooth motion vanishes; in bursts, whose sample times are not
-    # known well enough, by stretches at rest.
+    """Returns standard deviations of position [m] and heading [rad] of poses, if measurable."""
+    # Measured by sixth differences, in which smooth motion vanishes; for bursts, whose sample times
+    # are too uncertain for that, by stretches at rest.
     if bursts is not None:
         sigma = _spread_at_rest(unwrapped(pose.values))
     else:
@@ -211,7 +212,7 @@ def pose_residual(pose: Stream) -> Array:
 
 
 def _spread_at_rest(pose: Array) -> Array | None:
-    """Returns the spread (3,) in stretches whose halves do not differ; None if too few."""
+    """Returns the spread (3,) in stretches whose halves agree; None if there are too few."""
     count = len(pose) // REST_SAMPLES
     blocks = pose[: count * REST_SAMPLES].reshape(count, REST_SAMPLES, 3)
     spread = blocks.std(axis=1, ddof=1)

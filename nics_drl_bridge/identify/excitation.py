@@ -1,4 +1,4 @@
-"""Excitation: what a drive moved, and moved independently, and so what a fit can learn from it."""
+"""Excitation: which variables a drive moved, and moved independently, so a fit can learn them."""
 
 from dataclasses import dataclass
 
@@ -12,48 +12,51 @@ from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, white_noise
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.spec import RobotSpec
 
-STILL = 1e-3  # a variable whose spread is below this share of its range did not move
-# nor did a state below this multiple of its noise whose command did not move
+STILL = 1e-3  # a variable whose spread is below this fraction of its range did not move
+# a state below this multiple of its noise did not move if its command did not
 NOISE_ONLY = 1.5
-DEPENDENT = 1e-7  # a normalised feature with a smaller part orthogonal to those before is a copy
+# a normalised feature whose part orthogonal to the earlier ones is smaller is a copy
+DEPENDENT = 1e-7
 # commands are linearly dependent if a normalised combination is smaller
 TOGETHER = 1e-3
 MIN_SAMPLES_PER_TERM = 5
-# a velocity component below this share of the other one is modelled as zero
+# a velocity component below this fraction of the other one is modelled as zero
 NEGLIGIBLE = 1e-3
-NOISY = 5e-4  # a measured state is noisy if its noise exceeds this share of its range
-BULK = 0.75  # share of the rows used in the initial fit
+# a measured state is noisy if its noise exceeds this fraction of its range
+NOISY = 5e-4
+BULK = 0.75  # fraction of the rows used in the initial fit
 CONCENTRATIONS = 12
 FAR = 8.0  # an outlier is this many standard deviations of the bulk away
 LEAST = 1e-6  # rates below this, in SI units, are rounding errors and never outliers
+# percentiles that bound the usual range; jumps in 5 % of the rows lie outside
 USUAL = (
     5.0,
     95.0,
-)  # percentiles that bound the usual range; jumps in 5 % of the rows lie outside
-MOST = 0.2  # a larger share of rows is not outliers but a misfit of the model
-BEYOND = 0.5  # a value beyond its limits by this share of its range is a sensor fault
+)
+MOST = 0.2  # a larger fraction of rows are not outliers but a misfit of the model
+# a value beyond its limits by this fraction of its range is a sensor fault
+BEYOND = 0.5
 # If there are outliers, the misfit of the rest is estimated from its tail, not from its median.
 BULK_PERCENTILE = 90.0
 GAUSSIAN_BULK = 1.645
 GRID_S = 0.05
 ENDS = (2.0, 98.0)  # percentiles that bound the range of a command
-# a drive over a smaller share of a command's range says little about the rest
+# a drive over a smaller fraction of a command's range says little about the rest
 NARROW = 0.4
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """Excitation of a robot's variables by a drive."""
+    """Which of a robot's variables a drive moves."""
 
-    unmoved: tuple[
-        str, ...
-    ]  # variables that the drive never moved, so that no term contains them
+    # variables that the drive never moved, so no term contains them
+    unmoved: tuple[str, ...]
     together: tuple[str, ...]  # commands that moved, but were linearly dependent
     levels: dict[str, int]  # number of different values of each command, at most 10
 
     @classmethod
     def of(cls, samples: Samples, spec: RobotSpec) -> "Excitation":
-        """Returns the excitation by a drive."""
+        """Computes the excitation from a drive's samples."""
         together = commands_together(samples, spec)
         return cls(unmoved_variables(samples, spec), together, levels(samples, spec))
 
@@ -81,7 +84,7 @@ def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
 
 
 def combinations(samples: Samples, spec: RobotSpec) -> Array:
-    """Returns orthonormal combinations (N, C) of the commands, by their sizes, that stayed put."""
+    """Returns orthonormal combinations (N, C) of the scaled commands that stayed constant."""
     command = samples.x[:, len(spec.state) :]
     reach = np.array([c.max - c.min for c in spec.command])
     moved = np.flatnonzero(command.std(axis=0) >= STILL * reach)
@@ -105,12 +108,11 @@ def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Splits columns into an independent set and copies; earlier, low-order ones are kept first.
 
-    One that is nothing but zeros counts as a copy.
+    A column of zeros counts as a copy.
     """
     unit = chi / np.maximum(np.linalg.norm(chi, axis=0), np.finfo(np.float64).tiny)
-    apart = (
-        np.abs(np.diag(qr(unit, mode="r")[0])) > DEPENDENT
-    )  # no pivoting: from predecessors
+    # no pivoting: each column is compared with its predecessors
+    apart = np.abs(np.diag(qr(unit, mode="r")[0])) > DEPENDENT
     return np.flatnonzero(apart), np.flatnonzero(~apart)
 
 
@@ -120,7 +122,7 @@ def moved_terms(
     names: tuple[str, ...],
     unmoved: tuple[str, ...],
 ) -> NDArray[np.int64]:
-    """Returns the terms (K, V) of variables that moved; refuses too few samples for them."""
+    """Returns the terms (K, V) of variables that moved; FitError if the samples are too few."""
     still = [names.index(name) for name in unmoved]
     moved: NDArray[np.int64] = powers[(powers[:, still] == 0).all(axis=1)]
     if len(samples.t) < MIN_SAMPLES_PER_TERM * len(moved):
@@ -146,7 +148,7 @@ def terms_through_state(
 
 
 def moving_dofs(dq: Array) -> tuple[int, ...]:
-    """Returns the indices of the rates (T, D) that move: vx, vy if not negligible, the others."""
+    """Returns indices of the rates (T, D) that move: vx, vy unless negligible, and the others."""
     size = np.sqrt((dq**2).mean(axis=0))
     return tuple(
         d for d in range(len(size)) if d > 1 or size[d] > NEGLIGIBLE * size[:2].max()
@@ -160,7 +162,7 @@ def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
 
 
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
-    """Selects the rows of a target (T,) on features (T, K) that are no outliers."""
+    """Selects the rows of a target (T,) on features (T, K) that are not outliers."""
     everything = np.ones(len(target), dtype=np.bool_)
     plain = _left(chi, target)
     if not (
@@ -190,7 +192,7 @@ def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
 
 
 def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
-    """Returns absolute residuals (T,) of the fit to the best fitting rows, found from `chosen`."""
+    """Returns absolute residuals (T,) of a fit to the best-fitting rows, starting from `chosen`."""
     for _ in range(CONCENTRATIONS):
         rest = _left(chi, target, chosen)
         again = np.argsort(rest, kind="stable")[: len(chosen)]
@@ -203,7 +205,7 @@ def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
 def _left(
     chi: Array, target: Array, rows: NDArray[np.intp] | slice = slice(None)
 ) -> Array:
-    """Returns absolute residuals (T,) of the least squares on some rows."""
+    """Returns absolute residuals (T,) of a least-squares fit to some rows."""
     return np.abs(
         target - chi @ np.linalg.lstsq(chi[rows], target[rows], rcond=None)[0]
     )
@@ -223,15 +225,15 @@ class CommandCoverage:
 
     name: str
     unit: str
-    low: float  # its range, without 2 % at each end
+    low: float  # its range, without the outer 2 % at each end
     high: float
-    share: float  # of the range that the robot's limits allow
-    own: float  # share of its spread that the other commands do not explain
+    share: float  # fraction of the range that the robot's limits allow
+    own: float  # fraction of its spread that the other commands do not explain
     levels: int  # number of different values; more than ten count as ten
-    fault: str  # why nothing can be learnt about it; empty if something can
+    fault: str  # why it can't be learnt; empty if it can
 
     def line(self) -> str:
-        """Returns one line for people."""
+        """Formats one line for people."""
         if self.fault:
             return f"{self.name}: {self.fault}"
         moved = f"from {self.low:.2f} to {self.high:.2f} {self.unit}"
@@ -240,7 +242,7 @@ class CommandCoverage:
 
 
 def narrow(recording: Recording, spec: RobotSpec) -> list[str]:
-    """A sentence for each command of which a drive covers a small part."""
+    """Returns a sentence for each command of which a drive covers only a small part."""
     return [
         f"{c.name} covers {100.0 * c.share:.0f} % of its range, {c.low:.3g} to {c.high:.3g} "
         f"{c.unit}: beyond that the simulator guesses; drive over the whole range, or narrow it in "
@@ -277,7 +279,7 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
 
 
 def _own(x: Array) -> Array:
-    """Returns the share (C,) of each column's spread that is linearly independent of the others."""
+    """Returns the fraction (C,) of each column's spread that is independent of the others."""
     centred = x - x.mean(axis=0)
     own = np.zeros(x.shape[1])
     for i, size in enumerate(np.linalg.norm(centred, axis=0)):

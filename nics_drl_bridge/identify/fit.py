@@ -1,4 +1,4 @@
-"""Eq. 1 and 2 on one page (Sec. IV-A): features, least squares, pruning, least squares again."""
+"""Eqs. 1 and 2 on one page (Sec. IV-A): features, least squares, pruning, least squares again."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,13 +20,12 @@ from nics_drl_bridge.threads import one_blas_thread
 
 Alpha = float | Literal["auto"]
 Order = int | Literal["auto"]
-Library = Callable[
-    [NDArray[np.int64], RobotSpec], NDArray[np.bool_]
-]  # terms (D, K) of powers
+# selects terms (D, K) by their powers
+Library = Callable[[NDArray[np.int64], RobotSpec], NDArray[np.bool_]]
 
 ALPHA: Alpha = 0.99
 ORDER = 2
-# standardised coefficients below this share of the rates are rounding errors
+# standardised coefficients below this fraction of the rates are rounding errors
 ROUNDING = 1e-9
 SAME_STEP = 1e-3
 ROUNDING_S = 1e-6
@@ -54,17 +53,17 @@ class Regression:
     """Least squares of dQ/dt on all features (Eq. 1)."""
 
     samples: Samples  # T rows, without implausible ones
-    powers: NDArray[
-        np.int64
-    ]  # (K, V) exponents of the features that moved, without copies
+    # (K, V) exponents of the features that moved, without copies
+    powers: NDArray[np.int64]
     chi: Array  # (T, K) features
-    beta: Array  # (D, K) standardised coefficients; zero where not allowed or insignificant
-    inliers: NDArray[np.bool_]  # (D, T) rows that are no outliers
+    # (D, K) standardised coefficients; zero where not allowed or insignificant
+    beta: Array
+    inliers: NDArray[np.bool_]  # (D, T) rows that are not outliers
     moving: tuple[int, ...]  # degrees of freedom that move; the others have no terms
     excitation: excitation.Excitation  # of the variables by the drive
-    dependent: tuple[str, ...]  # terms that are copies of others on this drive
-    terms_total: int  # D x K before anything was left out
-    left_out: float  # share of the rows that were implausible
+    dependent: tuple[str, ...]  # terms that duplicate others on this drive
+    terms_total: int  # D x K before any selection
+    left_out: float  # fraction of the rows that were implausible
 
     def rows(self, d: int) -> tuple[Array, Array]:
         """Returns features (n, K) and rates (n,) of a degree of freedom without its outliers."""
@@ -82,15 +81,15 @@ class Fit:
     model: TaylorModel  # the pruned model, with standard errors
     regression: Regression  # on all features
     rmse: Array  # (D,) root mean square residual of dQ/dt, in the dof's unit, without outliers
-    r2: Array  # (D,) share of the variance explained; 1 if the dof does not move
-    alpha: Alpha  # by which it was pruned
-    outliers: Array  # (D,) share of the rows that were dropped as outliers
+    r2: Array  # (D,) fraction of the variance explained; 1 if the dof does not move
+    alpha: Alpha  # threshold used for pruning
+    outliers: Array  # (D,) fraction of the rows dropped as outliers
     condition: Array  # (D,) condition number of the standardised kept features
 
     @cached_property
     @np.errstate(over="ignore", invalid="ignore")
     def curves(self) -> tuple[statistics.Curve, ...]:
-        """Accuracy against the number of terms, of the degrees of freedom that move."""
+        """Accuracy against the number of terms, for the degrees of freedom that move."""
         found = self.regression
         names = (self.model.dofs, self.model.variables)
         kept = {d: _kept(found, d, self.alpha, *names) for d in found.moving}
@@ -101,7 +100,7 @@ class Fit:
 
     @property
     def unmoved(self) -> tuple[str, ...]:
-        """Variables that the drive never moved, so that no term contains them."""
+        """Variables that the drive never moved, so no term contains them."""
         return self.regression.excitation.unmoved
 
 
@@ -125,10 +124,10 @@ def regress(
     allowed: Library | None = None,
 ) -> Regression:
     """Fits all features of order 1 to 4 (Eq. 1); FitError: too few samples, or nothing moved."""
-    # Of those that a library, if any, allows each degree of freedom.
-    # `noisy` is any recording but an exact one: insignificant terms are dropped before Eq. 2, and
-    # the body twist is a function of the state alone, if any, and zero at zero speed, if it moved:
-    # within a step a command acts through the state, and in noise the two can't be told apart.
+    # `allowed`, if given, selects the features of each degree of freedom.
+    # `noisy` is True unless a recording is exact: insignificant terms are dropped before Eq. 2, and
+    # the body twist depends on the state alone, if there is one, and is zero at zero speed: within
+    # a step a command acts through the state, and in noise the two can't be separated.
     believed = excitation.plausible(samples.x, spec)
     samples = samples.rows(believed)
     excited = excitation.Excitation.of(samples, spec)
@@ -191,8 +190,8 @@ def by_weight(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
 
 
 def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.bool_]:
-    """Selects the standardised coefficients (K,) to keep: the largest, up to the share `alpha`."""
-    # With the one that crosses it (Eq. 2); those up to `noise_floor` are rounding errors.
+    """Selects the standardised coefficients (K,) to keep: the largest, up to a fraction `alpha`."""
+    # Includes the one that crosses it (Eq. 2); those up to `noise_floor` are rounding errors.
     order = by_weight(beta, noise_floor)
     size = np.abs(beta[order])
     return np.isin(
@@ -201,9 +200,9 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
 
 
 def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:
-    """Keeps the share `alpha` of a regression (Eq. 2), or `auto`; estimates the kept terms anew."""
-    # The term that crosses the share is kept: else a differential robot would lose a wheel. `auto`
-    # keeps as many terms, in the same order, as improve the cross-validated error.
+    """Keeps the fraction `alpha` of a regression (Eq. 2), or `auto`; refits the kept terms."""
+    # The term that crosses the threshold is kept, else a differential robot would lose a wheel.
+    # `auto` keeps as many terms, in the same order, as improve the cross-validated error.
     samples = regression.samples
     shape = regression.beta.shape
     coefficients = np.zeros(shape)
@@ -270,7 +269,7 @@ def _floor(regression: Regression, d: int) -> float:
 def _curve(
     regression: Regression, d: int, dofs: tuple[str, ...], variables: tuple[str, ...]
 ) -> statistics.Curve:
-    """Returns the accuracy of a degree of freedom by its first terms; `kept` is the knee."""
+    """Returns the accuracy of a degree of freedom by its number of terms; `kept` is the knee."""
     order, (chi, target) = (
         by_weight(regression.beta[d], _floor(regression, d)),
         regression.rows(d),
@@ -284,9 +283,9 @@ def _curve(
 def _reestimate(
     coefficients: Array, errors: Array, d: int, regression: Regression, states: int
 ) -> None:
-    """Replaces a state's coefficients (K,) and errors by instruments, unless these are too weak."""
-    # The noise of a state is both in X and in its rate, so that least squares would mistake it for
-    # a fast decay; that of the state one step earlier is independent: it is an instrument for X.
+    """Replaces a state's coefficients (K,) and errors by instrumental ones, unless weak."""
+    # The noise of a state is in both X and its rate, which least squares would mistake for a fast
+    # decay. The noise one step earlier is independent, so the earlier state is an instrument for X.
     samples = regression.samples
     inside = regression.inliers[d]
     kept = np.flatnonzero(coefficients)

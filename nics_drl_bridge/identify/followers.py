@@ -1,4 +1,4 @@
-"""Followers: delay, lag, dead zone and limits of each state that follows a command, unmeasured."""
+"""Followers: delay, lag, dead zone and limits of each unmeasured state that follows a command."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,41 +19,45 @@ from nics_drl_bridge.robot.curve import InputCurve, delays
 from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 
+# fall, rise and dead zone of a motor without limits
 FREE = (
     -np.inf,
     np.inf,
     0.0,
-)  # fall, rise and dead zone of a motor that holds nothing back
-# tried with limits
+)
+# lags tried together with limits
 LAGS_S = (0.05, 0.15, 0.4)
 DELAYS_S = (0.0, 0.05, 0.1, 0.2)
+# trial limits, in the command's range per second
 RATES = (
     0.25,
     0.5,
     1.0,
     2.0,
     4.0,
-)  # limits that are tried, in the command's range per second
+)
+# trial dead zones, as fractions of the command's maximum
 DEAD = (
     0.03,
     0.07,
     0.15,
     0.3,
-)  # dead zones that are tried, as shares of the command's reach
-HELPS = 0.95  # what is tried must take the sum of squares to this share,
-WORTH = 0.8  # and to this one once all is adjusted to it
-# Standard deviation of a uniform distribution about one of its ends, as a share of its width: a
-# lag before a limit looks like a delay, which may be none.
+)
+HELPS = 0.95  # a trial must reduce the sum of squares to this fraction
+WORTH = 0.8  # and to this fraction once everything is readjusted
+# Standard deviation of a uniform distribution about one of its ends, as a fraction of its width: a
+# lag before a limit looks like a delay, so the true delay may be anything down to zero.
 END = 3.0**-0.5
-# a component of the twist counts if commands leave less than this share of it
+# a component of the twist counts if commands leave less than this fraction unexplained
 EXPLAINED = 0.5
-NO_EFFECT = 1e-6  # a limit or dead zone is not determined by less than this share of the residual
-WIDER = 5.0  # times by which a limit may change while it is adjusted
+# a limit or dead zone that changes less than this fraction of the residual is undetermined
+NO_EFFECT = 1e-6
+WIDER = 5.0  # factor by which a limit may change during adjustment
 
 
 @dataclass(frozen=True)
 class _Following:
-    """A way in which states follow their commands; (S,) each."""
+    """Parameters by which states follow their commands, each (S,)."""
 
     lags: Array  # [s]
     delays: Array  # from the pose's clock [s]
@@ -62,19 +66,20 @@ class _Following:
 
 @dataclass(frozen=True)
 class _Adjusted:
-    """The best way to follow, and its errors."""
+    """The best parameters, and their errors."""
 
     best: _Following
-    cost: float  # sum of squares that it leaves
-    sigma: Array  # (2, m) of delays, and of their sums with lags, of the states that moved [s]
+    cost: float  # sum of squared residuals
+    # (2, m) of delays, and of delay plus lag, for the states that moved [s]
+    sigma: Array
     motor_sigma: Array  # (S, 3) of fall, rise and dead zone
 
 
 def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
-    """Sharpens a timing by a delay and a lag of each command of its own, and what motors do.
+    """Refines a timing by a separate delay and lag for each command, and the effects of motors.
 
-    What stands between command and motion beside one lag, as a servo of higher order, adds to a
-    command's delay: the latency is the least delay.
+    Dynamics beyond a single lag, such as those of a higher-order servo, add to a command's delay.
+    The latency is the minimum of these delays.
     """
     if drive.recording.state is not None or not drive.spec.state or not timing.sigma:
         return timing
@@ -88,7 +93,7 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     alike = np.abs(delay - delay[first]) <= clocks.CERTAIN * np.hypot(
         sigma[0], sigma[0, first]
     )
-    # True if wheels told the latency
+    # True if the wheels determined the latency
     told = len(timing.sigma) > 1
     motors = found.best.motors
     held = motors.limited
@@ -147,7 +152,7 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
 def late_inputs(
     spec: RobotSpec, timing: clocks.TimingEstimate
 ) -> tuple[InputCurve, ...]:
-    """Returns the curves of commands that have a dead zone, or act later than others."""
+    """Returns the input curves of commands that have a dead zone, or act later than others."""
     dead = timing.motors.dead if timing.motors else np.zeros(len(timing.delays))
     rows = zip(spec.state, timing.delays.tolist(), dead.tolist(), strict=False)
     each = {v.follows: (d, zone) for v, d, zone in rows if d > 0.0 or zone > 0.0}
@@ -159,7 +164,7 @@ def late_inputs(
 def limits_of(
     spec: RobotSpec, timing: clocks.TimingEstimate
 ) -> dict[str, tuple[float, float]]:
-    """Returns the greatest fall and rise of states that have them, at a gain of one."""
+    """Returns the maximum fall and rise of limited states, at a gain of one."""
     if timing.motors is None:
         return {}
     rows = zip(
@@ -176,7 +181,7 @@ def limits_of(
 
 
 def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
-    """Returns the greatest fall and rise (S, 2) of the states, at the gains of their responses."""
+    """Returns the maximum fall and rise (S, 2) of the states, at the gains of their responses."""
     limits = np.tile([-np.inf, np.inf], (len(spec.state), 1))
     gains = calibration.responses
     for i, v in enumerate(spec.state):
@@ -185,7 +190,7 @@ def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
 
 
 def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Samples:
-    """Returns samples with the rates that states with limits would have without."""
+    """Returns samples with the rates that limited states would have without limits."""
     rates = samples.dq.copy()
     names = [c.name for c in spec.command]
     for i, response in enumerate(calibration.responses):
@@ -202,7 +207,7 @@ def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Sa
 def _found(
     drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp]
 ) -> _Adjusted:
-    """Returns how moved states follow, with limits and dead zones if they clearly explain more."""
+    """Finds how moved states follow; with limits and dead zones only if they clearly help."""
     twists = drive.twists
     command = drive.recording.command
     spec = drive.spec
@@ -212,7 +217,7 @@ def _found(
     shift = timing.latency - timing.offset
     size = len(timing.lags)
     start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
-    for _ in range(2):  # what commands do not explain hides what motors do
+    for _ in range(2):  # twice, because unexplained commands hide the effects of motors
         target = (begin, twists.end[rows], twists.twist[rows][:, moving])
         left = clocks.response_residual(command, spec, target, MAX_ORDER)
         unexplained = np.mean(
@@ -229,11 +234,12 @@ def _found(
         ((begin - begin[0]) / clocks.CLUSTER_S).astype(np.intp), len(moving)
     )
     best = _adjusted(left, start, moved, shift, cluster)
+    # the effect of one may hide that of another
     for tries in (
         _with_limits,
         _with_dead_zones,
         _with_limits,
-    ):  # what one does hides another
+    ):
         for i in moved:
             tried = tries(
                 best.best, i, command.values[:, signals.followed(spec)[i]], shift
@@ -251,7 +257,7 @@ def _found(
 def _with_limits(
     now: _Following, i: int, reach: Array, shift: float
 ) -> Iterator[_Following]:
-    """Yields ways to follow in which state i has limits, and less of a lag and a delay."""
+    """Yields trials in which state i has limits, with a smaller lag and delay."""
     for rate, lag, delay in product(
         RATES, LAGS_S, {*(shift + d for d in DELAYS_S), *now.delays}
     ):
@@ -281,7 +287,7 @@ def _adjusted(
     shift: float,
     cluster: NDArray[np.intp],
 ) -> _Adjusted:
-    """Adjusts delays and lags of moved states, and limits and dead zones where there are any."""
+    """Adjusts delays and lags of moved states, and any limits and dead zones."""
     count = len(moved)
     given = np.stack(start.motors, axis=1)  # (S, 3)
     held = np.nonzero(np.isfinite(given) & (given != 0.0))
@@ -335,7 +341,7 @@ def _of_sum(state: str) -> str:
 
 
 def about_sums(calibration: Calibration) -> Iterator[str]:
-    """Tells of latency and lags that could not be told apart."""
+    """Yields a sentence on latencies and lags that could not be separated."""
     own = delays(
         [r.command for r in calibration.responses], calibration.inputs
     ).tolist()
@@ -343,7 +349,5 @@ def about_sums(calibration: Calibration) -> Iterator[str]:
         sigma = calibration.uncertainty.get(_of_sum(response.state))
         if sigma is not None:
             both = calibration.command_latency_s + delay + response.lag_s
-            finding = (
-                f"Latency and the lag of {response.state} can hardly be told apart"
-            )
+            finding = f"Latency and the lag of {response.state} can hardly be separated"
             yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."

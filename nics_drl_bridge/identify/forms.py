@@ -1,6 +1,6 @@
-"""Forms: what motors and tyres do to commands, found in a motion and sought by predictions.
+"""Forms: effects of motors and tyres on commands, detected in a motion and tested by predictions.
 
-Input curves are those of Hammerstein models: a dead zone, saturation, a gain of its own backwards.
+Input curves are those of Hammerstein models: dead zone, saturation, a separate reverse gain.
 """
 
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import scipy  # .signal loads in a second, when it is used
+import scipy  # .signal loads in a second, when used
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
@@ -24,48 +24,51 @@ from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 LAGS_S = (0.05, 0.15, 0.4, 1.0, 2.0)
-DEAD = np.linspace(0.0, 0.45, 10)  # shares of the command's reach
+# trial dead zones, as fractions of the command's maximum
+DEAD = np.linspace(0.0, 0.45, 10)
 FULL = np.linspace(0.15, 1.0, 18)
-WORTH = 0.03  # a curve takes at least this share of what is left without it
-CLEAR = 0.25  # one of the turn rate this, as understeer looks alike; then it is beyond doubt
+WORTH = 0.03  # minimum fraction of the residual variance that a curve must explain
+# fraction from which it is beyond doubt; higher for the turn rate, where understeer looks alike
+CLEAR = 0.25
 STRIDE_S = 0.04
 NOTHING = 1e-6  # [m/s, rad/s]
-# of the search for a delay
+# order of the model in the search for a delay
 DELAY_ORDER = 2
 DELAY_STEP_S = 0.02
 LONGEST_S = 0.4
 ALIKE_S = 0.01  # delays of commands that differ by less are tried as one
-# steps of their refinement
+# step of their refinement
 DELAY_SCALE_S = 0.05
 CURVE_SCALE = 0.1
-# of a gain backwards
+# step of a reverse gain
 BACK_SCALE = 0.2
 BACK_RANGE = (0.2, 5.0)
-# share of a command's reach at which the search for a dead zone begins
+# fraction of a command's maximum at which the search for a dead zone starts
 SMALL_DEAD = 0.05
-# share of the rows in which a command drives backwards, to tell its gain
+# minimum fraction of the rows in which a command drives backwards, to determine its reverse gain
 TWO_WAY = 0.05
-# share of a command's reach by which it must exceed the end of its curve
+# fraction of a command's maximum by which it must exceed the end of its curve
 NEAR_END = 0.01
-SELDOM = 1.0  # percentage of a drive that is to exceed a limit of a rate
-STRONG = 95.0  # percentile of the rates at which limits are first sought
+SELDOM = 1.0  # percentage of a drive that must exceed a rate limit for it to count
+STRONG = 95.0  # percentile of the rates at which the search for limits starts
 LEVER_SCALE_M = 0.05
 TURN_SCALE = 0.1
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A curve that explains a component of the twist better than none."""
+    """A curve that explains a component of the twist better than a straight line."""
 
     curve: InputCurve
-    gain: float  # share of the unexplained variance that it explains
-    drives: bool  # True if of the speed
+    gain: float  # fraction of the unexplained variance that it explains
+    drives: bool  # True if it is of the speed
 
 
 def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
-    """Returns the best curve of the command at a place; None if a straight line does as well."""
+    """Returns the best curve of the command at an index; None if a straight line does as well."""
     given = structure_of(spec)
-    acts = np.ones(3) if given is None else given[0][:, place]  # what it drives
+    # components of the twist that it drives
+    acts = np.ones(3) if given is None else given[0][:, place]
     twists = [
         dof for v in spec.state if v.twist and acts[dof := POSE_RATES.index(v.twist)]
     ]
@@ -132,21 +135,20 @@ def _curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
 
 @dataclass(frozen=True)
 class Form:
-    """Effects that a model of a motion has besides gains and lags."""
+    """Effects in a motion model besides gains and lags."""
 
     curves: tuple[InputCurve, ...] = ()
     friction: tuple[str, ...] = ()  # states with dry friction
-    limits: tuple[str, ...] = ()  # states with a greatest fall and rise
-    back: tuple[str, ...] = ()  # commands whose curve has a gain of its own backwards
-    drag: tuple[str, ...] = ()  # states with a drag by their square, and a back-EMF
-    # True if a car turns less at speed than its textbook, and slips aside
+    limits: tuple[str, ...] = ()  # states with a maximum fall and rise
+    back: tuple[str, ...] = ()  # commands whose curve has a separate reverse gain
+    drag: tuple[str, ...] = ()  # states with a quadratic drag and a back-EMF
+    # True if a car turns less at speed than its textbook, and slips sideways
     tyres: bool = False
-    delays: tuple[
-        tuple[str, float], ...
-    ] = ()  # likely ones of all commands [s]; (): they share it
+    # initial delays of all commands [s]; empty if they share one
+    delays: tuple[tuple[str, float], ...] = ()
 
     def latency_at(self, inputs: shooting.Inputs, values: Array) -> float:
-        """Returns the common latency of the commands for values (I,): the least delay [s]."""
+        """Returns the common latency of the commands for values (I,): their minimum delay [s]."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
         return float(
             min((at[f"{name}.delay"] for name, _ in self.delays), default=at["latency"])
@@ -212,7 +214,7 @@ def problem_of(
     t = samples.t
     dt = samples.dt
 
-    @lru_cache(maxsize=8)  # most values of a form shape no commands
+    @lru_cache(maxsize=8)  # most values of a form do not affect the commands
     def late(latency: float, curves: tuple[InputCurve, ...]) -> Array:
         return taken(command, spec, curves, t - latency, t - latency + dt)
 
@@ -234,7 +236,7 @@ def problem_of(
 def inputs_of(
     drive: Drive, latency: float, samples: Samples, form: Form
 ) -> shooting.Inputs:
-    """Returns the values that are sought besides coefficients: latency, and those of a form."""
+    """Returns the values to be estimated besides coefficients: latency, and those of a form."""
     rows = _rows_of_commands(drive, latency, form)
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
     for name in form.friction:
@@ -257,7 +259,7 @@ def inputs_of(
         for word, rate in (("fall", -rates[name]), ("rise", rates[name])):
             size = max(float(np.percentile(rate, STRONG)), 1e-3)
             rows[f"{name}.{word}"] = (size, 0.3 * size, 0.1 * size, 10.0 * size)
-    if not drive.spec.state:  # what is left of the mounting
+    if not drive.spec.state:  # the remaining error of the mounting
         reach = 2.0 * drive.spec.footprint_radius
         aside = reach if sided(drive.spec) else 0.0
         rows["x"] = (0.0, LEVER_SCALE_M, -reach, reach)
@@ -304,7 +306,7 @@ def _rows_of_commands(
 
 
 def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
-    """Returns curves without effect of commands that drive the robot both ways."""
+    """Returns neutral curves of commands that drive the robot both ways."""
     spec = drive.spec
     command = samples.x[:, len(spec.state) :]
     found = []
@@ -320,7 +322,7 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
 
 
 def _drivers(spec: RobotSpec) -> tuple[int, ...]:
-    """Returns the places of the commands that drive a robot ahead, as its textbook tells."""
+    """Returns the indices of the commands that drive a robot ahead, according to its textbook."""
     given = structure_of(spec)
     return () if given is None else tuple(np.flatnonzero(given[0][0]).tolist())
 
@@ -340,7 +342,7 @@ def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
 
 
 def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
-    """Returns a form in which the commands of curves have gains of their own backwards."""
+    """Returns a form in which the commands of curves have separate reverse gains."""
     more = tuple(c for c in curves if c.command not in {c.command for c in form.curves})
     return replace(
         form, curves=form.curves + more, back=tuple(c.command for c in curves)
@@ -350,10 +352,10 @@ def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
 def reached(
     model: TaylorModel, drive: Drive, samples: Samples, errors: Mapping[str, float]
 ) -> TaylorModel:
-    """Returns a model without ends of curves that were never reached, and limits that hardly were.
+    """Returns a model without curve ends that were never reached, and limits that hardly were.
 
-    Nor does it have limits that are less than their errors, by name. Its range of a command in
-    effect is that of what was sent.
+    Limits below their errors (by name) are removed as well. The range of a command in effect
+    becomes that of the commands sent.
     """
     names = [c.name for c in drive.spec.command]
     sent = drive.recording.command.values
@@ -391,7 +393,7 @@ def reached(
 
 
 def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
-    """Returns the delay [s] of the commands by which they best explain the rates of the state."""
+    """Returns the delay [s] of the commands that best explains the rates of the state."""
     tries, late = _delayed(drive, calibration, samples)
     left = [_left(drive.spec, samples, command) for command in late]
     found = np.isfinite(left).all()
@@ -403,7 +405,7 @@ def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> fl
 def likely_delays(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> tuple[tuple[str, float], ...]:
-    """Returns likewise the delay of each command beside the others; nothing if they are alike."""
+    """Returns the delay of each command separately, given the others; empty if they are alike."""
     tries, late = _delayed(drive, calibration, samples)
     now = int(np.abs(tries - calibration.command_latency_s).argmin())
     found = []
@@ -421,7 +423,7 @@ def likely_delays(
 def _delayed(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> tuple[Array, Array]:
-    """Returns delays (N,) that may be [s], and the commands in effect (N, T, C) by each."""
+    """Returns possible delays (N,) [s], and the commands in effect (N, T, C) for each."""
     form = Form(calibration.inputs)
     now = calibration.command_latency_s
     inputs = inputs_of(drive, now, samples, form)
@@ -437,7 +439,7 @@ def _delayed(
 
 
 def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
-    """Returns how much of the rates of the state commands in effect (T, C) leave unexplained."""
+    """Returns the part of the state's rates that commands in effect (T, C) leave unexplained."""
     states = len(spec.state)
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
     x = np.concatenate([samples.x[:, :states], command], axis=1)

@@ -1,7 +1,7 @@
-"""Lets a recorded gyro turn the poses of odometry, and says relative to what a model's errors are.
+"""Corrects odometry's heading by a recorded gyro, and states what a model's errors refer to.
 
-Odometry's heading is only as good as the grip of the wheels: those of a skid-steer slip in every
-turn. Its displacements along the heading of the gyro are the better pose to learn from.
+Odometry's heading is only as good as the grip of the wheels, and those of a skid-steer slip in
+every turn. Its displacements along the gyro's heading are the better pose to learn from.
 """
 
 from collections.abc import Iterator
@@ -19,23 +19,21 @@ from nics_drl_bridge.recording.heading import (
 )
 from nics_drl_bridge.recording.recording import Recording
 
-LEAST_COVERED = 0.9  # share of a drive for which there must be a gyro
-# difference from 1 of the ratio of turns, if the gyro is to fit a tracker
+LEAST_COVERED = 0.9  # minimum fraction of a drive that the gyro must cover
+# deviation from 1 of the ratio of turns, above which the gyro does not match a tracker
 UNLIKE_TRACKER = 0.1
 
 
 def turned_by_gyro(recording: Recording) -> Recording:
-    """Returns a recording whose odometry turns by the gyro, if one was recorded and both differ.
+    """Returns a recording whose odometry turns by the gyro, if one was recorded and the two differ.
 
-    `gyro` then tells how they compare. Other poses are not changed, but compared; `repairs` hold a
-    sentence on what was found.
+    `gyro` then holds the comparison. Other poses are compared but not changed; `repairs` gets a
+    sentence on the finding.
     """
     if recording.imu is None or recording.gyro is not None:
         return recording
     if recording.imu.clock != recording.pose.clock:
-        told = (
-            "The gyro is on another clock than the pose, and was not compared with it."
-        )
+        told = "The gyro is on another clock than the pose, so it was not compared with it."
         return replace(recording, repairs=(*recording.repairs, told))
     turning = _compared(recording)
     if turning is None:
@@ -51,7 +49,7 @@ def turned_by_gyro(recording: Recording) -> Recording:
         )
         if covered < LEAST_COVERED:
             sentences = (
-                f"The gyro covers {covered:.0%} of the drive only, so the heading is that of "
+                f"The gyro covers only {covered:.0%} of the drive, so the heading is that of "
                 "odometry, which it contradicts; record its topic without gaps.",
             )
             return replace(recording, repairs=(*recording.repairs, *sentences))
@@ -62,7 +60,7 @@ def turned_by_gyro(recording: Recording) -> Recording:
 
 
 def relative_to(recording: Recording) -> str:
-    """Says relative to what the errors of a model are that was learnt from a recording."""
+    """States what the errors of a model learnt from a recording are relative to."""
     by = recording.measured_by
     turning = recording.gyro
     if by == "truth":
@@ -73,17 +71,17 @@ def relative_to(recording: Recording) -> str:
         if turning.contradicts:
             return (
                 "That is relative to odometry with its heading from the gyro, which contradicts "
-                f"odometry's own by {turning.apart:.2g} rad in {WINDOW_S:g} s; nothing here tells "
+                f"odometry's own by {turning.apart:.2g} rad in {WINDOW_S:g} s; nothing here shows "
                 "how far the path drifts."
             )
         return (
-            "That is relative to odometry, whose heading the gyro confirms; nothing here tells "
+            "That is relative to odometry, whose heading the gyro confirms; nothing here shows "
             "how far the path drifts."
         )
     if by == "odometry":
-        return "That is relative to odometry; nothing here tells how far that drifts."
+        return "That is relative to odometry; nothing here shows how far that drifts."
     return (
-        "That is relative to the recorded pose; nothing here tells whether it is odometry, which "
+        "That is relative to the recorded pose; nothing here shows whether it is odometry, which "
         "drifts."
     )
 
@@ -99,7 +97,7 @@ def _compared(recording: Recording) -> Turning | None:
 
 
 def _fits(recording: Recording, turning: Turning) -> bool:
-    """True if the gyro can be believed, beside this pose."""
+    """True if the gyro is credible, given this pose."""
     if not turning.plausible:
         return False
     if recording.measured_by == "odometry":
@@ -112,14 +110,14 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
     if turning.mirrored:
         yield Mistake(
             "The gyro turns against the heading: one of them is mirrored, and the gyro was not "
-            "used. Counter-clockwise is positive; write `scale: -1` beside its `from:`, or mend "
+            "used. Counter-clockwise is positive; write `scale: -1` beside its `from:`, or fix "
             "its driver."
         )
         return
     if turning.in_degrees:
         yield Mistake(
             f"The gyro turns {1.0 / turning.scale:.3g} times as far as the heading, as degrees "
-            "would, and was not used: write `unit: deg/s` beside its `from:`, or mend its driver."
+            "would, and was not used: write `unit: deg/s` beside its `from:`, or fix its driver."
         )
         return
     if not turning.plausible:

@@ -1,4 +1,4 @@
-"""Hypotheses on a motion: a base by the textbook, and orders of terms that depart from it."""
+"""Hypotheses on a motion: the textbook as a base, and orders of terms beyond it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,41 +19,39 @@ from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-ORDERS = (1, 2, 3)  # of which `auto` chooses
-PULLS = (0.1, 0.01, 0.001)  # of which each order chooses
-WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
+ORDERS = (1, 2, 3)  # orders that `auto` chooses from
+PULLS = (0.1, 0.01, 0.001)  # pulls that are tried for each order
+WORTH = 0.95  # a higher order must reduce the error to this fraction
 FOLDS = 3
-# of trials
+# spacing of trials' windows
 SPACING_S = 0.5
 EVALUATIONS = 25
 BASE_ORDER = 3
 BASE_EVALUATIONS = 100
 HORIZON_S = 5.0
-NOTHING = 1e-4  # m, rad: what is left of a part of a mounting that was left out
-LONGEST_LAG_S = 2.0  # a state that takes longer is rolling on: it hides no latency
+NOTHING = 1e-4  # m, rad: size below which a removed part of a mounting counts as zero
+LONGEST_LAG_S = 2.0  # a state that takes longer is coasting, so it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 
-Hypothesis = tuple[
-    int, float
-]  # order, 0 for the textbook's terms alone, and pull to these
+# (order, 0 for the textbook's terms alone; pull towards these)
+Hypothesis = tuple[int, float]
 TEXTBOOK = 0, 0.0
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial of one order, on parts of the training part that its fits did not see."""
+    """A trial of one order, on parts of the training data that its fits did not see."""
 
-    order: int  # 0: of the textbook's terms alone
-    pull: float  # to the textbook's terms
-    error: float  # mean error after `HORIZON_S`, as a share of the path
-    errors: dict[
-        float, Array
-    ]  # (W,) distances at the ends of predictions, by horizon [m]
+    order: int  # 0: only the textbook's terms
+    pull: float  # weight that keeps coefficients near the textbook's
+    error: float  # mean error after `HORIZON_S`, as a fraction of the path
+    # (W,) distances at the ends of predictions, by horizon [m]
+    errors: dict[float, Array]
 
     @property
     def level(self) -> float:
         """Geometric mean of the mean errors over all horizons that fit; infinite if none does."""
-        # Over half a second what drives a robot shows best, over five where it ends.
+        # Short horizons show best what drives a robot, long ones where it ends up.
         means = [float(each.mean()) for each in self.errors.values() if len(each)]
         return float(np.exp(np.mean(np.log(means)))) if means else np.inf
 
@@ -97,7 +95,7 @@ class Draft:
         evaluations: int = shooting.EVALUATIONS,
         pull: float = shooting.PULL,
     ) -> shooting.Predictive:
-        """Adjusts the terms of a linear fit, and those of a base to which they are pulled."""
+        """Adjusts the terms of a linear fit, and those of a base that they are pulled towards."""
         base, first = terms.together(base, linear)
         free = ((base.coefficients != 0.0) | (first != 0.0)) & ~terms.defined(
             self.spec
@@ -107,14 +105,14 @@ class Draft:
         )
 
     def error_of(self, found: shooting.Predictive) -> float:
-        """Returns the mean distance of predicted ends to measured ones, over all horizons [m]."""
+        """Returns the mean distance of predicted from measured ends, over all horizons [m]."""
         error = self.problem.errors(found.model, found.values)[0]
         return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
 
     def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
-        """Fits each to all but one of `FOLDS` parts of a drive, and predicts that part.
+        """Cross-validates each hypothesis over `FOLDS` parts of a drive.
 
-        A part without which a variable would not have moved is not left out.
+        A part is not left out if a variable would not have moved without it.
         """
         samples = self.problem.samples
         values = self.inputs.start
@@ -171,7 +169,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class Base:
-    """The textbook's terms with the form that predict best: what models depart from."""
+    """The textbook's terms with the best-predicting form, from which models depart."""
 
     draft: Draft  # its inputs start from the values found
     found: shooting.Predictive
@@ -184,9 +182,9 @@ def base_of(
     clear: tuple[InputCurve, ...] = (),
     known: Base | None = None,
 ) -> Base:
-    """Fits the textbook with and without each part of a form; keeps what predicts.
+    """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
-    Clear curves are not doubted. A known base is fitted anew, to other data.
+    `clear` curves are always kept. A known base is refitted to other data.
     """
 
     def fitted(form: forms.Form, before: Base | None = None) -> Base:
@@ -207,9 +205,8 @@ def base_of(
     error = error_of(best)
     if len(calibration.inputs) > len(clear):
         plain = fitted(forms.Form(clear))
-        if (other := error_of(plain)) < error or np.isinf(
-            other
-        ):  # too short a drive tells nothing
+        # the drive is too short to judge
+        if (other := error_of(plain)) < error or np.isinf(other):
             best = plain
             error = other
     for change, worth in changes(drive, calibration, samples):
@@ -225,11 +222,11 @@ def base_of(
 def changes(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> Iterator[tuple[Callable[[forms.Form], forms.Form], float]]:
-    """Yields changes of the form of a robot's motion, and to which share each takes the error."""
-    # Drag and friction are hard to tell apart: both are tried, then each without the other.
+    """Yields changes to the form of a motion, and the fraction to which each must cut the error."""
+    # Drag and friction are hard to distinguish, so both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
     late = forms.likely_delays(drive, calibration, samples)
-    if late:  # a wrong time hides what else there is, and is hidden by it
+    if late:  # first, because a wrong delay hides other effects and is hidden by them
         yield lambda form: replace(form, delays=late), WORTH
     if terms.tyres_slip(drive.spec):
         yield lambda form: replace(form, tyres=True), WORTH
@@ -251,13 +248,13 @@ def changes(
 
 
 def hypotheses(order: Order) -> tuple[Hypothesis, ...]:
-    """Returns those that are tried for an order, from the least free to the freest."""
+    """Returns the hypotheses for an order, from the most constrained to the least."""
     orders = ORDERS if order == "auto" else (order,)
     return (TEXTBOOK, *((o, pull) for o in orders for pull in PULLS))
 
 
 def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
-    """Returns the first trial that none clearly improves on; of an order that was asked for."""
+    """Returns the first trial that no other clearly improves on; of one `order` if given."""
     asked = [trial for trial in trials if order in ("auto", trial.order)] or list(
         trials
     )
@@ -269,7 +266,7 @@ def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
 
 
 def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
-    """Returns the lags [s] by which a base's states follow, by name, with their own delays."""
+    """Returns the lags [s] by which a base's states follow, by name, plus their own delays."""
     alone = model.powers.sum(axis=1) == 1
     found = {}
     delays = model.delays[model.drivers]
@@ -281,8 +278,8 @@ def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
 
 
 def about_lags(latency: float, lags: dict[str, float], beside: float) -> str:
-    """Says that a latency [s] is known as its sum with lags, found `beside` one of their own."""
-    # A second lag of a servo is a latency to a model that has one.
+    """States that only the sum of latency [s] and lags is known; `beside` was found with lags."""
+    # A model with one lag treats the second lag of a servo as latency.
     sums = ", ".join(f"{beside + lag:.3f} s for {name}" for name, lag in lags.items())
     return f"Latency ({latency:.3f} s) can't be told from the lags: trust their sums, {sums}."
 
@@ -299,9 +296,9 @@ def standard_errors(found: shooting.Predictive) -> Array:
 def with_certain_mounting(
     draft: Draft, calibration: Calibration, found: shooting.Predictive
 ) -> Draft | None:
-    """Returns a draft whose mounting lacks what is below three standard errors; None if nothing is.
+    """Returns a draft without the parts of its mounting below 3 standard errors; None if all stay.
 
-    What is left out is zero in the calibration that `remounted` returns.
+    Removed parts are zero in the calibration that `remounted` returns.
     """
     sigma = found.value_errors[-3:]
     total = geometry.compose(found.values[-3:], calibration.mounting)
@@ -326,7 +323,7 @@ def with_certain_mounting(
 
 
 def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
-    """Adds the mounting that predictions show to what the calibration has."""
+    """Adds the mounting found by predictions to that of the calibration."""
     x, y, heading = map(
         float, geometry.compose(found.values[-3:], calibration.mounting)
     )
@@ -344,7 +341,7 @@ def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibrati
 
 
 def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
-    """Tells of a higher order than the usual one."""
+    """Yields a sentence if the order is higher than usual."""
     if trials and (best := chosen(list(trials))) is not trials[0]:
         errors = ", ".join(
             f"{trial.error:.1%} by order {trial.order}" for trial in trials
@@ -355,7 +352,7 @@ def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
 
 
 def about_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
-    """Names what a model of a motion has beside the textbook's terms, and what it gains by it."""
+    """Lists what a motion model has besides the textbook's terms, and how much that improves it."""
     form = base.draft.form
     best = chosen(trials, order)
     parts = [

@@ -1,4 +1,4 @@
-"""Identification of a model from a recording: the row of stages `STAGES` over a prepared drive."""
+"""Identification of a model from a recording: the stages `STAGES`, run over a prepared drive."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -65,50 +65,48 @@ from nics_drl_bridge.threads import one_blas_thread
 
 T = TypeVar("T")
 
-ORDERS_OF_INFERRED = (2, 3, 4)  # of which `auto` chooses if the state follows commands
+# orders that `auto` chooses from if the state follows commands
+ORDERS_OF_INFERRED = (2, 3, 4)
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of the stages in order; None or empty until they have run, or if not learnable."""
+    """Findings of the stages in order; None or empty before they have run, or if not learnable."""
 
-    training: Drive  # the part of the drive to learn from; repaired by `repair`
-    whole: Drive  # repaired by `repair`
+    training: Drive  # the training part of the drive, repaired by `repair`
+    whole: Drive  # the whole drive, repaired by `repair`
     timing: timings.TimingEstimate  # of `clocks`; nominal before
-    repairs: tuple[str, ...] = ()  # sentences of `repair`
-    # (n,) expected over the training part's twists, of `mounting`
+    repairs: tuple[str, ...] = ()  # sentences from `repair`
+    # (n,) expected over the training part's twists, from `mounting`
     speed: Array | None = None
-    mounting: Mounting | None = None  # of `mounting`
-    # Of `clocks`, `mounting`, `responses` and `noise`; then of `refine`.
+    mounting: Mounting | None = None  # from `mounting`
+    # From `clocks`, `mounting`, `responses` and `noise`; then from `refine`.
     calibration: Calibration = field(default_factory=Calibration)
-    noise: Noise = field(
-        default_factory=Noise
-    )  # the pose sensor's of `noise`; the rest of `judge`
-    # of `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
+    # the pose sensor's from `noise`; the rest from `judge`
+    noise: Noise = field(default_factory=Noise)
+    # from `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
     width: float | None = None
-    samples: Samples | None = None  # of the training part on one time axis, of `fit`
-    clear: tuple[InputCurve, ...] = ()  # input curves beyond doubt, of `inputs`
-    base: hypotheses.Base | None = None  # of the textbook's terms, of `fit`
-    trials: tuple[
-        hypotheses.Trial, ...
-    ] = ()  # of orders, on parts of the training part, of `fit`
-    regression: fitting.Regression | None = None  # on all features (Eq. 1), of `fit`
-    linear: fitting.Fit | None = None  # the pruned fit (Eq. 2), of `prune`
-    model: TaylorModel | None = None  # of `prune`; then of `refine` and `complete`
-    refinement: tuple[str, ...] = ()  # sentences of `refine`
-    assumptions: tuple[str, ...] = ()  # sentences of `complete`
-    unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
-    # open-loop errors on that part, of `judge`
+    samples: Samples | None = None  # of the training part on one time axis, from `fit`
+    clear: tuple[InputCurve, ...] = ()  # input curves beyond doubt, from `inputs`
+    base: hypotheses.Base | None = None  # of the textbook's terms, from `fit`
+    # of orders, on parts of the training part, from `fit`
+    trials: tuple[hypotheses.Trial, ...] = ()
+    regression: fitting.Regression | None = None  # on all features (Eq. 1), from `fit`
+    linear: fitting.Fit | None = None  # the pruned fit (Eq. 2), from `prune`
+    model: TaylorModel | None = None  # from `prune`; then from `refine` and `complete`
+    refinement: tuple[str, ...] = ()  # sentences from `refine`
+    assumptions: tuple[str, ...] = ()  # sentences from `complete`
+    unseen: Samples | None = None  # of the part that the fit did not see, from `judge`
+    # open-loop errors on that part, from `judge`
     held_out: open_loop.OpenLoop | None = None
-    judgement: tuple[
-        HorizonErrors, ...
-    ] = ()  # on that part, beside yardsticks, of `judge`
-    # the textbook fitted to the training part, of `judge`
+    # on that part, compared with yardsticks, from `judge`
+    judgement: tuple[HorizonErrors, ...] = ()
+    # the textbook fitted to the training part, from `judge`
     yardstick: Yardstick | None = None
-    # sentence on the model in whose place the textbook was put, of `settle`
+    # sentence on the model that the textbook replaced, from `settle`
     replaced: str = ""
-    notes: tuple[str, ...] = ()  # all sentences, of `judge`
-    # on all data, of `refit`; None if the trial's model is kept
+    notes: tuple[str, ...] = ()  # all sentences, from `judge`
+    # on all data, from `refit`; None if the trial's model is kept
     refit: "Findings | None" = None
 
 
@@ -116,7 +114,7 @@ Stage = Callable[[Drive, Findings], Findings]
 
 
 def known(found: T | None, name: str, stage: str) -> T:
-    """Returns a finding that a later stage can't do without, else raises FitError."""
+    """Returns a finding that a later stage needs. Raises FitError if it is missing."""
     if found is None:
         raise FitError(
             f"{name} is missing; put the stage {stage!r} before those that need it."
@@ -143,7 +141,7 @@ def repair(drive: Drive, findings: Findings) -> Findings:
 
 
 def clocks(drive: Drive, findings: Findings) -> Findings:
-    """Finds the period of bursts, the offset between clocks, the latency of commands, and lags."""
+    """Finds the period of bursts, the clock offset, the latency of commands, and lags."""
     training = findings.training
     spec = drive.spec
     derived = motions.by_motion(spec, drive.recording)
@@ -184,7 +182,7 @@ def mounting(drive: Drive, findings: Findings) -> Findings:
 
 
 def responses(drive: Drive, findings: Findings) -> Findings:
-    """Finds how states that were not measured follow the commands, and the scale of the wheels."""
+    """Finds how unmeasured states follow the commands, and the scale of the wheels."""
     training = findings.training
     calibration = findings.calibration
     found = calibration.responses
@@ -197,7 +195,7 @@ def responses(drive: Drive, findings: Findings) -> Findings:
 
 
 def noise(drive: Drive, findings: Findings) -> Findings:
-    """Measures the noise of the pose: without it, a drive without corrections is an exact one."""
+    """Measures the noise of the pose; a drive without noise and corrections is treated as exact."""
     position, heading = findings.training.pose_noise or (0.0, 0.0)
     noisy = replace(
         findings.calibration, position_noise_m=position, heading_noise_rad=heading
@@ -206,7 +204,7 @@ def noise(drive: Drive, findings: Findings) -> Findings:
 
 
 def motion(drive: Drive, findings: Findings) -> Findings:
-    """Takes the state from the poses, if it is a part of the twist that was not measured."""
+    """Derives the state from the poses, if it is an unmeasured part of the twist."""
     if not motions.by_motion(drive.spec, drive.recording):
         return findings
     calibration = findings.calibration
@@ -219,14 +217,14 @@ def motion(drive: Drive, findings: Findings) -> Findings:
 
 
 def aligned(drive: Drive, findings: Findings) -> Samples:
-    """Puts a drive on one time axis by what was found."""
+    """Resamples a drive on one time axis, using the findings."""
     if findings.width is None:
         return align(drive, findings.calibration)
     return motions.samples_of(drive, findings.calibration, findings.width)
 
 
 def inputs(drive: Drive, findings: Findings) -> Findings:
-    """Finds the latency, and dead zones and saturation of commands, that explain a motion."""
+    """Finds the latency, and the dead zones and saturation of commands, that explain a motion."""
     if findings.width is None:
         return findings
     training = findings.training
@@ -251,7 +249,7 @@ def _with_delay(findings: Findings, samples: Samples) -> Findings:
 
 
 def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
-    """Fits the order that predicts parts of the training part best that its fits did not see."""
+    """Fits the order that best predicts parts of the training data that its fits did not see."""
     training = findings.training
     spec = drive.spec
     order = drive.settings.order
@@ -260,7 +258,7 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
         base = hypotheses.base_of(
             training, findings.calibration, samples, findings.clear, findings.base
         )
-        trials = findings.trials  # a refit knows what was chosen
+        trials = findings.trials  # a refit reuses the choice
         trials = trials or base.draft.tried(hypotheses.hypotheses(order))
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
@@ -285,7 +283,7 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
 
 
 def fit(drive: Drive, findings: Findings) -> Findings:
-    """Puts the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
+    """Resamples the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
     if findings.width is not None:
         return _fit_of_motion(drive, findings)
     calibration = findings.calibration
@@ -297,7 +295,8 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     trials = findings.trials
     samples = followers.unlimited(samples, calibration, spec)
     inferred = drive.recording.state is None and not calibration.is_exact
-    if settings.order == "auto" and inferred and not trials:  # a refit knows them
+    # a refit reuses the trials
+    if settings.order == "auto" and inferred and not trials:
         trials = _trials_of_orders(drive, findings)
     order = fitting.ORDER if settings.order == "auto" else settings.order
     order = hypotheses.chosen(list(trials)).order if trials else order
@@ -315,7 +314,7 @@ def fit(drive: Drive, findings: Findings) -> Findings:
 
 
 def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
-    """Tries each order on parts of the training part that its fits did not see."""
+    """Tries each order on parts of the training data that its fits did not see."""
     training = findings.training
     trials = []
     span = 0.0, training.duration_s, hypotheses.HORIZON_S, open_loop.SPACING_S
@@ -332,11 +331,10 @@ def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Tria
 
 
 def prune(drive: Drive, findings: Findings) -> Findings:
-    """Keeps the terms of Eq. 2, and fits them anew."""
+    """Keeps the terms of Eq. 2, and refits them."""
     regression = known(findings.regression, "the fit of all terms", "fit")
-    if (
-        findings.width is not None
-    ):  # what a mirror allows is kept: the predictions weigh it
+    # keeps what mirror symmetry allows, because predictions weight these terms
+    if findings.width is not None:
         return findings
     linear = fitting.pruned(regression, drive.spec, drive.settings.alpha)
     limits = followers.scaled_limits(findings.calibration, drive.spec)
@@ -382,7 +380,7 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(
             base.found
         ):
-            return draft.base(other=book), best.order == 0  # a search may go astray
+            return draft.base(other=book), best.order == 0  # the search may diverge
         return found, True
 
     found, kept_order = refined_by(draft)
@@ -435,18 +433,18 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
 
 
 def about_options(drive: Drive, order: int, kept_order: bool) -> Iterator[str]:
-    """Says which options had no effect on a model whose state is the motion."""
+    """Yields the options that had no effect on a model whose state is the motion."""
     settings = drive.settings
     if settings.alpha != "auto":
-        why = "where the state is the motion, predictions of parts of the drive weigh the terms"
+        why = "where the state is the motion, predictions of parts of the drive weight the terms"
         yield f"alpha = {settings.alpha:g} was not used: {why}."
     if settings.order != "auto" and not kept_order:
-        why = "predictions with its terms went astray, so the textbook's terms were kept alone"
+        why = "predictions with its terms diverged, so only the textbook's terms were kept"
         yield f"order = {order} was not used: {why}."
 
 
 def complete(drive: Drive, findings: Findings) -> Findings:
-    """Completes the model, on request, by the textbook for inputs that never moved."""
+    """Completes the model by the textbook for inputs that never moved, if requested."""
     if not drive.settings.assume:
         return findings
     linear, model = _fitted(findings)
@@ -455,7 +453,7 @@ def complete(drive: Drive, findings: Findings) -> Findings:
 
 
 def judge(drive: Drive, findings: Findings) -> Findings:
-    """Tries the model on unseen data, measures what it leaves unexplained, says what to doubt."""
+    """Tests the model on unseen data, measures what it leaves unexplained, and lists doubts."""
     linear, model = _fitted(findings)
     spec = drive.spec
     whole = findings.whole
@@ -497,7 +495,7 @@ def judge(drive: Drive, findings: Findings) -> Findings:
 def _with_actuators(
     drive: Drive, findings: Findings, yardstick: Yardstick
 ) -> tuple[Drive, Findings]:
-    """Returns a drive of a steered robot, and its findings, whose state is speed and angle."""
+    """Returns a drive of a steered robot, and its findings, with speed and angle as state."""
     calibration = findings.calibration
     spec = actuated_spec(yardstick, findings.whole)
     parts = [
@@ -509,7 +507,7 @@ def _with_actuators(
 
 
 def settle(drive: Drive, findings: Findings) -> Findings:
-    """Puts the fitted textbook in the place of a model that predicts unseen data worse."""
+    """Replaces a model by the fitted textbook if that predicts unseen data better."""
     if findings.yardstick is None or not acceptance.loses_to_textbook(
         findings.judgement
     ):
@@ -528,7 +526,7 @@ def settle(drive: Drive, findings: Findings) -> Findings:
             drive, start = _with_actuators(drive, start, yardstick)
             spec = drive.spec
         samples = aligned(start.training, start)
-        if spec is not start_spec:  # figures of another state's rates
+        if spec is not start_spec:  # these figures are of another state's rates
             linear = fitting.fit(samples, spec, noisy=True)
             start = replace(start, regression=linear.regression, linear=linear)
         book = textbook_model(yardstick, model, samples, spec)
@@ -554,7 +552,7 @@ def settle(drive: Drive, findings: Findings) -> Findings:
 
 
 def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
-    """All that is to be told of a model, the gravest first."""
+    """Collects all sentences on a model, the most serious first."""
     linear, _ = _fitted(findings)
     spec = drive.spec
     calibration = findings.calibration
@@ -590,7 +588,7 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
 
 
 def _why_replaced(drive: Drive, findings: Findings) -> Iterator[str]:
-    """Tells if rows that are too far apart are why a model lost to its textbook."""
+    """Yields a sentence if a coarse sampling rate explains why a model lost to its textbook."""
     if not findings.replaced or drive.recording.state is None:
         return
     linear, _ = _fitted(findings)
@@ -602,7 +600,7 @@ def _why_replaced(drive: Drive, findings: Findings) -> Iterator[str]:
 def _left_out(
     drive: Drive, findings: Findings, order: int | None = None
 ) -> dict[float, Array]:
-    """Returns errors (W,) by horizon [s] on left-out parts; with an order, by what was found."""
+    """Returns errors (W,) by horizon [s] on left-out parts; with an order, reusing the findings."""
     training = findings.training
     stages = STAGES[: STAGES.index(complete)]
     pose = training.recording.pose
@@ -642,7 +640,7 @@ def _left_out(
 
 
 def refit(drive: Drive, findings: Findings) -> Findings:
-    """Fits the judged model anew to all data, unless it then predicts what it knew worse."""
+    """Refits the judged model to all data, unless it then predicts the training part worse."""
     until = drive.settings.train_until_s
     if findings.calibration.is_exact or until >= drive.duration_s or findings.replaced:
         return findings
@@ -677,9 +675,8 @@ def refit(drive: Drive, findings: Findings) -> Findings:
 
 
 def _plain(found: Findings) -> tuple[str, ...]:
-    return tuple(
-        map(str, _sentences(found))
-    )  # of a file, which knows no kinds of sentences
+    # plain strings for a file, which has no kinds of sentences
+    return tuple(map(str, _sentences(found)))
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:
@@ -716,7 +713,7 @@ STAGES: tuple[Stage, ...] = (
     settle,
     refit,
 )
-"""In order; each builds on what the stages before it found."""
+"""In order; each uses the findings of those before it."""
 
 
 def begun(drive: Drive) -> Findings:
@@ -728,7 +725,7 @@ def begun(drive: Drive) -> Findings:
 def run(
     stages: Sequence[Stage], drive: Drive, findings: Findings | None = None
 ) -> Findings:
-    """Runs a row of stages over a drive, from what is known, and returns their findings."""
+    """Runs stages over a drive, starting from given findings, and returns their findings."""
     findings = findings or begun(drive)
     for stage in stages:
         findings = stage(drive, findings)
@@ -737,31 +734,29 @@ def run(
 
 @dataclass(frozen=True)
 class Identified:
-    """Result of an identification: a model of all data, and what a trial of it showed.
+    """Result of an identification: a model of all data, and the results of its trial.
 
-    The trial learnt the first part of the drive only, and was judged on the rest.
+    The trial learnt only the first part of the drive, and was judged on the rest.
     """
 
     drive: Drive  # the whole drive, repaired
-    model: TaylorModel  # refined and, on request, completed; with standard errors and quality
+    # refined and, if requested, completed; with standard errors and quality
+    model: TaylorModel
     calibration: Calibration
     fit: fitting.Fit  # the linear fit, before refinement
-    samples: Samples  # that the fit used
-    unseen: (
-        Samples | None
-    )  # of the part that the trial did not see; None if there are too few
-    held_out: (
-        open_loop.OpenLoop | None
-    )  # its open-loop errors there; None if it was too short
+    samples: Samples  # used by the fit
+    # of the part that the trial did not see; None if there are too few
+    unseen: Samples | None
+    # its open-loop errors there; None if the part was too short
+    held_out: open_loop.OpenLoop | None
     noise: Noise  # of sensors and motion, each level measured or assumed
-    findings: Findings  # of all stages, of the trial
-    notes: tuple[
-        str, ...
-    ]  # sentences on findings, on what was not learnt, and on assumptions
+    findings: Findings  # findings of all stages on the trial
+    # sentences on findings, on what was not learnt, and on assumptions
+    notes: tuple[str, ...]
 
     @property
     def trial(self) -> "Identified":
-        """The model, and what belongs to it, that was judged on data that it never saw."""
+        """The result of the trial: the model that was judged on data it never saw."""
         return _result(self.findings, self.findings)
 
     @property
@@ -781,19 +776,19 @@ class Identified:
 
     @property
     def coverage(self) -> dict[float, float]:
-        """Share of the held-out ends within the 95 % band of predictions, by horizon [s]."""
+        """Fraction of held-out ends within the 95 % band of predictions, by horizon [s]."""
         return {
             e.horizon_s: e.coverage for e in self.judgement if e.coverage is not None
         }
 
     @property
     def judgement(self) -> tuple[HorizonErrors, ...]:
-        """Errors on data held out, beside those of yardsticks, by horizon."""
+        """Errors on held-out data, compared with those of yardsticks, by horizon."""
         return self.findings.judgement
 
     @property
     def assessment(self) -> acceptance.Assessment:
-        """What the model is fit for, and the reasons."""
+        """What the model is suitable for, and the reasons."""
         spec = self.drive.spec
         findings = self.findings
         mistaken = any(isinstance(note, verdict.Mistake) for note in self.notes)
@@ -815,13 +810,13 @@ class Identified:
 
     @property
     def verdict(self) -> acceptance.Verdict:
-        """What the model is fit for, in one of three words."""
+        """What the model is suitable for, as one of three verdicts."""
         return self.assessment.verdict
 
     @property
     def dead_zone(self) -> float:
-        """Greatest value of the command that drives it at which the robot stands; 0 if none."""
-        # A state with dry friction begins to move where the command's effect exceeds that.
+        """Maximum of the driving command at which the robot stays at rest; 0 if none."""
+        # A state with dry friction starts to move when the command's effect exceeds the friction.
         model = self.model
         states = self.model.state_size
         dead = {curve.command: curve.dead for curve in model.inputs}
@@ -853,8 +848,8 @@ def identify(
     assume: bool = False,
     strict: bool = False,
 ) -> Identified:
-    """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
-    # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.
+    """Learns a model up to `train_until` [s], and tests it on the rest; see `Settings`."""
+    # Default: two thirds. RecordingError: unusable for this robot. FitError: too little excitation.
     drive = Drive(turned_by_gyro(check(recording, spec)), spec)
     until = train_until if train_until is not None else recording.learn_until_s
     until = LEARNT_SHARE * drive.duration_s if until is None else until
@@ -884,7 +879,7 @@ def _result(trial: Findings, final: Findings) -> Identified:
 
 
 def cut(recording: Recording, until: float) -> Recording:
-    """Returns a recording up to `until` [s] after its first pose; commands last a little longer."""
+    """Returns a recording up to `until` [s] after its first pose; commands last slightly longer."""
     pose = recording.pose.t
 
     def part(stream: Stream, margin: float = 0.0) -> Stream:

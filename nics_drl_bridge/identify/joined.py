@@ -1,4 +1,4 @@
-"""Joins recordings of one robot for one fit: the clocks of each are aligned by itself."""
+"""Joins recordings of one robot for one fit, aligning the clocks of each recording separately."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,14 +13,13 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 
 def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recording:
-    """Joins recordings of a robot; RecordingError if one is not of it, or its clocks stay apart."""
+    """Joins recordings of a robot; RecordingError for another robot, or clocks that can't align."""
     if not recordings:
         raise RecordingError("no recording was given; give one or more.")
     if len(recordings) == 1:
         return recordings[0]
-    turned = [
-        turned_by_gyro(each) for each in recordings
-    ]  # a gyro's bias is that of a drive
+    # a gyro's bias differs between drives
+    turned = [turned_by_gyro(each) for each in recordings]
     offsets = [clock_offset(each, spec) for each in turned]
     joined = join(turned, offsets)
     gyros = [each.gyro for each in turned]
@@ -30,7 +29,7 @@ def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recordi
 
 
 def clock_offset(recording: Recording, spec: RobotSpec) -> float:
-    """Returns what, added to the pose's stamps, gives the commands' clock [s], by this drive."""
+    """Returns the offset [s] from the pose's clock to the commands', found from this drive."""
     if recording.pose.clock == recording.command.clock:
         return 0.0
     drive = Drive(check(recording, spec), spec)

@@ -35,8 +35,9 @@ from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 HORIZONS_S = (0.5, 1.0, 2.0, HORIZON_S, 10.0)
 BANDED_S = HORIZONS_S[:4]
 FOLDS = 5
-EVALUATIONS = 8  # of the fit to all but one part, which starts at the fit to all
-# percentage of the ends within a band, of so many at least
+# limit for the fits to all parts but one, which start from the fit to all parts
+EVALUATIONS = 8
+# percentage of ends within a band, and the minimum number of ends for it
 WITHIN = 95.0
 FEWEST = 20
 
@@ -59,9 +60,9 @@ def judged(
     bands: dict[float, float],
     textbook: Yardstick | None,
 ) -> tuple[HorizonErrors, ...]:
-    """Compares predictions of the held-out part, by the horizons that fit into it.
+    """Compares predictions of the held-out part, at the horizons that fit into it.
 
-    `bands` are distances within which 95 % of the ends are expected [m], by horizon [s].
+    `bands` are the distances within which 95 % of the ends are expected [m], by horizon [s].
     """
     begin = drive.settings.train_until_s
     told = []
@@ -113,9 +114,8 @@ def noise_beside(
     if other is None:
         return None
     difference = distances(ends, chosen) - distances(other, chosen)
-    if not np.isfinite(
-        difference
-    ).all():  # one of them runs away: there is no doubt about it
+    # one of them diverges, so the ranking is clear
+    if not np.isfinite(difference).all():
         return 0.0
     return comparison_noise(difference, chosen.start_t, horizon)
 
@@ -150,8 +150,8 @@ def bands_of(
 ) -> dict[float, float]:
     """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
 
-    Parts of the training part are predicted by the model, adjusted to the others. `derived` are
-    the samples of a motion that was taken from the poses, and what the model departed from.
+    Each fold of the training part is predicted by the model adjusted to the others. `derived` are
+    the samples of a motion derived from the poses, and the base that the model departed from.
     """
     pose = training.recording.pose
     errors: dict[float, list[Array]] = {h: [] for h in BANDED_S}

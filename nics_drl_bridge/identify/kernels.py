@@ -1,4 +1,4 @@
-"""Compiled sensitivities: poses at the ends of windows, and their derivatives by coefficients."""
+"""Compiled sensitivities: poses at the ends of windows, and derivatives by the coefficients."""
 
 import math
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import advance_state, get_bounds, sum_back_emf
 
-# windows that are predicted at a time: vector instructions take some at once
+# number of windows predicted at a time, for vector instructions
 WIDTH = 16
 # below this angle the series of sin(a)/a is exact to the last digits [rad]
 SMALL_TURN = 0.3
@@ -59,8 +59,8 @@ def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, 
 @kernel(allocates=True)
 def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-untyped-def]
     """Writes end poses (W, 3), and derivatives (W, 3, P) by the `free` (P,) of `terms`."""
-    # Of body twists along courses of X (W, T, V + 1), with a last entry of 1, integrated as in
-    # the simulator: whole `steps` (W,) of `dt` [s] and a `share` (W,) of one more; headings are
+    # Body twists along courses of X (W, T, V + 1), whose last entry is 1, are integrated as in the
+    # simulator: whole `steps` (W,) of `dt` [s] and a `share` (W,) of one more; headings are
     # unwrapped.
     dof = terms.dof
     coefficient = terms.coefficient
@@ -124,20 +124,21 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
 
 
 class Shot(NamedTuple):
-    """Windows to predict from their first states: inputs of `shoot`, and what it writes."""
+    """Windows to predict from their first states: inputs and outputs of `shoot`."""
 
     state: Array  # (W, S) at the start
     first: NDArray[np.intp]  # (W,) rows of `command` (T, C) at the start
     command: Array
-    stop: NDArray[np.intp]  # (W, H) steps after which poses are wanted; 0: not wanted
-    end: Array  # (W, H, 3) poses then from those at the start; headings unwrapped
+    stop: NDArray[np.intp]  # (W, H) steps after which poses are requested; 0: none
+    # (W, H, 3) poses then, relative to those at the start; headings unwrapped
+    end: Array
     slope: Array  # (W, H, 3, P) their derivatives by the free coefficients
 
 
 class Tangent(NamedTuple):
-    """Scratch memory of L windows: values now, and their derivatives by the free coefficients.
+    """Scratch memory of L windows: current values, and their derivatives by the free coefficients.
 
-    There is room for a whole number of `WIDTH` coefficients.
+    There is space for a multiple of `WIDTH` coefficients.
     """
 
     x: Array  # (S + C + 1, L) X and a last entry of 1
@@ -154,7 +155,7 @@ class Tangent(NamedTuple):
 
 
 def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
-    """Returns scratch memory for `shoot`."""
+    """Allocates scratch memory for `shoot`."""
     lanes = WIDTH
     free = -(-free // WIDTH) * WIDTH
     shapes = (
@@ -177,7 +178,7 @@ def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
 def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
     """Predicts windows in steps of dt [s], and the derivatives by the `free` (P,) of `terms`.
 
-    The free terms ascend, and so do the degrees of freedom of the terms.
+    The indices of free terms, and the degrees of freedom of the terms, must ascend.
     """
     for begin in range(0, shot.state.shape[0], WIDTH):
         end = min(begin + WIDTH, shot.state.shape[0])
@@ -191,7 +192,7 @@ def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
 
 @kernel
 def _begin(shot, begin, end, scratch):  # type: ignore[no-untyped-def]
-    """Puts windows to their starts, and returns the steps to the last horizon."""
+    """Initialises windows at their starts, and returns the number of steps to the last horizon."""
     scratch.x[-1] = 1.0
     last = 0
     scratch.pose[:] = 0.0
@@ -210,7 +211,7 @@ def _begin(shot, begin, end, scratch):  # type: ignore[no-untyped-def]
 
 @kernel(inline=True)
 def _put(shot, w, n, lane, scratch):  # type: ignore[no-untyped-def]
-    """Writes what is wanted after n steps, and the command of the next."""
+    """Writes the requested outputs after n steps, and the command of the next step."""
     row = min(shot.first[w] + n, shot.command.shape[0] - 1)
     for i in range(shot.command.shape[1]):
         scratch.x[shot.state.shape[1] + i, lane] = shot.command[row, i]
@@ -224,7 +225,7 @@ def _put(shot, w, n, lane, scratch):  # type: ignore[no-untyped-def]
 
 @kernel
 def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
-    """Computes the terms and the rates; their derivatives by the state if any are wanted."""
+    """Computes the terms and the rates, and their derivatives by the state if any are needed."""
     states = scratch.state_slope.shape[1]
     sloped = free.shape[0] > 0
     scratch.rate[:] = 0.0
@@ -257,7 +258,7 @@ def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
 
 @kernel
 def _multiply(product, first, factors, degree, without, x):  # type: ignore[no-untyped-def]
-    """Writes products (L,) of a number and all factors but one."""
+    """Writes products (L,) of a number and all factors except one."""
     for lane in range(product.shape[0]):
         product[lane] = first
     for f in range(degree):
@@ -269,7 +270,7 @@ def _multiply(product, first, factors, degree, without, x):  # type: ignore[no-u
 
 @kernel(inline=True)
 def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
-    """Moves a window and its derivatives by a step."""
+    """Advances a window and its derivatives by a step."""
     rate = scratch.rate[:, lane]
     pose = scratch.pose[lane]
     sloped = free.shape[0] > 0
@@ -353,7 +354,7 @@ def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped
 
 @kernel
 def _hold(slope, value, moved, rate, dt, bounds):  # type: ignore[no-untyped-def]
-    """Shortens the derivatives (P,) of a state by drag; none are left if it sticks or is held."""
+    """Scales derivatives (P,) of a state by its drag; zeroes them if it sticks or is limited."""
     unheld = value + dt * min(max(rate, bounds.fall), bounds.rise)
     slower = 1.0 + dt * bounds.drag * abs(unheld)
     if slower > 1.0:
@@ -367,7 +368,7 @@ def _hold(slope, value, moved, rate, dt, bounds):  # type: ignore[no-untyped-def
 
 @kernel
 def limp(states, targets, share, fall, rise):  # type: ignore[no-untyped-def]
-    """Follows targets (T,) from the first state (T,) by a share of what is left, within limits."""
+    """Follows targets (T,) from the first state, a fraction of the rest per step, within limits."""
     for k in range(1, states.shape[0]):
         change = share * (targets[k - 1] - states[k - 1])
         states[k] = states[k - 1] + min(max(change, fall), rise)

@@ -1,9 +1,9 @@
-"""Motion as state: the body twist, taken from the pose, of robots whose state is a part of it."""
+"""Motion as state: the body twist derived from the pose, for robots whose state is part of it."""
 
 from dataclasses import replace
 
 import numpy as np
-import scipy  # .signal loads in a second, when it is used
+import scipy  # .signal loads in a second, when used
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
@@ -25,24 +25,24 @@ from nics_drl_bridge.robot.spec import (
 )
 
 WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
-# share of the usual speed, and turn rate, that the noise of a twist may reach
+# fraction of the usual speed, and turn rate, that the noise of a twist may reach
 NOISE = 0.02
-SAMPLES = 2.5  # half a width holds at least this many samples
-# steps of models, by that of the poses
+SAMPLES = 2.5  # minimum number of samples in half a width
+# steps of models, by the step of the poses
 FINE_S = 0.01
 COARSE_S = 0.02
 COARSE_FROM_S = 0.015
 
 
 def by_motion(spec: RobotSpec, recording: Recording) -> bool:
-    """True if a state that is a part of the body twist was not measured, or wheels are inputs."""
+    """True if a state that is part of the body twist was not measured, or wheels are inputs."""
     if recording.state is not None:
         return False
     return any(v.twist for v in spec.state) or not (spec.state or spec.takes_cmd_vel)
 
 
 def half_width(drive: Drive) -> float:
-    """Returns the half-width [s] over which poses are smoothed: the shortest that quiets them."""
+    """Returns the half-width [s] for smoothing poses: the shortest that reduces noise enough."""
     t = drive.dated.t
     pose = unwrapped(drive.dated.values)
     span = float(t[-1] - t[0])
@@ -89,7 +89,7 @@ def with_motion(
 
 
 def as_smooth(command: Array, step: float, width: float) -> Array:
-    """Returns commands (T, C) at uniform times as smooth as a twist that parabolas gave."""
+    """Returns commands (T, C) at uniform times, smoothed like a twist derived by parabolas."""
     sums = np.cumsum(command, axis=0) * step
     rows = 2 * max(2, round(width / step)) + 1
     return np.asarray(
@@ -108,7 +108,7 @@ def _following(
 
 
 def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
-    """Puts a drive `with_motion` on the time axis of its state, poses smoothed like it."""
+    """Resamples a drive from `with_motion` at the times of its state, with poses smoothed alike."""
     state = known_state(drive)
     spec = drive.spec
     grid = state.t
@@ -124,10 +124,10 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
 
 
 def known_state(drive: Drive) -> Stream:
-    """Returns the state of a drive `with_motion`."""
+    """Returns the state of a drive from `with_motion`."""
     if drive.recording.state is None:
         raise RecordingError(
-            f"{drive.recording.source}: its motion was not derived yet."
+            f"{drive.recording.source}: its motion has not been derived yet."
         )
     return drive.recording.state
 
@@ -146,7 +146,7 @@ def grid_of(drive: Drive, calibration: Calibration, period: float) -> Array:
 
 
 def surrogate(spec: RobotSpec) -> RobotSpec:
-    """Returns a robot whose state follows its commands, one by one: for delays and lags."""
+    """Returns a robot whose state follows its commands one by one, to find delays and lags."""
 
     def follows(command: CommandVariable) -> StateVariable:
         given = command.model_dump(include={"unit", "min", "max"})

@@ -22,19 +22,20 @@ from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.kinds import compute_steady_twist, has_textbook, slips
 from nics_drl_bridge.robot.spec import RobotSpec
 
-TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
-DISTINCT = 4.0  # the second direction of motion must exceed the noise by this factor
-MIN_SECOND = 0.05  # it must have at least this share of the size of the first
+TURN_SCALE_M = 0.2  # weight of a yaw rate: the speed at this distance
+DISTINCT = 4.0  # minimum ratio of the second direction of motion to the noise
+MIN_SECOND = 0.05  # minimum ratio of its size to that of the first
 STILL = 1e-3
-ONE_WAY = 0.05  # share of all turning that does not count as the other way
-# less of the direction without extent lies in the plane: it only never turned
+# fraction of all turning below which turning the other way does not count
+ONE_WAY = 0.05
+# a smaller in-plane part of the direction without extent means that the body never turned
 FLAT = 0.02
 MIN_LENGTH = 1e-4  # m, rad
 REGULAR = 0.8
 BLOCKS = 8
 STRONG = 10.0  # instruments with a smaller F are weak (Staiger, Stock 1997)
-SAME = 1e-6  # part of an instrument by which it differs from others
-RIDGE = 1e-12  # of the noise of a drive without any
+SAME = 1e-6  # minimum part of an instrument that differs from the others
+RIDGE = 1e-12  # regularisation, relative to the noise, for a drive without any
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,12 @@ class Mounting:
     lever: Array  # (2,) position of the tracked point in `base_link` [m]
     rotation_sigma: float  # [rad]
     lever_sigma: Array  # (2,) [m]; NaN for a component that could not be learnt
-    ways: int  # in which the robot turned: 2 for left and right
-    slip: bool = False  # True if the lever can't be told from slip
+    ways: int  # number of directions in which the robot turned: 2 for left and right
+    slip: bool = False  # True if the lever arm can't be distinguished from slip
 
     @property
     def hidden(self) -> tuple[str, str]:
-        """Reasons that the lever arm along x, and y, could not be learnt; empty where it was."""
+        """Reasons why the lever arm along x, and y, could not be learnt; empty where it was."""
         known_x, known_y = ~np.isnan(self.lever_sigma)
         along = "" if known_y else "no speed was known apart from the tracked one"
         if known_x:
@@ -67,12 +68,11 @@ class Mounting:
 def mounting_of(
     drive: Drive, timing: clocks.TimingEstimate, states: Array | None
 ) -> Mounting | None:
-    """Estimates the mounting by states (n, S) at gain one; None if the drive does not show it."""
+    """Estimates the mounting from states (n, S) at gain one; None if the drive does not show it."""
     spec = drive.spec
     twists = drive.twists
-    if not (
-        has_textbook(spec) or spec.takes_cmd_vel
-    ):  # which way it faces is not known
+    # its forward direction is unknown
+    if not (has_textbook(spec) or spec.takes_cmd_vel):
         return None
     if spec.moves_sideways:
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
@@ -101,9 +101,9 @@ def mounting_of(
 def by_instruments(
     motion: TwistIntervals, states: Array, forward: Array, spec: RobotSpec
 ) -> Mounting | None:
-    """Estimates the mounting by functions of the states (n, S); None if these are too weak."""
-    # They know nothing of the noise of the twists, and whatever they do along x, they do nothing
-    # along y: limited information maximum likelihood (Anderson, Rubin 1949).
+    """Estimates the mounting by instruments from the states (n, S); None if these are too weak."""
+    # The states are independent of the twists' noise, and what they do along x they do not do along
+    # y: limited-information maximum likelihood (Anderson, Rubin 1949).
     powers = taylor.list_exponents(states.shape[1], MAX_ORDER)
     chi = taylor.evaluate(
         states / np.maximum(np.abs(states).max(axis=0), STILL), powers
@@ -147,10 +147,10 @@ def by_instruments(
 
 
 def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mounting:
-    """Estimates the mounting on a robot that may slip aside when it turns.
+    """Estimates the mounting on a robot that may slip sideways when it turns.
 
-    Tyres of a car give way in proportion to the force on them: a slip of speed^2 x turn rate
-    (Gillespie). What skids slips the other way backwards: without that, it looks like a lever arm.
+    A car's tyres yield in proportion to the lateral force: a slip of speed^2 x turn rate
+    (Gillespie). Skidding is opposite in reverse; without reversing it looks like a lever arm.
     """
     along = rotate(motion.twist[:, :2], -plain.rotation)
     speed = along[:, 0]
@@ -175,7 +175,7 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
 
 
 def _ways(values: Array, certain: NDArray[np.bool_] | bool = True) -> int:
-    """Counts the signs that values (n,) certainly have, but for a small share of all."""
+    """Counts the signs that values (n,) certainly have, ignoring a small fraction of all."""
     least = ONE_WAY * max(float(np.abs(values).mean()), STILL)
     return sum(
         float((certain * np.maximum(s * values, 0.0)).mean()) > least
@@ -184,7 +184,7 @@ def _ways(values: Array, certain: NDArray[np.bool_] | bool = True) -> int:
 
 
 def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
-    """Adds those parts of a mounting that are significant, and all uncertainties."""
+    """Adds the significant parts of a mounting, and all uncertainties."""
     if mounting is None:
         return calibration
     names = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
@@ -204,13 +204,13 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
 def mounting_without_lateral_motion(
     motion: TwistIntervals, forward: Array, noise: float = 0.0
 ) -> Mounting | None:
-    """Estimates the mounting of a robot that never moves sideways; None if it is not shown.
+    """Estimates the mounting of a robot that never moves sideways; None if the drive lacks motion.
 
-    Turning that a noise of the heading [rad] explains is none.
+    Turning within the noise of the heading [rad] does not count.
     """
     # The lateral speed of the tracked point is then yaw rate x lever arm: `cos(rotation) uy -
-    # sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. On a
-    # single curvature the lever arm is set to zero. Of the speed (n,) only the sign matters.
+    # sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. With a
+    # single curvature the lever arm is set to zero. Only the sign of the speed (n,) matters.
     rows = motion.twist * np.array([1.0, 1.0, TURN_SCALE_M])
     size, axes = np.linalg.svd(rows, full_matrices=False)[1:]
     size = size / np.sqrt(len(rows))
@@ -251,8 +251,8 @@ def mounting_without_lateral_motion(
 def lateral_lever(
     motion: TwistIntervals, rotation: float, speed: Array
 ) -> tuple[float, float]:
-    """Estimates the lever arm along y and its uncertainty [m] from a speed (n,); maybe NaN."""
-    # `ux = gain speed - lever_y wz`, faster outside of curves.
+    """Estimates the lever arm along y and its uncertainty [m] from a speed (n,); may be NaN."""
+    # `ux = gain speed - lever_y wz`: the outside of a curve is faster.
     along = rotate(motion.twist[:, :2], -rotation)[:, 0]
     chi = np.stack([speed, motion.twist[:, 2]], axis=1)
     size = np.linalg.svd(chi * np.array([1.0, TURN_SCALE_M]), compute_uv=False)
@@ -328,7 +328,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
 
 
 def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
-    """Selects the times (n,) at which the command is known: not in gaps of regular rows."""
+    """Selects the times (n,) at which the command is known, outside gaps of regular rows."""
     span = np.diff(command.t)
     usual = float(np.median(span)) if len(span) else 0.0
     if not (span < clocks.LONG_STEP * usual).mean() > REGULAR:
@@ -345,7 +345,7 @@ Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
 def jackknifed(
     drive: Drive, twists: TwistIntervals, offset: float, estimate: Estimate
 ) -> Mounting | None:
-    """Estimates a mounting, as uncertain as its jackknife; twists' clock is `offset` behind."""
+    """Estimates a mounting with jackknife uncertainty; the twists' clock is `offset` behind."""
     whole = estimate(drive, twists)
     if whole is None:
         return None

@@ -1,4 +1,4 @@
-"""Noise of the sensors, and the motion, over a second, that a model leaves unexplained."""
+"""Noise of the sensors, and motion over a second that a model leaves unexplained."""
 
 from typing import Any
 
@@ -25,13 +25,13 @@ SPACING_S = 0.25
 GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
-# a window whose error is more than this many times the median contains a jump
+# a window whose error exceeds this many times the median contains a jump
 OUTLYING = 10.0
 # a larger error of a prediction over a second is divergence, not drift
 RUN_AWAY_M = 1e4
 BLOCKS = 8
 TINY = 1e-9
-NEGLIGIBLE = 1e-4  # a smaller level is rounding: a tenth of a millimetre after a second
+NEGLIGIBLE = 1e-4  # smaller levels are rounding: a tenth of a millimetre after a second
 # percentage of a normal distribution within one standard deviation
 WITHIN_SIGMA = 68.27
 MIN_ROWS = 40
@@ -64,7 +64,7 @@ def motion_noise(
     model: TaylorModel,
     samples: Samples,
 ) -> Noise:
-    """Adds drift and odometry's noise, of recorded or scaled wheels' twists, to the sensor's."""
+    """Adds drift, and odometry's noise from recorded or scaled wheel twists, to the sensor's."""
     measured: dict[str, Any] = {"state_drift": _state_drift(drive, model, samples)}
     rest = odometry_residual(drive, calibration, model, samples)
     if rest is not None:
@@ -77,8 +77,8 @@ def motion_noise(
 
 
 def claimed(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
-    """Returns the pose's deviations by its covariances, where they are the greater ones."""
-    # Differences do not show an error that stays for a while; nor does a drift contain it.
+    """Returns the pose's deviations according to its covariances, where these are larger."""
+    # Differences do not show an error that persists for a while, and drift does not include it.
     if sigma is None:
         return {}
     usual = []
@@ -103,7 +103,7 @@ def _measured(std: float, unit: str, uncertainty: float | None) -> Level:
 
 
 def level(variances: Array, unit: str) -> Level:
-    """Returns a measured level from squares (n,) by time; its uncertainty comes from blocks."""
+    """Returns a measured level from squares (n,) over time; its uncertainty comes from blocks."""
     std = float(np.sqrt(max(float(variances.mean()), 0.0)))
     means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
     spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
@@ -124,7 +124,7 @@ def _errors(
         return None
     if (state := drive.recording.state) is None:
         ends = open_loop.predict(model, calibration, drive, chosen)
-    else:  # from the state measured all the way, so that its drift is not counted twice
+    else:  # restart from the measured state, so that its drift is not counted twice
         course = open_loop.course_of(model, calibration, drive, chosen)
         begin = chosen.start_t + calibration.clock_offset_s
         t = begin[:, None] + model.dt * np.arange(course.x.shape[1])
@@ -150,7 +150,7 @@ def _pose_drift(
     away = np.sum((chosen.end - chosen.start)[inside, :2] ** 2, axis=1)
     turn = error[inside, 2] ** 2 - 2.0 * heading**2
     grown = max(float(turn.mean()), 0.0)
-    # Errors of the initial heading, and heading drift on the way, cause lateral errors.
+    # Errors of the initial heading, and heading drift along the path, cause lateral errors.
     aside = 0.5 * away * (heading**2 + grown / 3.0)
     shift = 0.5 * size[inside] ** 2 - 2.0 * position**2 - aside
     return {

@@ -17,14 +17,15 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 HORIZON_S = 5.0
 SPACING_S = 0.1
-SETTLE_S = 1.0  # windows start no sooner than this after the first command if the state is inferred
-# from a window's end to the nearest sample, as a share of the period
+# windows start at least this long after the first command if the state is inferred
+SETTLE_S = 1.0
+# maximum distance from a window's end to the nearest sample, as a fraction of the period
 END_TOLERANCE = 0.6
 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Errors of predictions that start at a measured pose, know the commands, and end at one."""
+    """Errors of predictions from a measured pose, by the commands, to another measured pose."""
 
     horizon_s: float  # length of each prediction
     windows: int  # number of predictions
@@ -32,10 +33,9 @@ class OpenLoop:
     median_position_error_m: float
     max_position_error_m: float
     mean_heading_error_rad: float  # absolute
-    mean_path_m: float  # length of the measured path in the horizon
-    median_displacement_m: (
-        float  # from start to end: the error of predicting a standstill
-    )
+    mean_path_m: float  # length of the measured path over the horizon
+    # from start to end, which is the error of predicting a standstill
+    median_displacement_m: float
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def windows(
 def predict(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Array:
-    """Predicts poses (W, 3) at windows' ends by commands, from measured or commanded states."""
+    """Predicts poses (W, 3) at windows' ends from commands and measured or inferred states."""
     if drive.recording.state is None:
         relative = _by_one_rollout(model, calibration, drive, chosen)
     else:
@@ -109,7 +109,7 @@ def predict(
 
 
 def tracked_ends(chosen: Windows, calibration: Calibration, relative: Array) -> Array:
-    """Returns poses (W, 3) of the tracked body after `base_link` moved by relative ones."""
+    """Returns poses (W, 3) of the tracked body after `base_link` moved by relative poses."""
     return calibration.to_tracked(
         geometry.compose(calibration.to_base(chosen.start), relative)
     )
@@ -118,14 +118,14 @@ def tracked_ends(chosen: Windows, calibration: Calibration, relative: Array) -> 
 def _by_one_rollout(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Array:
-    """Returns relative poses (W, 3) from one roll-out: an inferred state needs commands only."""
+    """Returns relative poses (W, 3) from one rollout: an inferred state needs only commands."""
     recording = drive.recording
     spec = drive.spec
     start, end = (
         t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t)
     )
     lead = np.ceil((max(0.0, start.min() - recording.command.t[0]) + 1.0) / model.dt)
-    # Whole steps before the first window: windows of regular poses then begin and end on the grid.
+    # Whole steps before the first window, so that windows of regular poses lie on the grid.
     grid = start.min() + model.dt * np.arange(
         -lead, (end.max() - start.min()) / model.dt + 2.0
     )
@@ -145,7 +145,7 @@ def _by_one_rollout(
 def _from_measured_states(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
-    """Returns poses (W, T + 1, 3), states, commands, whole steps (W,), share (W,) of a last one."""
+    """Returns poses (W, T + 1, 3), states, commands, whole steps (W,), fraction (W,) of another."""
     start, end = (
         t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t)
     )
@@ -185,7 +185,7 @@ def open_loop_error(
     stop: float,
     horizon: float = HORIZON_S,
 ) -> OpenLoop:
-    """Predicts a part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
+    """Predicts part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
     chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:
         fault = f"the {stop - start:.1f} s from {start:.1f} s on hold no window of {horizon:g} s"

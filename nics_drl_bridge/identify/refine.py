@@ -30,25 +30,29 @@ HORIZONS_S = (1.0, 2.5, 5.0)
 SPACING_S = 0.25
 MIN_WINDOWS = 10
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
-OUTLYING = 10.0  # a window whose error is this many times the median contains a jump,
-OUTLYING_SHARE = 0.25  # if the error is also more than this share of the longest path
+# a window whose error exceeds this many times the median contains a jump
+OUTLYING = 10.0
+# provided that the error also exceeds this fraction of the longest path
+OUTLYING_SHARE = 0.25
 MOST_OUTLIERS = 0.3
 # slopes of a diverging model are clipped, so that their scaling stays finite
 STEEPEST = 1e100
 TURN_RAD = 1e-5  # step of the finite difference by the rotation
 DIVERGED = 1e3
 LEAST_SCALE = 0.05
-# A model uses the values at the start of a step: a time is uncertain by the standard deviation of
-# a uniform distribution over the step.
+# A model uses the values at the start of a step, so a time is uncertain by the standard deviation
+# of a uniform distribution over the step.
 WITHIN = 12.0**-0.5
-FASTEST = 0.99  # share of its distance by which a state nears its command in one step, at most
-WORTH = 0.1  # terms are removed while the error rises by less than this share in total
+# maximum fraction of its distance by which a state approaches its command in one step
+FASTEST = 0.99
+# terms are removed while the error rises by less than this fraction in total
+WORTH = 0.1
 
 
 def refined(
     linear: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration, str]:
-    """Refines a linear fit by its predictions and removes terms; with a sentence on the result."""
+    """Refines a linear fit by its predictions, removes terms; returns a sentence on the result."""
     model, calibration = by_definition(linear.add_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
     why = (
@@ -64,15 +68,15 @@ def refined(
             note = f"{by}: {best.error:.4f} m (root mean square) is left on the training part."
             return merged(best.model, linear, errors), best.calibration, note
         except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
-            why = "The predictions of the fitted model run away on the training part"
-            note = f"{why}, so that it could not be refined."
+            why = "The predictions of the fitted model diverge on the training part"
+            note = f"{why}, so it could not be refined."
     return merged(model, linear, {}), calibration, note
 
 
 def without_doubtful_rotation(
     problem: "Problem", best: "Refined", before: Calibration
 ) -> "Refined":
-    """Refines anew without a rotation that is below three standard errors."""
+    """Refines again without a rotation that is below three standard errors."""
     calibration = best.calibration
     sigma = calibration.uncertainty.get("rotation_rad", 0.0)
     turned = calibration.rotation_rad
@@ -100,7 +104,7 @@ def readjusted(
 def by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed to vx = 1 speed; lateral motion is noise unless commanded."""
+    """Scales an inferred speed so that vx = 1 speed; lateral motion is noise unless commanded."""
     coefficients = model.coefficients.copy()
     limits = model.limits.copy()
     if not spec.moves_sideways:
@@ -143,10 +147,9 @@ class Problem:
     """Prediction problem of a refinement: windows of one drive, the same for every trial model."""
 
     drive: Drive
-    chosen: tuple[open_loop.Windows, ...]  # of each horizon, without jumps of the pose
-    courses: tuple[
-        open_loop.Course, ...
-    ]  # of X over them if the state was measured, else empty
+    chosen: tuple[open_loop.Windows, ...]  # for each horizon, without jumps of the pose
+    # courses of X over them if the state was measured, else empty
+    courses: tuple[open_loop.Course, ...]
 
 
 def problem_of(
@@ -190,7 +193,7 @@ def prediction_errors(
     """Returns the errors (n,) of all predictions: x, y and heading of each window [m]."""
     each = zip(*(vars(windows).values() for windows in problem.chosen), strict=True)
     chosen = open_loop.Windows(*map(np.concatenate, each))
-    with np.errstate(all="ignore"):  # a trial step may diverge; it is then rejected
+    with np.errstate(all="ignore"):  # a trial step may diverge and is then rejected
         if problem.courses:
             ends = [
                 open_loop.relative_ends(course, model)[0] for course in problem.courses
@@ -198,7 +201,7 @@ def prediction_errors(
             predicted = open_loop.tracked_ends(
                 chosen, calibration, np.concatenate(ends)
             )
-        else:  # of all windows by one roll-out
+        else:  # all windows by a single rollout
             predicted = open_loop.predict(model, calibration, problem.drive, chosen)
         error = predicted - chosen.end
         error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
@@ -209,7 +212,7 @@ def prediction_errors(
 
 
 def _scale(problem: Problem, chosen: open_loop.Windows) -> Array:
-    """Returns factors (W, 3) of errors, by the variances of the poses at both ends."""
+    """Returns factors (W, 3) of errors, from the variances of the poses at both ends."""
     return np.asarray(np.sqrt(problem.drive.trust(chosen.start_t, chosen.end_t)))
 
 
@@ -240,18 +243,18 @@ def prediction_slopes(
 class _Free:
     model: TaylorModel
     calibration: Calibration
-    coefficients: Mask  # (D, K) that are free
+    coefficients: Mask  # (D, K) free coefficients
     time: str | None  # free field of the calibration
-    names: tuple[str, ...]  # all such fields
+    names: tuple[str, ...]  # all free fields
 
     @classmethod
     def of(
         cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec
     ) -> "_Free":
-        """Frees what neither definition nor measurement fixes."""
-        # The rotation is defined by the direction without motion, of which an omnidirectional robot
-        # has none. Where it is known apart from a lever arm, and where a time is known, they are
-        # fixed: a model that leaves out a term would bend them to make up for it.
+        """Frees what neither a definition nor a measurement fixes."""
+        # The rotation is defined by the direction without motion; omnidirectional robots lack one.
+        # A rotation known without a lever arm, and a known time, are fixed: a model that lacks
+        # a term would change them to compensate.
         known = calibration.uncertainty
         time = None
         if calibration.responses and "clock_offset_s" in known:
@@ -292,7 +295,7 @@ class _Free:
         )
 
     def bounds(self) -> tuple[Array, Array]:
-        """Returns bounds (P,) by which no state that follows a command overshoots it in a step."""
+        """Returns bounds (P,) within which no state that follows a command overshoots in a step."""
         low = np.full(self.model.coefficients.shape, -np.inf)
         high = -low
         rest = np.full(len(self.names), np.inf)
@@ -308,7 +311,7 @@ class _Free:
 
 def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state."""
-    # An inferred speed is that along the direction of travel, vx = 1 speed; known lags are fixed.
+    # An inferred speed is along the direction of travel, vx = 1 speed; known lags are fixed.
     free = model.coefficients != 0.0
     if not calibration.responses:
         # the rates of a measured state were fitted to that state itself
@@ -332,7 +335,7 @@ def lag_is_measured(calibration: Calibration) -> bool:
 
 
 def linear_terms(model: TaylorModel, *names: str | None) -> list[int | None]:
-    """Returns the columns of the terms that are one variable alone; None without such a term."""
+    """Returns the columns of the terms of a single variable; None without such a term."""
     wanted = (
         np.array([v == name for v in model.variables], dtype=np.int64) for name in names
     )
@@ -353,7 +356,7 @@ class Refined:
 
 
 def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
-    """Adjusts coefficients and calibration to the least open-loop error; no term is added."""
+    """Adjusts coefficients and calibration to minimise the open-loop error; adds no terms."""
     free = _Free.of(model, calibration, problem.drive.spec)
     first = model.coefficients[free.coefficients]
     theta = np.append(first, [float(getattr(calibration, name)) for name in free.names])
@@ -432,7 +435,7 @@ def _response(model: TaylorModel, i: int, response: Response) -> Response:
 
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
-    """Removes terms of the twist that hardly improve predictions, least first; refines anew."""
+    """Removes terms of the twist that hardly improve predictions, weakest first; refines again."""
     best = refined
     tried = set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
@@ -440,16 +443,14 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
-        if not coefficients[
-            :3
-        ].any():  # the last term: without it the robot would not move
+        # the last term: without it the robot would not move
+        if not coefficients[:3].any():
             break
         shorter = replace(best.model, coefficients=coefficients)
         try:
             again = refine(problem, shorter, best.calibration)
-        except (
-            np.linalg.LinAlgError
-        ):  # the remaining model is unstable: its slopes overflow
+        # the remaining model is unstable: its slopes overflow
+        except np.linalg.LinAlgError:
             continue
         if again.error < limit:
             best = again
@@ -462,7 +463,7 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
 
 
 def _weakest(refined: Refined, tried: set[tuple[int, int]]) -> tuple[int, int] | None:
-    """Returns the untried free term of the twist with the least weight over the range of X."""
+    """Returns the untried free term of the twist with the smallest weight over the range of X."""
     model = refined.model
     free = free_coefficients(model, refined.calibration)[:3]
     reach = np.maximum(np.abs(model.low), np.abs(model.high))

@@ -1,4 +1,4 @@
-"""Repair of a drive: faulty rows, jumps of the localiser, commands; refuses units and axes."""
+"""Repair of a drive: faulty rows, localiser jumps, commands; refuses wrong units and axes."""
 
 from dataclasses import replace
 from typing import Any
@@ -25,66 +25,71 @@ from nics_drl_bridge.recording.stamping import select_new_rows
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
 from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
 
-NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
-STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
-USUAL = 60.0  # (percentile that counts as usual: jumps in 20 % of the rows spoil 40 % of them)
-REACH = 1.5  # than this many times the distance that the greatest command allows in that time,
-HEADING_REACH = 0.1  # than this angle [rad], for a heading,
-STATE_SHARE = 0.2  # and than this share of the usual range, for a state
-# A localiser jumps for good where a step differs from the motion around it by more than
-FARTHER = 3.0  # this many times the distance at the speed (turn rate) that 95 % of the drive keep,
-SPEED_OVER_S = 0.5  # over this time,
-UNUSUAL = 12.0  # than this many usual differences (`USUAL`),
-# than this share of the robot's radius, or than this angle [rad]
+# number of samples on either side whose median difference measures a jump
+NEIGHBOURS = 3
+STEPS = 6.0  # a jump exceeds this many usual changes from sample to sample
+# percentile that counts as usual: jumps in 20 % of the rows affect 40 % of the changes
+USUAL = 60.0
+REACH = 1.5  # this many times the distance that the maximum command allows in that time
+HEADING_REACH = 0.1  # this angle [rad], for a heading
+STATE_SHARE = 0.2  # and this fraction of the usual range, for a state
+# A localiser jumps permanently where a step differs from the surrounding motion by more than
+# this many times the distance at the speed (turn rate) that 95 % of the drive stays below
+FARTHER = 3.0
+SPEED_OVER_S = 0.5  # over this time
+UNUSUAL = 12.0  # this many usual differences (`USUAL`)
+# and this fraction of the robot's radius, or this angle [rad]
 JUMP_SHARE = 0.5
 JUMP_TURN = 0.3
-AROUND = 5  # steps on either side of one
-TOLD = 3  # jumps that are told one by one
-MOST_JUMPS = 0.02  # of the steps: more of them are noise
-# jumps in more than this share of the rows are not faults of single samples
+AROUND = 5  # number of steps on either side
+TOLD = 3  # maximum number of jumps to report individually
+MOST_JUMPS = 0.02  # fraction of the steps above which jumps are noise
+# fraction of the rows above which jumps are not faults of single samples
 MOST = 0.15
-HELD_S = 0.5  # a pose that keeps one value for longer, and then leaps, was held
-EXCESS = 0.01  # commands may exceed their limits by this share of their range
-# times the limit is another unit: degrees are 57, rpm 9.5 times larger
+HELD_S = 0.5  # a pose that keeps one value for longer, and then leaps, was frozen
+EXCESS = 0.01  # commands may exceed their limits by this fraction of their range
+# ratio to the limit that suggests another unit: degrees give 57, rpm 9.5
 WRONG_UNIT = 5.0
 UNIT_PERCENTILE = 75.0
 STEERED_PERCENTILE = 95.0
-# Commands are compared with the motion over this time [s], that many times or more, at any delay
-# and offset of clocks;
+# Commands are compared with the motion over this time [s], at least this many times, for any delay
+# and clock offset;
 DELAYS_S = np.linspace(-1.0, 1.5, 26)
 COMPARED_S = 1.0
 MIN_COMPARED = 20
-# from this correlation on, another unit explains sizes by up to this ratio
+# from this correlation on, another unit may explain ratios up to this one
 ALIKE = 0.85
 NEAR = 1.2
-# times that a robot drives otherwise than told: less is slip, or a worn wheel
+# ratio to the commanded speed that is not just slip or a worn wheel
 SCALED = 1.5
-# a pose that stays within this, or this
+# a pose that stays within these,
 STANDING_M = 1e-3
 STANDING_RAD = 2e-3
 FROZEN = 12.0
-# many times its noise, never moved
-# least correlation of each of two commands with what the other should move
+# or within this many times its noise, never moved
+# minimum correlation of each of two commands with what the other should move
 SWAPPED = 0.6
+# in speed and turn rate
 PLACES = {
     "linear.x": 0,
     "angular.z": 1,
     "throttle": 0,
     "steering": 1,
-}  # in speed and turn rate
+}
+# commands of a robot that moves sideways
 SIDEWAYS = (
     "linear.x",
     "linear.y",
     "angular.z",
-)  # commands of a robot that moves sideways
+)
 CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
-# Least distance to measure a direction of travel, of the footprint's radius, of the pose's noise
+# Minimum distance for measuring a direction of travel, in footprint radii and in noise of the pose
 TRAVEL_SHARE = 0.1
 TRAVEL_NOISE = 25.0
 
 
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
-    """Drops rows, joins what jumps split, clips commands; a sentence on each kind of fault."""
+    """Drops rows, joins at jumps, clips commands; returns a sentence on each kind of fault."""
     notes: list[str] = []
     for repair in (
         _without_repetitions,
@@ -115,9 +120,9 @@ def _without_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording
 
 
 def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
-    """Leaves out a pose that was held where tracking was lost, so that there is a gap instead.
+    """Removes poses frozen where tracking was lost, which leaves a gap.
 
-    A robot that stands is seen at the same place, too, but goes on from there.
+    A robot at rest also keeps its place, but continues from there.
     """
     recording = drive.recording
     t = drive.sample_t
@@ -142,7 +147,7 @@ def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
         span = f"from {t[begin] - t[0]:.1f} s to {t[end] - t[0]:.1f} s"
         leap_m = np.hypot(*(pose[end + 1] - pose[end])[:2])
         finding = f"The pose keeps one value {span} and then leaps by {leap_m:.2f} m"
-        cause = "as where tracking was lost: these rows were left out"
+        cause = "as if tracking was lost: these rows were left out"
         notes.append(Gap(f"{finding}, {cause}, and what happened there is not known."))
     return _with_rows(recording, "pose", ~held)
 
@@ -158,9 +163,7 @@ def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
         count = int(jump.sum())
         if share > MOST:
             fault = f"{recording.source}: {name}: {share:.0%} of the rows {jumps}"
-            raise RecordingError(
-                f"{fault}; look for two sources that are mixed in one stream."
-            )
+            raise RecordingError(f"{fault}; look for two sources mixed in one stream.")
         if count:
             recording = _with_rows(recording, name, ~jump)
             some = f"{name}: {count} of {len(jump)} rows ({share:.1%})"
@@ -195,7 +198,7 @@ def _jumps_of_state(state: recordings.Stream) -> NDArray[np.bool_]:
 
 
 def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
-    """Moves all poses after a jump of the localiser to where the motion before it leads."""
+    """Moves all poses after a localiser jump to where the motion before it leads."""
     recording = drive.recording
     t = drive.sample_t
     pose = drive.recording.pose.values
@@ -227,13 +230,13 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
         f" and {len(told) - TOLD} more" if len(told) > TOLD else ""
     )
     finding = f"jumps {some} as no speed of this robot explains"
-    split = "the drive is split there: it goes on from where it was before"
+    split = "the drive is split there and continues from where it was before"
     notes.append(Gap(f"pose: {finding}; {split}."))
     return replace(recording, pose=replace(recording.pose, values=place))
 
 
 def _greatest(drive: Drive, apart: Array) -> Array:
-    """Returns by how much steps (2, T) in metres and radians may differ from those around them."""
+    """Returns the allowed difference of steps (2, T), in m and rad, from those around them."""
     t = drive.sample_t
     pose = unwrapped(drive.recording.pose.values)
     every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], SPEED_OVER_S)))
@@ -255,7 +258,7 @@ def _greatest(drive: Drive, apart: Array) -> Array:
 def _stands_out(
     values: Array, least: Array, turning: bool = False
 ) -> NDArray[np.bool_]:
-    """Selects values (T,) that differ alike from both sides, by `least` and `STEPS` changes."""
+    """Selects values (T,) that differ equally from both sides, by `least` and `STEPS` changes."""
     count = len(values)
     if count <= 2 * NEIGHBOURS:
         return np.zeros(count, dtype=np.bool_)
@@ -275,7 +278,7 @@ def _stands_out(
 
 
 def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
-    """Clips commands to the robot's limits, unless it followed them beyond."""
+    """Clips commands to the robot's limits, unless the robot followed them beyond."""
     recording = drive.recording
     spec = drive.spec
     low = spec.command_low
@@ -294,7 +297,7 @@ def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
         return recording
     notes += [
         f"{c.name} was beyond the robot's limits, {c.min:g} to {c.max:g} {c.unit}, in {share:.0%} "
-        "of the rows: it was taken as held at them; the model says nothing of the range beyond."
+        "of the rows: it was clipped to them; the model does not cover the range beyond."
         for c, share in zip(spec.command, beyond.mean(axis=0), strict=True)
         if share > 0.0
     ]
@@ -302,7 +305,7 @@ def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
 
 
 def _rates_left(recording: recordings.Recording, command: Array) -> float:
-    """Returns the share of the state's rates that commands leave unexplained; 0 without state."""
+    """Returns the fraction of the state's rates that commands do not explain; 0 without a state."""
     state = recording.state
     if state is None or len(state.t) < 2:
         return 0.0
@@ -332,13 +335,15 @@ def check_units(drive: Drive) -> None:
             if size > WRONG_UNIT * limit:
                 name = f"{recording.source}: {variable.name}"
                 unit = variable.unit
-                fault = f"is {size:.4g} and more where its limit is {limit:g} {unit}"
+                fault = f"is {size:.4g} or more, but its limit is {limit:g} {unit}"
                 alike = "degrees, millimetres or revolutions per minute look like this"
                 raise RecordingError(f"{name} {fault}; it must be in {unit} ({alike}).")
     for variable, column in zip(spec.command, recording.command.values.T, strict=True):
         size = float(np.percentile(np.abs(column), STEERED_PERCENTILE))
         if variable.steers and size > FARTHEST_STEERED:
-            fault = f"{variable.name} is {size:.4g} rad and more, and no wheel steers so far"
+            fault = (
+                f"{variable.name} is {size:.4g} rad or more, and no wheel steers so far"
+            )
             line = f"{variable.name}: {{from: ..., unit: deg}}"
             advice = f"write `{line}` for degrees, or a `scale:` for a steering wheel"
             raise RecordingError(f"{recording.source}: {fault}; {advice}.")
@@ -347,10 +352,10 @@ def check_units(drive: Drive) -> None:
 def check_commands(
     drive: Drive, command: recordings.Stream | None = None
 ) -> tuple[str, ...]:
-    """Refuses swapped commands, with a RecordingError; tells other units and a mirrored motion.
+    """Refuses swapped commands, with a RecordingError; reports other units and mirrored motion.
 
-    By how the speed and the turn rate that they ask for, or those before they were clipped,
-    compare with those that were driven.
+    Compares the speed and turn rate that commands ask for (or those before they were clipped) with
+    the measured ones.
     """
     spec = drive.spec
     sent = command or drive.recording.command
@@ -369,14 +374,12 @@ def check_commands(
         times = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
         for other in CONFUSED.get(unit, ()) if alike[place, place] > ALIKE else ():
             if 1.0 / NEAR < times * UNITS[other].factor < NEAR:
-                finding = (
-                    f"The commands ask for {times:.3g} times the {name} that was driven"
-                )
+                finding = f"The commands ask for {times:.3g} times the measured {name}"
                 advice = f"write `unit: {other}` beside `from:`"
                 notes.append(Mistake(f"{finding}: if they are in {other}, {advice}."))
                 break
         else:
-            same_quantity = unit in CONFUSED  # a steering angle is no turn rate
+            same_quantity = unit in CONFUSED  # a steering angle is not a turn rate
             differs = not 1.0 / SCALED < times < SCALED
             if same_quantity and differs and alike[place, place] > ALIKE:
                 notes.append(Doubt(_about_scale(name, times)))
@@ -384,16 +387,14 @@ def check_commands(
 
 
 def _about_scale(name: str, times: float) -> str:
-    """Says that a robot drives by another speed, or turn rate, than its commands ask for."""
-    finding = (
-        f"The commands ask for {times:.3g} times the {name} that was driven, steadily"
-    )
+    """Formats a sentence on a robot that drives by another speed or turn rate than commanded."""
+    finding = f"The commands consistently ask for {times:.3g} times the measured {name}"
     causes = "the scale of this command, or that of the pose, is wrong"
     return f"{finding}: {causes}, or the robot's own driver scales it."
 
 
 def check_pose_moves(drive: Drive) -> None:
-    """Refuses poses that stay where they are while commands change (RecordingError)."""
+    """Refuses poses that stay in place while commands change (RecordingError)."""
     recording = drive.recording
     values = unwrapped(drive.recording.pose.values)
     if not moved_commands(recording.command).any():
@@ -412,7 +413,7 @@ def check_pose_moves(drive: Drive) -> None:
 
 
 def check_encoders(drive: Drive) -> tuple[str, ...]:
-    """Tells of measured wheels that turn against the motion that they make by the textbook."""
+    """Yields measured wheels that turn against the motion they cause according to the textbook."""
     recording = drive.recording
     spec = drive.spec
     state = recording.state
@@ -452,20 +453,18 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
 def _check_swapped(
     drive: Drive, pair: list[int], crosswise: float, straight: float
 ) -> None:
-    """Refuses two commands that are more alike to what the other should move than to their own."""
+    """Refuses two commands that correlate better with the other's motion than with their own."""
     if crosswise > max(SWAPPED, straight):
         one, other = (drive.spec.command[place].name for place in pair)
         fault = (
-            f"{one} and {other} are swapped: each moves the robot as the other should"
+            f"{one} and {other} are swapped: each moves the robot like the other should"
         )
-        advice = (
-            f"write the column of `{other}:` behind `{one}:`, and the other way round"
-        )
+        advice = f"write the column of `{other}:` after `{one}:`, and vice versa"
         raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
 
 
 def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]:
-    """Checks commands of a robot that moves sideways, whose pose sensor may be turned."""
+    """Checks commands of a robot that moves sideways, whose pose sensor may be rotated."""
     spec, (start, end, driven) = drive.spec, _driven(drive)
     keys = [c.cmd_vel or c.name for c in spec.command]
     if sorted(keys) != sorted(SIDEWAYS) or len(start) < MIN_COMPARED:
@@ -474,9 +473,10 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     best = np.zeros((3, 3))
     for delay in DELAYS_S:
         asked = held(command, spec, start - delay, end - delay)[:, order]
-        with np.errstate(invalid="ignore"):  # of what never changed
+        with np.errstate(invalid="ignore"):  # commands that never changed
             alike = np.nan_to_num(np.corrcoef(asked.T, driven.T)[:3, 3:])
-        if np.abs(alike).sum() > np.abs(best).sum():  # a turn moves a sensor aside
+        # a rotated mounting moves the sensor sideways
+        if np.abs(alike).sum() > np.abs(best).sum():
             best = alike
             chi = np.column_stack([asked, driven[:, 2]])
             way = np.linalg.lstsq(chi, driven[:, :2], rcond=None)[0]
@@ -484,9 +484,8 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     size = np.abs(best)
     for k, straight in enumerate(along[:2] + size[2, 2]):
         _check_swapped(drive, [order[k], order[2]], min(along[2], size[k, 2]), straight)
-    if (
-        best[0, 1] * best[1, 0] > 0.0
-    ):  # opposite signs are of poses that are turned by 90 degrees
+    # opposite signs come from poses rotated by 90 degrees
+    if best[0, 1] * best[1, 0] > 0.0:
         _check_swapped(
             drive, order[:2], min(size[0, 1], size[1, 0]), size[0, 0] + size[1, 1]
         )
@@ -503,7 +502,7 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
 
 
 def _driven(drive: Drive) -> tuple[Array, Array, Array]:
-    """Returns the ends (n,) of spans of time [s], and the twist (n, 3) that was driven in each."""
+    """Returns the ends (n,) of time spans [s], and the twist (n, 3) measured in each."""
     t = drive.dated.t
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
     first = np.searchsorted(t, start)
@@ -516,7 +515,7 @@ def _driven(drive: Drive) -> tuple[Array, Array, Array]:
 
 
 def _places(spec: RobotSpec) -> list[int]:
-    """Returns the places of commands in speed and turn rate; none if any of them is another."""
+    """Returns the indices of commands in speed and turn rate; none if any command is another."""
     keys = [c.cmd_vel or c.name for c in spec.command]
     return [PLACES[key] for key in keys] if {*keys} <= {*PLACES} else []
 
@@ -524,9 +523,9 @@ def _places(spec: RobotSpec) -> list[int]:
 def _asked_and_driven(
     drive: Drive, command: recordings.Stream
 ) -> tuple[Array, Array, Array] | None:
-    """Returns speed and turn rate (n, 2), as commanded and as driven, and how alike (2, 2).
+    """Returns speed and turn rate (n, 2), commanded and measured, and their correlations (2, 2).
 
-    None if that does not show.
+    None if they can't be determined.
     """
     spec, places, (start, end, moved) = drive.spec, _places(drive.spec), _driven(drive)
     wheels = (
@@ -536,9 +535,8 @@ def _asked_and_driven(
     wheels = wheels and "wheel_radius" not in spec.assumed and has_textbook(spec)
     if not (places or wheels) or len(start) < MIN_COMPARED:
         return None
-    axis = np.sqrt(
-        ((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum()
-    )  # of travel, ahead or back
+    # direction of travel, ahead or back
+    axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())
     axis = axis / max(abs(axis), 1e-9)
     driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
     best = np.zeros((2, 2)), driven
@@ -548,7 +546,7 @@ def _asked_and_driven(
         twist[:, places or [0, 1]] = (
             sent if places else textbook(spec).compute_twist(sent)[:, [0, 2]]
         )
-        with np.errstate(invalid="ignore"):  # of what never changed
+        with np.errstate(invalid="ignore"):  # commands that never changed
             alike = np.corrcoef(twist.T, driven.T)[:2, 2:]
         best = max(
             best, (np.abs(np.nan_to_num(alike)), twist), key=lambda e: e[0].sum()
@@ -589,14 +587,14 @@ def check_axes(drive: Drive) -> None:
         if "offset" in line:
             other = "exchange x and y"
         else:
-            other = "turn x or y so, or remove such a scale"
+            other = "reverse x or y, or remove such a scale"
         raise RecordingError(
             f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103)."
         )
 
 
 def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:
-    """Returns the share (0 to 1) of the body velocity between poses that the state explains."""
+    """Returns the fraction (0 to 1) of the body velocity between poses that the state explains."""
     span = np.diff(t)
     keep = span > 0.0
     velocity = (

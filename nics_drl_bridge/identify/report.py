@@ -21,16 +21,16 @@ CURVE_POINTS = 8
 TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_arm_y_m"
 DEAD_ZONE = "dead zone on both sides of 0"
 EAGER = "does more than in proportion, by minus"
-LEAST_DIGITS = 3  # of a coefficient: the printed equations predict as the model does
-# share of the error of standing still above which a model is hardly better
+# minimum digits of a coefficient, with which the printed equations predict like the model
+LEAST_DIGITS = 3
+# fraction of the error of standing still above which a model hardly helps
 MOST_LEFT = 0.5
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    spec = (
-        identified.drive.spec
-    )  # of a textbook that was written, which may have another state
+    # if the textbook replaced the model, its state may differ
+    spec = identified.drive.spec
     model = identified.model
     latency = identified.recording.latency.sentences()
     until = identified.train_until_s
@@ -84,7 +84,7 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
 
 
 def opening(report: str) -> str:
-    """Returns the conclusion and the model of a fit report: what is read first."""
+    """Returns the conclusion and the model of a fit report, which are read first."""
     return "\n\n".join(report.split("\n\n")[:2])
 
 
@@ -113,16 +113,16 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
 
 
 def units_of(spec: RobotSpec) -> dict[str, str]:
-    """Returns the units of a robot's variables, by name; none of shares."""
+    """Returns the units of a robot's variables, by name; empty for fractions."""
     names = zip(spec.variable_names, spec.variable_units, strict=True)
     return {name: unit * (unit != "1") for name, unit in names}
 
 
 def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
-    """Yields a line per value of the stages around the terms, with the calibration's uncertainty.
+    """Yields a line per parameter of the stages around the terms, with its uncertainty.
 
-    Of those the names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` of a command,
-    `vx.fall`, `.rise`, `.friction` and `.drag` of a state, `vx.back_emf.throttle` of both.
+    The names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` for a command, `vx.fall`,
+    `.rise`, `.friction` and `.drag` for a state, and `vx.back_emf.throttle` for a pair.
     """
     model = identified.model
     sigma = identified.calibration.uncertainty
@@ -139,7 +139,7 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
             ),
             ("least", "saturates below", units[curve.command], -np.inf),
             ("most", "saturates above", units[curve.command], np.inf),
-            ("back", "gain backwards, relative to forwards", "", 1.0),
+            ("back", "reverse gain, relative to forward", "", 1.0),
             ("delay", "delay after the common latency", "s", 0.0),
         )
     ]
@@ -147,8 +147,8 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
     rates = zip(model.variables, model.dof_units[3:], *actuators, strict=False)
     for state, unit, (fall, rise), friction, drag in rates:
         values += [
-            (f"{state}.fall", "greatest fall", fall, unit, -np.inf),
-            (f"{state}.rise", "greatest rise", rise, unit, np.inf),
+            (f"{state}.fall", "maximum fall", fall, unit, -np.inf),
+            (f"{state}.rise", "maximum rise", rise, unit, np.inf),
             (f"{state}.friction", "dry friction", friction, unit, 0.0),
             (f"{state}.drag", "drag, times its square", drag, "", 0.0),
         ]
@@ -172,9 +172,9 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Formats a number so that it can be used, with its standard error: `(4.63 +- 0.02)`.
+    """Formats a number with its standard error, ready for computation: `(4.63 +- 0.02)`.
 
-    To the digits that the error leaves, but never to fewer than `LEAST_DIGITS`.
+    Keeps the digits that the error allows, but at least `LEAST_DIGITS`.
     """
     if error is None or error <= 1e-6 * value:
         return f"{value:.5g}"
@@ -189,7 +189,7 @@ def with_error(value: float, error: float | None) -> str:
 
 
 def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
-    """Tells of the pruned linear fit, where it gave the terms: not those of a motion."""
+    """Describes the pruned linear fit if the terms come from it, unlike those of a motion."""
     if identified.findings.width is not None or identified.findings.replaced:
         return {}
     fit = identified.fit
@@ -213,7 +213,9 @@ def _pruning(alpha: Alpha) -> str:
     if alpha == "auto":
         knee = "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve"
         fewest = "the fewest terms, largest standardised coefficient first"
-        return f"{knee}: {fewest}, whose cross-validated error can't be told from the least."
+        return (
+            f"{knee}: {fewest}, whose cross-validated error is as good as the minimum."
+        )
     pruned = (
         f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own"
     )
@@ -330,7 +332,7 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     both = "clock_offset_s" in sigma
     latency = "only its sum with the clock offset is known" if both else untold
     if identified.findings.width is not None and not both:
-        latency = "it can't be told from the lags"
+        latency = "it can't be separated from the lags"
     few = "the drive shows too few directions of motion"
     hidden = (few, few) if mounting is None else mounting.hidden
     unknown = recording.wheels is None
@@ -385,7 +387,7 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
 
 
 def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
-    """True if median errors [m] (maybe NaN, inf) are hardly below those of a robot that stands."""
+    """True if median errors [m] (may be NaN, inf) are hardly below those of standing still."""
     # The mean path and the robot's radius [m] set the scale for circles.
     return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
 
@@ -403,7 +405,7 @@ def why_useless(identified: Identified, spec: RobotSpec) -> str:
         error = np.inf
     if not is_useless(error, standing, held_out.mean_path_m, spec.footprint_radius):
         return ""
-    end = f"end {error:.3g} m off" if np.isfinite(error) else "have run away"
+    end = f"end {error:.3g} m off" if np.isfinite(error) else "have diverged"
     way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
     still = f"while a robot standing still would be {standing:.2f} m off"
     fault = f"the fitted model is useless: on unseen data its predictions {end} {way}, {still}"
@@ -425,6 +427,6 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
     for note in identified.notes:
         if isinstance(note, Mistake | Doubt):
             return f"{note[0].lower()}{note[1:].rstrip('.')}"
-    got = "that nothing held the robot up, that it got each command"
+    got = "that nothing blocked the robot, that it received each command"
     shown = f"{got} and that rows {apart} show how it responds"
-    return f"the recording does not show why, so make sure {shown}, and record anew"
+    return f"the recording does not show why, so make sure {shown}, and record again"

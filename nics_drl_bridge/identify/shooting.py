@@ -1,4 +1,4 @@
-"""Prediction-error method: a model by the errors of its predictions over seconds (Ljung, ch. 7).
+"""Prediction-error method: fits a model to its prediction errors over seconds (Ljung, ch. 7).
 
 Each window starts at a measured state and follows the commands; the derivatives of its end by the
 coefficients are computed along the way.
@@ -22,47 +22,46 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
-Commands = Callable[
-    [Array], Array
-]  # those in effect (T, C) during each step, by values (I,)
-Shape = Callable[
-    [TaylorModel, Array], TaylorModel
-]  # a model with friction and limits by values
+# commands in effect (T, C) during each step, by values (I,)
+Commands = Callable[[Array], Array]
+# a model with friction and limits, by values
+Shape = Callable[[TaylorModel, Array], TaylorModel]
 
-Trust = Callable[
-    [Array, Array], Array
-]  # weights of motions from start to end, usually 1
+# weights of motions from start to end, usually 1
+Trust = Callable[[Array, Array], Array]
 
-HORIZONS_S = (0.3, 1.0, 2.5, 5.0)  # the shortest tells a latency from a lag
+HORIZONS_S = (0.3, 1.0, 2.5, 5.0)  # the shortest separates latency from lag
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
-FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
-PULL = 0.001  # usual weight of the first coefficients against the predictions
-# error that weighs as much, at a pull of 1, as a term as large as the rates
+FARTHEST_M = 50.0  # errors are clipped at this distance per second of the horizon
+PULL = 0.001  # usual weight of the first coefficients relative to the predictions
+# error that weighs as much, at a pull of 1, as a term the size of the rates
 REFERENCE_M_S = 0.1
-DRIFT_M_S = 0.01  # by which good predictions go astray: noise counts as time
-DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
+DRIFT_M_S = 0.01  # drift of good predictions: noise counts as this much time
+# step of finite differences by the values of inputs, relative to their scale
+DIFFERENCE = 0.02
 EVALUATIONS = 60
 TOLERANCE = 1e-6
-INSIDE = 0.05  # share of its range by which a value starts from its bounds
-LEAST_SCALE = 0.02  # of the loss: smaller errors count as their squares [m/s]
+# minimum distance of a start value from its bounds, as a fraction of its range
+INSIDE = 0.05
+LEAST_SCALE = 0.02  # scale of the loss, below which errors count by their squares [m/s]
 NO_ERROR = 1e-9
-SAME_STEP = 0.01  # share of a step by which two steps may differ
+SAME_STEP = 0.01  # fraction of a step by which two steps may differ
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Values on which the commands in effect depend, as a delay [s], and their bounds."""
+    """Values that the commands in effect depend on, such as a delay [s], and their bounds."""
 
-    names: tuple[str, ...]  # of values
+    names: tuple[str, ...]  # of the values
     start: Array  # (I,)
     scale: Array  # (I,)
     low: Array  # (I,)
-    high: Array  # (I,); values where it is not above `low` are known
+    high: Array  # (I,); values whose bound is not above `low` are known
 
     @property
     def sought(self) -> Rows:
-        """Places of the values that are not known."""
+        """Indices of the unknown values."""
         return np.flatnonzero(self.high > self.low)
 
     def begun_at(self, other: "Inputs") -> "Inputs":
@@ -82,10 +81,10 @@ class Shooting:
     commands: Commands
     shaped: Shape
     trust: Trust
-    # True if the last three values are the pose of what `q` is, in the base
+    # True if the last three values are the pose of the body that `q` describes, in the base
     mounted: bool = False
     noise_m: float = 0.0  # standard deviation of measured positions
-    fixed: Array | None = None  # values (I,) that are used instead of those given
+    fixed: Array | None = None  # (I,) values that override those given
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
 
@@ -114,7 +113,7 @@ class Shooting:
         return first[some], np.where(whole, steps, 0)[some]
 
     def moved(self, first: Rows, steps: Rows) -> Array:
-        """Returns the measured poses (W, H, 3) at windows' horizons from those at their starts."""
+        """Returns the measured poses (W, H, 3) at windows' horizons, relative to the starts."""
         pose = self.samples.q[:, :3]
         return geometry.between(pose[first][:, None], pose[first[:, None] + steps])
 
@@ -133,7 +132,7 @@ class Shooting:
         steps: Rows,
         free: Mask | None = None,
     ) -> tuple[Array, Array]:
-        """Returns poses (W, H, 3), derivatives (W, H, 3, P) by `free` (D, K) coefficients."""
+        """Returns poses (W, H, 3), derivatives (W, H, 3, P) by the `free` (D, K) coefficients."""
         values = values if self.fixed is None else self.fixed
         model = self.shaped(model, values)
         if free is None:
@@ -162,7 +161,7 @@ class Shooting:
     def errors(
         self, model: TaylorModel, values: Array, inside: Mask | None = None
     ) -> tuple[Array, Array]:
-        """Returns errors (W, H, 3) of predictions, and the lengths (W, H) of paths; maybe NaN."""
+        """Returns prediction errors (W, H, 3), and the lengths (W, H) of paths; may be NaN."""
         first, steps = self.starts(inside)
         error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
         error[..., 2] = geometry.wrap_angle(error[..., 2])
@@ -171,7 +170,7 @@ class Shooting:
 
 
 def _seen_from(mounting: Array, shot: Shot) -> tuple[Array, Array]:
-    """Returns ends (W, H, 3) and their derivatives of a body at a pose (3,) in the base."""
+    """Returns ends (W, H, 3) and their derivatives for a body at a pose (3,) in the base."""
     end = geometry.between(mounting, geometry.compose(shot.end, mounting))
     end[..., 2] = shot.end[..., 2]
     arm = np.broadcast_to(mounting[:2], (*end.shape[:2], 2))
@@ -197,14 +196,13 @@ class Predictive:
     residual: Array  # (n,)
     free: Mask  # (D, K)
     starts: Array  # (n,) start of the window of each residual [s]
-    value_errors: (
-        Array  # (I,) standard errors of the values; NaN of those that were known
-    )
+    # (I,) standard errors of the values; NaN for known ones
+    value_errors: Array
 
     def named_errors(self, names: tuple[str, ...]) -> dict[str, float]:
-        """Returns the errors of values that belong to a command or a state, as `throttle.dead`.
+        """Returns the errors of values that belong to a command or state, such as `throttle.dead`.
 
-        Those that the predictions do not depend on have none.
+        Values that do not affect the predictions are left out.
         """
         errors = zip(names, self.value_errors.tolist(), strict=True)
         return {
@@ -225,15 +223,15 @@ def fitted(
     pull: float = PULL,
     first: Array | None = None,
 ) -> Predictive:
-    """Adjusts free coefficients (D, K) and values of inputs to the least prediction errors.
+    """Adjusts free coefficients (D, K) and input values to minimise the prediction errors.
 
-    They are pulled to those of the model. The search starts at the `first` if these are better.
+    Coefficients are pulled towards the model's. The search starts at `first` if that is better.
     """
     return _Search(problem, model, free, inputs, inside, pull).run(first, evaluations)
 
 
 class _Search:
-    """Least squares over windows, by scaled values and coefficients (I + P,): zero is the model."""
+    """Least squares over windows, by scaled values and coefficients (I + P,); 0 is the model."""
 
     def __init__(
         self,
@@ -269,7 +267,7 @@ class _Search:
         self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
 
     def at(self, theta: Array) -> tuple[TaylorModel, Array]:
-        """Returns the model without what values shape, and the values of the inputs."""
+        """Returns the model, before values shape it, and the values of the inputs."""
         coefficients = self.model.coefficients.copy()
         coefficients[self.free] += theta[self.count :] * self.unit
         late = self.inputs.start.copy()
@@ -290,11 +288,11 @@ class _Search:
         return rows, slopes.reshape(len(rows), slope.shape[-1])
 
     def residual(self, theta: Array) -> Array:
-        """Returns what is to be small (n + P,)."""
+        """Returns the residual (n + P,): errors, and pulls of the coefficients."""
         return np.append(self.shot(theta, False)[0], self.pull * theta[self.count :])
 
     def jacobian(self, theta: Array) -> Array:
-        """Returns its derivatives (n + P, I + P)."""
+        """Returns the derivatives (n + P, I + P) of the residual."""
         count = self.count
         unit = self.unit
         rest, slope = self.shot(theta, True)
@@ -312,7 +310,7 @@ class _Search:
         return np.ascontiguousarray(np.reshape(every, (self.count, len(rest))).T)
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
-        """Searches for the least errors."""
+        """Searches for the minimum of the errors."""
         count = self.count
         start = np.zeros(self.count + len(self.unit))
         begun = self.residual(start)
@@ -330,7 +328,7 @@ class _Search:
         at = self.sought
         low[:count] = ((inputs.low - inputs.start) / inputs.scale)[at]
         high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
-        aside = INSIDE * (high - low)[:count]  # at a bound the search would stay there
+        aside = INSIDE * (high - low)[:count]  # at a bound the search would not move
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
         found = least_squares(
             self.residual,
@@ -346,7 +344,7 @@ class _Search:
         return self.predictive(found.x)
 
     def predictive(self, theta: Array) -> Predictive:
-        """Returns the model with what tells its uncertainty."""
+        """Returns the model with the data for its uncertainty."""
         best, late = self.at(theta)
         best = self.problem.shaped(best, late)
         rest, slope = self.shot(theta, True)

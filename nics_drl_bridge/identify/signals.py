@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # .signal loads in a second, when it is used
+import scipy  # .signal loads in a second, when used
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
@@ -18,7 +18,8 @@ from nics_drl_bridge.robot.spec import RobotSpec
 SMOOTHING_BATCH = 64
 DEFAULT_LAG_S = 0.1
 DIFFERENCE = 6
-DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
+# factor by which a sixth difference amplifies white noise
+DIFFERENCE_GAIN = np.sqrt(924.0)
 GAUSSIAN_MAD = 0.6745
 
 
@@ -29,7 +30,7 @@ def taken(
     start: Array,
     end: Array,
 ) -> Array:
-    """Returns means (..., C) of commands in effect over intervals (...) [s], by their curves."""
+    """Returns means (..., C) of commands in effect over intervals (...) [s], given their curves."""
     names = [c.name for c in spec.command]
     stream = replace(command, values=apply_curves(command.values, names, curves))
     late = delays(names, curves)
@@ -47,7 +48,7 @@ def held(
     powers: NDArray[np.int64] | None = None,
 ) -> Array:
     """Returns means (..., C), or of powers (K, C), of held commands over intervals (...) [s]."""
-    # Before its first command a robot stands still: commands that ever change are zero then.
+    # Before its first command a robot is at rest, so commands that ever change are zero then.
     still = np.clip(0.0, spec.command_low, spec.command_high)
     before = np.where(moved_commands(command), still, command.values[0])
     values = np.concatenate([before[None], command.values])
@@ -65,7 +66,7 @@ def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
 
 
 def _means(t: Array, parts: Array, start: Array, end: Array) -> Array:
-    """Returns means (..., K) over intervals of what has the integrals (T, K) between times."""
+    """Returns means (..., K) over intervals, from the integrals (T, K) between times."""
     area = np.concatenate([np.zeros((1, parts.shape[1])), np.cumsum(parts, axis=0)])
     means = np.empty((*start.shape, parts.shape[1]))
     for k, column in enumerate(area.T):
@@ -97,18 +98,18 @@ def speed_index(spec: RobotSpec) -> int | None:
 
 
 def nominal_lags(spec: RobotSpec) -> Array:
-    """Returns the spec's time constants (S,) `NAME_lag` [s], else a typical one."""
+    """Returns the spec's time constants (S,) `NAME_lag` [s], or a typical one."""
     return np.array(
         [spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state]
     )
 
 
 class Motors(NamedTuple):
-    """Motors, which hold back states that follow commands with a gain of one, beside their lags."""
+    """Motors, which limit states that follow commands with a gain of one, in addition to lags."""
 
-    fall: Array  # (S,) least and greatest rates [unit of the command / s]
+    fall: Array  # (S,) minimum and maximum rates [unit of the command / s]
     rise: Array
-    dead: Array  # (S,) a smaller command moves nothing [its unit]
+    dead: Array  # (S,) maximum command without an effect [its unit]
 
     @property
     def limited(self) -> NDArray[np.bool_]:
@@ -117,7 +118,7 @@ class Motors(NamedTuple):
 
 
 def free_motors(states: int) -> Motors:
-    """Returns motors that hold nothing back."""
+    """Returns motors without any limits."""
     return Motors(np.full(states, -np.inf), np.full(states, np.inf), np.zeros(states))
 
 

@@ -14,15 +14,16 @@ from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 UNLIKE = 0.05  # correlation below which residuals are assumed to be independent
-LONGEST = 0.1  # longest correlation of residuals, as a share of the rows
-CERTAIN = 3.0  # a term of a noisy fit must be this many times its standard error
+LONGEST = 0.1  # longest correlation of residuals, as a fraction of the rows
+CERTAIN = 3.0  # minimum ratio of a term of a noisy fit to its standard error
 WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
-# relative step and end of `minimise`
+# relative step and termination of `minimise`
 DIFFERENCE = 1e-4
 TOLERANCE = 1e-7
 MAX_STEPS = 40
 BLOCKS = 5
-WORTH = 1e-3  # terms that lower the error by less than this share of the rates' size are not kept
+# terms that lower the error by less than this fraction of the rates' size are dropped
+WORTH = 1e-3
 
 
 def unexplained(chi: Array, signal: Array) -> Array:
@@ -106,7 +107,7 @@ def long_run(chi: Array, residual: Array) -> Array:
 def clustered_errors(
     jacobian: Array, residual: Array, cluster: NDArray[np.intp]
 ) -> Array:
-    """Returns cluster-robust standard errors (P,) (Cameron, Miller 2015), also for few clusters."""
+    """Returns cluster-robust standard errors (P,) (Cameron, Miller 2015), even for few clusters."""
     groups = np.unique(cluster)
     count, terms = jacobian.shape
     if len(groups) < 2 or count <= terms:
@@ -115,7 +116,7 @@ def clustered_errors(
     sums = np.stack([scores[cluster == g].sum(axis=0) for g in groups])
     inverse = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     few = len(groups) / (len(groups) - 1.0) * (count - 1.0) / (count - terms)
-    if len(groups) > 3:  # the variance of Student's t
+    if len(groups) > 3:  # variance of Student's t
         few *= (len(groups) - 1.0) / (len(groups) - 3.0)
     return _deviations(inverse @ (sums.T @ sums) @ inverse * few)
 
@@ -158,7 +159,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
 
 
 def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
-    """Selects features (K,) of a noisy target (T,) that are `CERTAIN` times their errors."""
+    """Selects features (K,) of a noisy target (T,) that exceed `CERTAIN` times their errors."""
     rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
     power = max(float(rest @ rest), np.finfo(np.float64).tiny)
     rho = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 0.98)
@@ -202,20 +203,19 @@ class Curve:
     """Cross-validated error of one degree of freedom against its number of terms."""
 
     dof: str
-    terms: tuple[str, ...]  # n in the order of Eq. 2, the largest weight first
-    error: (
-        Array  # (n + 1,) RMSE of the first 0..n terms on blocks held out of their fit
-    )
+    terms: tuple[str, ...]  # n terms in the order of Eq. 2, largest weight first
+    # (n + 1,) RMSE of the first 0..n terms on blocks left out of their fit
+    error: Array
     kept: int  # number of terms in the model
 
     @property
     def share(self) -> Array:
-        """Error (n + 1,) as a share of the size of the rates."""
+        """Error (n + 1,) as a fraction of the size of the rates."""
         return self.error / max(float(self.error[0]), np.finfo(np.float64).tiny)
 
 
 def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
-    """Returns the curve of features (T, n), the largest weight first; `kept` is its knee."""
+    """Returns the curve of features (T, n), largest weight first; `kept` is its knee."""
     squares = cross_validated(chi, target)
     error = np.sqrt(squares.mean(axis=0))
     sigma = (
@@ -227,7 +227,7 @@ def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
 
 
 def knee(error: Array, sigma: Array) -> int:
-    """Returns the fewest terms within one standard error of the least (Breiman's rule)."""
+    """Returns the fewest terms within one standard error of the minimum (Breiman's rule)."""
     least = int(np.argmin(error))
     limit = error[least] + max(float(sigma[least]), WORTH * float(error[0]))
     return int(np.flatnonzero(error <= limit)[0])
@@ -253,7 +253,7 @@ def cross_validated(chi: Array, target: Array) -> Array:
 
 
 def _safe(r: Array) -> Array:
-    """Makes a triangle solvable: features that the other blocks did not excite are dropped."""
+    """Makes a triangle solvable by dropping features that the other blocks did not excite."""
     diagonal = np.abs(np.diag(r))
     singular = diagonal <= 1e-10 * max(float(diagonal.max()), 1e-300)
     if not singular.any():

@@ -22,11 +22,11 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 Mask = NDArray[np.bool_]
 Powers = NDArray[np.int64]
 
-NOTHING = 1e-9  # spread of a rate that is none
+NOTHING = 1e-9  # spread of a rate that counts as zero
 
 
 def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
-    """Names the variables that change sign in a mirror; None if the textbook does not tell."""
+    """Names the variables that change sign in a mirror; None if the textbook does not say."""
     rng = np.random.default_rng(0)
     reach = np.maximum(spec.command_high, -spec.command_low)
     some = rng.uniform(0.1, 0.9, (8, len(spec.command))) * reach
@@ -50,12 +50,12 @@ def is_reversed(name: str, odd: tuple[str, ...]) -> bool:
 
 
 def sided(spec: RobotSpec) -> bool:
-    """True if a lever arm along y can be told from unequal wheels: not if one turns the robot."""
+    """True if a lever arm along y is distinguishable from unequal wheels."""
     return spec.moves_sideways or mirrored(spec) is not None
 
 
 def tyres_slip(spec: RobotSpec) -> bool:
-    """True if the motion of a car that steers in front is a state: it may slip aside."""
+    """True for a front-steered car whose motion is its state: it may slip sideways."""
     given = structure_of(spec)
     told = {v.twist for v in spec.state} >= {"vx", "vy", "wz"}
     return told and given is not None and given[1].used and not given[1].front_drive
@@ -64,8 +64,8 @@ def tyres_slip(spec: RobotSpec) -> bool:
 def library(powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()) -> Mask:
     """Selects the terms (D, K) that each degree of freedom may have.
 
-    A state that is a component of the twist is so by definition. Slip along y acts in proportion.
-    Beyond the first order, what a mirror reverses is made of what it reverses. Commands that were
+    A state that is a component of the twist is so by definition. Slip along y is proportional.
+    Beyond the first order, what a mirror reverses only has reversed terms. Commands that were
     `held` at one value act as a constant.
     """
     names = spec.variable_names
@@ -80,7 +80,7 @@ def library(powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()) -> Mask
             allowed[d] &= (reversed_ == is_reversed(name, odd)) | (order <= 1)
     if spec.state:  # commands act through the state
         allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
-    if not spec.state or odd is not None:  # who gets no command comes to rest
+    if not spec.state or odd is not None:  # without a command, the robot comes to rest
         pushed = [is_reversed(name, odd or ()) for name in held]
         rest = [is_reversed(name, odd or ()) not in pushed for name in spec.dof_names]
         allowed[rest] &= order > 0
@@ -97,7 +97,7 @@ def library(powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()) -> Mask
 def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
     """Selects the terms (D, K) that each degree of freedom may have.
 
-    Where poses are those of the robot's `centred` reference point, motion along x is even in what a
+    If poses are those of the robot's `centred` reference point, motion along x is even in what a
     mirror reverses, and beyond the first order the rest is odd. States lag behind their commands.
     """
     names = spec.variable_names
@@ -121,7 +121,7 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
 def by_textbook(
     powers: Powers, spec: RobotSpec, held: tuple[str, ...] = (), tyres: bool = False
 ) -> Mask:
-    """Selects the terms (D, K) by which the twist follows commands with a lag, as textbooks do."""
+    """Selects the terms (D, K) by which the twist follows commands with a lag, as in textbooks."""
     names = spec.variable_names
     states = len(spec.state)
     order = powers.sum(axis=1)
@@ -147,7 +147,8 @@ def by_textbook(
                 3 + i,
                 2 * first[speed[0]] + first[[v.twist for v in spec.state].index("wz")],
             )
-        has(3 + i, first[i])  # without a constant: who gets no command comes to rest
+        # no constant, because without a command the robot comes to rest
+        has(3 + i, first[i])
         commands = first[states:][np.abs(moves[part]) > 0.0]
         if bicycle.used and variable.twist == "wz" and paced:
             has(3 + i, first[speed[0]], *(commands + first[speed[0]]))
@@ -164,7 +165,7 @@ def linear_fit(
     order: int,
     allowed: Callable[..., Mask] = library,
 ) -> Fit:
-    """Fits all terms of the library of an order to the rates (Eq. 1); the twist by definition."""
+    """Fits all library terms up to an order to the rates (Eq. 1); the twist by definition."""
     variables = (*spec.state, *spec.command)
     unmoved = excitation.unmoved_variables(samples, spec)
     mean = samples.x.mean(axis=0)
@@ -197,9 +198,8 @@ def _by_definition(
     )
     coefficients = np.zeros((len(model.dofs), len(powers)))
     coefficients[:, : len(model.powers)] = model.coefficients
-    if (
-        not spec.moves_sideways
-    ):  # what is left of lateral motion is noise, unless it is a state
+    # remaining lateral motion is noise, unless it is a state
+    if not spec.moves_sideways:
         coefficients[1] = 0.0
     for i, variable in enumerate(spec.state):
         if variable.twist:
@@ -220,9 +220,9 @@ def _by_definition(
 
 
 def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel:
-    """Shares what commands of one unit do that always moved together, as four wheels of three ways.
+    """Distributes an effect over commands of one unit that always moved together.
 
-    By the least coefficients of all that make the same of these commands.
+    Uses the minimum-norm coefficients, for example for four wheels and three degrees of freedom.
     """
     still = excitation.combinations(samples, spec)
     command = samples.x[:, len(spec.state) :]
@@ -291,7 +291,7 @@ def together(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]
 
 
 def defined(spec: RobotSpec) -> Mask:
-    """Selects the degrees of freedom (D,) that are not fitted: those of which the state tells."""
+    """Selects the degrees of freedom (D,) that the state defines, so that they are not fitted."""
     by_state = np.zeros(len(spec.dof_names), dtype=np.bool_)
     for i, variable in enumerate(spec.state):
         by_state[POSE_RATES.index(variable.twist) if variable.twist else 3 + i] = True

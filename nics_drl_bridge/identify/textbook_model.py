@@ -1,4 +1,4 @@
-"""A fitted textbook as a Taylor model: written in the place of a model that loses to it."""
+"""A fitted textbook as a Taylor model, which replaces a model that predicts worse."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,24 +20,23 @@ from nics_drl_bridge.robot.taylor import TaylorModel, evaluate
 
 Powers = NDArray[np.int64]
 
-# times the greatest value of an actuator on a drive that its range reaches
+# ratio of an actuator's range to its maximum on a drive
 MARGIN = 1.25
-LEAST_COSINE = 0.1  # of a steering angle
-NEGLIGIBLE = 1e-3  # share of a rate below which a term of the expansion is left out
-# share of the widest range that is searched: a limit beyond it was not found
+LEAST_COSINE = 0.1  # minimum cosine of a steering angle
+NEGLIGIBLE = 1e-3  # fraction of a rate below which a term of the expansion is left out
+# fraction of the widest searched range above which a limit counts as not found
 UNLIMITED = 0.5
 
 
 def textbook_calibration(
     yardstick: Yardstick, calibration: Calibration, spec: RobotSpec
 ) -> Calibration:
-    """Returns the calibration of a drive as the fitted textbook sees it."""
+    """Returns the calibration of a drive according to the fitted textbook."""
     response = yardstick.response
     x, y, heading = map(float, response.mounting)
     latency = max(response.delay_s, 0.0)
-    early = max(
-        -response.delay_s, 0.0
-    )  # motion before its commands is of another clock
+    # motion that precedes its commands has another clock
+    early = max(-response.delay_s, 0.0)
     if not spec.state:  # a lag without a state acts as a delay
         used = response.gain.any(axis=1)
         latency += float(response.lag_s[used].mean())
@@ -58,10 +57,10 @@ def textbook_calibration(
 def textbook_model(
     yardstick: Yardstick, model: TaylorModel, samples: Samples, spec: RobotSpec
 ) -> TaylorModel | None:
-    """Returns the fitted textbook by terms, in the step and the range of a model of the same drive.
+    """Returns the fitted textbook as terms, with the step and range of a model of the same drive.
 
-    Trigonometric functions are expanded over the rows of the samples. None for a state whose
-    relation to the twist no textbook tells.
+    Trigonometric functions are expanded over the rows of the samples. None for a state that no
+    textbook relates to the twist.
     """
     response = yardstick.response
     book = _Expansion(response, samples, spec, model)
@@ -121,9 +120,8 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
         "speed_lag": float(response.lag_s[0]),
         "steering_lag": float(response.lag_s[2]),
     }
-    if (
-        "speed_gain" in spec.parameters
-    ):  # of a car that is told shares of throttle and steering
+    # a car commanded by fractions of throttle and steering
+    if "speed_gain" in spec.parameters:
         found |= {"speed_gain": gains[0], "greatest_steering": gains[1]}
     data["parameters"] = spec.parameters | found
     return RobotSpec.model_validate(data)
@@ -132,7 +130,7 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
 def with_actuators(
     drive: Drive, spec: RobotSpec, yardstick: Yardstick, calibration: Calibration
 ) -> Drive:
-    """Returns a drive, whose motion is known, of a robot whose state is speed and steering angle.
+    """Returns a drive, with known motion, of a robot whose state is speed and steering angle.
 
     The speed is that of the motion, the angle that of the textbook for the commands.
     """
@@ -155,7 +153,7 @@ def with_actuators(
 
 
 def _places_of_bicycle(response: TextbookResponse) -> tuple[int, int]:
-    """Returns the places of speed and steering among the commands of a bicycle."""
+    """Returns the indices of speed and steering among the commands of a bicycle."""
     speed = int(np.argmax(np.abs(response.gain[0])))
     return speed, 1 - speed
 
@@ -178,7 +176,7 @@ def _responses(
 
 
 def _dead_zones(response: TextbookResponse, spec: RobotSpec) -> Iterator[InputCurve]:
-    """Yields the dead zone of a speed command whose effect is less, or more, than in proportion."""
+    """Yields the dead zone of a speed command whose effect is below, or above, proportional."""
     if not response.bicycle.used or response.offset[0] == 0.0:
         return
     place = int(np.argmax(np.abs(response.gain[0])))
@@ -187,7 +185,7 @@ def _dead_zones(response: TextbookResponse, spec: RobotSpec) -> Iterator[InputCu
 
 
 class _Expansion:
-    """Terms of a textbook, degree of freedom by degree of freedom."""
+    """Terms of a textbook, by degree of freedom."""
 
     def __init__(
         self,
@@ -207,7 +205,7 @@ class _Expansion:
         self.limits = np.tile([-np.inf, np.inf], (self.states, 1))
 
     def rate_of(self, actuator: int) -> float:
-        """Returns the rate [1/s] by which a step of the model brings an actuator to its target."""
+        """Returns the rate [1/s] at which a step of the model brings an actuator to its target."""
         lag = float(self.response.lag_s[actuator])
         dt = self.like.dt
         return (1.0 - float(np.exp(-dt / lag))) / dt
@@ -219,7 +217,7 @@ class _Expansion:
         return row
 
     def command_place(self, command: int) -> int:
-        """Returns the place of a command among the variables."""
+        """Returns the index of a command among the variables."""
         return self.states + command
 
     def add(self, dof: int, row: NDArray[np.int64], value: float) -> None:
@@ -234,7 +232,7 @@ class _Expansion:
         rows: Sequence[NDArray[np.int64]],
         factor: float = 1.0,
     ) -> None:
-        """Adds the terms that come nearest to a target (T,) over the samples, times a factor."""
+        """Adds the terms that best approximate a target (T,) over the samples, times a factor."""
         powers = np.array(rows, dtype=np.int64).reshape(len(rows), self.x.shape[1])
         chi = evaluate(self.x, powers)
         size = np.maximum(np.linalg.norm(chi, axis=0), 1e-12)
@@ -251,7 +249,7 @@ class _Expansion:
         return [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
 
     def turn_rate(self, speed: Array, steering: Array) -> Array:
-        """Returns the turn rate (T,) of a bicycle for its speed and what its steering is told."""
+        """Returns the turn rate (T,) of a bicycle for its speed and commanded steering."""
         bicycle = self.response.bicycle
         gain = self.response.gain[2, int(np.argmax(np.abs(self.response.gain[2])))]
         angle = np.clip(gain * steering + self.response.offset[2], -1.4, 1.4)
@@ -390,13 +388,13 @@ class _Expansion:
                     self.add(dof, self.unit(int(turning)), share)
 
     def speed_limits(self) -> tuple[float, float]:
-        """Returns the greatest fall and rise of the speed, infinite where none was found."""
+        """Returns the maximum fall and rise of the speed, infinite where none was found."""
         rise, fall = (float(each) for each in self.response.limit)
         most = UNLIMITED * LIMIT_RANGE[1]
         return -fall if fall < most else -np.inf, rise if rise < most else np.inf
 
     def made(self) -> TaylorModel:
-        """Returns the model."""
+        """Builds the model."""
         keys = sorted({key for row in self.terms.values() for key in row})
         coefficients = np.zeros((len(self.spec.dof_names), len(keys)))
         for dof, row in self.terms.items():

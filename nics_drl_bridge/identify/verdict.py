@@ -1,4 +1,4 @@
-"""Verdict on a drive and its model: sentences on all that was found, quality, or a refusal."""
+"""Verdict on a drive and its model: sentences on all findings, quality, or a refusal."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -26,23 +26,24 @@ from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
 MIN_ROWS = 20
 FEW_LEVELS = 2
 ILL_CONDITIONED = 1e6
-FAR_OFF = 0.25  # predictions whose mean error exceeds this share of the path are not to be trusted
+# predictions whose mean error exceeds this fraction of the path can't be trusted
+FAR_OFF = 0.25
 UNEXPLAINED = 0.5
-WORSE = 1.25  # times the trial's error on the part that both know; a refit beyond is not believed
+# ratio to the trial's error on the training part, above which a refit is rejected
+WORSE = 1.25
 MANY_OUTLIERS = 0.001
-BACKWARDS = 0.3  # angle [rad] from half a turn below which a body faces backwards
-# a pause of the pose longer than so many usual steps, and MAX_GAP_S, is a gap
+BACKWARDS = 0.3  # angle [rad] from half a turn, below which a body faces backwards
+# a pause of the pose longer than this many usual steps, and MAX_GAP_S, is a gap
 GAP_STEPS = 3.0
-GAPS_TOLD = 12  # one by one, the longest of them, in the order of time
-LINEAR = "Predictions by terms of a higher order ran away, so the model has those of order 1 alone."
-EARLY = "The robot moves"  # begins a note on motion before its commands
-COARSE = (
-    2.0 / 3.0
-)  # share of a state's range between two rows that is sampled too coarsely
+# maximum number of gaps to report individually: the longest, in order of time
+GAPS_TOLD = 12
+LINEAR = "Predictions by terms of a higher order diverged, so the model has only those of order 1."
+EARLY = "The robot moves"  # start of a note on motion before its commands
+# fraction of a state's range between two rows that is sampled too coarsely
+COARSE = 2.0 / 3.0
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
-MIRRORED = (
-    -0.5
-)  # correlation of yaw rate and steering below which the robot turns the wrong way
+# correlation of yaw rate and steering below which the robot turns the wrong way
+MIRRORED = -0.5
 
 
 class Gap(str):
@@ -50,15 +51,15 @@ class Gap(str):
 
 
 class Doubt(str):
-    """A sentence on something that looks mistaken, but may be the robot's own way."""
+    """A sentence on something that looks wrong, but may be how the robot behaves."""
 
 
 class Mistake(str):
-    """A sentence on something that was mapped wrongly: the model holds for the mapping alone."""
+    """A sentence on a wrong mapping; the model is only valid with that mapping."""
 
 
 def about_stamps(drive: Drive) -> Iterator[str]:
-    """Tells of the stamps and the noise of the poses."""
+    """Yields sentences on the stamps and the noise of the poses."""
     if (bursts := drive.bursts) is not None:
         finding = f"Poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
         spread = "the samples of a burst were spread over the time since the one before"
@@ -76,19 +77,19 @@ def time_without_pose(drive: Drive) -> float:
 
 
 def _gap_rows(drive: Drive) -> list[int]:
-    """Returns the poses after which there is a gap, that of the longest first."""
+    """Returns the poses that precede a gap, starting with the longest gap."""
     t = drive.dated.t
     span = np.diff(t)
     usual = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
     wide = span > max(MAX_GAP_S, GAP_STEPS * usual)
-    if drive.recording.episodes:  # between two of them there is no drive
+    if drive.recording.episodes:  # there is no motion between two episodes
         wide &= np.diff(drive.recording.episode_at(t)) == 0
     rows = np.flatnonzero(wide)
     return [int(row) for row in rows[np.argsort(-span[rows], kind="stable")]]
 
 
 def about_gaps(drive: Drive) -> Iterator[str]:
-    """Tells each gap in the pose: when, how long, and how far the pose moved across it."""
+    """Yields a sentence per gap in the pose: when, how long, how far the pose moved across it."""
     t = drive.dated.t
     pose = drive.dated.values
     rows = _gap_rows(drive)
@@ -112,7 +113,7 @@ def about_gaps(drive: Drive) -> Iterator[str]:
 def coarsest_state(
     recording: Recording, spec: RobotSpec, unmoved: Sequence[str]
 ) -> str:
-    """Names the measured state that changes by most of its range from row to row; "" if none."""
+    """Names the measured state that changes by most of its range between rows; "" if none."""
     if recording.state is None:
         return ""
     values = recording.state.values
@@ -134,7 +135,7 @@ def coarsest_state(
 def about_clocks(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
-    """Tells of clock offset and latency."""
+    """Yields sentences on clock offset and latency."""
     sigma = calibration.uncertainty
     recording = drive.recording
     clocks_differ = recording.pose.clock != recording.command.clock
@@ -148,7 +149,7 @@ def about_clocks(
         finding = f"{EARLY} {timing.early:.2f} s before its commands"
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
         if recording.state is not None:
-            cause = "its state is stamped by another clock; stamp both by one, and record anew"
+            cause = "its state is stamped by another clock; stamp both by one, and record again"
         yield Mistake(f"{finding}: {cause}.")
     if timing.drift != 0.0:
         rate = f"{abs(timing.drift) * 1e3:.1f} ms in every second"
@@ -161,7 +162,7 @@ def about_clocks(
             "No command ever changed, so clock offset and latency could not be learnt."
         )
     elif not timing.separated and clocks_differ:
-        why = "since no measurement on the commands' clock follows them"
+        why = "because no measurement on the commands' clock follows them"
         fix = "the latency is taken as zero. Record the wheels or the state to separate them"
         yield Gap(
             f"Only the sum of clock offset and command latency can be known, {why}; {fix}."
@@ -175,7 +176,7 @@ def about_clocks(
 def about_mounting(
     drive: Drive, calibration: Calibration, mounting: Mounting | None
 ) -> Iterator[str]:
-    """Tells where and how the tracked body sits on the robot."""
+    """Yields sentences on the position and rotation of the tracked body on the robot."""
     if mounting is None:
         taken = "is taken to be exactly at base_link; drive in every direction and turn"
         yield Gap(
@@ -183,10 +184,11 @@ def about_mounting(
         )
         return
     x, y = calibration.lever_arm_m
+    # predictions may have found one later
     names = (
         "lever_arm_x_m",
         "lever_arm_y_m",
-    )  # of which predictions may have told one later
+    )
     found = (name in calibration.uncertainty for name in names)
     x_hidden, y_hidden = (
         why * (not f) for why, f in zip(mounting.hidden, found, strict=True)
@@ -200,7 +202,7 @@ def about_mounting(
         if faces_backwards(calibration) and not drive.spec.steers:
             yield Doubt(
                 f"{finding}: the body faces backwards, or the speed that is commanded has the "
-                "wrong sign (it can't be told which)."
+                "wrong sign (the drive does not show which)."
             )
         else:
             yield f"{finding}."
@@ -217,14 +219,14 @@ def about_mounting(
 
 
 def faces_backwards(calibration: Calibration) -> bool:
-    """True if the robot travels where the back of the tracked body points."""
+    """True if the robot travels in the direction that the back of the tracked body faces."""
     return bool(abs(geometry.wrap_angle(calibration.rotation_rad - np.pi)) < BACKWARDS)
 
 
 def about_responses(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
-    """Tells of states that were not measured, and of the wheels."""
+    """Yields sentences on unmeasured states and the wheels."""
     moved = moved_commands(drive.recording.command)
     names = [c.name for c, m in zip(drive.spec.command, moved, strict=True) if m]
     for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=False):
@@ -265,7 +267,7 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
 
 
 def missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
-    """Returns the variables that never moved, but for a slip aside where none can be driven."""
+    """Returns the variables that never moved, except sideways slip if it can't be commanded."""
     slips = [v.name for v in spec.state if v.twist == "vy" and not spec.moves_sideways]
     return tuple(
         name for name in linear.regression.excitation.unmoved if name not in slips
@@ -273,12 +275,12 @@ def missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
 
 
 def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
-    """Returns those names that are commands: what a driver can move."""
+    """Returns the names that are commands, which a driver can move."""
     return [c.name for c in spec.command if c.name in names]
 
 
 def levels_of(command: Stream, spec: RobotSpec) -> dict[str, int]:
-    """Returns the number of different values of each command as it was recorded."""
+    """Returns the number of different values of each command as recorded."""
     columns = zip(spec.command, command.values.T, strict=True)
     return {c.name: len(np.unique(np.round(values, 9))) for c, values in columns}
 
@@ -286,16 +288,16 @@ def levels_of(command: Stream, spec: RobotSpec) -> dict[str, int]:
 def unlearnt(
     linear: Fit, calibration: Calibration, spec: RobotSpec, levels: dict[str, int]
 ) -> Iterator[str]:
-    """Tells of inputs that were not moved, alone or at many levels, and of dependent states.
+    """Yields sentences on inputs not moved, alone or at many levels, and dependent states.
 
-    `levels` are the numbers of different values of the commands as they were recorded: a motor
-    that saturates makes two of many.
+    `levels` are the numbers of different values of the commands as recorded, because a motor that
+    saturates reduces many values to two.
     """
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
     if unmoved := ", ".join(missed(linear, spec)):
         finding = f"The model has no terms of {unmoved}, which never moved"
-        yield Gap(f"{finding}: it is valid for this drive's constant value only.")
+        yield Gap(f"{finding}: it is only valid for this drive's constant value.")
     still = _commands(excitation.unmoved, spec)
     if missing := ", ".join(name for name in still if name not in already):
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
@@ -306,7 +308,7 @@ def unlearnt(
         else:
             shares = "one has all of it"
         told = f"{shares}, and the model holds where they move so; drive each on its own to learn"
-        why = "always moved together, so their effects can't be told apart"
+        why = "always moved together, so their effects can't be separated"
         yield Gap(f"{together} {why}: {told}.")
     if copies := _list(
         [v.name for v in spec.state if v.name in linear.regression.dependent]
@@ -321,12 +323,12 @@ def unlearnt(
     if coarse := _list([name for name, count in moved.items() if count == FEW_LEVELS]):
         finding = "between them the model is a straight line, whatever the robot does"
         yield Gap(
-            f"{coarse} took two values only: {finding}; drive with values in between."
+            f"{coarse} took only two values: {finding}; drive with values in between."
         )
 
 
 def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
-    """Tells each reason to doubt a linear fit."""
+    """Yields each reason to doubt a linear fit."""
     dofs = linear.model.dofs
     for dof, outliers, condition in zip(
         dofs, linear.outliers, linear.condition, strict=True
@@ -355,7 +357,7 @@ def _list(names: Sequence[str]) -> str:
 def mirror_note(
     samples: Samples, spec: RobotSpec, calibration: Calibration
 ) -> Iterator[str]:
-    """Tells if the robot turns right when commanded to turn left, and which sign explains it."""
+    """Yields a sentence if the robot turns against its command, and which sign explains it."""
     for i, command in enumerate(spec.command, start=len(spec.state)):
         if not command.turns:
             continue
@@ -388,7 +390,7 @@ def mirror_note(
 def tried(
     model: TaylorModel, calibration: Calibration, drive: Drive, t: float
 ) -> OpenLoop | None:
-    """Tries a model on a drive from t [s] on; None if that is too short."""
+    """Tries a model on a drive from t [s] on; None if the rest is too short."""
     try:
         return open_loop_error(model, calibration, drive, t, drive.duration_s)
     except RecordingError:
@@ -403,11 +405,11 @@ def ran_away(tried: OpenLoop | None) -> bool:
 def untried(
     drive: Drive, held_out: OpenLoop | None, judgement: tuple[HorizonErrors, ...]
 ) -> Iterator[str]:
-    """Tells of a drive too short to try a model on unseen data, or over 5 s of it."""
+    """Yields a sentence if a drive is too short to try a model on unseen data, or on 5 s."""
     if held_out is None:
         shown = "the model was not tried on unseen data"
         if judgement:
-            shown = f"the model was tried over {judgement[-1].horizon_s:g} s only"
+            shown = f"the model was only tried over {judgement[-1].horizon_s:g} s"
         left = max(drive.duration_s - drive.settings.train_until_s, 0.0)
         yield Gap(
             f"The last {left:.1f} s, held out of the fit, are too short for a prediction over "
@@ -423,7 +425,7 @@ def with_quality(
     judgement: tuple[HorizonErrors, ...],
     spec: RobotSpec,
 ) -> TaylorModel:
-    """Returns the model with its figures of merit."""
+    """Returns the model with its quality figures."""
 
     def by_dof(values: Array) -> dict[str, float]:
         return {
@@ -453,21 +455,21 @@ def with_quality(
 
 
 def replaced_by_textbook(lost: HorizonErrors) -> str:
-    """Says that a model lost to its textbook, which was put in its place."""
+    """Formats a sentence on a model that lost to its textbook and was replaced by it."""
     if lost.textbook is None:
         return ""
     off = f"{lost.model.position_m:.3g} m off after {lost.horizon_s:g} s"
-    finding = f"The model that was learnt ends {off}, the fitted textbook "
+    finding = f"The learnt model ends {off}, the fitted textbook "
     finding += f"{lost.textbook.position_m:.3g} m, on the same unseen data"
-    return f"{finding}: the model that was written is the textbook, fitted to the training part."
+    return f"{finding}: the model written is the textbook, fitted to the training part."
 
 
 def refitted(until: float, duration: float, worse: bool) -> str:
-    """Says of how much of a drive a model is, and what its errors are of."""
+    """States how much of a drive a model covers, and what its errors refer to."""
     if worse:
         why = (
             f"fitted to all {duration:.1f} s, it was not shown to predict them as well"
         )
-        return f"The model is of the first {until:.1f} s only: {why}."
+        return f"The model covers only the first {until:.1f} s: {why}."
     shown = f"errors on unseen data are those of a trial that had learnt the first {until:.1f} s"
     return f"The model was fitted to all {duration:.1f} s once it had been judged; {shown}."

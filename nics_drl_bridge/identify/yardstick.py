@@ -1,10 +1,10 @@
-"""Yardsticks of a model: a robot that keeps its twist, and its fitted textbook kinematics."""
+"""Yardsticks for a model: a robot that keeps its twist, and the fitted textbook kinematics."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # .signal loads in a second, when it is used
+import scipy  # .signal loads in a second, when used
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
@@ -24,48 +24,47 @@ from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
 
-HORIZONS_S = (1.0, 2.5, 5.0)  # the fit's predictions end after these times
+HORIZONS_S = (1.0, 2.5, 5.0)  # horizons at which the fit compares predictions
 STEP_S = 0.02
 SPACING_S = 0.1
 MOST_WINDOWS = 200
-# poses that tell the twist at a window's start: time and number
+# poses that determine the twist at a window's start: time span and number
 BEFORE_S = 0.2
 FEWEST = 4
-# greatest standard error of a speed at a start that is taken from a parabola
+# maximum standard error of a start speed that is taken from a parabola
 STEADY_M_S = 0.05
-HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
-LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
+HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as this many metres
+LOSS_SCALE = 0.2  # scale of the soft L1 loss [m/s]
 MOST_EVALUATIONS = 60
 TOLERANCE = 1e-4
 GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
-JUMP = 3.0  # speeds beyond so many times the 90th percentile are jumps of the localiser
-DELAYS_S = np.arange(
-    -0.1, 0.51, 0.05
-)  # at each of these delays between streams of one clock
-FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
+JUMP = 3.0  # speeds beyond this many times the 90th percentile are localiser jumps
+# at each of these delays for streams on one clock
+DELAYS_S = np.arange(-0.1, 0.51, 0.05)
+FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and at these for streams on two
 LAG_S = 0.15
 LAG_RANGE_S = (0.005, 5.0)
-# of acceleration [m/s^2]
+# limit of accelerations [m/s^2]
 LIMIT = 10.0
 LIMIT_RANGE = (0.05, 1e3)
 NOTHING = 1e-9
-PROBE = 0.5  # share of the range of a command at which the textbook is asked for its structure
+# fraction of the range of a command at which the textbook is probed for its structure
+PROBE = 0.5
 
 
 @dataclass(frozen=True)
 class TextbookResponse:
-    """Actuators follow gain * command + offset, with lags, after a delay.
+    """Actuators that follow gain * command + offset, with lags, after a delay.
 
     Actuators are the body twist (vx, vy, wz), or speed, 0, steering angle of a bicycle.
     """
 
     delay_s: float
-    gain: Array  # (3, C) actuator per command
+    gain: Array  # (3, C) actuator per unit of command
     offset: Array  # (3,)
     lag_s: Array  # (3,)
-    limit: (
-        Array  # (2,) greatest acceleration, deceleration of the first actuator [m/s^2]
-    )
+    # (2,) maximum acceleration and deceleration of the first actuator [m/s^2]
+    limit: Array
     bicycle: BicycleGeometry
     mounting: Array  # (3,) pose of the tracked body in `base_link`
 
@@ -75,12 +74,12 @@ class Yardstick:
     """A fitted textbook robot to compare a model with."""
 
     response: TextbookResponse
-    clock_offset_s: float  # added to the pose's stamps, gives the commands' clock
+    clock_offset_s: float  # added to the pose's stamps to give the commands' clock
 
     def predict(
         self, drive: Drive, chosen: Windows, twist: Array | None = None
     ) -> Array:
-        """Predicts poses (W, 3) at windows' ends, from twists (W, 3) at their starts if known."""
+        """Predicts poses (W, 3) at windows' ends from twists (W, 3) at their starts, if known."""
         duration = (chosen.end_t - chosen.start_t)[:, None]
         course = _course(drive, chosen.start_t + self.clock_offset_s, duration)
         twist = twists_before(drive, chosen.start_t) if twist is None else twist
@@ -90,7 +89,7 @@ class Yardstick:
 
 
 def kept_twist(drive: Drive, chosen: Windows, twist: Array | None = None) -> Array:
-    """Predicts poses (W, 3) at windows' ends of a robot that keeps the twist of their starts."""
+    """Predicts poses (W, 3) at windows' ends for a robot that keeps the twist at their starts."""
     twist = twists_before(drive, chosen.start_t) if twist is None else twist
     moved = twist * (chosen.end_t - chosen.start_t)[:, None]
     return geometry.compose(chosen.start, geometry.exp(moved))
@@ -99,7 +98,7 @@ def kept_twist(drive: Drive, chosen: Windows, twist: Array | None = None) -> Arr
 def twists_before(drive: Drive, at: Array) -> Array:
     """Estimates twists (W, 3) of the tracked body at times (W,) of poses, from those just before.
 
-    By parabolas, whose ends are in time, or by lines where poses are noisy: four times as steady.
+    Uses parabolas, which do not lag, or lines for noisy poses, which are four times as steady.
     """
     t = drive.dated.t
     pose = unwrapped(drive.dated.values)
@@ -122,7 +121,7 @@ def twists_before(drive: Drive, at: Array) -> Array:
 def _without_jumps(
     drive: Drive, until_s: float, horizon: float, spacing: float
 ) -> tuple[Windows, Array]:
-    """Selects windows in which the localiser did not jump, and twists (W, 3) at their starts."""
+    """Selects windows without localiser jumps, and twists (W, 3) at their starts."""
     chosen = windows(drive, Calibration(), 0.0, until_s, horizon, spacing)
     if not len(chosen.start_t):
         return chosen, np.zeros((0, 3))
@@ -136,8 +135,8 @@ def _without_jumps(
 
 
 class _Course(NamedTuple):
-    start_t: Array  # (W,) of windows, on the commands' clock [s]
-    duration: Array  # (W, H) to the ends of predictions [s]
+    start_t: Array  # (W,) starts of windows, on the commands' clock [s]
+    duration: Array  # (W, H) durations of predictions [s]
     grid_t: Array  # (G,) [s]
     command: Array  # (G, C) means over steps of the grid
 
@@ -151,14 +150,14 @@ def _course(drive: Drive, start_t: Array, duration: Array) -> _Course:
 
 
 def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) -> Array:
-    """Returns poses (W, H, 3) of the tracked body seen from its start, where it had a twist."""
+    """Returns poses (W, H, 3) of the tracked body relative to its start, given the twist there."""
     bicycle = response.bicycle
     mounting = response.mounting
     target = course.command @ response.gain.T
     begin = course.start_t - response.delay_s - course.grid_t[0]
     arm = np.array([mounting[1], -mounting[0], 0.0]) * twist[:, 2:]
     actuator = _turned(twist, mounting[2]) + arm
-    if bicycle.used:  # a command of zero is a stop, whatever the offset
+    if bicycle.used:  # a command of zero means stop, whatever the offset
         more = np.maximum(np.abs(target[:, 0]) + response.offset[0], 0.0)
         target = np.stack(
             [np.sign(target[:, 0]) * more, 0.0 * more, target[:, 2]], axis=1
@@ -196,12 +195,12 @@ def _turned(twist: Array, angle: float) -> Array:
 
 @dataclass(frozen=True)
 class _Form:
-    """A first response, and which of its values are free."""
+    """An initial response, and which of its values are free."""
 
     start: TextbookResponse
     moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
-    mounted: NDArray[np.bool_]  # (3,) of the mounting
-    # True if it speeds up and slows down by the same acceleration
+    mounted: NDArray[np.bool_]  # (3,) free values of the mounting
+    # True if acceleration and deceleration have the same limit
     one_limit: bool = False
 
     @property
@@ -226,7 +225,7 @@ class _Form:
         )
 
     def unpack(self, theta: Array) -> TextbookResponse:
-        """Returns the response of free values (P,)."""
+        """Returns the response for free values (P,)."""
         r = self.start
         rows = self.moves.any(axis=1)
         count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(self.slips)]
@@ -288,7 +287,7 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
 def _first_guess(
     drive: Drive, until_s: float, clock_offset: float, offsets: bool
 ) -> _Form:
-    """Fits gains, lags and maybe offsets to motions over `GUESS_S` at the best delay, linearly."""
+    """Fits gains, lags, maybe offsets linearly to motions over `GUESS_S` at the best delay."""
     structure = structure_of(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
     seen, before = _without_jumps(drive, until_s, GUESS_S, SPACING_S)
@@ -323,7 +322,7 @@ def _first_guess(
                 ),
             )
         )
-    # Wheels of unequal gain are a lever arm across; without a textbook, any gain is any mounting.
+    # Unequal wheels look like a lateral lever arm; without a textbook, any gain may be one.
     mounted = np.array([True, np.count_nonzero(book[0]) < 2, True]) & (
         structure is not None
     )
@@ -338,7 +337,7 @@ def _regressed(
     bicycle: BicycleGeometry,
     offsets: bool,
 ) -> tuple[float, Array, Array, Array]:
-    """Regresses twist + lag * change on commands: what is left, gains, offsets, lags."""
+    """Regresses twist + lag * change on commands; returns residual, gains, offsets, lags."""
     left = 0.0
     gain = np.zeros(moves.shape)
     offset = np.zeros(3)
@@ -364,15 +363,15 @@ def _regressed(
 def fit_yardstick(
     drive: Drive, until_s: float, clock_offset_s: float = 0.0, one_limit: bool = False
 ) -> Yardstick:
-    """Fits the textbook of a drive's robot, as a fair hand-made model of it, up to `until_s` [s].
+    """Fits the textbook of a drive's robot up to `until_s` [s], as a fair hand-made model of it.
 
-    To open-loop errors after `HORIZONS_S`. With `one_limit` it speeds up and slows down by the same
-    acceleration. Raises RecordingError if the part is too short for them.
+    Minimises open-loop errors after `HORIZONS_S`. With `one_limit`, acceleration and deceleration
+    have the same limit. Raises RecordingError if the part is too short for these horizons.
     """
     spacing = max(SPACING_S, (until_s - HORIZONS_S[-1]) / MOST_WINDOWS)
     chosen, twist = _without_jumps(drive, until_s, HORIZONS_S[-1], spacing)
     if not len(chosen.start_t):
-        fault = f"the first {until_s:.1f} s hold no window of {HORIZONS_S[-1]:g} s"
+        fault = f"the first {until_s:.1f} s contain no window of {HORIZONS_S[-1]:g} s"
         raise RecordingError(
             f"{drive.recording.source}: {fault}; record a longer drive."
         )

@@ -1,4 +1,4 @@
-"""Compiled roll-out of the yardstick: first-order twists, or a bicycle, over windows."""
+"""Compiled rollout of the yardstick: first-order twists, or a bicycle, over windows."""
 
 import math
 from typing import NamedTuple
@@ -20,7 +20,7 @@ STRAIGHT = BicycleGeometry(False, False, 1.0, 0.0)
 
 @kernel
 def _limited(value, target, lag, limit):  # type: ignore[no-untyped-def]
-    """Returns a target so near that a first-order lag towards it keeps to `limit` (2,)."""
+    """Returns a target close enough that a first-order lag towards it stays within `limit` (2,)."""
     gap = target - value
     most = lag * (limit[0] if gap * value >= 0.0 else limit[1])
     return value + most * math.tanh(gap / most)
@@ -42,8 +42,8 @@ def _twist(state, bicycle):  # type: ignore[no-untyped-def]
 def roll_windows(ends, actuator, begin, stops, target, lag, limit, bicycle, dt):  # type: ignore[no-untyped-def]
     """Writes relative poses (W, H, 3) at ascending `stops` (W, H), in steps of `dt` after `begin`.
 
-    `actuator` (W, 3) holds the states at the start and is used up: a body twist, or speed, 0 and
-    angle of a steered robot; `target` (G, 3) their targets on a grid, `begin` (W,) places on it;
+    `actuator` (W, 3) holds the initial states and is overwritten: a body twist, or speed, 0 and
+    angle of a steered robot; `target` (G, 3) their targets on a grid, `begin` (W,) indices in it;
     `lag` (3,) [s]; `limit` (2,) of the speed's acceleration and deceleration [m/s^2].
     """
     for w in range(len(begin)):

@@ -59,7 +59,7 @@ def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
     both = found.command_latency_s + found.responses[0].lag_s
     assert both == pytest.approx(0.15, abs=3.0 * sigma)
     assert any(
-        "can hardly be told apart: trust their sum" in note for note in found.notes
+        "can hardly be separated: trust their sum" in note for note in found.notes
     )
 
 

@@ -43,8 +43,8 @@ def judged(found, position, path=2.0):
             0.0,
             "end 0.02 m off after 5 s; a fitted textbook 0.5 m, constant twist 1 m.",
         ),
-        (math.inf, 2.0, "the predictions run away within 5 s."),
-        (math.nan, 2.0, "the predictions run away within 5 s."),
+        (math.inf, 2.0, "the predictions diverge within 5 s."),
+        (math.nan, 2.0, "the predictions diverge within 5 s."),
     ],
 )
 def test_the_accuracy_is_a_share_of_the_path_beside_those_of_the_yardsticks(

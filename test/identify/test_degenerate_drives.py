@@ -101,7 +101,7 @@ def test_straight_only_of_a_differential_robot_names_the_turn_command(differenti
 @pytest.mark.parametrize(
     ("column", "constant", "name", "advice"),
     [
-        (0, 0.6, "speed_command", "is valid for this drive's constant value only"),
+        (0, 0.6, "speed_command", "is only valid for this drive's constant value"),
         (
             1,
             -0.4,
@@ -287,7 +287,7 @@ def test_two_valued_commands_are_told(differential):
     rng = np.random.default_rng(0)
     held = rng.integers(0, 2, (60, 2)) * [1.0, 4.0] - [0.0, 2.0]
     found = identify(driven(differential, np.repeat(held, 25, axis=0)), differential)
-    assert said(found, "took two values only")
+    assert said(found, "took only two values")
     assert harmless(found, differential)
 
 

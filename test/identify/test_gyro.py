@@ -119,7 +119,7 @@ def test_poses_of_unknown_origin_are_not_turned_but_the_fix_is_told(slipping):
         (
             "odometry",
             False,
-            "relative to odometry; nothing here tells how far that drifts.",
+            "relative to odometry; nothing here shows how far that drifts.",
         ),
         ("odometry", True, "relative to odometry with its heading from the gyro"),
         ("tracker", False, "relative to motion capture or a localiser."),
@@ -184,4 +184,4 @@ def test_the_model_turns_as_the_robot_truly_does(slipping):
     assert right < 0.05
     first = conclude(by_gyro).accuracy
     assert "relative to odometry with its heading from the gyro" in first
-    assert "relative to odometry; nothing here tells" in conclude(by_wheels).accuracy
+    assert "relative to odometry; nothing here shows" in conclude(by_wheels).accuracy

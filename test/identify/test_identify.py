@@ -274,7 +274,9 @@ def test_what_is_assumed_of_a_car_by_its_motion_turns_it_by_its_speed(steering):
 def test_parameters_that_nobody_gave_are_told():
     spec, model = by_throttle(0.0)
     _, (note,) = assume_textbook(model, spec, ("vy", "wz", "steering"))
-    assert "by default, as the robot's YAML file gives no greatest_steering" in note
+    assert (
+        "by default, because the robot's YAML file gives no greatest_steering" in note
+    )
     every = {name: spec.parameters[name] for name in spec.parameters}
     spec, model = by_throttle(0.0, parameters=every)
     _, (note,) = assume_textbook(model, spec, ("vy", "wz", "steering"))

@@ -106,7 +106,7 @@ def test_a_refit_that_knows_the_first_part_worse_is_not_believed(
     monkeypatch.setattr(verdict, "WORSE", 0.0)
     found = identify(recording, load_robot("differential"))
     assert found.model is found.trial.model
-    assert any("is of the first 26.7 s only" in note for note in found.notes)
+    assert any("covers only the first 26.7 s" in note for note in found.notes)
 
 
 def test_an_exact_drive_needs_no_textbook_no_band_and_no_other_fit(differential):

@@ -32,9 +32,9 @@ CAUSES = {
     "the pose jumps": "pose: jumps|its pose jumps",
     "the pose has a gap": "has a gap of|more gaps",
     "rows are repeated": "repeat the row before them",
-    "two values": "two values only",
+    "two values": "only two values",
     "the drive is too short": "too short|too few|longer than these|record a longer drive",
-    "nobody knows": "does not show why|record anew|60 s or longer",
+    "nobody knows": "does not show why|record again|60 s or longer",
 }
 """What statements blame, by what they say."""
 

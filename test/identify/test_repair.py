@@ -432,7 +432,7 @@ def test_a_stream_that_is_mixed_of_two_is_refused(car):
     recording = drive(car, duration=20.0)
     values = recording.pose.values.copy()
     values[::5, :2] += 0.5
-    with pytest.raises(RecordingError, match="two sources that are mixed"):
+    with pytest.raises(RecordingError, match="two sources mixed"):
         identify(replace(recording, pose=replace(recording.pose, values=values)), car)
 
 

@@ -147,7 +147,7 @@ def test_a_drive_too_short_to_try_the_model_is_not_judged(car):
 def test_a_robot_held_up_is_not_put_down_to_the_rate(differential):
     free = record(differential, np.random.default_rng(0), 60.0, dt=0.01)
     sentence = verdict_on(held_up(free, 20.0, 30.0), differential)
-    assert "make sure that nothing held the robot up" in sentence
+    assert "make sure that nothing blocked the robot" in sentence
     assert "rows 0.01 s apart" in sentence
     assert "higher rate" not in sentence
 
@@ -204,4 +204,4 @@ def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request)
     assert found.verdict is acceptance.Verdict.DO_NOT_TRAIN
     ran_away = replace(found.held_out, mean_position_error_m=np.inf)
     sentence = why_useless(replace(found, held_out=ran_away), spec)
-    assert "its predictions have run away after 5 s" in sentence
+    assert "its predictions have diverged after 5 s" in sentence

@@ -88,7 +88,7 @@ def test_a_robot_that_keeps_its_twist_is_predicted_by_it():
 def test_a_drive_too_short_to_learn_from_is_refused():
     spec = load_robot("differential")
     with pytest.raises(
-        RecordingError, match="hold no window of 5 s; record a longer drive"
+        RecordingError, match="contain no window of 5 s; record a longer drive"
     ):
         fit_yardstick(Drive(drive(spec, duration=6.0), spec), 4.0)
 
