@@ -1,4 +1,4 @@
-"""What a robot looks like: its URDF to robot_state_publisher, and RViz.
+"""The description of a robot: robot_state_publisher with its URDF, and RViz.
 
 ros2 launch nics_drl_bridge description.launch.py model:=mecanum rviz:=true
 """

@@ -1,4 +1,4 @@
-"""A simulator, and on its topics all that runs on a vehicle.
+"""A simulator and, on its topics, everything that runs on a vehicle.
 
 ros2 launch nics_drl_bridge simulation.launch.py model:=differential world:=corridor
 ros2 service call /command_gate/arm std_srvs/srv/Trigger

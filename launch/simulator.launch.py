@@ -1,4 +1,4 @@
-"""A simulator and the description of its robots alone, to drive from elsewhere by `cmd_vel`.
+"""Only a simulator and the description of its robots, to be driven through `cmd_vel`.
 
 ros2 launch nics_drl_bridge simulator.launch.py model:=differential world:=corridor
 """

@@ -1,7 +1,7 @@
-"""All that runs on a vehicle, beside the drivers of its lidar and its base.
+"""Everything that runs on a vehicle, except the drivers of its lidar and base.
 
-Give it a file of parameters of your own: model, limits and latency are those of the robot. An
-emergency stop that was never heard counts as pressed, whatever the file says.
+Give your own parameter file, because model, limits and latency depend on the robot. Without any
+`e_stop` message, the emergency stop counts as pressed, whatever the file says.
 
 ros2 launch nics_drl_bridge vehicle.launch.py params_file:=car.yaml
 """

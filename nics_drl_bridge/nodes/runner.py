@@ -1,4 +1,4 @@
-"""All that every node needs: parameters, start, end, a single instance, and diagnostics."""
+"""What every node needs: parameters, start and end, a single instance, and diagnostics."""
 
 import contextlib
 import gc
@@ -41,24 +41,24 @@ UNCONFIGURED = "unconfigured"
 INACTIVE = "inactive"
 ACTIVE = "active"
 DELIVERY_S = 0.5
-GREATEST_DOMAIN_ID = 232  # above it there are no ports
+GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 EXIT_BAD_INPUT = 2
 # time until the graph shows all nodes [s]
 SETTLE_S = 0.3
 POLL_S = 0.02
-ANSWER_S = 1.5  # a node that does not answer within it is dead; the graph shows it for 20 s more
+ANSWER_S = 1.5  # a silent node counts as dead, though the graph shows it for 20 s more
 DIAGNOSTICS_S = 1.0
 RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
-SHARED = "model"  # a file sets it for nodes that have no model, too
+SHARED = "model"  # a file may also set it for nodes without a model
 
 
 def open_context(
     args: Sequence[str] | None = None, domain_id: int | None = None
 ) -> Context:
-    """Return a new context, local unless the environment sets a range. Raises BackendError."""
+    """Return a new context, on this machine unless the environment sets a range. BackendError."""
 
     def make() -> Context:
         context = Context()
@@ -69,7 +69,7 @@ def open_context(
         asked = os.environ.get("ROS_DOMAIN_ID", "0")
     else:
         asked = str(domain_id)
-    # DDS would end the process
+    # otherwise DDS would end the process
     if asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID:
         raise BackendError(
             f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}."
@@ -88,7 +88,7 @@ def open_context(
 
 
 def last_word(publisher: Publisher, message: Any) -> None:
-    """Publish what has to arrive although the publisher is destroyed next."""
+    """Publish a message that must arrive although the publisher is destroyed next."""
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=DELIVERY_S))
 
@@ -98,7 +98,7 @@ def run_node(
     args: Sequence[str] | None = None,
     sole_name: str = "",
 ) -> Any:
-    """Run a node until a signal (`ENDING`), then stop and destroy it in order; return it."""
+    """Run a node until a signal (`ENDING`), then stop and destroy it cleanly; return it."""
     stopping, started = threading.Event(), threading.Event()
 
     def end(*_: Any) -> None:
@@ -121,7 +121,7 @@ def run_node(
             node = make(context)
             if hasattr(node, "start"):
                 node.start()
-        gc.collect()  # now, as the next one may take a tenth of a second while the robot moves
+        gc.collect()  # now, because later it may take 0.1 s while the robot moves
         started.set()
         for sentence in unknown(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
@@ -151,7 +151,7 @@ def _sentence(error: Exception) -> str:
 
 
 def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
-    """Wait until a condition holds; False if it does not within the time."""
+    """Wait until a condition holds; return False if it does not within `seconds`."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
@@ -161,7 +161,7 @@ def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
 
 
 def spin(node: Node, stopping: threading.Event) -> None:
-    """Spin a node until it is to stop, or its context has been shut down."""
+    """Spin a node until `stopping` is set or its context has been shut down."""
     executor = StandingExecutor(node.context)
     executor.add_node(node)
     with contextlib.suppress(ExternalShutdownException):
@@ -172,8 +172,8 @@ def spin(node: Node, stopping: threading.Event) -> None:
 
 @contextlib.contextmanager
 def sole(context: Context, name: str) -> Iterator[None]:
-    """Ensure a single instance while a node runs; BackendError if another is running."""
-    # The probe resolves its name as the node will.
+    """Ensure a single instance while a node runs. Raises BackendError if another is running."""
+    # The probe resolves its name exactly like the node.
     probe = Node(
         name, context=context, start_parameter_services=False, enable_rosout=False
     )
@@ -190,7 +190,7 @@ def sole(context: Context, name: str) -> Iterator[None]:
             if taken or (_seen(probe, whole) and _lives(probe, whole)):
                 fix = "end it, or give this one a namespace: `--ros-args -r __ns:=/robot_2`."
                 raise BackendError(
-                    f"a node {whole!r} runs already in ROS domain {domain}; {fix}"
+                    f"a node {whole!r} already runs in ROS domain {domain}; {fix}"
                 )
         finally:
             probe.destroy_node()
@@ -223,7 +223,7 @@ def _lives(probe: Node, whole: str) -> bool:
 
 
 def steadily(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
-    """Call at a period of the steady clock, also while the time of the robot stands still."""
+    """Call a function periodically on the steady clock, even while simulated time stands still."""
     return node.create_timer(
         period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME)
     )
@@ -240,7 +240,7 @@ def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None
 
 
 def declare_model(node: Node) -> SimulatorModel:
-    """Declare the parameter `model`, and open it; ConfigError if `cmd_vel` can't drive it."""
+    """Declare the parameter `model` and open it; ConfigError if `cmd_vel` can't drive it."""
     model = open_model(str(declare_row(node, MODEL)))
     model.robot.require_cmd_vel()
     return model
@@ -261,8 +261,8 @@ def declare(
     span: tuple[float, float] | None = None,
     read_only: bool = False,
 ) -> Any:
-    """Declare a parameter of the default's type, and return its value, which lies in a span."""
-    # a managed node: from configure to cleanup
+    """Declare a parameter of the default's type, limited to a span, and return its value."""
+    # a managed node fixes it only from configure to cleanup
     if read_only and hasattr(node, "fixed"):
         node.fixed.add(name)
         read_only = False
@@ -272,7 +272,7 @@ def declare(
         setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
     given = given_values(node)
     many = isinstance(default, list)
-    # rclpy itself refuses an integer, as in `rate:=2`, for a floating-point parameter.
+    # rclpy refuses an integer, as in `rate:=2`, for a floating-point parameter.
     if name in given and isinstance(default[0] if many else default, float):
         types = Parameter.Type
         value = given[name].value
@@ -285,7 +285,7 @@ def declare(
 
 
 def given_values(node: Node) -> dict[str, Parameter]:
-    """Return the node's own dictionary of initial values, to which rclpy has no public access."""
+    """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
     found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
     return found
 

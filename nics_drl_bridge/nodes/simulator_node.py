@@ -1,4 +1,4 @@
-"""simulator_node: a simulator, the fast one or another, behind the topics of the hardware."""
+"""simulator_node: the fast simulator, or another one, behind the topics of the hardware."""
 
 import heapq
 import itertools
@@ -55,13 +55,13 @@ QUIET_S = 5.0
 # longest time between two checks for delayed data that are due [s]
 LONGEST_TICK_S = 0.005
 
-# Makes the simulator of some robots; may declare its own parameters at the node. Its control
-# period is that of the given model.
+# Makes the simulator of some robots; it may declare parameters at the node. The control period is
+# the model's.
 MakeSimulator = Callable[[Node, SimulatorModel, AnyWorld, int], FastSimulator]
 
 
 class Outbox:
-    """Publishes messages after a latency and a jitter, each topic in order, or at once."""
+    """Publishes messages after a latency and a jitter, or at once; each topic keeps its order."""
 
     def __init__(self) -> None:
         self._random = np.random.default_rng(0)
@@ -72,7 +72,7 @@ class Outbox:
     def send(
         self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]
     ) -> None:
-        """Publish a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
+        """Publish a message or its bytes after a delay and a random fraction of a jitter [ns]."""
         delay, jitter = late
         if jitter:
             delay += int(self._random.integers(jitter + 1))
@@ -91,7 +91,7 @@ class Outbox:
             publisher.publish(content)
 
     def drop(self, publishers: Collection[Publisher]) -> None:
-        """Drop what waits for publishers that are about to end."""
+        """Drop the waiting messages of publishers that are about to end."""
         self._waiting = [
             waiting for waiting in self._waiting if waiting[2] not in publishers
         ]
@@ -100,7 +100,7 @@ class Outbox:
             self._latest.pop(publisher, None)
 
     def clear(self) -> None:
-        """Drop the waiting messages: they are from an episode that is over."""
+        """Drop all waiting messages, because their episode is over."""
         self._waiting.clear()
         self._latest.clear()
 
@@ -143,7 +143,7 @@ class RobotPort:
         free = np.full(model.lidar.beams, np.inf, np.float32)
         scan = conversions.scan_to_ros(model.lidar, free, 0, frames.laser)
         scan.scan_time = time.scan_ns / NS_PER_S
-        # Beam 0 of a device that turns counter-clockwise was measured first.
+        # A device that turns counter-clockwise measures beam 0 first.
         sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
         self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
         self._scan = wire.ScanWriter(scan)
@@ -238,7 +238,7 @@ class CommandInlet:
             self.heard.append(node.create_subscription(*given))
 
     def close(self) -> None:
-        """Listen no more."""
+        """End the subscriptions."""
         for each in self.heard:
             self._node.destroy_subscription(each)
 
@@ -283,16 +283,17 @@ class CommandInlet:
         )
 
     def watch(self) -> None:
-        """Warn once of each node that publishes the other type, which is never received."""
+        """Warn once about each node that publishes the other type, which is never received."""
         self._types.look(self._kind)
 
 
 class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
-    With the parameter `robots` it is a fleet, each in a namespace below its own. Simulated time
-    begins at the system's and never runs backwards. `~/reset` begins an episode; in lock-step the
-    world moves when each robot has a command, and `~/repeat` publishes the present data again.
+    The parameter `robots` makes a fleet, with each robot in a namespace below the node's. Simulated
+    time starts at the system time and never runs backwards. `~/reset` begins an episode. In
+    lock-step the world moves once each robot has a command; `~/repeat` publishes the present data
+    again.
     """
 
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
@@ -311,17 +312,17 @@ class DeviceNode(qos.QosWatch):
         self._lags = 0
         self._hardware = model.robot.name
         self._told_ns = 0  # newest time on `/clock`
-        self.device.advance()  # compiles before anything waits for it
+        self.device.advance()  # compiles before any peer waits
         self._first_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
         self.now_ns = self._first_ns
         self._open_topics()
         self._start_time()
-        # its entities are those of the first episode, too
+        # its entities include those of the first episode
         self.standard = open_services(self)
         self.begin()
 
     def use_world(self, world: AnyWorld) -> None:
-        """Simulate a world with the robots that it was started with; `begin` an episode next."""
+        """Simulate a world with the robots of the start; call `begin` next."""
         simulator = self.make_simulator(world, len(self._names))
         self.world, self.device = (
             world,
@@ -337,12 +338,12 @@ class DeviceNode(qos.QosWatch):
         return self._make(self, self.model, world, robots)
 
     def _size(self, kept: Sequence[int]) -> None:
-        """Keep what was heard by some robots, and make room for those beyond them."""
+        """Keep the commands of the robots in `kept`, and make room for new robots."""
         count = self.device.robots
         command_ns_before = self._command_ns
         heard_before = self._heard
         self._command_ns = np.zeros(count, np.int64)
-        # in lock-step: those that have their command
+        # in lock-step: the robots that have a command
         self._heard = np.zeros(count, np.bool_)
         known = [k for k in kept if k < len(command_ns_before)]
         self._command_ns[: len(known)] = command_ns_before[known]
@@ -350,7 +351,7 @@ class DeviceNode(qos.QosWatch):
 
     @property
     def robot_names(self) -> tuple[str, ...]:
-        """Namespace of each robot that it was started with; for a single one the robot's name."""
+        """Namespace of each robot of the start; for a single robot its name."""
         return tuple(name or self.model.robot.name for name in self._names)
 
     @property
@@ -398,13 +399,13 @@ class DeviceNode(qos.QosWatch):
         self._ports.append(port)
 
     def add_robot(self, namespace: str) -> None:
-        """Open the topics of a robot that the device has now, its last one."""
+        """Open the topics of the robot that was added to the device last."""
         self._open_robot(namespace)
         self._size(range(self.device.robots - 1))
         self._publish_mounts()
 
     def reopen_robots(self) -> None:
-        """Open the topics of the robots that it was started with, and of no other."""
+        """Open the topics of exactly the robots of the start."""
         self.remove_robots(range(len(self._ports)))
         for name in self._names:
             self._open_robot(name)
@@ -412,7 +413,7 @@ class DeviceNode(qos.QosWatch):
         self._publish_mounts()
 
     def remove_robots(self, gone: Sequence[int]) -> None:
-        """Close the topics of robots that the device has no more."""
+        """Close the topics of robots that have left the device."""
         kept = [k for k in range(len(self._ports)) if k not in gone]
         for k in gone:
             self._ports[k].close()
@@ -425,7 +426,7 @@ class DeviceNode(qos.QosWatch):
     def _open_transforms(self) -> None:
         self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._transforms is None:
-            silent = "so that neither /tf nor /tf_static is published"
+            silent = "so neither /tf nor /tf_static is published"
             fix = how_to_install("tf2_msgs")
             self.get_logger().warning(
                 f"the package tf2_msgs is not installed, {silent}; {fix}."
@@ -441,7 +442,7 @@ class DeviceNode(qos.QosWatch):
             self._fixed.publish(self._transforms(transforms=mounts))
 
     def _start_time(self) -> None:
-        # Steady: with use_sim_time the node's clock would wait for this very node.
+        # On the steady clock: with use_sim_time the node's clock would wait for this very node.
         runner.steadily(self, WATCH_S, self._watch)
         step_ns = self._time.step_ns
         self._odom_pace = device_parameters.TopicPace(self._time.odom_ns, step_ns)
@@ -452,7 +453,7 @@ class DeviceNode(qos.QosWatch):
         self._complete = self.create_guard_condition(self._advance_if_complete)
         if self._time.mode == "realtime":
             period = step_ns / NS_PER_S / self._time.rate
-            # A tick that divides the step, if data are published later than they are measured.
+            # If data are published later than measured, use a tick that divides the step.
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
             self._timer = runner.steadily(self, period / ticks, self._on_time)
@@ -502,7 +503,7 @@ class DeviceNode(qos.QosWatch):
             self._advance_if_complete()
 
     def _advance_if_complete(self) -> None:
-        """In lock-step, moves the world if all robots that are there have their command."""
+        """In lock-step, move the world once all present robots have a command."""
         if (
             self._time.lockstep
             and not self.paused
@@ -517,7 +518,7 @@ class DeviceNode(qos.QosWatch):
         steady_ns = time.monotonic_ns()
         if self._real_time.lost(steady_ns, self.now_ns):
             self._lags += 1
-            fix = "ask for a smaller rate, scan_rate or odom_rate, or fewer robots"
+            fix = "choose a lower rate, scan_rate or odom_rate, or fewer robots"
             told = f"this machine does not keep up with real time; {fix}"
             self.get_logger().warning(told, throttle_duration_sec=5.0)
             self._real_time.begin(steady_ns, self.now_ns + self._time.step_ns)
@@ -529,7 +530,7 @@ class DeviceNode(qos.QosWatch):
         self._outbox.flush(max(self.now_ns, self._real_time.time_at(steady_ns)))
 
     def _on_clock(self) -> None:
-        """Tell the time between two steps, which may be too far apart for timers by `/clock`."""
+        """Publish the time between two steps, which may be too far apart for timers on `/clock`."""
         if self.paused:
             return
         time_ns = self._real_time.time_at(time.monotonic_ns())
@@ -549,7 +550,7 @@ class DeviceNode(qos.QosWatch):
 
     def advance(self) -> None:
         """Move the world by one step, and publish what is due."""
-        if not self._time.lockstep:  # those that have been silent stop
+        if not self._time.lockstep:  # robots without recent commands stop
             self.device.commands[
                 self.now_ns - self._command_ns > self._timeout_ns()
             ] = 0.0
@@ -559,11 +560,11 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def begin(self, rewind: bool = False) -> None:
-        """Begin the episode of the parameters, with time at its start if it is to be rewound."""
+        """Begin the episode of the parameters; if `rewind`, set time back to its start."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
-        # may raise, so that all goes on
+        # comes first: if it raises, the present episode goes on
         self.device.begin(seed, start if given else None)
         if rewind:
             self.now_ns = self._first_ns
@@ -576,8 +577,8 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def rewind(self) -> None:
-        """Put the time back to its start, while everything stays where it is."""
-        # commands stay as old as they are
+        """Set the time back to its start; nothing moves."""
+        # keep the age of the commands
         self._command_ns += self._first_ns - self.now_ns
         self.now_ns = self._first_ns
         self._outbox.clear()
@@ -587,12 +588,12 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def step(self) -> None:
-        """Move the world by one step, and publish all that is due; also while it is paused."""
+        """Move the world by one step, even while paused, and publish what is due."""
         self.advance()
         self._outbox.flush(self.now_ns)
 
     def pause(self, paused: bool) -> None:
-        """Hold time, or let it go on."""
+        """Pause or resume time."""
         self.paused = paused
         if not paused:
             self._go_on()
@@ -625,12 +626,12 @@ class DeviceNode(qos.QosWatch):
     def _require_world(self) -> None:
         if self.standard is not None and not self.standard.has_world:
             raise BackendError(
-                "no world is loaded; load one by the service load_world."
+                "no world is loaded; load one with the service load_world."
             )
 
     def _repeat(self) -> tuple[bool, str]:
         if not self._time.lockstep:
-            return False, "data are repeated in lock-step alone"
+            return False, "data are only repeated in lock-step"
         self._publish_data(odom_due=True, scan_due=True)
         return True, ""
 
@@ -653,7 +654,7 @@ class DeviceNode(qos.QosWatch):
                     moving += port.moving(conversions.stamp_to_ros(now_ns), sensed)
             if scan_due:
                 port.publish_scan(sensed, now_ns)
-        if moving:  # with the delay of the odometry that it comes from
+        if moving:  # with the delay of the odometry behind it
             message = self._transforms(transforms=moving)
             self._outbox.send(self._moving, message, now_ns, self._time.odom_late_ns)
 
@@ -667,7 +668,7 @@ def declare_renderer(node: Node, default: Renderer) -> Renderer:
 def fast_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> FastSimulator:
-    """Make the fast simulator, with the lidar that the parameter `renderer` names."""
+    """Make the fast simulator with the lidar renderer that the parameter `renderer` names."""
     renderer = declare_renderer(node, "baked")
     tell = node.get_logger().warning
     drawn = device_parameters.randomisation(node)

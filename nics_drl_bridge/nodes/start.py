@@ -1,4 +1,4 @@
-"""Entry points of the nodes: one sentence, not a traceback, where ROS 2 is missing."""
+"""Entry points of the nodes; without ROS 2 they print one sentence, not a traceback."""
 
 import faulthandler
 import os
@@ -13,10 +13,10 @@ EXIT_BAD_INPUT = 2
 
 
 def start(node: str, args: list[str] | None = None) -> None:
-    """Run a node by its name and end the process; what can't be used is one sentence, and 2."""
+    """Run a node by its name and end the process; bad input gives one sentence and exit code 2."""
     from nics_drl_bridge.nodes import ending, output, usage
 
-    for number in ending.ending_signals():  # to import the node takes seconds
+    for number in ending.ending_signals():  # importing the node takes seconds
         signal.signal(number, lambda *_: os._exit(0))
     words = sys.argv[1:] if args is None else args[1:]
     if any(word in usage.HELP for word in words):
@@ -26,8 +26,8 @@ def start(node: str, args: list[str] | None = None) -> None:
         sys.stderr.write(f"{sentence}\n")
         ending.leave(EXIT_BAD_INPUT)
     output.forward_output(output.log_file(node, words))
-    faulthandler.enable()  # a crash of a library is told with the place in Python
-    # As the log of ROS 2 would say it, which is there seconds later.
+    faulthandler.enable()  # shows where Python was when a library crashes
+    # In the format of the ROS 2 log, which is available only seconds later.
     sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
     sys.stderr.flush()
     code: Any = 0
@@ -38,7 +38,7 @@ def start(node: str, args: list[str] | None = None) -> None:
         main(args)
     except SystemExit as end:
         code = end.code
-    except BaseException:  # noqa: BLE001  (it is told, and the process ends)
+    except BaseException:  # noqa: BLE001  (it is printed, and the process ends)
         traceback.print_exc()
         code = 1
     ending.leave(code if isinstance(code, int) else 0 if code is None else 1)

@@ -1,4 +1,4 @@
-"""Which nodes `nics up` and the launch files start, and with which parameters; without ROS 2.
+"""The nodes that `nics up` and the launch files start, and their parameters; needs no ROS 2.
 
 A launch is a list of arguments and of functions, each of which yields the nodes of one part:
 `simulator`, `bridge`, `description`. An empty argument leaves the value of the parameter
@@ -27,7 +27,7 @@ STATE_PUBLISHER = "robot_state_publisher"
 RVIZ = "rviz2"
 SHIPPED_LASER = "laser"  # frame of the lidar in the URDFs of the shipped robots
 TRANSFORMS = ("/tf", "/tf_static")
-# RViz names topics absolutely; here they are those of the robot's namespace.
+# RViz names topics absolutely; here they are remapped to the robot's namespace.
 SHOWN = (
     "scan",
     "odom",
@@ -58,18 +58,18 @@ class Argument:
     default: str
     about: str
     choices: tuple[str, ...] = ()
-    same_as: str = ""  # another argument, whose value is the default
+    same_as: str = ""  # another argument whose value is the default
 
 
 @dataclass(frozen=True)
 class NodeStart:
-    """A node that is to be started."""
+    """A node to start."""
 
     package: str
-    executable: str  # and name of the node
+    executable: str  # also the name of the node
     namespace: str
-    parameters: Mapping[str, Any]  # text, numbers, booleans, or lists of one of them
-    params_file: str = ""  # whose values `parameters` take precedence over; empty: none
+    parameters: Mapping[str, Any]  # text, numbers, booleans, or lists of one kind
+    params_file: str = ""  # `parameters` take precedence over it; empty: none
     remappings: Sequence[tuple[str, str]] = ()
     arguments: Sequence[str] = ()  # words of the command line before those of ROS 2
     log_level: str = ""
@@ -81,15 +81,15 @@ class NodeStart:
 
 
 class Robot(NamedTuple):
-    """A robot, and where its names lie."""
+    """A robot and the namespaces of its names."""
 
     namespace: str  # of its topics
-    frames: str  # put before its frames
+    frames: str  # prefix of its frames
     transforms: str  # namespace of its `tf` and `tf_static`
 
 
 class Setup:
-    """What the arguments and the file of parameters ask for together."""
+    """The settings from the arguments and the parameter file together."""
 
     def __init__(self, values: Values) -> None:
         flags = {name: flag_of(name, values.get(name, "")) for name in FLAGS}
@@ -111,7 +111,7 @@ class Setup:
             ]
 
     def __getitem__(self, name: str) -> str:
-        """Return an argument; empty if it was left so, or is none of this launch."""
+        """Return an argument; empty if it was left empty or the launch does not have it."""
         return self.values.get(name, "")
 
     def text(self, name: str) -> str | None:
@@ -123,7 +123,7 @@ class Setup:
         return self[name] == "true" if self[name] else None
 
     def _of_file(self, name: str, node: str) -> Any:
-        """Return what the file of parameters says of one, for a node in any namespace."""
+        """Return a value from the parameter file, for a node in any namespace."""
         found = None
         for key in ("/**", f"/**/{node}", node, f"/{node}") if node else ("/**",):
             found = (
@@ -132,7 +132,7 @@ class Setup:
         return found
 
     def limits(self) -> str:
-        """Return the gate's limits; if empty and a model was given, its shipped ones, if any."""
+        """Return the gate's limits; by default the shipped limits of the given model, if any."""
         if self["limits"] or not self["model"]:
             return self["limits"]
         robot = self.model if self._opened is None else self._opened.robot.name
@@ -143,12 +143,12 @@ class Setup:
         )
 
     def frame(self, node: str, robot: Robot) -> str | None:
-        """Return the frame of a robot of a fleet; None for one robot, whose file names it."""
+        """Return a frame of a robot in a fleet; None for a single robot, whose file names it."""
         base = self._of_file(BASE_FRAME.name, node) or BASE_FRAME.default
         return f"{robot.frames}{base}" if robot.frames else None
 
     def description(self) -> str:
-        """Return the URDF of the robot, with the frames that the file of parameters names."""
+        """Return the URDF of the robot, with the frames from the parameter file."""
         base = str(self._of_file(BASE_FRAME.name, self.simulator) or BASE_FRAME.default)
         laser = str(self._of_file("laser_frame", self.simulator) or "")
         shipped = base == BASE_FRAME.default and laser in ("", SHIPPED_LASER)
@@ -171,8 +171,8 @@ class Setup:
         arguments: Sequence[str] = (),
         remappings: Sequence[tuple[str, str]] = (),
     ) -> NodeStart:
-        """Return a node with the parameters that are given; those that are None are left out."""
-        # As in Nav2, transforms stay in a namespace; those of a fleet, and its map, in that of all.
+        """Return a node with the given parameters; those that are None are left out."""
+        # As in Nav2, transforms stay in a namespace; a fleet shares one for transforms and map.
         alone = robot.transforms == robot.namespace
         place = "" if alone else f"/{robot.transforms}/".replace("//", "/")
         moved = TRANSFORMS if alone else (*TRANSFORMS, "map")
@@ -198,7 +198,7 @@ Part = Callable[[Setup], Iterator[NodeStart]]
 
 @dataclass(frozen=True)
 class Launch:
-    """What is started together, and by which arguments it is chosen."""
+    """Parts that are started together, and the arguments that select them."""
 
     about: str
     parts: Sequence[Part]
@@ -206,7 +206,7 @@ class Launch:
     simulated: bool = False
 
     def nodes(self, given: Values) -> list[NodeStart]:
-        """Return the nodes for the arguments that are given. Raises BridgeError."""
+        """Return the nodes for the given arguments. Raises BridgeError."""
         setup = Setup(complete(self.arguments, given))
         return [node for part in self.parts for node in part(setup)]
 
@@ -218,7 +218,7 @@ def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
         if name not in known:
             raise ConfigError(f"unknown argument {name!r}; {suggest(name, known)}")
     values: dict[str, str] = {}
-    for argument in arguments:  # one that is the default of another stands before it
+    for argument in arguments:  # an argument comes after the one that is its default
         default = values[argument.same_as] if argument.same_as else argument.default
         value = given.get(argument.name, default)
         if argument.choices and value not in argument.choices:
@@ -229,21 +229,21 @@ def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
 
 
 def opened(model: str) -> Any:
-    """Return an opened model; it takes seconds, so only what is not shipped is opened."""
+    """Return an opened model; this takes seconds, so shipped models are not opened."""
     from nics_drl_bridge.generator import open_model
 
     return open_model(model)
 
 
 def flag_of(name: str, given: str) -> str:
-    """Return `true` or `false` of an argument, or nothing if it was left empty. ConfigError."""
+    """Return `true`, `false` or "" for an empty argument. Raises ConfigError for other words."""
     if given.lower() not in FLAG_WORDS:  # refused here, before any node is started
         raise ConfigError(f"launch argument {name!r} is {given!r}; give true or false.")
     return FLAG_WORDS[given.lower()]
 
 
 def names_of(robots: Any) -> tuple[str, ...]:
-    """Return the namespaces of a fleet by a count or their list; none for one robot."""
+    """Return the namespaces of a fleet from a count or a list; none for one robot."""
     if isinstance(robots, list):
         words = [str(each) for each in robots]
     else:
@@ -263,7 +263,7 @@ def names_of(robots: Any) -> tuple[str, ...]:
 
 
 def numbers_of(start: str) -> list[float] | None:
-    """Return the numbers x, y, heading of each robot; None if it was left empty. ConfigError."""
+    """Return x, y, heading of each robot; None if left empty. Raises ConfigError."""
     words = re.findall(r"[^\s,\[\]]+", start)
     try:
         found = [float(word) for word in words]
@@ -321,7 +321,7 @@ def bridge(setup: Setup) -> Iterator[NodeStart]:
 
 
 def description(setup: Setup) -> Iterator[NodeStart]:
-    """Yield robot_state_publisher of each robot, and RViz, where they are wanted."""
+    """Yield robot_state_publisher of each robot, and RViz, if requested."""
     timed = {"use_sim_time": setup.flag("use_sim_time")}
     drawn = setup.description()
     if setup.flag("use_robot_state_pub"):
@@ -334,7 +334,7 @@ def description(setup: Setup) -> Iterator[NodeStart]:
             yield setup.node(STATE_PUBLISHER, STATE_PUBLISHER, robot, parameters)
     if setup.flag("rviz"):
         first = setup.robots[0]
-        # of all robots
+        # the map is shared by all robots
         topics = [("/map", f"/{first.transforms}/map".replace("//", "/"))]
         topics += [(f"/{topic}", topic) for topic in SHOWN]
         yield setup.node(RVIZ, RVIZ, first, timed, ("-d", setup["rviz_config"]), topics)
@@ -344,11 +344,11 @@ def common(use_sim_time: str) -> list[Argument]:
     """Return the arguments of every launch."""
     return [
         Argument(
-            "model", "", "Shipped robot, or folder of a model; empty: of params_file"
+            "model", "", "Shipped robot, or folder of a model; empty: from params_file"
         ),
-        Argument("namespace", "", "Of the robot, or of the fleet"),
+        Argument("namespace", "", "Namespace of the robot, or of the fleet"),
         Argument("use_sim_time", use_sim_time, "Use /clock"),
-        Argument("log_level", "info", "Of all nodes"),
+        Argument("log_level", "info", "Log level of all nodes"),
     ]
 
 
@@ -368,27 +368,33 @@ def of_nodes() -> list[Argument]:
 def of_simulator(robots: str = "") -> list[Argument]:
     """Return the arguments of a simulator."""
     kinds = ("simulator", "mujoco")
-    start = "x, y, heading [m, rad] of each robot; empty: drawn"
+    start = "Start x, y, heading [m, m, rad] of each robot; empty: drawn at random"
     return [
         Argument("simulator", kinds[0], "The fast simulator, or MuJoCo", kinds),
-        Argument("world", "", "Shipped world, or a YAML file; empty: of params_file"),
-        Argument("robots", robots, "How many, or their namespaces, as '[a, b]'"),
+        Argument("world", "", "Shipped world, or a YAML file; empty: from params_file"),
+        Argument(
+            "robots", robots, "Number of robots, or their namespaces, as in '[a, b]'"
+        ),
         Argument("start", "", start),
     ]
 
 
 def of_bridge() -> list[Argument]:
-    """Return the arguments of gate, middleware and policy, but for the emergency stop."""
-    limits = "Of the gate; empty: of the model, if given, or of params_file"
+    """Return the arguments of gate, middleware and policy, except the emergency stop."""
+    limits = (
+        "Limits of the gate; empty: those of the model, if given, else from params_file"
+    )
     return [
         Argument(
-            "policy", "", "Policy file, or a policy by name; empty: of params_file"
+            "policy", "", "Policy file, or name of a policy; empty: from params_file"
         ),
         Argument("limits", "", limits),
         Argument(
-            "autostart", "true", "Managed nodes configure and activate themselves"
+            "autostart",
+            "true",
+            "Configure and activate the managed nodes automatically",
         ),
-        Argument(IMU, "", "Topic of the gyro, auto or none; empty: of params_file"),
+        Argument(IMU, "", "Topic of the gyro, auto or none; empty: from params_file"),
     ]
 
 
@@ -397,7 +403,7 @@ def e_stop_required(default: str) -> Argument:
     return Argument(
         "e_stop_required",
         default,
-        "An e_stop that was never heard counts as pressed; empty: true",
+        "Require e_stop: if never received, it counts as pressed; empty: true",
     )
 
 
@@ -407,15 +413,15 @@ def of_description() -> list[Argument]:
     view = str(share_folder() / "config" / "rviz" / "bridge.rviz")
     return [
         Argument("use_robot_state_pub", installed, "Start robot_state_publisher"),
-        Argument("urdf", "", "File of the robot; empty: of the model"),
-        Argument("use_rviz", "false", "The same as rviz, by its name in Nav2"),
+        Argument("urdf", "", "URDF file of the robot; empty: the model's"),
+        Argument("use_rviz", "false", "Nav2's name for rviz"),
         Argument("rviz", "", "Start RViz", same_as="use_rviz"),
-        Argument("rviz_config", view, "File for RViz"),
+        Argument("rviz_config", view, "Configuration file for RViz"),
     ]
 
 
 def prefix_of(package: str) -> Path | None:
-    """Return the folder that a ROS 2 package is installed in, or None."""
+    """Return the folder in which a ROS 2 package is installed, or None."""
     folders = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     for folder in map(Path, filter(None, folders)):
         if (
@@ -426,12 +432,12 @@ def prefix_of(package: str) -> Path | None:
 
 
 def whole_simulation(robots: str = "") -> Launch:
-    """Return a simulator, and on its topics all that runs on a vehicle."""
+    """Return a simulator and, on its topics, everything that runs on a vehicle."""
     arguments = [*common("true"), *of_nodes(), *of_simulator(robots), *of_bridge()]
     return Launch(
         "Several robots in one simulator, each with gate, middleware and policy."
         if robots
-        else "A simulator, and on its topics all that runs on a vehicle.",
+        else "A simulator and, on its topics, everything that runs on a vehicle.",
         [simulator, bridge, description],
         [*arguments, e_stop_required("false"), *of_description()],
         simulated=True,
@@ -444,9 +450,9 @@ def fleet() -> Launch:
 
 
 def vehicle() -> Launch:
-    """Return all that runs on a vehicle; an emergency stop that was never heard stops it."""
+    """Return everything that runs on a vehicle; without any `e_stop` message it stays stopped."""
     return Launch(
-        "Gate, middleware and policy of a vehicle, beside the drivers of its lidar and its base.",
+        "Gate, middleware and policy of a vehicle; start the drivers of lidar and base separately.",
         [bridge, description],
         [*common("false"), *of_nodes(), *of_bridge(), *of_description()],
     )
@@ -455,7 +461,7 @@ def vehicle() -> Launch:
 def simulator_alone() -> Launch:
     """Return a simulator and the description of its robots, to drive by `cmd_vel`."""
     return Launch(
-        "A simulator alone, to drive from elsewhere by cmd_vel.",
+        "Only a simulator, to be driven through cmd_vel from elsewhere.",
         [simulator, description],
         [*common("true"), *of_nodes(), *of_simulator(), *of_description()],
         simulated=True,
@@ -465,16 +471,16 @@ def simulator_alone() -> Launch:
 def bridge_alone() -> Launch:
     """Return middleware, policy and gate on a robot's topics."""
     return Launch(
-        "Gate, middleware and policy on a robot's topics.",
+        "Gate, middleware and policy on the topics of a robot.",
         [bridge],
         [*common("false"), *of_nodes(), *of_bridge(), e_stop_required("true")],
     )
 
 
 def description_alone() -> Launch:
-    """Return what a robot looks like: its URDF to robot_state_publisher, and RViz."""
+    """Return the description of a robot: robot_state_publisher with its URDF, and RViz."""
     return Launch(
-        "The URDF of a robot to robot_state_publisher, and RViz.",
+        "The description of a robot: robot_state_publisher with its URDF, and RViz.",
         [description],
         [*common("false"), *of_description()],
     )
@@ -488,4 +494,4 @@ LAUNCHES: dict[str, Callable[[], Launch]] = {
     "bridge": bridge_alone,
     "description": description_alone,
 }
-"""Every launch by name: those of `nics up`, and of the files in `launch/`."""
+"""Every launch by name, for `nics up` and the files in `launch/`."""

@@ -1,11 +1,11 @@
 """Transport of messages: UDP, so that a stalled listener can't block a publisher.
 
-Fast DDS's shared memory has a lock for each listening process: one that is frozen or killed while
-it has it blocks everyone who sends to it. UDP has none; a lock-step step takes a twentieth longer.
+Fast DDS's shared memory has a lock for each listening process. A listener that is frozen or killed
+while it holds the lock blocks every sender. UDP has no lock; it makes a lock-step step 5 % longer.
 
-If discovery stays on this machine, rmw_fastrtps chooses the transports itself, so a profile does
-it, which Fast DDS reads once in a process: the result is checked. A node that other code creates
-there afterwards may have shared memory. Otherwise an environment variable is enough, and stays.
+If discovery stays on this machine, rmw_fastrtps chooses the transports itself. Then only a profile
+can select UDP; Fast DDS reads it once per process, so the result is checked. A node that other code
+creates afterwards may use shared memory. Otherwise an environment variable is enough, and remains.
 """
 
 import contextlib
@@ -29,20 +29,20 @@ ONLY_LOCAL = "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
 # rcl treats any other value as LOCALHOST
 OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")
-OLDEST_DISTRIBUTION = "humble"  # it has no discovery ranges
+OLDEST_DISTRIBUTION = "humble"  # has no discovery ranges
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
 UDP = "UDPv4"
 PROFILE = Path(__file__).with_name("this_machine.xml")
-# The same variable in Fast DDS 3 and 2 (the library's name tells), and files that it reads here.
+# The variable in Fast DDS 3 and in Fast DDS 2, and files that it reads in the working folder.
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 PROFILES_HERE = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 FAST_DDS_2 = b"libfastrtps.so"
 FAST_DDS_2_DISTRIBUTIONS = (OLDEST_DISTRIBUTION, "iron", "jazzy")
-# discovery that the profile does not do
+# kinds of discovery that the profile does not support
 PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
 TABLE = Path("/proc/net/udp")
-# RTPS: a domain's first is that of its multicast
+# RTPS: the first port of a domain is for multicast
 FIRST_PORT = 7400
 PORTS_OF_A_DOMAIN = 250
 
@@ -56,7 +56,7 @@ def stays_here(environment: Mapping[str, str]) -> bool:
 
 
 def chosen(environment: Mapping[str, str]) -> bool:
-    """True if the user has chosen the transports: any but UDP, or by profiles of Fast DDS."""
+    """True if the user has chosen transports other than UDP, or Fast DDS profiles."""
     named = environment.get(TRANSPORTS, "") not in ("", UDP)
     return (
         named
@@ -77,10 +77,12 @@ class Transport:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._in_force: bool | None = None  # the profile; None: not tried yet
+        self._in_force: bool | None = (
+            None  # whether the profile applies; None: not tried yet
+        )
 
     def open(self, make: Callable[[], Context]) -> Context:
-        """Return a context over UDP, or ROS 2's default. Raises BackendError."""
+        """Return a context over UDP if possible, else with ROS 2's default. Raises BackendError."""
         with self._lock:
             stay_on_this_machine(os.environ)
             here = stays_here(os.environ)
@@ -115,11 +117,9 @@ class Transport:
         if self._in_force:
             return context
         context.try_shutdown()
-        why = (
-            "since a node was started in this process before, or discovery went further"
-        )
+        why = "because a node was started in this process before, or discovery had a wider range"
         get_logger("nics_drl_bridge").warning(
-            f"Fast DDS did not take on {PROFILE}, "
+            f"Fast DDS did not apply {PROFILE}, "
             f"{why if PROFILE.is_file() else 'which is missing'}: it sends through shared memory, "
             "and a process that is frozen or killed can hold this one up. Make the bridge's node "
             "or env first, or keep them in a process of their own."
@@ -131,7 +131,7 @@ class Transport:
 def _changed(
     environment: MutableMapping[str, str], words: Mapping[str, str]
 ) -> Iterator[None]:
-    # Without the older discovery variable, which overrides the others.
+    # Without the older discovery variable, which would override the others.
     kept = {key: environment.pop(key, None) for key in (ONLY_LOCAL, *words)}
     environment.update(words)
     try:
@@ -177,7 +177,7 @@ def multicast_port(domain_id: int) -> int:
 
 
 def ports_of(process: int | str = "self") -> set[int]:
-    """Return the UDP ports over IPv4 that a process has bound, on Linux."""
+    """Return the IPv4 UDP ports that a process has bound, on Linux."""
     names = set()
     for file in Path(f"/proc/{process}/fd").iterdir():
         with contextlib.suppress(OSError):  # another thread has closed it

@@ -1,4 +1,4 @@
-"""A live robot for the page of `nics watch`: its topics, listened to; a goal is all it sends."""
+"""A live robot for the page of `nics watch`; it listens to topics and sends only goals."""
 
 import threading
 from dataclasses import replace
@@ -26,13 +26,13 @@ from nics_drl_bridge.watch.server import Request
 NAME = "nics_watch"
 GATE = ": gate"
 PERIOD_S = 1.0 / 30.0
-SIDE_M = 10.0  # of the field that is shown where no world is given
+SIDE_M = 10.0  # side of the field shown if no world is given [m]
 
 
 class RosSource:
     """Shows the topics of a robot, with the estimate of its own middleware.
 
-    A goal that is set on the page goes out on `goal_pose`; nothing else is sent. Raises
+    A goal that is set on the page is published on `goal_pose`; nothing else is sent. Raises
     ConfigError, BackendError.
     """
 
@@ -49,7 +49,7 @@ class RosSource:
         self._world = world or World(
             name="map", bounds=bounds, goal_distance=(0.0, 1.0)
         )
-        # the one that is shown
+        # the world that is shown
         self._within = None if world is None else world.members[0]
         self._model = model
         self.period_s = PERIOD_S
@@ -59,7 +59,7 @@ class RosSource:
         self._goal = np.zeros((0, 2))
         self._gate: str | None = None
         self._truth: Array | None = None
-        # in which goals are; as the estimate or the simulator names it
+        # frame of goals, as named by the estimate or the simulator
         self._map_frame = "map"
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
@@ -136,7 +136,7 @@ class RosSource:
         )
 
     def advance(self) -> bool:
-        """Follow the robot's way where there is news; True after scans of another lidar."""
+        """Extend the robot's path if it has moved; return True after scans of another lidar."""
         with self._topics.lock:
             lidar = self._new_lidar
             self._new_lidar = None
@@ -150,7 +150,7 @@ class RosSource:
         return lidar is not None
 
     def take(self, request: Request) -> bool:
-        """Send a goal; ignore all else. Raises ConfigError for one off the field."""
+        """Send a goal and ignore other requests. Raises ConfigError for a goal off the field."""
         if request.kind == "goal":
             if self._within is not None:
                 check_place("goal", self._within, request.x, request.y)
@@ -163,7 +163,7 @@ class RosSource:
         return False
 
     def close(self) -> None:
-        """Leave the domain."""
+        """Close the node and its context."""
         self._context.try_shutdown()
         self._thread.join()
         self._node.destroy_node()

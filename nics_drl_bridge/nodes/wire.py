@@ -1,4 +1,4 @@
-"""Scans, odometry and twists from and to their bytes: "plain CDR" of OMG DDS-XTypes 7.4.3."""
+"""Serialised scans, odometry and twists: "plain CDR" of OMG DDS-XTypes 7.4.3."""
 
 import math
 import struct
@@ -18,11 +18,11 @@ HEAD = 4  # bytes of the header, not counted for alignment; the second one gives
 # offsets of stamp and frame of a message's header
 STAMP = 4
 FRAME = 12
-# raised by all readers for bytes of another type
+# raised by all readers for bytes of another message type
 UNREADABLE = (ValueError, struct.error)
 PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
-# Numbers of an odometry before each: pose, its covariance, twist, its covariance.
+# Offsets among the numbers of an odometry, which are pose, covariance, twist, covariance.
 POSE_COVARIANCE = 7
 TWIST = 7 + 36
 DOUBLES = 7 + 36 + 6 + 36
@@ -31,12 +31,12 @@ SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 def _order(content: Bytes) -> str:
     if len(content) < HEAD or content[0] != 0 or content[1] not in PLAIN:
-        raise ValueError(f"the bytes {bytes(content[:HEAD]).hex()} begin no plain CDR")
+        raise ValueError(f"the header {bytes(content[:HEAD]).hex()} is not plain CDR")
     return "<" if content[1] else ">"
 
 
 def _after_text(content: Bytes, place: int, order: str) -> int:
-    place = _aligned(place, 4)  # a text begins there with its length
+    place = _aligned(place, 4)  # a text starts with its length, aligned
     (length,) = struct.unpack_from(f"{order}I", content, place)
     return place + 4 + int(length)
 
@@ -104,7 +104,7 @@ def angles_of(content: Bytes) -> tuple[float, float]:
 
 
 def twist_of(content: Bytes, place: int = HEAD) -> tuple[float, float, float]:
-    """Return linear.x, linear.y, angular.z of a serialised Twist, which begins at an offset."""
+    """Return linear.x, linear.y, angular.z of a Twist serialised at an offset."""
     x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, place)
     return x, y, w
 
@@ -121,7 +121,7 @@ def truth_of(content: Bytes) -> bool:
 
 
 class OdometryWriter:
-    """Serialises the odometries of one robot, whose frames and all else are those of a message."""
+    """Serialises the odometry of one robot; all other fields are copied from a message."""
 
     def __init__(self, message: Odometry) -> None:
         self._content = bytearray(serialize_message(message))
@@ -146,7 +146,7 @@ class OdometryWriter:
 
 
 class ScanWriter:
-    """Serialises the scans (B,) of one lidar, whose header and all else are those of a message."""
+    """Serialises the scans (B,) of one lidar; all other fields are copied from a message."""
 
     def __init__(self, message: LaserScan) -> None:
         self._content = bytearray(serialize_message(message))

@@ -1,4 +1,4 @@
-"""A simulator's `map`, and `initialpose`, which puts a robot elsewhere."""
+"""A simulator's topics `map`, and `initialpose`, which moves a robot."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,14 +14,14 @@ from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 
-LOOK_S = 0.2  # time between two looks at what stands in the world
+LOOK_S = 0.2  # time between two checks of what stands in the world [s]
 
 
 class WorldTopics:
-    """Publishes `map`, the occupancy of all that stands, and puts robots at `initialpose`.
+    """Publishes `map`, the occupancy of everything that stands, and puts robots at `initialpose`.
 
-    The map is for late joiners, too, and published anew when something stands elsewhere; before
-    anybody subscribes it is not made.
+    The map also reaches late joiners, and is published again when something has changed. It is not
+    computed before anyone subscribes.
     """
 
     def __init__(self, node: Any, world: Callable[[], DeviceWorld]) -> None:
@@ -34,7 +34,7 @@ class WorldTopics:
         runner.steadily(node, LOOK_S, self._look)
 
     def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
-        """Listen for a robot, whose number is looked up at each message."""
+        """Subscribe for a robot; `robot` returns its number at each message."""
         kind = PoseWithCovarianceStamped
         topic = f"{namespace}{INITIAL_POSE}"
         return self._node.create_subscription(

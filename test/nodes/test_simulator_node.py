@@ -425,7 +425,7 @@ def test_in_real_time_the_next_data_come_anyway(realtime):
     answer = realtime.peer.call(Trigger, "simulator_node/repeat")
     assert (answer.success, answer.message) == (
         False,
-        "data are repeated in lock-step alone",
+        "data are only repeated in lock-step",
     )
 
 

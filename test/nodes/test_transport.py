@@ -36,7 +36,7 @@ NODES = (
     "command_gate",
     *map(many, ("simulator_node", "policy_node", "middleware_node")),
 )
-WARNING = "Fast DDS did not take on "
+WARNING = "Fast DDS did not apply "
 
 
 @pytest.mark.parametrize(
