@@ -350,7 +350,7 @@ def test_the_command_line_imports_a_kind_of_sensor(trap):
     assert trap.canary.exists()
     done = nics("--sensor-kind", f"{trap.file}:Trap", "list", "robots", cwd=trap.folder)
     assert done.returncode == 2
-    assert "is no subclass of lidar.sensor.Sensor" in done.stderr
+    assert "is not a subclass of lidar.sensor.Sensor" in done.stderr
 
 
 def test_a_task_of_ones_own_is_opened_where_the_caller_names_it(trap):

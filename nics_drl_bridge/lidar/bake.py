@@ -15,12 +15,12 @@ from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
 
-TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a share of the radius
-# between grid rotations, steps are of at most half of this [rad]
+TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a fraction of the radius
+# upper limit of twice the steps between grid rotations [rad]
 COARSE = np.radians(2.0)
 MOST_NUMBERS = 2**31 - 2**20
-FIRST_BEAM = -(2**15)  # least first beam of a row, relative to the bearing
-# an edge that two corners miss by more [beams] is found by climbing the hull
+FIRST_BEAM = -(2**15)  # minimum first beam of a row, relative to the bearing
+# if two corners miss an edge by more than this [beams], it is found by climbing the hull
 MISS = 0.02
 
 
@@ -118,7 +118,7 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
             two, climb = _candidates(wound, parts, len(hull))
             miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
-            # near contact, the rim of a cell does not bound its interior
+            # close to contact, the rim of a cell does not bound its interior
             far_off[:, 0] = True
             cell[..., 2 + 2 * side : 4 + 2 * side] = np.where(
                 far_off[..., None], climb, two
@@ -132,7 +132,7 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
 
 
 def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
-    """Outermost value in each cell (T, D); as two distances are blended, it extends to the next."""
+    """Outermost value in each cell (T, D) up to the next cell: two distances are blended."""
     count = len(values) // parts
     turned = outer.reduce(
         [values[k:][: count * parts : parts] for k in range(parts + 1)]
@@ -161,7 +161,7 @@ def _wound(hull: Array, hints: NDArray[np.int64], along: Array) -> NDArray[np.in
 def _candidates(
     wound: NDArray[np.int64], parts: int, corners: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Two corners (T, D, 2) that can be an edge within each cell; or where to climb from.
+    """Two corners (T, D, 2) that can be an edge within each cell, or a start for climbing.
 
     Along a line and around a circle outside, the corner changes monotonically: those at the rim of
     a cell enclose all others. If more than two, those at one and three quarters represent all.

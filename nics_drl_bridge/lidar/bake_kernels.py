@@ -7,7 +7,7 @@ import numpy as np
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
 
-EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a share of the whole width
+EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
 
 
 @kernel(allocates=True)
@@ -79,7 +79,7 @@ def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore
         first += 1
     while last > first and not np.isfinite(fine[last]):
         last -= 1
-    # thinner than the spacing of the points: hit by none
+    # the shape is thinner than the spacing of the points, so no point hits it
     if not np.isfinite(fine[first]):
         fine[:] = along((edge[0] + edge[1]) / 2.0, corners, radius, distance, cos, sin)
         return
@@ -100,9 +100,9 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
 def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
     """Write the rows of one rotation [rad] into the table's ranges (R,) float32 [m].
 
-    The layout (3, D) is the begin of the row of each distance, its first beam relative to the
+    The layout (3, D) holds, per distance, the start of its row, its first beam relative to the
     bearing, and its width in beams. `shape` are corners and radius, see `row`; edges are (D, 2),
-    beams a `step` apart [rad], with so many phases (points) each.
+    beams are a `step` apart [rad], with `phases` points each.
     """
     c = math.cos(turn)
     s = math.sin(turn)

@@ -1,9 +1,9 @@
 """Compiled steps of a scan: bodies looked up (Eq. 3), fused by the minimum (Eq. 4).
 
-Not the nearest row of the table, but the two around the true distance are blended, in each the two
-points around a beam; and the beams that hit follow from the true silhouette, as one on the wrong
-side of a beam is by far the largest error of a plain look-up. `scan_kernels` takes each step for
-many bodies at once.
+Instead of taking the nearest row of the table, a look-up blends the two rows around the true
+distance, and in each row the two points around a beam. The true silhouette decides which beams hit,
+because an edge on the wrong side of a beam is by far the largest error of a plain look-up.
+`scan_kernels` takes each step for many bodies at once.
 """
 
 import math
@@ -16,7 +16,9 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar import exact_kernels as exact
 
-ABOVE_ZERO = 2.0**24  # Added before truncation to an integer: numbers are rounded down
+ABOVE_ZERO = (
+    2.0**24
+)  # added before truncation to an integer, so that numbers are rounded down
 PER_TURN = 0.5 / math.pi
 UNSEEN, LOOKED_UP, COMPUTED = range(3)
 ATAN = tuple(
@@ -94,7 +96,7 @@ def sensor_pose(pose, mount):  # type: ignore[no-untyped-def]
 
 @kernel
 def compute(out, here, bodies, me, near, walls, lidar, found):  # type: ignore[no-untyped-def]
-    """Fuse walls, and of the bodies `near` those that are not looked up."""
+    """Fuse walls, and those bodies in `near` that are not looked up."""
     computed = False
     for k in near:
         if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
@@ -112,7 +114,7 @@ def compute(out, here, bodies, me, near, walls, lidar, found):  # type: ignore[n
 
 @kernel(contracts=True, inline=True)
 def way_of(body, x, y, lidar):  # type: ignore[no-untyped-def]
-    """Way to scan a body: computed where the lidar is in its circle, or the table is too coarse."""
+    """How to scan a body: computed if the lidar is in its circle or the table is too coarse."""
     dx = body[exact.X] - x
     dy = body[exact.Y] - y
     radius = body[exact.RADIUS]
@@ -127,14 +129,14 @@ def way_of(body, x, y, lidar):  # type: ignore[no-untyped-def]
 
 @kernel(contracts=True, inline=True)
 def polar(dx, dy):  # type: ignore[no-untyped-def]
-    """Return distance [m] and bearing [rad] of a place, in single precision."""
+    """Return the distance [m] and bearing [rad] of a point, in single precision."""
     distance = math.sqrt(np.float32(dx * dx + dy * dy))
     return distance, arctan2_single(np.float32(dy), np.float32(dx))
 
 
 @kernel(contracts=True, inline=True)
 def nearest_cell(distance, bearing, radius, heading, shape, table):  # type: ignore[no-untyped-def]
-    """Cell below a distance at the nearest rotation, first hull corner, share of the next cell."""
+    """Cell below a distance at the nearest rotation, first hull corner, weight of the next cell."""
     place = (distance - radius) * shape.per_metre
     ring = np.int32(
         max(min(np.int32(place), np.int32(table.distances - 2)), np.int32(0))
@@ -172,7 +174,7 @@ def seen_at(dx, dy, c, s):  # type: ignore[no-untyped-def]
 def silhouette(pair, hull, shape, hulls, seen, side):  # type: ignore[no-untyped-def]
     """Direction of the right (side 1) or left (-1) silhouette of a shape from its bearing [rad].
 
-    It is either corner of a pair; a negative one is minus the stride of climbing from the other.
+    It is one corner of a pair. A negative index is minus the stride of climbing from the other.
     """
     first = hull + (pair & 0xFFFF)
     other = pair >> 16
@@ -221,7 +223,7 @@ def in_beams(right, left, bearing, heading, beams):  # type: ignore[no-untyped-d
 
 @kernel(contracts=True, inline=True)
 def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-def]
-    """First beam between silhouettes, hits; the point before it from the bearing, and share."""
+    """First beam between silhouettes, number of hits; the point before that beam, its weight."""
     begin = np.int32(low)  # conversion is faster than rounding up
     begin = np.int32(max(np.int32(begin + np.int32(low > begin)), np.int32(0)))
     hits = np.int32(min(np.int32(high), np.int32(count - 1)) - begin + 1)
@@ -237,7 +239,7 @@ def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-d
 
 @kernel(inline=True)
 def points_of(start, place, point, shift, hits):  # type: ignore[no-untyped-def]
-    """Indices of the points of a row around the first beam; the next may be of the next beam."""
+    """Indices of a row's points around the first beam; the second may belong to the next beam."""
     phases = np.int32(1 << shift)
     width = np.int32(place & 0xFFFF)
     beam = point >> shift

@@ -1,9 +1,9 @@
-"""Bodies in square cells: those around a point are found without a look at all the others.
+"""Bodies sorted into square cells, so that those around a point are found without testing all.
 
-A body lies in the cell of its centre. One larger than a cell lies in none: it is always found, as
-are those that move. The outermost cells reach to infinity. Bodies are sorted at once, so that those
-of neighbouring cells lie side by side, or added one by one to chains that begin in the cells.
-Shared arguments: n is a world, k a body of it, a place is in [m].
+A body lies in the cell of its centre. One that moves or is larger than a cell is in no cell and is
+always found. The outermost cells reach to infinity. Bodies are either sorted all at once, so that
+neighbouring cells are contiguous, or added one by one to a chain per cell. Shared arguments: n is a
+world, k a body in it, places are in [m].
 """
 
 import math
@@ -17,11 +17,11 @@ from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 
 LEFT, BOTTOM, PER_METRE, SIDE, LARGEST, MOVED, FRAME = range(7)
 """Columns of `BodyCells.frame`: x, y of the first cell [m], cells per metre, cells in a row,
-greatest radius of the bodies in cells [m], greatest distance moved since by any of them [m]."""
+maximum radius of the bodies in cells [m], maximum distance moved since by any of them [m]."""
 PER_BODY = 1.0  # Cells
 
 
-FEWEST = 20  # Least number of bodies among which those in cells are found in less time
+FEWEST = 20  # with fewer bodies, testing all takes less time than cells
 
 
 class BodyCells(NamedTuple):
@@ -60,7 +60,7 @@ def _place(way, cells_per_metre, side):  # type: ignore[no-untyped-def]
 
 @kernel
 def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
-    """Lay the cells of a world, which are empty then, over a square from (low_x, low_y) on."""
+    """Lay the cells of a world over a square from (low_x, low_y) on; they are empty then."""
     if cells.first.shape[0] > 0:
         frame = cells.frame[n]
         frame[LEFT] = low_x
@@ -126,7 +126,9 @@ def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
         if bodies[k, RADIUS] > 0.0:
             first[cell_of[k] + 1] -= 1
             then[first[cell_of[k] + 1]] = k
-    for cell in range(first.shape[0] - 1):  # each entry is that of the cell before it
+    for cell in range(
+        first.shape[0] - 1
+    ):  # shift: each entry is the count of the cell before it
         first[cell] = first[cell + 1]
     first[first.shape[0] - 1] = end
 
@@ -141,7 +143,7 @@ def _copy(body, to):  # type: ignore[no-untyped-def]
 def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-def]
     """Sort the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
 
-    Of neighbours in the same lines of memory, few miss the cache; `spare` (K, 7) is scratch.
+    Neighbours then share cache lines, so few accesses miss the cache. `spare` (K, 7) is scratch.
     """
     sort(n, bodies[:standing], standing, cells)
     first = cells.first[n]
@@ -161,7 +163,7 @@ def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-
 
 @kernel(inline=True)
 def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
-    """Return the least and the greatest row, and column, of the cells around a place."""
+    """Return minimum and maximum row, then column, of the cells around a place."""
     frame = cells.frame[n]
     per_metre = cells.frame[n, PER_METRE]
     side = cells.frame[n, SIDE]
@@ -175,7 +177,7 @@ def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
-    """Write to `found` the sorted bodies that may be within `reach` [m] of a place; how many."""
+    """Write to `found` the sorted bodies that may be within `reach` [m]; return their number."""
     first = cells.first
     then = cells.then
     found = cells.found
@@ -196,7 +198,7 @@ def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def around_added(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
-    """Like `around`, of the bodies that were added one by one."""
+    """Do the same as `around` for bodies that were added one by one."""
     first = cells.first
     then = cells.then
     found = cells.found
@@ -208,7 +210,7 @@ def around_added(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
     for row in range(low, high + 2):
         begin = row * side + left
         end = row * side + right
-        if row > high:  # of the bodies in no cell
+        if row > high:  # the chain of bodies in no cell
             begin = side * side
             end = side * side
         for cell in range(begin, end + 1):

@@ -1,7 +1,7 @@
 """Compiled exact scanner: the ranges of one object in one scan.
 
-Each function lowers the beams that hit its object in a scan `out` (B,), float32 [m]: one after the
-other they are the minimum of Eq. 4. Positions are in the frame of the lidar.
+Each function lowers the ranges of the beams that hit its object in a scan `out` (B,), float32 [m];
+applied one after the other, they compute the minimum of Eq. 4. Positions are in the lidar's frame.
 """
 
 import math
@@ -32,13 +32,13 @@ ATAN = (
     0.0010844927512,
 )
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
-"""Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
+"""Columns of a placed body; an absent body has radius 0, and `SHAPE` is an index."""
 INF, MINUS_INF = np.array([np.inf, -np.inf], np.float32).view(np.int32)
-# Beams that meet a wall at once; of MANY a multiple of UNIT
+# beams intersected with a wall at once; with MANY, a multiple of UNIT
 BLOCK = 48
 UNIT = 16
 MANY = 1000
-TOGETHER = 8  # Walls whose beams are found at once
+TOGETHER = 8  # walls whose beams are found at once
 AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
     np.uintp(k * TOGETHER) for k in range(11)
 )
@@ -81,7 +81,7 @@ def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
     angles = step * np.arange(-most, most)
     turns = np.concatenate((np.cos(angles), np.sin(angles))).astype(np.float32)
     count = directions.shape[1]
-    # Half of the angle without beams, but for half a step, by which no rounding matters:
+    # Half of the angle without beams, less half a step so that rounding does not matter.
     blind = min(max(math.pi - 0.5 * step * count, 0.0), HALF_PI)
     back = first + 0.5 * step * (count - 1) + math.pi
     sides = np.array([back + blind - HALF_PI, back - blind + HALF_PI])
@@ -303,7 +303,7 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         cross = ax * ey - ay * ex
         chord2 = range_max * range_max * length2 - cross * cross
         share = 1.0 / length2
-        # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
+        # As fractions of its length: the wall is nearest at `foot`, and in range within +-`half`.
         foot = -(ax * ex + ay * ey) * share
         half = math.sqrt(max(chord2, 0.0)) * share
         begins = max(foot - half - ROUNDING, 0.0)

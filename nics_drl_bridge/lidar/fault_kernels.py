@@ -40,7 +40,7 @@ class Distortion(NamedTuple):
     per_step: np.float32  # 1 / step of the quantisation [1/m]
     step: np.float32  # [m]
     rest: np.float32  # of the step, beyond float32
-    first: np.float32  # times the step, the least multiple within the limits
+    first: np.float32  # times the step, the minimum multiple within the limits
     last: np.float32
 
 

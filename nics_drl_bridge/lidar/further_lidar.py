@@ -13,7 +13,7 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, to_device
 
-# greatest deviation of the last beam from the declared angle [rad]
+# maximum deviation of the last beam from the declared angle [rad]
 ANGLE_TOLERANCE = 1e-3
 
 
@@ -85,7 +85,7 @@ class FurtherLidar(Sensor):
         return from_device(message.ranges, self.lidar)
 
     def shares(self, readings: Readings) -> Readings:
-        """Ranges as shares of the maximum: 1 free, 0 too close or unknown."""
+        """Ranges as fractions of the maximum: 1 free, 0 too close or unknown."""
         known = np.nan_to_num(readings, nan=0.0, posinf=np.inf, neginf=0.0)
         shares: Readings = np.clip(known / np.float32(self.lidar.range_max), 0.0, 1.0)
         return shares.astype(np.float32)

@@ -14,13 +14,13 @@ RINGS = 13
 PLACES = 256
 BANDS = 8
 SEED = 0
-# of the nearest ring from the shape's circle, as a share of the lidar's range
+# of the nearest ring from the shape's circle, as a fraction of the lidar's range
 TOUCHING = 1e-3
-OUTLIER = 0.3  # greatest allowed error of any beam [m]
+OUTLIER = 0.3  # maximum allowed error of any beam [m]
 DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
 # between line of sight and edge at most, in the search for outliers [rad]
 SLANT = np.radians(1.5)
-# least interval of looked-up distances, as a share of the lidar's range
+# minimum interval of looked-up distances, as a fraction of the lidar's range
 NARROWEST = 0.1
 
 
@@ -33,7 +33,7 @@ def lookup_distances(
     by more than `OUTLIER`: long thin shapes err when near and seen at a slant, distant ones where a
     beam grazes them. Only beams with a return in both count: which ones hit is exact. Placements
     are the same for all shapes. `exact` and `baked` are `Scanner.arguments` of these renderers, the
-    shape is an index in the table with its radius [m]. Returns the least and the greatest distance
+    shape is an index in the table with its radius [m]. Returns the minimum and the maximum distance
     to its origin [m]; both inf if it may not be looked up.
     """
     low, high, (corners, first) = exact.range_min, exact.range_max, exact.outlines

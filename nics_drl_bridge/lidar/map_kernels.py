@@ -23,7 +23,9 @@ COLUMN, ROW, ASIDE, ABOVE, QUADRANT, SIDE = (np.uintp(k * LANES) for k in range(
 distance [cells]; column and row relative to the lidar, index increments of one column and one row,
 the quadrant's bit shift, and the side of the free square."""
 LONGEST = 255  # side of the largest square that fits in a byte [cells]
-PARALLEL = np.float32(1e-12)  # least component of a direction: its inverse stays finite
+PARALLEL = np.float32(
+    1e-12
+)  # minimum component of a direction: its inverse stays finite
 # a return at exactly range_max must not be lost to rounding; `finish` decides
 SLACK = 1.0 + 1e-6
 

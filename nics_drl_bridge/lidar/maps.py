@@ -44,7 +44,7 @@ class GridMap:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # True: cells that are neither free nor occupied stop a beam
     unknown_stops: bool = False
-    # least value of occupied cells; 100 as in Nav2's static layer
+    # minimum value of occupied cells; 100 as in Nav2's static layer
     occupied_from: int = OCCUPIED
 
     @cached_property

@@ -47,8 +47,8 @@ def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
 def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
     """Fill each sector from its own beams, by a sparse table (Bender, Farach-Colton 2000).
 
-    Row k has the least of each 2**k beams in a row. As whole numbers, ranges have the same order,
-    NaN is the greatest, and LLVM vectorises.
+    Row k has the minimum of each 2**k beams in a row. As whole numbers, ranges have the same order,
+    NaN is the maximum, and LLVM vectorises.
     """
     beams = ranges.shape[0]
     rows = 1

@@ -47,17 +47,17 @@ Render = Callable[[Readings, NDArray[np.int64]], None]
 
 
 class Sensor(Schema, ABC):
-    """A sensor of a robot beside its lidar.
+    """A sensor of a robot in addition to its lidar.
 
     A subclass is found by its `kind`, the name of an entry point of `nics_drl_bridge.sensors`, or
     of a class that `add_sensor_kind` imported. A reading is S numbers, float32; NaN is unknown.
     """
 
-    # type of its message, as sensor_msgs/msg/LaserScan, with a header
+    # type of its message, such as sensor_msgs/msg/LaserScan; it must have a header
     message: ClassVar[str]
 
     kind: str
-    # also its topic, below the robot's namespace
+    # also the name of its topic, below the robot's namespace
     name: str = Field(pattern="^[a-z][a-z0-9_]*$")
 
     @property
@@ -97,29 +97,29 @@ class Sensor(Schema, ABC):
         """Return the part of an observation (..., P), in [0, 1], of readings (..., S)."""
 
     def points(self, reading: Readings) -> Array:
-        """Return where a reading (S,) shows something in `base_link` (Q, 2) [m]; none here."""
+        """Return points (Q, 2) in `base_link` that a reading (S,) shows [m]; none here."""
         return np.zeros((0, 2))
 
 
 CODE_IN_DATA = (
-    "names a file of code, which a file of data may not; import it with "
+    "names a file of code, which a data file must not do; import it with "
     "`nics --sensor-kind path/to/file.py:ClassName ...` or `add_sensor_kind` in Python, and write "
     "`kind: ClassName` instead."
 )
 
 
 def add_sensor_kind(place: str) -> type[Sensor]:
-    """Import a kind of sensor from `path/to/file.py:ClassName`, which files then name `ClassName`.
+    """Import a kind of sensor from `path/to/file.py:ClassName`; files then name it `ClassName`.
 
-    It runs the file: call it with a path of your own, never with one that a file of data names.
+    This runs the file. Pass only your own paths, never a path from a data file.
     """
     return extensions.import_class("sensors", place, Sensor)
 
 
 def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
-    """Return a sensor of a caller's own entries, whose `kind` may be `path/to/file.py:ClassName`.
+    """Return a sensor from a caller's entries; `kind` may be `path/to/file.py:ClassName`.
 
-    Entries that were read from a file go through `sensor_of_data`. Raises ConfigError.
+    Use `sensor_of_data` for entries from a file. Raises ConfigError.
     """
     if not isinstance(given, Sensor) and isinstance(given, Mapping):
         kind = str(given.get("kind"))
@@ -129,9 +129,9 @@ def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
 
 
 def sensor_of_data(given: Sensor | Mapping[str, Any]) -> Sensor:
-    """Return a sensor of the entries of a file, which name a known kind and never code.
+    """Return a sensor from the entries of a file, which must name a known kind and never code.
 
-    Raises ConfigError if they describe none.
+    Raises ConfigError if they describe no sensor.
     """
     if isinstance(given, Sensor):
         return given
@@ -143,7 +143,7 @@ def sensor_of_data(given: Sensor | Mapping[str, Any]) -> Sensor:
     found = extensions.load("sensors", kind)
     if not (isinstance(found, type) and issubclass(found, Sensor)):
         raise ConfigError(
-            f"sensor kind {kind!r}: is no subclass of lidar.sensor.Sensor."
+            f"sensor kind {kind!r}: is not a subclass of lidar.sensor.Sensor."
         )
     return validate(dict(given), found, f"sensor {given.get('name')!r}")
 
@@ -165,7 +165,7 @@ def unread(sensors: Sequence[Sensor], *lead: int) -> dict[str, Readings]:
 
 
 def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
-    """Raise ConfigError if two sensors, or one and the robot's own topics or frames, collide."""
+    """Raise ConfigError if sensors collide with each other or the robot's topics or frames."""
     names = list(TAKEN)
     used = list(frames)
     for sensor in sensors:

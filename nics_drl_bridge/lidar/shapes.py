@@ -15,12 +15,12 @@ from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, Outline
 
 MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000  # in one group of obstacles
-# Extent of a shape [m]: less is invisible, more fits in no world
+# minimum and maximum extent of a shape [m]: smaller is invisible, larger fits in no world
 SMALLEST = 1e-6
 LARGEST = 1e4
-# corners within this distance, as a share of the shape's radius, coincide
+# corners within this distance, as a fraction of the shape's radius, coincide
 SAME_PLACE = 1e-9
-FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
+FARTHEST = 1e8  # maximum coordinate in a map [m], enough for UTM
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Size = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
@@ -36,7 +36,7 @@ class Outlined(Schema):
 
     @property
     def radius(self) -> float:
-        """Of the circle around the origin that holds the shape [m]."""
+        """Radius of the circle around the origin that encloses the shape [m]."""
         return _reach(self.outline)
 
 
@@ -138,7 +138,7 @@ def _reach(outline: Array) -> float:
 
 
 def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
-    """Bodies (..., 7) of shapes (...) at poses (..., 3), of radii (...) [m], 0 if absent."""
+    """Place shapes (...) of radii (...) [m], 0 if absent, at poses (..., 3) as bodies (..., 7)."""
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses

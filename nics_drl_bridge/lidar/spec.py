@@ -1,9 +1,9 @@
 """LidarSpec: the single definition of a lidar's beams, limits and header fields.
 
-In the package ranges follow REP-117: `inf` is no return, `-inf` too close, NaN an invalid
-measurement, everything else within the limits. Devices differ; `LidarSpec.no_return` names the
-convention, and only this module handles it. Limits are compared in float32, as in the message: 0.16
-m is a little less there, and still a return.
+In the package, ranges follow REP-117: `inf` is no return, `-inf` is too close, NaN is an invalid
+measurement, and everything else is within the limits. Devices differ: `LidarSpec.no_return` names
+the convention, and only this module handles it. Limits are compared in float32, as in the message:
+a limit of 0.16 m becomes slightly less, and a return at 0.16 m still counts.
 """
 
 from functools import cached_property
@@ -65,16 +65,18 @@ class LidarSpec(Schema):
 
     name: str = "lidar"  # used in messages and reports
     beams: int = Field(ge=1, le=100_000)  # B
-    angle_min: float  # of the first beam, in the frame of the lidar [rad]
-    angle_max: float  # of the last beam, or of the end of the circle [rad]
+    angle_min: float  # angle of the first beam, in the frame of the lidar [rad]
+    angle_max: float  # angle of the last beam, or of the end of the circle [rad]
     range_min: float = Field(ge=0.0)  # nearer returns are reported as `-inf` [m]
     # farther returns are reported as `inf` [m]
     range_max: float = Field(ge=1e-3, le=LARGEST)
     rate: float = Field(ge=1e-3, le=1e5)  # scans per second [Hz]
-    mount: Mount = (0.0, 0.0, 0.0)  # of `laser` in `base_link`
-    noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)  # of a range [m]
+    mount: Mount = (0.0, 0.0, 0.0)  # pose of `laser` in `base_link`
+    noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)  # noise of a range [m]
     frame: str = Field(default="laser", min_length=1)  # id of the lidar's own frame
-    no_return: NoReturn = "inf"  # the device's value for it; in the package it is `inf`
+    no_return: NoReturn = (
+        "inf"  # the device's value for no return; the package uses `inf`
+    )
     faults: LidarFaults = LidarFaults()  # further faults of the device's ranges
 
     @model_validator(mode="before")

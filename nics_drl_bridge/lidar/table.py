@@ -31,16 +31,16 @@ FORMAT = "nics_drl_bridge/lidar_table/4"
 ABOUT_FILE = "about.json"
 ARRAYS = ("grid", "start", "cell", "rows")
 TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))  # and a manifest
-# greatest default angle of points in a row, as `MOST_PHASES` allows [rad]
+# maximum default angle of points in a row, as `MOST_PHASES` allows [rad]
 POINT_ANGLE = 0.01
 MOST_PHASES = 8
-MOST_WIDE = 0xFFFF  # greatest number of beams in a row
+MOST_WIDE = 0xFFFF  # maximum number of beams in a row
 
 
 class Density(Schema):
     """Sampling density of a table; a shape with rotational symmetry is baked for one period."""
 
-    # from the shape's radius to out of range
+    # number of grid distances, from the shape's radius to out of range
     distances: int = Field(default=100, ge=3, le=10_000)
     rotations: int = Field(default=240, ge=1, le=100_000)  # in a full turn
     phases: Literal[1, 2, 4, 8] = 1  # points per beam, see `for_beams`
@@ -67,7 +67,7 @@ class TableAbout(Schema):
 
 
 def padding(beam_angle: float) -> int:
-    """Greatest number of values that a look-up reads from a row's begin: half a turn, a block."""
+    """Maximum number of values that a look-up reads from a row: half a turn, a block."""
     return math.ceil(math.pi / beam_angle) + 1 + 16
 
 
@@ -88,7 +88,7 @@ class LidarTable:
     shapes: tuple[Shape, ...]  # H
     density: Density
     beam_angle: float  # between the beams that it was baked for [rad]
-    # (H, 3) greatest distance [m], rotations in a period, first cell
+    # (H, 3) maximum distance [m], rotations in a period, first cell
     grid: NDArray[np.float64]
     start: NDArray[np.int32]  # (cells,) begin of each row in `rows`
     cell: NDArray[np.int16]  # (cells, 6) see above
@@ -96,7 +96,7 @@ class LidarTable:
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> "LidarTable":
-        """Create a table of shapes that are only scanned exactly: without limits or baking."""
+        """Create a table of shapes that are only scanned exactly, without limits or baking."""
         shapes = tuple(dict.fromkeys(shapes))
         grid = np.ones((len(shapes), 3))
         grid[:, 0] = [spec.range_max + 2.0 * shape.radius for shape in shapes]
@@ -109,7 +109,7 @@ class LidarTable:
 
     @property
     def has_rows(self) -> bool:
-        """True if its shapes can be looked up."""
+        """True if the shapes can be looked up."""
         return len(self.cell) > 0 or not self.shapes
 
     @property
@@ -206,7 +206,7 @@ class LidarTable:
             data = json.loads(read_text(path, MOST_BYTES))
         except (RecursionError, ValueError) as error:
             raise ModelError(
-                f"{path}: is no JSON ({error}); generate the model anew."
+                f"{path}: is not JSON ({error}); generate the model anew."
             ) from None
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ModelError(
@@ -219,7 +219,7 @@ class LidarTable:
         try:
             table._check()
         except (ArithmeticError, IndexError, ValueError) as error:
-            reason = f"is no lidar table ({error}); generate the model anew."
+            reason = f"is not a lidar table ({error}); generate the model anew."
             raise ModelError(f"{folder}: {reason}") from None
         return table
 
@@ -227,9 +227,7 @@ class LidarTable:
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
         types = [array.dtype for array in arrays if array.flags.c_contiguous]
         if types != [np.float64, np.int32, np.int16, np.float32]:
-            raise ValueError(
-                "an array has another type of number, or order of its axes"
-            )
+            raise ValueError("an array has another number type or axis order")
         if self.grid.shape != (len(self.shapes), 3) or not np.isfinite(self.grid).all():
             raise ValueError("the grid does not fit the shapes")
         counts = self.grid[:, 1] * self.density.distances
@@ -261,11 +259,11 @@ class LidarTable:
             or (hint >= corners).any()
             or (np.abs(other) >= corners).any()
         ):
-            raise ValueError("a cell names a corner that its shape has not")
+            raise ValueError("a cell names a corner that its shape does not have")
 
 
 def _mapped(path: Path) -> NDArray[Any]:
-    """Map a `.npy` file into memory; what is written to the array never reaches the file."""
+    """Map a `.npy` file into memory; writing to the array never changes the file."""
     try:
         with np.errstate(over="raise"):  # of a shape whose size is no number
             array = np.load(path, mmap_mode="c", allow_pickle=False)
@@ -273,6 +271,6 @@ def _mapped(path: Path) -> NDArray[Any]:
             raise TypeError("an archive of arrays")
     except Exception:  # noqa: BLE001 - a false header breaks numpy in any way
         raise ModelError(
-            f"{path}: is no array of numbers; generate the model anew."
+            f"{path}: is not an array of numbers; generate the model anew."
         ) from None
     return np.asarray(array)

@@ -27,11 +27,11 @@ from nics_drl_bridge.sim.world import World
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
-# Least number of pairs of a robot and a body for sorting bodies into cells
+# Minimum number of pairs of a robot and a body for sorting bodies into cells
 CROWD = 4096
-# Least number of robots: for fewer, testing all bodies takes less time
+# Minimum number of robots: for fewer, testing all bodies takes less time
 FEWEST_OF_A_CROWD = 8
-STANDING = 32  # Least number of obstacles, all of which stand, for sorting them into cells once
+STANDING = 32  # Minimum number of obstacles, all of which stand, for sorting them into cells once
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Sizes:
     worlds: int  # N
     robots: int  # M in each
     obstacles: int  # K in each
-    longest_delay: int  # greatest common latency of commands [substeps]
-    longest_age: int  # greatest age of an observation [substeps]
+    longest_delay: int  # maximum common latency of commands [substeps]
+    longest_age: int  # maximum age of an observation [substeps]
 
     @property
     def crowded(self) -> bool:

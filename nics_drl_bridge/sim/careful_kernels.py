@@ -36,7 +36,7 @@ from nics_drl_bridge.sim.state import (
     Surroundings,
 )
 
-SHARE = 1e-3  # A body that contributes less than this share of the closing speed is not stopped
+SHARE = 1e-3  # A body that contributes less than this fraction of the closing speed is not stopped
 SMALL = 0.1  # Step, in radii, by which an overlapping robot is moved to test whether it gets out
 MOST_MOVES = 1000
 

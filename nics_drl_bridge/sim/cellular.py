@@ -37,7 +37,7 @@ class Cellular(Schema):
     rows: int = Field(default=30, ge=4)  # along it
     # side, and diameter of a cylinder [m]
     cell: float = Field(default=0.15, ge=0.01, le=10.0)
-    # share of the cells that are filled at first
+    # fraction of the cells that are filled at first
     fill: tuple[float, float] = (0.1, 0.35)
     smoothing: tuple[int, int] = (2, 4)  # passes of the automaton
     # free space before and behind [m]
@@ -50,13 +50,13 @@ class Cellular(Schema):
         if self.columns * self.rows > MOST_CELLS:
             raise ValueError(f"columns times rows may be {MOST_CELLS}")
         if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:
-            raise ValueError("fill must be [least, greatest], from 0 to below 1")
+            raise ValueError("fill must be [minimum, maximum], from 0 to below 1")
         if self.passage > self.margin:
             raise ValueError(
                 "passage may be as wide as margin, in whose middle the robot starts"
             )
         if not 0 <= self.smoothing[0] <= self.smoothing[1] <= 100:
-            raise ValueError("smoothing must be [least, greatest], from 0 to 100")
+            raise ValueError("smoothing must be [minimum, maximum], from 0 to 100")
         return self
 
 

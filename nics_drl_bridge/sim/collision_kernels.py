@@ -18,7 +18,7 @@ from nics_drl_bridge.sim.state import Array
 
 # Outlines this near touch; their depth then decides about an overlap [m]
 TOUCHING = 1e-12
-ON_EDGE = 1e-9  # Tolerance beyond the ends of an edge for intersections, as a share of its length
+ON_EDGE = 1e-9  # tolerance beyond an edge's ends for intersections, as a fraction of its length
 FLOAT32 = 1e-6  # Relative rounding error of the distances of a map
 
 
@@ -118,7 +118,7 @@ def outline_point(x, y, outline):  # type: ignore[no-untyped-def]
 
 @kernel
 def _next_cut(ax, ay, ex, ey, after, q):  # type: ignore[no-untyped-def]
-    """Next cut of the edge from (ax, ay) along (ex, ey) by outline q, as a share of its length."""
+    """Next cut of the edge from (ax, ay) along (ex, ey) by outline q, as a fraction of the edge."""
     least = 1.0
     cx = q.corners[q.end - 1, 0]
     cy = q.corners[q.end - 1, 1]

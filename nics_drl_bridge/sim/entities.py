@@ -21,7 +21,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 OBSTACLE = "obstacle_"  # and its number: the name of an obstacle of the world
 NAME = re.compile(r"(?=.{1,120}\Z)[A-Za-z0-9_][A-Za-z0-9_./-]*")
-REACH = 10.0  # twist that a robot may be given, as a multiple of its greatest command
+REACH = 10.0  # twist that a robot may be given, as a multiple of its maximum command
 CORNERS = 32  # of the outline that stands for a circle
 
 # Makes the simulator of a world for a number of robots.

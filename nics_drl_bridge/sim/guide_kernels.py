@@ -23,14 +23,14 @@ TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
 """Cost of a metre where the circle just fits, where only the outline does, and where nothing does;
 in between it is interpolated."""
 ROUNDS, SETTLED = 20, np.float32(1e-3)
-"""Greatest number of sweeps in all four directions, and their change that ends them before [m]."""
+"""Maximum number of sweeps in all four directions, and their change that ends them before [m]."""
 
 
 class GuideGrid(NamedTuple):
     """Cells over the worlds of a set of P, and all that stands in every scene."""
 
     walls: NDArray[np.float32]  # (P, rows, columns) distance to walls and map [m]
-    frames: Array  # (P, 3) least x, y and the cells' side [m]
+    frames: Array  # (P, 3) minimum x, y and the cells' side [m]
     sizes: Integers  # (P, 2) rows and columns that a world has
     stands: NDArray[np.bool_]  # (P, K) obstacles that do not move
     outlines: OutlineArrays  # of the obstacles' shapes
@@ -147,7 +147,7 @@ def _spread(field, cost, u, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
-    """Update the ways row by row, from one of the corners; return the greatest change [m].
+    """Update the ways row by row, from one of the corners; return the maximum change [m].
 
     Both (rows, columns) are float32; the price of a cell is that of crossing it.
     """

@@ -3,7 +3,7 @@
 Conservative advancement: two features, a corner or an edge with a radius around it, are advanced by
 a time in which they cannot meet, until they touch or the substep ends. Along the direction between
 their nearest points, a corner approaches by at most its velocity times the time plus half its
-greatest acceleration times the time squared. The bound is exact to first order, so that sliding
+maximum acceleration times the time squared. The bound is exact to first order, so that sliding
 along a wall takes few iterations, and no contact is missed at any speed.
 
 Features touch when they are within `SLACK` and approach each other; bodies that overlap before are

@@ -18,17 +18,17 @@ from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.collision_kernels import on_wall
 from nics_drl_bridge.sim.state import Array, State, Surroundings
 
-DRAWS = 64  # Greatest number of draws per obstacle and period
+DRAWS = 64  # Maximum number of draws per obstacle and period
 MOST = 10_000  # Obstacles of a world at most: draws do not depend on how many there are
-TURN = 2.0  # Greatest turn rate of an obstacle [rad/s]
-MOST_CORNERS = 32  # Greatest number of waypoints that a patrol passes in a period
-# Least distance for which a force is computed [m]: at 0 it has no direction
+TURN = 2.0  # Maximum turn rate of an obstacle [rad/s]
+MOST_CORNERS = 32  # Maximum number of waypoints that a patrol passes in a period
+# Minimum distance for which a force is computed [m]: at 0 it has no direction
 NEAREST = 1e-3
 FAR = 8.0  # Forces beyond this many ranges are neglected
-STRONGEST = 5.0  # Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded
+STRONGEST = 5.0  # Maximum acceleration [m/s^2]: people reach no more, and the model's is unbounded
 ARRIVED = 0.3  # A goal is reached within this distance [m]
 ROOM = 0.2  # Free space around a walker at a new goal [m]
-LEAST_WALK = 1.0  # Least distance of a new goal [m], if such a goal is found
+LEAST_WALK = 1.0  # Minimum distance of a new goal [m], if such a goal is found
 # A goal is given up after twice the time of the straight path plus this [s]
 PATIENCE = 5.0
 CANDIDATES = 16

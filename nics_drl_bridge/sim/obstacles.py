@@ -14,7 +14,7 @@ from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import separation_kernels as at
 
 __all__ = ["Motion", "Patrol", "Pedestrian", "plan_arrays"]
-# Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
+# Maximum speed of an obstacle [m/s]; beyond, a control period is too coarse
 FASTEST = 10.0
 # Upper bound on the parameters of the social force model, each in its unit
 STRONGEST = 1e3
@@ -23,7 +23,7 @@ STRONGEST = 1e3
 def _fast(speed: tuple[float, float]) -> tuple[float, float]:
     if not 0.0 < speed[0] <= speed[1] <= FASTEST:
         raise ValueError(
-            f"speed must be [least, greatest], above 0 and at most {FASTEST:g} m/s"
+            f"speed must be [minimum, maximum], above 0 and at most {FASTEST:g} m/s"
         )
     return speed
 

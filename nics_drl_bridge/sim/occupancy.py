@@ -1,4 +1,4 @@
-"""A world as a grid of free and occupied cells, for planners: all that stands still in it."""
+"""A world as a grid of free and occupied cells, for planners; it shows all that stands still."""
 
 import math
 from collections.abc import Sequence
@@ -18,15 +18,15 @@ from nics_drl_bridge.sim.world import World
 
 Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
 CELL = 0.01  # side of a cell [m]
-MOST_CELLS = 1_000_000  # in fields with more cells it is larger
-SAMPLES = 8  # of an edge, in a cell
-ROUNDING = 1e-6  # share of a cell by which a field may exceed whole cells
+MOST_CELLS = 1_000_000  # in fields with more cells, the cells are larger
+SAMPLES = 8  # number of samples of an edge in a cell
+ROUNDING = 1e-6  # fraction of a cell by which a field may exceed whole cells
 
 
 def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
     """Return the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
     own = sampler.samplers[member].motions
-    # what is no part of the world stands
+    # bodies that are not part of the world stand still
     both = zip_longest(bodies, own[: len(bodies)])
     return [
         (sampler.shapes[int(body[SHAPE])], body[:3])
@@ -40,9 +40,9 @@ def occupancy(
 ) -> GridMap:
     """Return the map of a world: its own map, walls, and the given obstacles.
 
-    A cell is occupied if its centre is in something solid, or a wall runs through it; a field with
-    walls is closed by cells around it. The `cell` [m] is a greatest one: those of the world's own
-    map are divided evenly, so that nothing of it is lost; a larger world gets larger ones.
+    A cell is occupied if its centre is in something solid, or a wall runs through it. A field with
+    walls is closed by cells around it. `cell` [m] is the maximum size: cells of the world's own map
+    are divided evenly, so that none of its detail is lost. A large world gets larger cells.
     """
     grid = world.grid
     place, first, size, cell = _frame_of(world, cell)
@@ -88,7 +88,7 @@ def _frame_of(
 
 
 def _enclose(made: GridMap, half: Array) -> None:
-    """Occupy all around a field of half its size (2,) [m]."""
+    """Occupy everything outside a field, given half its size (2,) [m]."""
     rows, columns = (np.arange(count) for count in made.cells.shape)
     if not made.origin[2]:  # x is that of the column alone
         x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]

@@ -34,7 +34,7 @@ SCALED = {  # columns that a factor scales, and the levels that may be given ins
     "noise": (slice(0, 2), ("odom_linear", "odom_angular")),
     "drift": (slice(2, None), ("position_drift", "heading_drift")),
 }
-CORNERS = 256  # Number of mixtures of least and greatest factors that are checked for stability
+CORNERS = 256  # Number of mixtures of minimum and maximum factors that are checked for stability
 FAULT_COLUMNS = (  # see `lidar.fault_kernels`
     "noise_std",
     "noise_proportional",
@@ -59,7 +59,7 @@ UNIT = (np.zeros(1), np.ones(1))
 
 def _ordered(span: tuple[float, float]) -> tuple[float, float]:
     if span[0] > span[1]:
-        raise ValueError("a range is [least, greatest]")
+        raise ValueError("a range is [minimum, maximum]")
     return span
 
 
@@ -135,7 +135,7 @@ class LidarRanges(Schema):
 class ObstacleRanges(Schema):
     """Number and size of the obstacles of a scene."""
 
-    count: tuple[int, int] | None = None  # [least, greatest], instead of the world's
+    count: tuple[int, int] | None = None  # [minimum, maximum], instead of the world's
     size: Factor = AS_IT_IS  # factor on the size of every obstacle, one per episode
     # number of sizes, evenly spaced: each is baked
     rungs: int = Field(default=5, ge=2, le=100)
@@ -144,7 +144,7 @@ class ObstacleRanges(Schema):
     def _countable(self) -> "ObstacleRanges":
         if self.count and not 0 <= self.count[0] <= self.count[1] <= MOST_OBSTACLES:
             raise ValueError(
-                f"count must be [least, greatest] from 0 to {MOST_OBSTACLES}"
+                f"count must be [minimum, maximum] from 0 to {MOST_OBSTACLES}"
             )
         return self
 
@@ -253,7 +253,7 @@ class Sampler:
             np.array([most + 1.0, len(randomisation.sizes)]),
         )
         self._sizes = np.array(randomisation.sizes)
-        # The greatest of a command, and of an observation [substeps].
+        # The maximum of a command, and of an observation [substeps].
         self.longest_delay, self.longest_age = (int(most) for most in self._timing[1])
         self._labels = tuple(self._name(model))
 

@@ -25,14 +25,14 @@ TRIES = 2000
 RESTARTS = 50
 # Pairs of start and goal without a path after which the obstacles are redrawn
 DETOURS = 4
-MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
+MARGIN = 1e-9  # Minimum distance of obstacles from walls and from each other [m]
 DRAWN = 0
 NO_OBSTACLES = 1
 NO_ROBOTS = 2
 # columns of a group
 LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)
 X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
-"""Columns of a place: a region [m], headings [rad], cumulative share of the places up to it."""
+"""Columns of a place: a region [m], headings [rad], cumulative fraction of the places up to it."""
 
 
 class FreeSpace(NamedTuple):
@@ -41,7 +41,7 @@ class FreeSpace(NamedTuple):
     cells: MapField  # distances to the nearest wall or solid cell of the map
     # (rows, columns) number of the connected free space; 0 for none
     area: NDArray[np.int32]
-    bounds: Array  # (4,) least x, y and greatest x, y of the field [m]
+    bounds: Array  # (4,) minimum x, y and maximum x, y of the field [m]
     walls: Array  # (W, 4)
     grid: MapField  # the static map
     # (C,) row-major indices of the cells where a robot may start, and of those with any free space;
@@ -69,7 +69,7 @@ class ScenePlan(NamedTuple):
     least: float  # distance of a goal from its start [m]
     greatest: float
     around: bool  # True to draw goals around their starts
-    square: Array  # (3,) least x, least y, side of a square over the field [m]
+    square: Array  # (3,) minimum x, minimum y, side of a square over the field [m]
 
 
 class SceneScratch(NamedTuple):

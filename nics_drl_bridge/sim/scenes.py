@@ -116,12 +116,12 @@ class SceneSampler:
         slots = [
             g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])
         ]
-        self.count = len(slots)  # K, the greatest number of obstacles
+        self.count = len(slots)  # K, the maximum number of obstacles
         self.motions: tuple[Motion | None, ...] = tuple(
             world.obstacles[g].motion for g in slots
         )
         self.plan = _plan(world, footprint_radius, slots, known)
-        # Greatest number of cells, obstacles and corners; threads draw with a scratch memory each.
+        # Maximum number of cells, obstacles and corners; threads draw with a scratch memory each.
         corners = max(int(np.diff(self.plan.outlines.first).max()), 4)
         self.room = self.plan.space.area.size, len(self.plan.group), corners
         self.scratches: list[SceneScratch] = []
@@ -385,7 +385,7 @@ def _scratch(cells: int, count: int, corners: int) -> SceneScratch:
 
 
 def _square_over(field: MapField) -> Array:
-    """Least x, least y and side (3,) of a square that covers a field [m]."""
+    """Minimum x, minimum y and side (3,) of a square that covers a field [m]."""
     rows, columns = field.distances.shape
     place = kernels.place_in.py_func  # type: ignore[attr-defined]
     x, y = place(

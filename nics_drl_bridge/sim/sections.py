@@ -83,7 +83,7 @@ class Standing(NamedTuple):
         )
 
     def bounds(self, *places: tuple[float, ...]) -> Region:
-        """Return the least field that holds all shapes, and 1 m around places x, y, ... [m]."""
+        """Return the minimum field that holds all shapes, and 1 m around places x, y, ... [m]."""
         around = AROUND * np.array([(-1.0, -1.0), (1.0, 1.0)])
         corners = [around + place[:2] for place in places]
         for shape, pose in self.placed:

@@ -43,7 +43,7 @@ SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies
 ROBOT_GAP = 0.1  # Which an obstacle keeps to a robot, as people do [m]; less may look like a touch
 # Number of times a displacement is bent before the remaining excess is shortened
 PASSES = 3
-FINEST = 0.25  # Least step along a path through a static map, in cells
+FINEST = 0.25  # Minimum step along a path through a static map, in cells
 HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
 
 
@@ -55,7 +55,7 @@ class Traffic(NamedTuple):
     speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
     plans: Array  # (K, P) motions of the obstacles
     walls: Array  # (W, 4)
-    field: Array  # (4,) least x, y and greatest x, y of the field [m]
+    field: Array  # (4,) minimum x, y and maximum x, y of the field [m]
     grid: MapField
     period: float  # [s]
 

@@ -36,12 +36,12 @@ Indices = NDArray[np.int64]
 R = TypeVar("R")
 # Poses of robots (n, M, 3), or a function that tells them for scenes; None: as the scenes have them
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
-# Greatest number of robots in one world; each is tested against every other
+# Maximum number of robots in one world; each is tested against every other
 MOST_ROBOTS = 1_000
 # Most values in all worlds, some GB: beams of robots, states of obstacles
 MOST_NUMBERS = 2**30
 PER_BODY = 64
-# Beyond the range of commands that was recorded, as a share of their limits
+# Beyond the range of commands that was recorded, as a fraction of their limits
 TOLERANCE = 0.05
 # Arrays of the state with a row for each robot.
 OF_ROBOT = (
@@ -185,7 +185,7 @@ class FastSimulator:
     A world is bit-identical in any batch and any number of threads. Its M robots scan and hit each
     other. The renderer is `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`; `threads` parts
     of the worlds are stepped in parallel. The randomisation of each episode may be the name of a
-    shipped one, or a YAML file. `longest_delay` and `longest_age` are the greatest values that
+    shipped one, or a YAML file. `longest_delay` and `longest_age` are the maximum values that
     `data.delay` of commands (by default the model's) and `data.age` of scan and odometry may be set
     to [substeps], raised to the randomisation's. `tell` gets a message when commands leave the
     range of the fit.

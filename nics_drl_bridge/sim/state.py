@@ -69,7 +69,7 @@ class Movers(NamedTuple):
     moves: bool  # True if any obstacle moves
     plans: Array  # (K, P) see `obstacles.plan_arrays`
     waypoints: Array  # (Q, 2) of all patrols [m]
-    field: Array  # (4,) least x, y and greatest x, y of the field [m]
+    field: Array  # (4,) minimum x, y and maximum x, y of the field [m]
 
 
 class Surroundings(NamedTuple):

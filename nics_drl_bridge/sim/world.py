@@ -19,10 +19,10 @@ from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
 
 MOST_OBSTACLES = 10_000
-MOST_ACROSS_M = 1000.0  # diagonal; observations tell distances of goals up to 1000 m
+MOST_ACROSS_M = 1000.0  # diagonal; observations represent goal distances up to 1000 m
 MOST_WALLS = 10_000
 MOST_PLACES = 10_000
-SMALLEST_FIELD = 0.01  # Least side of a field [m]
+SMALLEST_FIELD = 0.01  # Minimum side of a field [m]
 Distance = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Side = Annotated[float, Field(ge=SMALLEST_FIELD, le=LARGEST)]
 Pose = tuple[Coordinate, Coordinate, Heading]
@@ -33,14 +33,14 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 class Obstacles(Schema):
     """A group of obstacles with common properties."""
 
-    # each takes any
+    # shapes, of which each obstacle takes any
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
-    # or [least, greatest], drawn per episode
+    # number of obstacles, or [minimum, maximum] to draw from per episode
     count: int | tuple[int, int] | None = None
     gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
     # fixed poses, x, y [m], heading [rad], instead of `count` at random
     at: tuple[Pose, ...] = ()
-    # their motion, see `sim.obstacles`; by default they stand still
+    # motion, see `sim.obstacles`; by default the obstacles stand still
     motion: Motion | None = None
 
     @field_validator("count", mode="before")
@@ -51,7 +51,9 @@ class Obstacles(Schema):
         if count is not None and not (
             whole and 0 <= several[0] <= several[1] <= MOST_OBSTACLES
         ):
-            needed = f"a whole number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
+            needed = (
+                f"a whole number, or [minimum, maximum], from 0 to {MOST_OBSTACLES}"
+            )
             raise ValueError(f"count must be {needed}")
         return count
 
@@ -63,7 +65,7 @@ class Obstacles(Schema):
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Least and greatest number of obstacles."""
+        """Minimum and maximum number of obstacles."""
         if self.count is None:
             return len(self.at), len(self.at)
         return (self.count, self.count) if isinstance(self.count, int) else self.count
@@ -99,21 +101,21 @@ class Goals(Places):
 class World(Schema):
     """World of the episodes; everything is in the frame `map`."""
 
-    name: str  # the name users refer to it by
-    # along x, y of a walled field around the origin [m]
+    name: str  # the name that users refer to
+    # size along x, y of a walled field around the origin [m]
     size: tuple[Side, Side] | None = None
-    bounds: Region | None = None  # instead, x1, y1, x2, y2 of a field without walls [m]
+    bounds: Region | None = None  # or x1, y1, x2, y2 of a field without walls [m]
     # further straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
-    # a static map beside or instead of a field: a shipped one, or Nav2's YAML, from this folder
+    # static map besides or instead of a field: a shipped one, or Nav2's YAML, relative to this file
     map: str | None = None
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
-    # around the footprint at start, goal, and on a path between [m]
+    # free space around the footprint at start, goal, and on a path between them [m]
     clearance: Distance = 0.3
-    # least and greatest, from start straight to goal [m]
+    # minimum and maximum straight distance from start to goal [m]
     goal_distance: tuple[Distance, Distance]
-    starts: Starts | None = None  # where robots start; None: anywhere with room
-    goals: Goals | None = None  # where goals lie; None: anywhere with room
+    starts: Starts | None = None  # where robots start; None: anywhere with enough space
+    goals: Goals | None = None  # where goals lie; None: anywhere with enough space
     _file: str | None = PrivateAttr(default=None)
     _spare: tuple[Shape, ...] = PrivateAttr(default=())
 
@@ -132,11 +134,11 @@ class World(Schema):
             )
         field = self.size or (x2 - x1, y2 - y1)
         if (across := math.hypot(*field)) > MOST_ACROSS_M:
-            fix = f"a field may be {MOST_ACROSS_M:g} m across, the farthest that a task can tell"
+            fix = f"a field may be {MOST_ACROSS_M:g} m across, the largest distance in observations"
             sides = f"{field[0]:g} m x {field[1]:g} m"
             raise ValueError(f"the field of {sides} is {across:.0f} m across; {fix}")
         if not 0.0 <= self.goal_distance[0] < self.goal_distance[1]:
-            raise ValueError("goal_distance must be [least, greatest] in metres")
+            raise ValueError("goal_distance must be [minimum, maximum] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:
             raise ValueError(
                 f"all groups of obstacles together may have {MOST_OBSTACLES}"
@@ -150,11 +152,11 @@ class World(Schema):
 
     @property
     def spare(self) -> tuple[Shape, ...]:
-        """Shapes for which a simulator keeps room, one body each; scenes are drawn without them."""
+        """Shapes for which a simulator reserves one body each; scenes are drawn without them."""
         return self._spare
 
     def with_spare(self, shapes: tuple[Shape, ...]) -> "World":
-        """Return the world with room for further bodies of some shapes."""
+        """Return the world with space reserved for additional bodies of some shapes."""
         copy = self.model_copy()
         copy._spare = shapes
         return copy
@@ -171,7 +173,7 @@ class World(Schema):
 
     @property
     def fingerprint(self) -> str:
-        """The name, and 8 digits of a SHA-256 over the content; of a map, not its path."""
+        """The name, and 8 digits of a SHA-256 over the content, including a map's content."""
         absent = {"bounds"} if self.bounds is None else set()
         content = self.model_dump_json(exclude={"map", *absent}).encode()
         if self.grid is not None:
@@ -190,7 +192,7 @@ class World(Schema):
 
     @property
     def extent(self) -> Region:
-        """Least x, least y, greatest x, greatest y of the field, or without one of the map [m]."""
+        """Minimum x, y and maximum x, y of the field, or of the map if there is no field [m]."""
         if self.size is not None:
             x = self.size[0] / 2.0
             y = self.size[1] / 2.0
@@ -228,7 +230,7 @@ def load_world(name: str | Path, also: Iterable[str] = ()) -> World:
 
 
 def check_places(world: World) -> None:
-    """Raise ConfigError for an obstacle outside the world, or that does not fit at a waypoint."""
+    """Raise ConfigError for an obstacle outside the world or without space at a waypoint."""
     for g, group in enumerate(world.obstacles):
         where = f"{world.source}: key 'obstacles.{g}"
         for n, pose in enumerate(group.at):

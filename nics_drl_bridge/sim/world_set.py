@@ -26,31 +26,31 @@ YAML = (".yaml", ".yml")
 GAZEBO = (".world", ".sdf")
 IMPORT = "nics world import"
 SPECIAL = "*?["
-KEYS = ("worlds", "generate")  # one of which only a set has
-MAP_KEYS = ("image",)  # of a Nav2 map's file, which may lie beside its world
+KEYS = ("worlds", "generate")  # only a set has one of these keys
+MAP_KEYS = ("image",)  # keys of a Nav2 map's file, which may lie next to its world
 BARN = "barn"  # the 250 worlds of a benchmark; one of them is `barn/7`
 
 
 class SetFile(Schema):
-    """The keys of a world set's YAML file."""
+    """Keys of a world set's YAML file."""
 
     name: str  # used in messages and results
-    # names, files, folders and globs; paths count from the folder of this file
+    # names, files, folders and globs; paths are relative to the folder of this file
     worlds: tuple[str, ...] = Field(default=(), max_length=MOST_MEMBERS)
-    without: tuple[str, ...] = ()  # of those, the ones to leave out
-    generate: Cellular | None = None  # beside or instead of those: worlds made here
+    without: tuple[str, ...] = ()  # worlds to leave out
+    generate: Cellular | None = None  # worlds to generate, in addition or instead
 
 
 @dataclass(frozen=True, eq=False)
 class WorldSet:
-    """Worlds of which every episode draws one by its seed, all with the same chance."""
+    """Worlds of which every episode draws one by its seed, with equal probability."""
 
     name: str
     members: tuple[World, ...]
     spare: tuple[Shape, ...] = ()  # see `World.spare`
 
     def with_spare(self, shapes: tuple[Shape, ...]) -> WorldSet:
-        """Return the set with room for further bodies of some shapes."""
+        """Return the set with space reserved for additional bodies of some shapes."""
         return replace(self, spare=shapes)
 
     @property
@@ -73,7 +73,7 @@ class WorldSet:
 
     @cached_property
     def extent(self) -> Region:
-        """Least x, least y, greatest x, greatest y of all members [m]."""
+        """Minimum x, minimum y, maximum x, maximum y of all members [m]."""
         extents = np.array([world.extent for world in self.members])
         low = extents[:, :2].min(axis=0).tolist()
         high = extents[:, 2:].max(axis=0).tolist()
@@ -86,10 +86,10 @@ AnyWorld: TypeAlias = World | WorldSet
 def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     """Load a world or a world set.
 
-    A world is a shipped one by name (`arena`, `barn/7`), or any other by the path of its YAML file.
-    A set is a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds, a folder, a glob
-    (`worlds/*.yaml`), or a YAML file with the key `worlds` or `generate`. Raises ConfigError
-    for a missing or wrong file; of a member it names which.
+    A world is given by the name of a shipped one (`arena`, `barn/7`) or the path of a YAML file; a
+    set by the name of a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds,
+    a folder, a glob (`worlds/*.yaml`), or a YAML file with the key `worlds` or `generate`. Raises
+    ConfigError for a missing or wrong file, naming the member that failed.
     """
     if not isinstance(name, str | Path):
         several = isinstance(name, list | tuple)
@@ -145,10 +145,10 @@ def _read_set(path: Path, file: SetFile) -> WorldSet:
 def _set_of(name: str, members: Sequence[World], source: str = "") -> WorldSet:
     source = source or f"world set {name!r}"
     if not members:
-        raise ConfigError(f"{source}: holds no world; name at least one.")
+        raise ConfigError(f"{source}: contains no world; name at least one.")
     if len(members) > MOST_MEMBERS:
         raise ConfigError(
-            f"{source}: holds {len(members)} worlds; {MOST_MEMBERS} are the most."
+            f"{source}: contains {len(members)} worlds; the maximum is {MOST_MEMBERS}."
         )
     return WorldSet(name, tuple(members))
 
@@ -176,7 +176,7 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
 def _member(path: Path) -> World:
     if _content(path, KEYS) is not None:
         raise ConfigError(
-            f"{path}: is a world set, and a set holds worlds; name its worlds."
+            f"{path}: is a world set, but a set contains worlds; name its worlds."
         )
     if path.suffix in GAZEBO or _content(path, MAP_KEYS) is not None:
         kind = "a world of Gazebo" if path.suffix in GAZEBO else "a map"

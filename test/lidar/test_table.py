@@ -216,7 +216,10 @@ def test_a_hostile_array_is_refused_although_its_checksum_is_right(folder, conte
     (folder / "rows.npy").write_bytes(content)
     write_sums(folder)
     told = refused(folder)
-    assert "rows.npy: is no array of numbers" in told or "is no lidar table (" in told
+    assert (
+        "rows.npy: is not an array of numbers" in told
+        or "is not a lidar table (" in told
+    )
 
 
 def test_an_array_with_another_order_of_its_axes_is_refused(table, folder):
@@ -230,7 +233,10 @@ def test_an_array_with_another_order_of_its_axes_is_refused(table, folder):
     [
         (lambda t: {"format": "nics_drl_bridge/lidar_table/3"}, "its format is not"),
         (lambda t: {"rows": t.rows[:-1]}, "a row lies outside"),
-        (lambda t: {"rows": t.rows.astype(np.float64)}, "an array has another type"),
+        (
+            lambda t: {"rows": t.rows.astype(np.float64)},
+            "an array has another number type",
+        ),
         (lambda t: {"start": t.start[:-1]}, "the number of cells"),
         (lambda t: {"start": t.start - 1}, "a row lies outside"),
         (lambda t: {"cell": t.cell[:, :5]}, "the number of cells"),

@@ -317,7 +317,7 @@ def test_what_moves_keeps_clear_of_a_static_map(heading):
     [
         (
             {"kind": "pedestrian", "speed": [0.8, 0.3]},
-            "speed must be [least, greatest]",
+            "speed must be [minimum, maximum]",
         ),
         ({"kind": "pedestrian", "speed": [0.0, 0.3]}, "above 0"),
         ({"kind": "pedestrian", "speed": [1.0, 30.0]}, "at most 10 m/s"),

@@ -239,7 +239,7 @@ def test_a_range_that_the_model_cannot_take_is_one_sentence(kinematics, sentence
             {"odometry": {"noise": [1, 2], "odom_linear": [0, 1]}},
             "either the factor noise or",
         ),
-        ({"obstacles": {"count": [4, 3]}}, "count must be [least, greatest]"),
+        ({"obstacles": {"count": [4, 3]}}, "count must be [minimum, maximum]"),
         ({"obstacles": {"size": [-1.0, 3]}}, "key 'obstacles.size.0'"),
         ({"latency": [0, 1]}, "unknown key 'latency'"),
     ],

@@ -167,11 +167,11 @@ def test_an_unknown_key_is_named_with_the_file_and_the_nearest_key(tmp_path):
         ({"obstacles": [circles(1, ())]}, "key 'obstacles.0.shapes'"),
         (
             {"obstacles": [circles(-1)]},
-            "count must be a whole number, or [least, greatest]",
+            "count must be a whole number, or [minimum, maximum]",
         ),
         (
             {"obstacles": [circles([3, 1])]},
-            "count must be a whole number, or [least, greatest]",
+            "count must be a whole number, or [minimum, maximum]",
         ),
         (
             {"obstacles": [circles("many")]},
@@ -265,7 +265,7 @@ def test_what_concerns_several_keys_is_said_without_the_whole_file():
         )
     assert (
         str(caught.value)
-        == "world.yaml: goal_distance must be [least, greatest] in metres."
+        == "world.yaml: goal_distance must be [minimum, maximum] in metres."
     )
 
 

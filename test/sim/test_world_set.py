@@ -238,7 +238,7 @@ def test_what_has_to_be_imported_is_told_with_the_command_for_it(tmp_path):
 def test_a_set_of_sets_is_refused(tmp_path):
     file = tmp_path / "set.yaml"
     file.write_text("name: s\nworlds: [set.yaml]\n")
-    with pytest.raises(ConfigError, match="is a world set, and a set holds worlds"):
+    with pytest.raises(ConfigError, match="is a world set, but a set contains worlds"):
         load_worlds(file)
 
 

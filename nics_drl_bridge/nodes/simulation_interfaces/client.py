@@ -31,7 +31,7 @@ NEEDED = {
     "ENTITY_STATE_SETTING": "SetEntityState",
     "ENTITY_STATE_GETTING": "GetEntityState",
 }
-# of a control period, as a share of a step; and of stamps, of a period
+# of a control period, as a fraction of a step; and of stamps, of a period
 TOLERANCE = 1e-3
 
 

@@ -17,7 +17,7 @@ from nics_drl_bridge.recording.messages import is_rotation
 from nics_drl_bridge.sim.entities import Entities, overlap
 
 HEIGHT = 0.5  # of whatever stands in a plane world, as in MuJoCo [m]
-LEAN = 0.02  # greatest angle of what stands upright [rad]
+LEAN = 0.02  # maximum angle of what stands upright [rad]
 SIZES = {
     Bounds.TYPE_BOX: "two",
     Bounds.TYPE_SPHERE: "two",

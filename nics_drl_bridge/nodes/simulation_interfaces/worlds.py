@@ -36,7 +36,7 @@ EMPTY = (
     (4.0, 4.0),
 )  # places in the field of a world without walls around it [m]
 CELL = 0.05  # [m]
-MOST_OPEN = 0.5  # share of what is free in a field that may be open to all around
+MOST_OPEN = 0.5  # fraction of what is free in a field that may be open to all around
 # Tags of SDF that are read, or say nothing of what stands in a plane.
 READ = {
     "sdf",
