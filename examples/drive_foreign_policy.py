@@ -1,4 +1,4 @@
-"""Somebody else's network drives to a goal, by a mapping that says what goes in and comes out."""
+"""Drive to a goal with someone else's network, using a mapping of its inputs and outputs."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ outputs:
 
 
 def network():
-    """It turns to the goal, and slows down for what is in front of it."""
+    """A network that turns to the goal and slows down before obstacles."""
     weights = np.zeros((38, 2), np.float32)
     weights[15:21, 0] = 0.2
     weights[37, 1] = 1.0

@@ -1,4 +1,4 @@
-"""One policy drives an episode in process and over DDS: the same numbers, to the bit."""
+"""Drive an episode with one policy in process and over DDS, with bit-identical results."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def main() -> None:
         there.close()
 
     difference = np.abs(inside.estimate - outside.estimate).max()
-    print(f"{outside.result} over DDS; the estimates are {difference:g} apart")
+    print(f"{outside.result} over DDS; the estimates differ by {difference:g}")
     runs = {"in process": [inside], "over DDS": [outside]}
     picture = draw_trajectories(runs, load_world(WORLD), model.robot.footprint_radius)
     Path("drive_over_dds.png").write_bytes(picture)

@@ -1,4 +1,4 @@
-"""A shipped policy drives 200 unseen episodes side by side, and six of them for the picture."""
+"""Evaluate a shipped policy on 200 unseen episodes in parallel, and draw six of them."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from nics_drl_bridge.policy.train import line_of
 from nics_drl_bridge.report.pictures import draw_trajectories
 from nics_drl_bridge.sim.world import load_world
 
-FIRST_SEED = 1_000_000  # which no training draws
+FIRST_SEED = 1_000_000  # no training draws these seeds
 
 
 def main() -> None:

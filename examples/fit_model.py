@@ -1,6 +1,6 @@
-"""Fits and prunes a Taylor model (Eq. 1, 2) of a recording, and predicts what the fit never saw.
+"""Fit and prune a Taylor model (Eq. 1, 2) of a recording, and predict data that the fit never saw.
 
-The picture `fit_model.png` shows predictions of 5 s beside what was measured.
+The picture `fit_model.png` compares predictions over 5 s with the measurements.
 """
 
 from pathlib import Path

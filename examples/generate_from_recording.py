@@ -1,4 +1,4 @@
-"""A recording of a textbook robot becomes a simulator, which then moves 64 robots at once."""
+"""Generate a simulator from a recording of a textbook robot, and move 64 robots at once."""
 
 from pathlib import Path
 

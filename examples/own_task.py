@@ -1,4 +1,4 @@
-"""A task of one's own: patrol between two places; `docs/tasks.md` explains each part."""
+"""A custom task: patrol between two places; `docs/tasks.md` explains each part."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +14,12 @@ from nics_drl_bridge.report.pictures import draw_trajectories
 
 @dataclass(frozen=True)
 class Patrol(Task):
-    radius: float = 0.3  # how near is there [m]
-    rounds: int = 3  # so many arrivals are a success
+    radius: float = 0.3  # distance at which a place counts as reached [m]
+    rounds: int = 3  # number of arrivals for success
 
     @property
-    def observation_space(
-        self,
-    ):  # the scan, then distance, cosine, sine of the goal's bearing
+    def observation_space(self):
+        # the scan, then distance, cosine and sine of the goal's bearing
         return self.box([0, -1, -1], [1000, 1, 1])
 
     def reset(self, episodes):
@@ -29,7 +28,7 @@ class Patrol(Task):
         count = np.zeros(goal.shape[:-1], np.int64)
         return {"goal": goal, "back": back, "arrivals": count, "arrived": count > 0}
 
-    def update(self, before, after, memory):  # whoever is there turns back
+    def update(self, before, after, memory):  # a robot that has arrived turns back
         memory["arrived"][...] = there = (
             distance(after.pose, memory["goal"]) < self.radius
         )
@@ -50,7 +49,7 @@ class Patrol(Task):
     def end(self, view, memory):
         return self.touches(view.ranges) | (memory["arrivals"] >= self.rounds)
 
-    def info(self, view, memory):  # what an evaluation reads
+    def info(self, view, memory):  # read by evaluations
         arrivals = memory["arrivals"].copy()
         touches = self.touches(view.ranges)
         return {
@@ -60,7 +59,7 @@ class Patrol(Task):
         }
 
 
-def main():  # by a policy that turns to the goal, and drives where that is ahead
+def main():  # the policy turns to the goal and drives once it is ahead
     robot = load_robot("differential")
     world = load_world("empty")
     policy = SimpleNamespace(

@@ -1,4 +1,4 @@
-"""A policy that drives straight at a wall, behind the rules and the shield of the command gate."""
+"""Drive straight at a wall behind the rules and the shield of the command gate."""
 
 from pathlib import Path
 
@@ -30,11 +30,11 @@ def main() -> None:
     print(
         f"the shield left {nearest[-1]:.2f} m between lidar and wall, at {speed[-1]:.2f} m/s"
     )
-    print(f"a command that is no number is stopped by the rule {stopped!r}")
+    print(f"a NaN command is stopped by the rule {stopped!r}")
 
     figure, (axes,) = panels(1, 1, (6.5, 3.6))
     time = np.arange(len(rows)) * model.control_period
-    axes.plot(time, np.full(len(rows), FULL_SPEED[0]), "--", label="asked for [m/s]")
+    axes.plot(time, np.full(len(rows), FULL_SPEED[0]), "--", label="requested [m/s]")
     axes.plot(time, speed, label="driven [m/s]")
     axes.plot(time, np.minimum(nearest, 3.0), label="nearest range, up to 3 [m]")
     axes.fill_between(time, 0.0, 3.0, where=shielded > 0, alpha=0.15, label="shielded")

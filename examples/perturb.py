@@ -1,4 +1,4 @@
-"""Success of a policy in the nominal simulator, and where robot, sensors and scene vary."""
+"""Measure a policy's success in the nominal simulator and with varied robot, sensors and scene."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Plans a drive that shows a robot's whole motion within a circle, and records a textbook robot."""
+"""Plan a drive through a robot's full range of motion in a circle, and record a textbook robot."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from nics_drl_bridge.report.pictures import drive_picture
 
 def main() -> None:
     robot = load_robot("ackermann")
-    # as `nics record --preview`
+    # like `nics record --preview`
     pattern = DrivePlan(robot, bound=2.0, duration=60.0).preview()
     print("\n".join(pattern.describe()))
     Path("record_drive.png").write_bytes(drive_picture(pattern, robot))
 
-    # `nics record` asks a real one
+    # `nics record` drives a real robot
     recording = textbook.record(robot, np.random.default_rng(0))
     save_recording(recording, "drive.npz")
     print(f"drive.npz holds {len(recording.pose.t)} poses")

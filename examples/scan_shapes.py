@@ -1,4 +1,4 @@
-"""Scans shapes in a mapped room, looked up and exactly, and says how far the two are apart."""
+"""Scan shapes in a mapped room by look-up and exactly, and compare the two."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ SHAPES = [
     Rectangle(size=(0.6, 0.4)),
     Polygon(points=((0.0, 0.0), (0.5, 0.0), (0.1, 0.1), (0.0, 0.5))),
 ]
-# x, y, heading
+# x [m], y [m], heading [rad] of each shape around the robot
 AROUND = np.array([(0.8, 0.3, 0.4), (-0.5, 0.9, 1.0), (0.2, -1.0, 2.0)])
 
 
@@ -23,7 +23,7 @@ def main() -> None:
     lidar = load_lidar("rplidar_a2")
     room = load_map("room")
     robots = room.cell_to_world(np.argwhere(room.distance_field > 0.5)[::400])
-    # from a cell's centre a beam may just touch a corner
+    # away from cell centres, where a beam may just touch a corner
     robots += np.array([0.013, 0.007])
     poses = np.concatenate([robots, np.zeros((len(robots), 1))], axis=1)
     scans = {}

@@ -1,4 +1,4 @@
-"""Three robots share one world: each turns to a goal of its own and drives there."""
+"""Drive three robots in one world, each to its own goal."""
 
 import gymnasium
 import numpy as np
@@ -11,7 +11,7 @@ SEED = 2
 
 
 def to_the_goal(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """Actions (M, 2) in [-1, 1]: forward speed and turn rate, by the goal's bearing."""
+    """Return actions (M, 2) in [-1, 1], forward speed and turn rate, from the goal's bearing."""
     ahead = np.where(cosine > 0.7, 0.6 * cosine, 0.0)
     return np.stack([ahead, np.where(cosine > 0.0, sine, np.sign(sine))], axis=-1)
 

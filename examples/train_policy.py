@@ -1,4 +1,4 @@
-"""Trains a policy for a short time in the fast simulator; it becomes one file, `policy.onnx`."""
+"""Train a policy briefly in the fast simulator; the result is one file, `policy.onnx`."""
 
 from pathlib import Path
 

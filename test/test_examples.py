@@ -15,7 +15,7 @@ MOST_BYTES = 100_000  # of a picture of the docs
 SAYS = {
     "compare_with_planner": r"differential: (8|9|10)\d%",
     "drive_foreign_policy": "success",
-    "drive_over_dds": "success over DDS; the estimates are 0 apart",
+    "drive_over_dds": "success over DDS; the estimates differ by 0",
     "evaluate_policy": r"success (9\d|100)",
     "fit_model": r"vx = 0\.\d+\*left_wheel",
     "own_task": r"success after \d+ steps",
