@@ -8,9 +8,9 @@ SHELL := /bin/bash
 PYTHON ?= python3
 RECORDING ?=
 PYTEST_ARGS ?=
-# Tests of one file run one after the other; PARALLEL= runs all of them so.
+# Tests of one file run one after the other; with an empty PARALLEL= all tests do.
 PARALLEL ?= -n auto --dist loadfile
-# Those of `make test` often wait for processes: three of them keep two cores at work.
+# Tests of `make test` often wait for processes, so three workers keep two cores busy.
 WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) * 3 / 2)))
 BENCHMARKS ?=
 QUICK ?=
@@ -22,20 +22,20 @@ BIN := $(VENV)/bin
 COMMA := ,
 SPACE := $(subst ,, )
 
-# The ROS wheels start python again with these two and leave them to all its children, where
-# another environment's python would load the wrong libraries.
+# The ROS wheels restart python with these two variables, and children inherit them; the python of
+# another environment would then load the wrong libraries.
 ifdef _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH
 endif
 
-# Containers often set it; but then each of the hundreds of processes compiles its libraries anew.
+# Containers often set it, but then each of hundreds of processes compiles its libraries again.
 unexport PYTHONDONTWRITEBYTECODE
 
-# The interpreter below PYTHON, so that an activated .venv is not taken for the base of itself.
+# The interpreter behind PYTHON, so that an activated .venv does not become its own base.
 BASE := $(shell $(CLEAN_ENV) $(PYTHON) -c 'import sys; print(getattr(sys, "_base_executable", sys.executable))' 2>/dev/null)
 VERSION := $(if $(BASE),$(shell $(BASE) -c 'import sys; print("%d.%d" % sys.version_info[:2])'))
-# Where a sourced ROS 2 lies; and where one lies that this interpreter can't import.
+# Location of a sourced ROS 2, and location of one that this interpreter can't import.
 SYSTEM_ROS := $(if $(BASE),$(shell $(BASE) -c 'import rclpy; print(rclpy.__path__[0])' 2>/dev/null))
 FOREIGN_ROS := $(if $(BASE)$(SYSTEM_ROS),$(if $(SYSTEM_ROS),,$(shell $(BASE) -c \
 	'import importlib.util as u; s = u.find_spec("rclpy"); print(s.origin if s else "")')))
@@ -44,11 +44,11 @@ ROS := $(if $(SYSTEM_ROS),system,$(if $(WHEELS_EXIST),wheels,none))
 EXTRAS := $(if $(SYSTEM_ROS),dev-without-ros,dev)
 DEMO_EXTRAS := bags,deploy,train,view$(if $(SYSTEM_ROS),,$(COMMA)ros)
 
-# Written last, so a half-built .venv has none and is built anew; its name says for which Python
-# and which ROS 2 the environment is. The demo needs a part of it only.
+# Written last, so that a half-built .venv lacks it and is built again; its name holds the Python and
+# the ROS 2 of the environment. The demo needs only a part of it.
 READY := $(VENV)/.ready-py$(VERSION)-$(ROS)
 READY_FOR_DEMO := $(VENV)/.demo-py$(VERSION)-$(ROS)
-# An environment that has lost its executables is installed into anew.
+# An environment that has lost its executables is installed again.
 ifeq ($(wildcard $(BIN)/nics),)
 .PHONY: $(READY) $(READY_FOR_DEMO)
 endif
@@ -61,7 +61,7 @@ OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
 
-setup: $(READY) ## build .venv: the package (editable) and all that tests and demo need
+setup: $(READY) ## build .venv: the package (editable) and everything that tests and demo need
 
 # $(1): the environment's file. $(2): extras to install.
 define BUILD
@@ -102,8 +102,8 @@ fi
 @touch $(1)
 endef
 
-# uv knows nothing of pip's settings, nor, unless told, of the system's certificates. PyTorch's own index has wheels for Linux without the
-# libraries of GPUs, which are five times the size; without it, those with them have to do.
+# uv ignores pip's settings and, by default, the system's certificates. PyTorch's own index has Linux wheels without GPU libraries, which
+# are a fifth of the size; without that index, the wheels with GPU libraries are used.
 WHEELS := $(subst $(SPACE),$(COMMA),$(strip $(or $(UV_FIND_LINKS),$(PIP_FIND_LINKS))))
 TORCH := $(if $(WHEELS),,--torch-backend cpu)
 UV_INSTALL = UV_SYSTEM_CERTS=$${UV_SYSTEM_CERTS:-1} $(if $(WHEELS),UV_FIND_LINKS=$(WHEELS)) $(if $(PIP_INDEX_URL),UV_DEFAULT_INDEX=$(PIP_INDEX_URL)) \
@@ -121,10 +121,10 @@ demo: $(or $(wildcard $(READY)),$(READY_FOR_DEMO)) ## run the whole chain on a r
 test: ros-status setup lint ## lint, types and tests: make test [PYTEST_ARGS="-k lidar"]
 	@$(MAKE) --no-print-directory types & types=$$!; $(MAKE) --no-print-directory pytest; wait $$types
 
-test-quick: setup ## under a minute, after each edit: no processes, no training
+test-quick: setup ## in under a minute, after each edit: no processes, no training
 	$(BIN)/python -m pytest -q $(PARALLEL) -m "not (ros or process or slow or campaign)" $(PYTEST_ARGS)
 
-test-all: test ## before a release: the long campaigns, other distributions, clients and Ray too
+test-all: test ## before a release: also long campaigns, other distributions, clients and Ray
 	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
 	$(MAKE) test-jazzy test-messages test-clients test-ament test-release test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
 
@@ -142,14 +142,14 @@ lint: setup ## ruff: rules and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-format: setup ## let ruff repair what it can
+format: setup ## let ruff fix what it can
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
 types: setup ## mypy
 	$(BIN)/mypy nics_drl_bridge
 
-# A test that waits for other processes may fail on a busy machine: what failed runs once more, alone.
+# Tests that wait for other processes may fail on a busy machine, so failed tests run again, alone.
 pytest: setup
 	@status=0; $(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(PYTEST_ARGS) || status=$$?; \
 	if [ $$status = 1 ]; then \
@@ -157,7 +157,7 @@ pytest: setup
 		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none --maxfail 5 -m "not campaign" $(PYTEST_ARGS); \
 	else exit $$status; fi
 
-# Environments apart, of what clashes with .venv; what they share with it has the same pins.
+# Separate environments for what conflicts with .venv; shared packages have the same pins.
 # $(1): folder. $(2): command that prints its constraints. $(3): what it holds.
 define BUILD_APART
 @echo "Building $(1) with Python $(VERSION); the first time takes a minute or more."
@@ -169,7 +169,7 @@ define BUILD_APART
 @touch $@
 endef
 
-# The wheels of another distribution have the names of ours.
+# The wheels of another distribution have the same names as ours.
 JAZZY := .venv-jazzy
 JAZZY_WHEELS := ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp
 JAZZY_EXTRAS := bags,deploy,mujoco,multi,test
@@ -184,7 +184,7 @@ $(JAZZY)/.ready: $(DESCRIBED_BY)
 	$(call BUILD_APART,$(JAZZY),grep -v '^ros-' constraints.txt,'.[$(JAZZY_EXTRAS)]' onnx \
 		$(JAZZY_WHEELS))
 
-# RLlib holds Gymnasium at a version of its own.
+# RLlib pins its own version of Gymnasium.
 RAY := .venv-ray
 RAY_EXTRAS := deploy,distributed,test,train
 RAY_TESTS := test/extras/ray/test_engine.py test/policy/test_train_vec_env.py
@@ -196,11 +196,11 @@ $(RAY)/.ready: $(DESCRIBED_BY) constraints-ray.txt
 	$(call BUILD_APART,$(RAY),(grep -v '^gymnasium==' constraints.txt; cat constraints-ray.txt),\
 		'.[$(RAY_EXTRAS)]')
 
-# Archives of repositories of which there are no wheels; what needs them is left out without them.
+# Archives of repositories without wheels; tests that need them are skipped without them.
 UPSTREAM ?= ../shared/upstream
 UPSTREAM_LIES_THERE := $(wildcard $(UPSTREAM)/launch_ros.tar.gz)
 
-# Message packages that have no wheels are built from their files.
+# Message packages without wheels are built from their sources.
 MESSAGES := .venv-messages
 MESSAGE_TESTS := test/nodes/test_device_node.py test/nodes/simulation_interfaces test/nodes/test_map_to_odom.py \
 	test/nodes/test_follow_path.py test/benchmarks/test_nav2_standards.py test/benchmarks/test_standards.py
@@ -219,12 +219,12 @@ $(MESSAGES)/.ready: test/build_messages.sh nics_drl_bridge/commands/message_buil
 	@$(CLEAN_ENV) test/build_messages.sh $(BIN)/nics $(MESSAGES) $(UPSTREAM)
 	@touch $@
 
-# The real tools over the wheels, and this package as colcon installs it.
+# The real tools on top of the wheels, and this package as colcon installs it.
 TOOLS := .venv-upstream
 TOOLS_EXTRAS := bags,deploy,mujoco,multi,ros,test
 UPSTREAM_TESTS := test/upstream test/nodes/test_launching.py
 
-test-upstream: $(MESSAGES)/.ready $(TOOLS)/.ready ## ours by the real `ros2 run`, `ros2 launch` and more, in .venv-upstream
+test-upstream: $(MESSAGES)/.ready $(TOOLS)/.ready ## this package under the real `ros2 run`, `ros2 launch` and more, in .venv-upstream
 	@$(CLEAN_ENV) test/install_upstream_tools.sh $(TOOLS) $(UPSTREAM) $(MESSAGES)
 	set +u; source $(TOOLS)/setup.bash; python -m pytest $(UPSTREAM_TESTS) $(PYTEST_ARGS)  # colcon reads unset variables
 
@@ -233,13 +233,13 @@ $(TOOLS)/.ready: $(DESCRIBED_BY) test/install_upstream_tools.sh
 		echo "make test-upstream: needs Linux on x86-64, a shell without a sourced ROS 2 and the sources" \
 			"of launch, launch_ros and ros2cli in $(UPSTREAM) (or UPSTREAM=folder)." >&2; exit 1; fi
 	$(call BUILD_APART,$(TOOLS),cat constraints.txt,'.[$(TOOLS_EXTRAS)]' osrf-pycommon psutil)
-	@$(TOOLS)/bin/python -m pip uninstall -qq -y nics_drl_bridge  # it comes by colcon
+	@$(TOOLS)/bin/python -m pip uninstall -qq -y nics_drl_bridge  # colcon installs it
 
-# Clients that speak DDS without ROS 2, apart from the wheels, whose libraries they must not load.
+# Clients that speak DDS without ROS 2, separate from the wheels, whose libraries they must not load.
 CLIENTS := .venv-clients
 CLIENT_LIBRARIES := cyclonedds==11.0.1 rosless==0.5.0 roswell==0.1.0
 
-test-clients: setup $(CLIENTS)/.ready ## clients of other make read a simulator and drive it
+test-clients: setup $(CLIENTS)/.ready ## third-party clients read a simulator and drive it
 	$(CLEAN_ENV) OTHER_CLIENTS_PYTHON=$(CLIENTS)/bin/python \
 		$(BIN)/python -m pytest test/nodes/test_other_clients.py $(PYTEST_ARGS)
 
@@ -250,8 +250,8 @@ $(CLIENTS)/.ready: Makefile
 		$(CLIENTS)/bin/python -m pip install -qq $(CLIENT_LIBRARIES)
 	@touch $@
 
-# The linters of ament, with the plugins that it looks for. `ament_xmllint` leaves package.xml out,
-# whose schema it would ask the network for; `make test` holds that against what colcon reads.
+# The ament linters, with the plugins that they expect. `ament_xmllint` skips package.xml, because it
+# would fetch the schema from the network; `make test` checks package.xml against what colcon reads.
 AMENT := .venv-ament
 AMENT_LIBRARIES := flake8 flake8-blind-except flake8-builtins flake8-class-newline flake8-comprehensions \
 	flake8-deprecated flake8-docstrings flake8-import-order flake8-quotes
@@ -272,10 +272,10 @@ $(AMENT)/.ready: Makefile
 		$(CLEAN_ENV) $(AMENT)/bin/python -m pip install -qq $(AMENT_LIBRARIES)
 	@touch $@
 
-test-release: setup ## wheel and source archive, installed into an environment of their own, run the demo
+test-release: setup ## run the demo from the wheel and the source archive, each in its own environment
 	$(CLEAN_ENV) $(BIN)/python -m pytest test/test_release.py $(PYTEST_ARGS)
 
-# To its end whatever one of them says; each is told with machine, commit and load.
+# Runs to the end even if a benchmark fails; each result names machine, commit and load.
 benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
 	@if [ -e $(MESSAGES)/setup.bash ]; then source $(MESSAGES)/setup.bash; fi; \
 		cd benchmarks && ../$(BIN)/python -m measuring.run_all \
@@ -288,18 +288,18 @@ docs: setup ## build the site of docs/ into build/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "to read and search it: open build/docs/index.html in a browser"
 
-reference: setup ## make docs/reference/ from the schemas of the files, the commands and the nodes
+reference: setup ## make docs/reference/ from file schemas, commands and nodes
 	$(BIN)/python docs/site/reference.py
 
-notebooks: setup ## run docs/notebooks/ and keep their outputs
+notebooks: setup ## run docs/notebooks/ and keep the outputs
 	$(BIN)/python docs/site/notebooks.py
 
-pictures: setup ## run the examples and keep their pictures in docs/examples/: make pictures [EXAMPLES="own_task"]
+pictures: setup ## run the examples and keep the pictures in docs/examples/: make pictures [EXAMPLES="own_task"]
 	$(BIN)/python docs/site/pictures.py $(EXAMPLES)
 
-clean: ## remove what building and testing left behind
+clean: ## remove the products of building and testing
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
-distclean: clean ## the same, and all environments (.venv and those of test-...) and runs/
+distclean: clean ## also remove all environments (.venv and those of test-...) and runs/
 	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(TOOLS) $(CLIENTS) $(AMENT) runs
