@@ -1,8 +1,8 @@
 """Compiled faults of a lidar: deviations of a real device from the exact ranges.
 
-The order is that of the device: skew (beams are measured from different poses), geometry (the
-scanner), then too close, noise, quantisation and dropouts, by `distort`. The faults of one robot
-are a row (P,) of numbers; one whose numbers are 0 takes no time and draws nothing.
+They apply in the order of the device: skew (beams are measured from different poses), geometry (the
+scanner), then too close, noise, quantisation and dropouts (`distort`). The faults of one robot are
+a row (P,) of numbers; a fault whose numbers are 0 takes no time and draws nothing.
 """
 
 import math
@@ -30,17 +30,17 @@ INF, MINUS_INF, NONE = np.array([np.inf, -np.inf, -2.0], np.float32).view(np.int
 
 
 class Distortion(NamedTuple):
-    """Faults of a device as applied to a return; each changes nothing where there is none."""
+    """Faults of a device, prepared to apply to a return; a missing fault changes nothing."""
 
     least: np.float32  # [m]
     most: np.float32
-    close: np.float32  # value for what is too close
+    close: np.float32  # value of a return that is too close
     std: np.float32  # of a range of 0, for a draw of 1 [m]
     grows: np.float32  # with the range [1]
     per_step: np.float32  # 1 / step of the quantisation [1/m]
     step: np.float32  # [m]
     rest: np.float32  # of the step, beyond float32
-    first: np.float32  # times the step, the minimum multiple within the limits
+    first: np.float32  # smallest multiple of the step within the limits, in steps
     last: np.float32
 
 
@@ -145,14 +145,14 @@ def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped
 
 @kernel(inline=True)
 def _told(value, measured, device):  # type: ignore[no-untyped-def]
-    """Return what was measured of a return, else what is told of what is too close or none."""
+    """Return the measured range, or the value reported for too close or no return."""
     other = device.close if value < device.close else value
     return measured if np.float32(value).view(np.uint32) < np.uint32(INF) else other
 
 
 @kernel(contracts=True, inline=True)
 def _coarse(value, device):  # type: ignore[no-untyped-def]
-    """Return the nearest multiple of the step that is within the limits."""
+    """Return the nearest multiple of the step within the limits."""
     count = np.floor(value * device.per_step + np.float32(0.5))
     count = device.first if count < device.first else count
     count = device.last if count > device.last else count
@@ -183,7 +183,7 @@ def _drop(ranges, share, far, by):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
-    """Write the pose (3,) `ago` [s] before, along the arc of a twist (3,); heading unwrapped."""
+    """Write the pose (3,) `ago` [s] earlier on the arc of a twist (3,); heading unwrapped."""
     turn = -twist[2] * ago
     half = 0.5 * turn
     # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.

@@ -34,17 +34,17 @@ class LidarFaults(Schema):
     the square of the range, in full at range_max.
     """
 
-    # which way it turns while the robot moves; none: all beams at once
+    # direction in which the device turns while the robot moves; none: all beams at once
     skew: Skew = "none"
-    # what it reports for a return nearer than range_min
+    # value reported for a return nearer than range_min
     too_close: TooClose = "minus_inf"
     # added to noise_std, per metre
     noise_proportional: float = Field(default=0.0, ge=0.0, le=10.0)
-    # returns are multiples of it [m]
+    # returns are multiples of this [m]
     quantisation: float = Field(default=0.0, ge=0.0, le=1e4)
     # probability that a return is lost
     dropout: float = Field(default=0.0, ge=0.0, le=1.0)
-    # added to dropout in full at range_max
+    # added to dropout, in full at range_max
     dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)
 
     @model_validator(mode="after")

@@ -1,7 +1,7 @@
 """Compiled fixtures of the worlds of a set, as lidars see them: walls and static maps.
 
-P worlds lie one after the other in flat arrays; of each copy that is simulated, `member` tells
-which one it is a copy of.
+P worlds are stored one after the other in flat arrays; `member` holds the world of each simulated
+copy.
 """
 
 from typing import NamedTuple
@@ -43,7 +43,7 @@ def grid_of(n, fixtures):  # type: ignore[no-untyped-def]
 
 @kernel(view=True)
 def fixtures_around(n, fixtures):  # type: ignore[no-untyped-def]
-    """Fixtures of one copy, as those of the only copy."""
+    """Fixtures of one copy, as if it were the only copy."""
     s = fixtures
     return Fixtures(s.member[n : n + 1], s.walls, s.first, s.squares, s.maps, s.frames)
 

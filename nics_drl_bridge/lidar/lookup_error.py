@@ -18,7 +18,7 @@ SEED = 0
 TOUCHING = 1e-3
 OUTLIER = 0.3  # maximum allowed error of any beam [m]
 DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
-# between line of sight and edge at most, in the search for outliers [rad]
+# maximum angle between line of sight and edge in the search for outliers [rad]
 SLANT = np.radians(1.5)
 # minimum interval of looked-up distances, as a fraction of the lidar's range
 NARROWEST = 0.1
@@ -65,7 +65,7 @@ def lookup_distances(
 def _widest(
     rings: Array, squares: Array, counts: Array, greatest: Array
 ) -> tuple[float, float]:
-    """Edges of the widest interval of rings in which all errors are small, or inf if too narrow."""
+    """Edges of the widest interval of rings with small errors, or inf if too narrow."""
     best = (np.inf, np.inf)
     width = NARROWEST * (rings[-1] - rings[0])
     for i in range(RINGS):
@@ -124,7 +124,7 @@ def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
 
 
 def _slanted(poses: Array, outline: Array, seed: int) -> Array:
-    """Draw poses with the lidar nearly on the line of an edge: rare, and off by its length."""
+    """Draw poses with the lidar nearly in line with an edge: rare, but with large errors."""
     rng = np.random.default_rng(seed)
     along = np.roll(outline, -1, axis=0) - outline
     length = np.hypot(*along.T)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 
-LANES = 48  # Beams that jump together: several vector registers, to hide the look-ups' latency
+LANES = 48  # beams that jump together: several vector registers hide the latency of look-ups
 DU, DV, PER_U, PER_V, U, V, T = (np.uintp(k * LANES) for k in range(7))
 COLUMN, ROW, ASIDE, ABOVE, QUADRANT, SIDE = (np.uintp(k * LANES) for k in range(6))
-"""Where the quantities of a lane begin: direction, its inverses, place in the cell of the lidar and
+"""Offsets of the quantities of a lane: direction, its inverses, place in the lidar's cell and
 distance [cells]; column and row relative to the lidar, index increments of one column and one row,
 the quadrant's bit shift, and the side of the free square."""
 LONGEST = 255  # side of the largest square that fits in a byte [cells]
@@ -72,7 +72,7 @@ def _line(at, step, cell):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _entry(at, step, size):  # type: ignore[no-untyped-def]
-    """Distances along a beam to where it enters and leaves [0, size] along one axis [cells]."""
+    """Distances along a beam at which it enters and leaves [0, size] on one axis [cells]."""
     if step == 0.0:
         return (-np.inf, np.inf) if 0.0 <= at < size else (np.inf, -np.inf)
     one = -at / step
@@ -84,7 +84,7 @@ def _entry(at, step, size):  # type: ignore[no-untyped-def]
 def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
     """Exact distance [cells] from (u, v) to the boundary of the solid cells, `inf` beyond `limit`.
 
-    Where the beam enters one, or from within, where it leaves it. All outside the map is free.
+    That is where the beam enters a solid cell, or leaves it if it starts inside. Outside is free.
     """
     rows = squares.shape[0] - 2
     columns = squares.shape[1] - 2
@@ -178,7 +178,7 @@ def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-un
     singles = lanes.single
     wholes = lanes.whole
     for j in range(LANES):
-        # idle ones repeat the last
+        # idle lanes repeat the last beam
         k = np.uintp(j)
         i = np.uintp(min(first + j, directions.shape[1] - 1))
         a = np.float32(directions[0, i])
@@ -208,7 +208,7 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
     """Move each lane to the end of its free square; True if any moved."""
     singles = lanes.single
     wholes = lanes.whole
-    # apart from the loop below, so that LLVM can vectorise that one
+    # separate from the loop below, so that LLVM can vectorise that loop
     for j in range(LANES):
         k = np.uintp(j)
         cell = (

@@ -1,4 +1,4 @@
-"""Static maps of square cells, also from files as Nav2's map_server reads them."""
+"""Static maps of square cells, also from the files of Nav2's map_server."""
 
 import io
 import struct
@@ -105,16 +105,16 @@ class GridMap:
 
 
 MAX_CELLS = 64_000_000
-MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not opened
+MAX_BYTES = 4 * MAX_CELLS + 2**20  # larger image files are not opened
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
-PIXELS_AT_ONCE = 2**20  # of an image whose brightness is computed
+PIXELS_AT_ONCE = 2**20  # pixels whose brightness is computed at once
 BRIGHTEST_16 = 65535.0  # of a pixel with 16 bits
-# of R, G, B (Rec. 709), as ImageMagick for Nav2
+# weights of R, G, B (Rec. 709), as in ImageMagick for Nav2
 LUMA = np.array([0.212656, 0.715158, 0.072186])
 
 
 class MapFile(Schema):
-    """The keys of a map's YAML file, those of Nav2's map_server.
+    """Keys of a map's YAML file, as in Nav2's map_server.
 
     Mode `trinary`: pixels are free, occupied, else unknown. `scale`: pixels between the thresholds
     become 0 to 100 %. `raw`: pixels from 0 to 100 are the percentage itself.
@@ -123,11 +123,13 @@ class MapFile(Schema):
     # path, absolute or relative to the folder of the YAML file
     image: str = Field(min_length=1)
     resolution: float = Field(ge=1e-4, le=100.0)  # side of a pixel [m]
-    origin: tuple[Coordinate, Coordinate, Heading]  # of the image's lower left corner
+    origin: tuple[
+        Coordinate, Coordinate, Heading
+    ]  # pose of the image's lower left corner
     negate: bool  # 0 or 1; True if white is occupied, rather than black
-    # from this darkness on pixels are occupied
+    # pixels at least this dark are occupied
     occupied_thresh: float = Field(ge=0.0, le=1.0)
-    free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
+    free_thresh: float = Field(ge=0.0, le=1.0)  # pixels at most this dark are free
     # how pixels become cells, see above
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
@@ -161,7 +163,7 @@ def files_of(name: str | Path) -> tuple[Path, Path]:
 
 
 def map_files(grid: GridMap, path: Path) -> None:
-    """Write a map as files of Nav2's map_server: YAML, and a PGM of the same name beside it.
+    """Write a map as files of Nav2's map_server: YAML, and a PGM of the same name next to it.
 
     `load_map` gives the same cells. They are trinary, or raw if some are neither free nor occupied.
     """
@@ -190,7 +192,7 @@ def map_files(grid: GridMap, path: Path) -> None:
 def cells_of(
     grey: NDArray[np.uint8], opaque: NDArray[np.bool_] | None, file: MapFile
 ) -> NDArray[np.int8]:
-    """Cells of an image (rows, columns) from its brightness and opacity, in its order of rows."""
+    """Cells (rows, columns) of an image from brightness and opacity, in the image's row order."""
     cells: NDArray[np.int8] = _cells_by_brightness(file)[grey]
     if opaque is not None and file.mode != "raw":
         cells[~opaque] = UNKNOWN

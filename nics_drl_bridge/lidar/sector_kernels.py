@@ -19,12 +19,12 @@ class SectorPlan(NamedTuple):
     """Assignment of the beams of one lidar to the sectors of one layout."""
 
     first: NDArray[np.int32]  # (S,) first beam of each sector
-    # (S,) number of its beams, which continue with beam 0 after the last
+    # (S,) number of beams of each sector; beam 0 follows the last
     hits: NDArray[np.int32]
     directions: NDArray[np.float64]  # (B, 2) of the beams in `base_link`
-    # (2,) of the lidar from the viewpoint [m]; zero: filled by beam
+    # (2,) position of the lidar relative to the viewpoint [m]; if zero, sectors are filled by beam
     shift: NDArray[np.float64]
-    angle_min: float  # begin of sector 0 [rad]
+    angle_min: float  # start of sector 0 [rad]
     width: float  # of the sectors [rad]
     range_min: float  # of the lidar [m]
     range_max: float
@@ -120,7 +120,7 @@ def _by_place(out, ranges, plan):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
-    """Sector of a return seen from the viewpoint, -1 if unknown, and its distance from there."""
+    """Sector of a return seen from the viewpoint, -1 if unknown, and its distance."""
     if r != r:
         return -1, np.float32(np.nan)
     reach = min(max(float(r), 0.5 * plan.range_min), plan.range_max)

@@ -29,7 +29,7 @@ Ranges = NDArray[np.float32]
 COARSEST_RAD = 0.21
 # A beam this near to a border counts in both: headers have angles in float32
 BORDER_RAD = 1e-4
-# Share by which a lidar's range may be less than the layout's, by float32
+# fraction by which a lidar's range may fall below the layout's, because of float32
 RANGE_TOLERANCE = 1e-5
 
 
@@ -37,7 +37,7 @@ class ScanLayout(Schema):
     """The scan that a policy sees: the nearest return in each sector, seen from the viewpoint."""
 
     sectors: int = Field(ge=4, le=1440)  # S
-    # begin of the first, counter-clockwise, in `base_link` [rad]
+    # start of the first sector in `base_link`; sectors follow counter-clockwise [rad]
     angle_min: float = -np.pi
     angle_max: float = np.pi  # end of the last sector [rad]
     range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns count as none [m]
@@ -68,9 +68,9 @@ LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars c
 
 
 def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
-    """Return the layout for a user's setting; ConfigError if it is none.
+    """Return the layout for a user's setting. Raises ConfigError if it is invalid.
 
-    None, a ScanLayout, a name in `LAYOUTS`, fields, or a number of sectors over the lidar's view.
+    It is None, a ScanLayout, a name in `LAYOUTS`, its fields, or a number of sectors over the view.
     """
     if given is None or isinstance(given, ScanLayout):
         return given
@@ -99,7 +99,7 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
 
 
 def sectors_over(lidar: LidarSpec) -> int:
-    """Number of sectors over a lidar's view, as wide as those of `LAYOUTS`."""
+    """Number of sectors over a lidar's view, with the width of those in `LAYOUTS`."""
     return max(4, round((lidar.angle_max - lidar.angle_min) / LAYOUTS["around"].width))
 
 
@@ -229,7 +229,7 @@ def reader_of(
         step = -step
     if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
         angles = f"angle_min {header.angle_min:g}, angle_increment {header.angle_increment:g}"
-        reason = "describes no lidar; mend the driver's parameters."
+        reason = "describes no lidar; fix the driver's parameters."
         raise ConfigError(f"LaserScan of {beams} beams, {angles}: {reason}")
     backwards = step < 0.0
     if backwards:
@@ -240,7 +240,7 @@ def reader_of(
         begin = -(-begin % turn)
     span = step * (beams - 1)
     if abs(span + step - turn) < 0.1 * step:
-        span = turn  # the next beam would be the first again
+        span = turn  # the beam after the last would be the first again
     elif turn - FULL_CIRCLE_TOLERANCE < span < turn + 0.1 * step:
         span = turn - 2.0 * FULL_CIRCLE_TOLERANCE  # first and last beam coincide
     fields = like.model_dump() | {
@@ -263,7 +263,7 @@ def reader_beside(
     near = np.allclose(limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4)
     same = near and found.lidar.beams == like.beams
     turned = found.lidar.angles - like.angles if same else np.ones(1)
-    # the same beams, off by full turns
+    # the beams may be the same, off by full turns
     whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))
     if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
         return Reader(like, found.backwards)

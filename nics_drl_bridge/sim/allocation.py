@@ -1,4 +1,4 @@
-"""Allocation of worlds, as the kernels take them: state, surroundings, and scratch memory."""
+"""Allocation of worlds for the kernels: state, surroundings and scratch memory."""
 
 import itertools
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ class Sizes:
 
     @property
     def crowded(self) -> bool:
-        """True if it pays to sort the bodies of a world into cells."""
+        """True if sorting the bodies of a world into cells pays off."""
         pairs = self.robots * (self.robots + self.obstacles)
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
 
@@ -57,7 +57,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     shape = (sizes.worlds, sizes.robots)
     bodies = sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
-    # One row for the newest; an age within a period needs the end of the period before it, too.
+    # One row for the newest; an age within a period also needs the end of the previous period.
     terms = make_terms(model.kinematics)
     longest = sizes.longest_delay + int(terms.late.max(initial=0))
     rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, longest))
@@ -122,7 +122,7 @@ def members_of(
 
 
 def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
-    """The same object for maps of the same content, which is then baked and stored once."""
+    """The same object for maps with equal content, which are then baked and stored once."""
     once: dict[Any, GridMap] = {}
     found: list[GridMap | None] = []
     for grid in grids:
@@ -140,7 +140,7 @@ def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
 
 
 def map_field(grid: GridMap | None) -> arrays.MapField:
-    """Return a static map as the kernels take it."""
+    """Return a static map for the kernels."""
     if grid is None:
         return arrays.NO_FIELD
     return arrays.MapField(
@@ -149,7 +149,7 @@ def map_field(grid: GridMap | None) -> arrays.MapField:
 
 
 def cells_of(sizes: Sizes, members: arrays.Members) -> BodyCells:
-    """Allocate the cells of all worlds, none where looking at all bodies takes less time."""
+    """Allocate the cells of all worlds, none if testing all bodies takes less time."""
     worlds = sizes.worlds if members.crowded or members.standing else 0
     return body_cells(worlds, sizes.robots + sizes.obstacles, members.standing)
 
@@ -176,7 +176,7 @@ def part_of(
     cells: BodyCells,
     part: slice,
 ) -> arrays.Part:
-    """Return the arguments of the kernels for one part of the worlds, with scratch of its own."""
+    """Return the kernels' arguments for one part of the worlds, with its own scratch memory."""
     dt, substeps, _ = model.timing
     motion = arrays.Dynamics(
         make_terms(model.kinematics), SERIES, float(dt), int(substeps)

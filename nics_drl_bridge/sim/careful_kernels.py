@@ -1,10 +1,10 @@
 """Compiled motion of the robots of one world in tight spots, up to their contacts.
 
-All bodies move at the same time. At the first contact, each body that approached the other stops:
-a robot until the end of the substep, an obstacle until the end of the period. Then the next
-contact is sought. A robot that touched something before does not stop but is turned aside: it
-loses what would bring it nearer, and slides and turns on. Shared arguments: m is a robot, until
-and time are in the substep [s].
+All bodies move at the same time. At the first contact, each body that approached the other stops: a
+robot until the end of the substep, an obstacle until the end of the period. Then the next contact
+is sought. A robot that was already in contact does not stop but is deflected: it loses the velocity
+component that would bring it nearer, and keeps sliding and turning. Shared arguments: m is a robot,
+until and time are in the substep [s].
 """
 
 import math
@@ -37,7 +37,7 @@ from nics_drl_bridge.sim.state import (
 )
 
 SHARE = 1e-3  # A body that contributes less than this fraction of the closing speed is not stopped
-SMALL = 0.1  # Step, in radii, by which an overlapping robot is moved to test whether it gets out
+SMALL = 0.1  # step, in radii, to test whether an overlapping robot moves out
 MOST_MOVES = 1000
 
 
@@ -286,11 +286,11 @@ def move_carefully(
 ) -> None:
     """Move the robots of one world that may meet something by one period, up to their contacts.
 
-    A robot in contact is marked and stops for the rest of the substep. In the next ones it slides
-    along what it touches, and turns, as far as that lets it. One that already overlaps something
-    gets no deeper. Without a contact it moves exactly as in `step_kernels.move_freely`. An obstacle
-    stopped by a robot is left with its mean velocity over the period; `any_moves` is true if any
-    obstacle does.
+    A robot in contact is marked and stops for the rest of the substep. Later it slides and
+    turns along what it touches, as far as possible. A robot that already overlaps something gets
+    no deeper. Without contact a robot moves exactly as in `step_kernels.move_freely`. An obstacle
+    stopped by a robot keeps its mean velocity over the period; `any_moves` is true if any obstacle
+    moves.
     """
     events = single.events
     touched = state.collided[n]

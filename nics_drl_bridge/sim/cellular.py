@@ -1,7 +1,8 @@
-"""Fields of cylinders grown by a cellular automaton, as those of BARN were: as many as wanted.
+"""Any number of fields of cylinders grown by a cellular automaton, as BARN's were.
 
-Cells are filled at random; then, some times, one with many filled neighbours is filled and one with
-few is emptied, which leaves clumps with ways between (Perille, Truong, Xiao and Stone, 2020).
+Cells are filled at random. Then, several times, cells with many filled neighbours are filled and
+cells with few are emptied, which leaves clumps with paths between them (Perille, Truong, Xiao and
+Stone, 2020).
 """
 
 import math
@@ -19,30 +20,30 @@ from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
 
 MOST_CELLS = 10_000
-TRIES = 200  # fields drawn for one world, until there is a way through
-# at least, at most so many of a cell's 8 neighbours are filled
+TRIES = 200  # fields drawn for one world, until one has a path through
+# a cell with at least, at most this many filled neighbours (of 8) is filled, emptied
 FILLED = 5
 EMPTIED = 1
-FINE = 2  # points of the search for a way, along a cell
+FINE = 2  # points per cell side in the search for a path
 
 
 class Cellular(Schema):
-    """Parameters of the worlds; each draws its own fill and smoothing between the two given."""
+    """Parameters of the worlds; each world draws its fill and smoothing from the given ranges."""
 
     kind: Literal["cellular"] = "cellular"  # which kind of generator this is
-    worlds: int = Field(ge=1, le=10_000)  # how many of them are made
-    # of the generator; another one makes other worlds
+    worlds: int = Field(ge=1, le=10_000)  # number of worlds
+    # seed of the generator; another seed makes other worlds
     seed: int = Field(default=0, ge=0)
-    columns: int = Field(default=30, ge=4)  # of cells across the field
-    rows: int = Field(default=30, ge=4)  # along it
-    # side, and diameter of a cylinder [m]
+    columns: int = Field(default=30, ge=4)  # number of cells across the field
+    rows: int = Field(default=30, ge=4)  # number of cells along the field
+    # side of a cell, and diameter of a cylinder [m]
     cell: float = Field(default=0.15, ge=0.01, le=10.0)
-    # fraction of the cells that are filled at first
+    # fraction of cells filled initially
     fill: tuple[float, float] = (0.1, 0.35)
     smoothing: tuple[int, int] = (2, 4)  # passes of the automaton
-    # free space before and behind [m]
+    # free space in front of and behind the field [m]
     margin: float = Field(default=4.0, ge=0.5, le=100.0)
-    # width that the way through has [m]
+    # width of the path through the field [m]
     passage: float = Field(default=0.5, ge=0.0, le=100.0)
 
     @model_validator(mode="after")
@@ -62,7 +63,7 @@ class Cellular(Schema):
 
 @lru_cache(2048)  # a training opens each of them several times
 def grow(given: Cellular, number: int) -> World:
-    """Return one of the worlds; the same for the same parameters. ConfigError if none has a way.
+    """Return one of the worlds, which the parameters determine. ConfigError if none has a path.
 
     The robot starts before the field, between two walls, and its goal lies beyond.
     """
@@ -72,7 +73,7 @@ def grow(given: Cellular, number: int) -> World:
         if _has_way(filled, given):
             return _world(filled, given, number)
     raise ConfigError(
-        f"key 'generate': none of {TRIES} fields drawn for world {number} has a way of "
+        f"key 'generate': none of {TRIES} fields drawn for world {number} has a path of "
         f"{given.passage:g} m; lower `fill` or `passage`."
     )
 

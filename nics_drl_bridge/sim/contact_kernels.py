@@ -1,8 +1,9 @@
 """Compiled contacts: which robots may touch something within a period, and what they touch.
 
-A robot whose circle cannot meet anything within the period moves freely; for the others, `near`
-lists the bodies that each substep tests. Where bodies are sorted into cells, a robot tests only
-those around it: all bodies in a crowd, in each period, or obstacles that stand, once in an episode.
+A robot whose circle cannot meet anything within the period moves freely. For the other robots,
+`near` lists the bodies to test in each substep. If bodies are sorted into cells, a robot tests only
+those around it. In a crowd all bodies are sorted in each period; otherwise standing obstacles are
+sorted once per episode.
 """
 
 import math
@@ -27,7 +28,7 @@ SEVERAL = 32
 def reaches(
     n: int, state: State, scene: Surroundings, nearby: Nearby, period: float
 ) -> tuple[float, bool]:
-    """Write how far what may move reaches in a period [s]; longest path, if an obstacle moves."""
+    """Write how far bodies reach in a period [s]; return longest path, if obstacles move."""
     reach = nearby.reach
     way = nearby.way
     bodies = state.bodies

@@ -1,4 +1,4 @@
-"""One world of a simulator: as its devices see it, and with robots that other physics moves."""
+"""One world of a simulator, as its devices see it or with robots moved by other physics."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ class DeviceWorld:
     ) -> None:
         self.simulator = simulator
         self._period = model.control_period
-        # Completes a scene that was drawn; the starts (1, M, 3) of its robots, if they were given.
+        # Completes a drawn scene and returns the starts (1, M, 3) of its robots, if given.
         self.arrange: Callable[[Scenes, Array | None], Array | None] = (
             lambda _, starts: starts
         )
@@ -61,7 +61,7 @@ class DeviceWorld:
 
     @property
     def touched(self) -> list[bool]:
-        """Per robot, true if it has touched something in this episode."""
+        """For each robot, true if it has touched something in this episode."""
         return [bool(one) for one in self.simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
@@ -88,7 +88,7 @@ class DeviceWorld:
         self._before[:] = self.simulator.data.pose[0]
 
     def exchange(self, simulator: FastSimulator, kept: NDArray[np.int64]) -> None:
-        """Go on in another simulator, whose first robots are those of these numbers here."""
+        """Continue in another simulator, whose first robots have these numbers here."""
 
         def moved(old: Array, new: Array) -> Array:
             new[: len(kept)] = old[kept]
@@ -101,7 +101,7 @@ class DeviceWorld:
         self._before = simulator.data.pose[0].copy()
 
     def put(self, robot: int) -> None:
-        """Take note that a robot was put elsewhere, which is no motion."""
+        """Record that a robot was put elsewhere, which does not count as motion."""
         self._before[robot] = self.simulator.data.pose[0, robot]
 
     def advance(self) -> None:
@@ -132,7 +132,7 @@ class DeviceWorld:
         )
 
 
-# Of odometry without noise: in ROS, a covariance of zeros means unknown
+# variance of odometry without noise; in ROS, a covariance of zeros means unknown
 LEAST_VARIANCE = 1e-9
 
 

@@ -68,7 +68,7 @@ def test_a_disc_as_wide_as_the_passage_can_get_to_the_goal(number):
 
 def test_a_field_without_a_way_is_refused():
     with pytest.raises(
-        ConfigError, match=r"has a way of 0\.5 m; lower `fill` or `passage`"
+        ConfigError, match=r"has a path of 0\.5 m; lower `fill` or `passage`"
     ):
         grow(Cellular(worlds=1, fill=(0.9, 0.9)), 0)
 
