@@ -1,4 +1,4 @@
-"""Entities of one world by their names: what stands there, is put elsewhere, comes and goes."""
+"""Entities of one world by name: what stands there, is moved, spawned or removed."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -19,20 +19,20 @@ from nics_drl_bridge.sim.sections import Placed
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-OBSTACLE = "obstacle_"  # and its number: the name of an obstacle of the world
+OBSTACLE = "obstacle_"  # prefix of the name of a world's obstacle, before its number
 NAME = re.compile(r"(?=.{1,120}\Z)[A-Za-z0-9_][A-Za-z0-9_./-]*")
-REACH = 10.0  # twist that a robot may be given, as a multiple of its maximum command
-CORNERS = 32  # of the outline that stands for a circle
+REACH = 10.0  # limit of a twist set on a robot, as a multiple of its maximum command
+CORNERS = 32  # number of corners of the outline that represents a circle
 
 # Makes the simulator of a world for a number of robots.
 
 
 class UnknownEntityError(BridgeError):
-    """There is no entity of that name."""
+    """No entity has that name."""
 
 
 class StillError(BridgeError):
-    """A twist was asked of an entity that stands still."""
+    """A twist was requested for an entity that stands still."""
 
 
 class OutsideError(BridgeError):
@@ -41,29 +41,29 @@ class OutsideError(BridgeError):
 
 @dataclass(eq=False)
 class Entity:
-    """A robot, or one or several shapes that move as one."""
+    """A robot, or one or more shapes that move as one."""
 
     name: str
     robot: int = -1  # index of the robot; -1 for shapes
     slots: tuple[int, ...] = ()  # indices of the bodies of its shapes
     # its shapes and their poses in the entity's own frame
     parts: tuple[Placed, ...] = ()
-    # (3,) where it was spawned; None for what the world came with
+    # (3,) pose at which it was spawned; None if it belongs to the world
     start: Array | None = None
     motion: Motion | None = None
 
 
 @dataclass
 class Entities:
-    """All entities of the world of a device; those of the world itself may be removed, too.
+    """All entities of a device's world; even those of the world itself may be removed.
 
-    `make` makes another simulator where shapes come that it has no room for, or robots come and
-    go; the episode goes on in it.
+    When robots come or go, or shapes come for which the simulator has no space, `make` makes a new
+    simulator, in which the episode continues.
     """
 
     device: DeviceWorld
     world: AnyWorld
-    robots: tuple[str, ...]  # names of those that the simulator began with
+    robots: tuple[str, ...]  # names of the robots that the simulator started with
     make: Callable[[AnyWorld, int], FastSimulator]
     removed: set[int] = field(default_factory=set)  # slots of the world's own obstacles
     spawned: dict[str, Entity] = field(default_factory=dict)
@@ -78,7 +78,7 @@ class Entities:
 
     @property
     def simulator(self) -> FastSimulator:
-        """The simulator that holds them at present."""
+        """The present simulator of the entities."""
         return self.device.simulator
 
     def _arrange(self, scenes: Scenes, starts: Array | None) -> Array:
@@ -87,7 +87,7 @@ class Entities:
         bodies[sorted(self.removed), RADIUS] = 0.0
         found = scenes.starts.copy()
         if starts is not None:
-            # that are still there
+            # robots of the start that are still there
             own = [self.robots.index(name) for name in self._launched]
             found[:, : len(own)] = starts[:, own]
         for entity in self.spawned.values():
@@ -109,7 +109,7 @@ class Entities:
             bodies[slot] = place(at, shape.radius, index)
 
     def bodies(self) -> Array:
-        """Return (K, 7) all obstacles as they stand, by their slots."""
+        """Return all obstacles (K, 7) as they stand, in the order of slots."""
         if self.simulator.moves:  # in the order of the slots
             self._table = self.simulator.obstacles[0]
         return self._table
@@ -168,12 +168,12 @@ class Entities:
         if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
             held = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
             told = f"x {pose[0]:g} m, y {pose[1]:g} m is outside the world"
-            raise OutsideError(f"{told}, which has {held}; move it.")
+            raise OutsideError(f"{told}, which spans {held}; move it.")
 
     def move(self, entity: Entity, pose: Array | None, twist: Array | None) -> None:
         """Put an entity at a pose (3,), or give it a twist (3,) along the axes of `map`.
 
-        Raises StillError for a twist of what stands still, ConfigError for one beyond a robot's
+        Raises StillError for a twist of an entity at rest, ConfigError for one beyond a robot's
         reach, OutsideError for a pose outside.
         """
         if (
@@ -182,7 +182,7 @@ class Entities:
             and entity.robot < 0
             and entity.motion is None
         ):
-            fix = "set its pose alone, or a twist of zeros"
+            fix = "set only its pose, or a zero twist"
             raise StillError(f"{entity.name!r} stands still and takes no twist; {fix}.")
         if pose is not None:
             self.require_inside(pose)
@@ -210,7 +210,7 @@ class Entities:
                 > REACH * np.maximum(-spec.command_low, spec.command_high)
             ).any():
                 told = f"the twist is more than {REACH:g} times what {spec.name!r} can be commanded"
-                raise ConfigError(f"{told}; give a slower one.")
+                raise ConfigError(f"{told}; give a smaller one.")
             state = textbook(spec).target(command)
         simulator.put_robot(robot, np.array(at), np.array(state))
         self.device.put(robot)
@@ -220,9 +220,9 @@ class Entities:
         self.simulator.put_bodies(bodies)
 
     def free_name(self, name: str) -> str:
-        """Return a name that no entity has: the given one, or that and a number."""
+        """Return an unused name: the given one, or the given one with a number."""
         taken = {entity.name for entity in self}
-        # A name of the world's own obstacles may come back with the next episode.
+        # Names of the world's own obstacles may return with the next episode.
         taken |= {f"{OBSTACLE}{k}" for k in range(self._own)}
         free = name
         number = 1
@@ -234,7 +234,7 @@ class Entities:
     def spawn(self, name: str, parts: Sequence[Placed], pose: Array) -> Entity:
         """Add shapes, at poses (3,) in the frame of an entity that is put at a pose (3,).
 
-        Raises OutsideError, and ConfigError for what the simulator can't hold.
+        Raises OutsideError, and ConfigError for shapes that the simulator can't hold.
         """
         self.require_inside(pose)
         used = {slot for entity in self.spawned.values() for slot in entity.slots}
@@ -285,7 +285,7 @@ class Entities:
         kept = [m for m in range(self.device.robots) if m != entity.robot]
         if not kept:
             raise ConfigError(
-                f"{entity.name!r} is the last robot, which a simulator needs."
+                f"{entity.name!r} is the last robot; a simulator needs one."
             )
         self.spawned.pop(entity.name, None)
         if entity.robot < 0:
@@ -301,7 +301,7 @@ class Entities:
         self._remake(self._spare, kept)
 
     def restore(self) -> None:
-        """Remove all that was spawned; from the next episode on all that was removed is back."""
+        """Remove all spawned entities; removed ones return with the next episode."""
         if self._spare or self.spawned or self._launched != list(self.robots):
             kept = list(range(len(self._launched)))
             self.spawned.clear()
@@ -312,16 +312,16 @@ class Entities:
     def _remake(
         self, spare: Sequence[Shape], robots: Sequence[int], count: int = 0
     ) -> None:
-        """Make a simulator for robots of these numbers here, and so many in all; go on in it."""
+        """Make a simulator that keeps these robots, with `count` in all, and continue in it."""
         old = self.simulator
         bodies = self.bodies().copy()
-        # An own world, as the simulator of the present one goes on if this one can't be made.
+        # A separate world, because the present simulator goes on if this one can't be made.
         new = self.make(self.world.with_spare(tuple(spare)), count or len(robots))
         slots = np.arange(new.sampler.count)
         slots[len(bodies) :] = -1
         table = np.zeros((len(slots), 7))
         table[: len(bodies)] = bodies[: len(slots)]
-        # The shapes that are spare come last, and each of them has a slot of its own.
+        # Spare shapes come last, and each has its own slot.
         new.take_over(old, np.array(robots, np.int64), slots)
         new.put_bodies(table)
         self._spare = list(spare)

@@ -1,6 +1,6 @@
-"""Guide: how far robots still have to drive to their goals, around all that stands in a scene.
+"""Guide: remaining path lengths of robots to their goals, around everything in a scene.
 
-Only a simulator knows it: it is for the reward of a training.
+Only a simulator knows them; they serve as a reward in training.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ from nics_drl_bridge.sim.scenes import Scenes, SetSampler
 from nics_drl_bridge.sim.state import State
 
 CELL = 0.15  # side of a cell [m]
-MOST_CELLS = 10_000  # in fields with more cells it is larger
+MOST_CELLS = 10_000  # larger fields get larger cells
 
 
 class Guide:
-    """Lengths of the ways from the robots to their goals, in `worlds` copies of a world or set.
+    """Path lengths from the robots to their goals, in `worlds` copies of a world or set.
 
     Args:
-        sampler: of the scenes.
+        sampler: sampler of the scenes.
         footprint: outline of the robots.
         worlds: N, number of copies.
     """
@@ -64,14 +64,14 @@ class Guide:
         self.fields = np.zeros((worlds, sampler.robots, *walls.shape[1:]), np.float32)
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
-        """Find the ways in the scenes of episodes that begin in some worlds (n,)."""
+        """Compute the path lengths in the scenes of episodes that begin in some worlds (n,)."""
         given = worlds, np.asarray(scenes.member, np.int64), scenes.bodies, scenes.goals
         kernels.guide(self.fields, *given, self._grid)
 
     def lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:
-        """Lengths (n, M) [m] of the ways from where the robots of some worlds are.
+        """Path lengths (n, M) [m] from the present places of the robots of some worlds.
 
-        A metre counts for more than one where obstacles are near, see `guide_kernels`.
+        Near obstacles, a metre counts as more than one; see `guide_kernels`.
         """
         poses = data.pose[rows]
         out = np.empty(poses.shape[:2])

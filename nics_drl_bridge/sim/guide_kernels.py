@@ -1,8 +1,8 @@
-"""Compiled: how far a robot still has to drive to its goal, around all that stands.
+"""Compiled path lengths from robots to their goals, around everything that stands.
 
-The arrival times of a front that starts at the goal (eikonal equation), on square cells, by fast
-sweeping (Zhao 2005). Near obstacles the front is slower, so that wide ways are shorter than tight
-ones; inside them it is slow, but goes on, so that every place has its way.
+They are the arrival times of a front that starts at the goal (eikonal equation), computed on square
+cells by fast sweeping (Zhao 2005). Near obstacles the front is slower, so wide paths count as
+shorter than tight ones. Inside obstacles it is slow but does not stop, so every place has a path.
 """
 
 import math
@@ -17,17 +17,17 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
 from nics_drl_bridge.sim.state import Array, Integers
 
-# space beside the robot's circle from which on a way is no longer tight [m]
+# free space around the robot's circle above which a path is no longer tight [m]
 COMFORT = 0.3
 TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
-"""Cost of a metre where the circle just fits, where only the outline does, and where nothing does;
+"""Cost of a metre where the circle just fits, where only the outline fits, and where neither fits;
 in between it is interpolated."""
 ROUNDS, SETTLED = 20, np.float32(1e-3)
-"""Maximum number of sweeps in all four directions, and their change that ends them before [m]."""
+"""Maximum number of sweeps in all four directions, and the change that ends them earlier [m]."""
 
 
 class GuideGrid(NamedTuple):
-    """Cells over the worlds of a set of P, and all that stands in every scene."""
+    """Cells over the P worlds of a set, and everything that stands in every scene."""
 
     walls: NDArray[np.float32]  # (P, rows, columns) distance to walls and map [m]
     frames: Array  # (P, 3) minimum x, y and the cells' side [m]
@@ -40,7 +40,7 @@ class GuideGrid(NamedTuple):
 
 @kernel(allocates=True)
 def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
-    """Write the distances (rows, columns) to walls and map, which `cells` have, of coarser cells.
+    """Write the distances of `cells` to walls and map for coarser cells (rows, columns).
 
     The field is `extent` (4,), beyond which nothing is free.
     """
@@ -58,9 +58,9 @@ def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-def]
-    """Write lengths of ways [m] from each cell to out[world, m] (rows, columns) float32.
+    """Write path lengths [m] from each cell to out[world, m] (rows, columns) float32.
 
-    Of the worlds (n,) given: member (n,), bodies (n, K, 7), goals (n, M, 2).
+    For the worlds (n,): member (n,), bodies (n, K, 7), goals (n, M, 2).
     """
     rows = grid.walls.shape[1]
     columns = grid.walls.shape[2]
@@ -114,7 +114,7 @@ def _gap(x, y, body, outline):  # type: ignore[no-untyped-def]
 
 @kernel
 def _cost(space, grid):  # type: ignore[no-untyped-def]
-    """Cost of a metre at a place with so much space around it [m]."""
+    """Cost of a metre at a place, given the free space around it [m]."""
     beside = space - grid.outer
     if beside >= COMFORT:
         return 1.0
@@ -147,9 +147,9 @@ def _spread(field, cost, u, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
-    """Update the ways row by row, from one of the corners; return the maximum change [m].
+    """Update the path lengths row by row from one corner; return the maximum change [m].
 
-    Both (rows, columns) are float32; the price of a cell is that of crossing it.
+    Both (rows, columns) are float32; the price of a cell is the cost of crossing it.
     """
     rows, columns = ways.shape
     most = np.float32(0.0)
@@ -179,7 +179,7 @@ def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def lengths(out, poses, member, fields, grid):  # type: ignore[no-untyped-def]
-    """Write the lengths (N, M) [m] of the ways from poses (N, M, 3), interpolated linearly."""
+    """Write the path lengths (N, M) [m] from poses (N, M, 3), interpolated linearly."""
     for n in range(out.shape[0]):
         p = member[n]
         x = grid.frames[p, 0]

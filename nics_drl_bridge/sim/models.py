@@ -1,4 +1,4 @@
-"""Models of entities to spawn: shapes and where they are in the entity, of YAML or SDF."""
+"""Models of entities to spawn, from YAML or SDF: shapes and their poses in the entity."""
 
 import tempfile
 from collections.abc import Iterator
@@ -16,19 +16,19 @@ from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, root_of
 from nics_drl_bridge.sim.sections import Placed
 from nics_drl_bridge.sim.world import Pose
 
-HEIGHT = 0.2  # of what counts in SDF, as with `nics world import` [m]
+HEIGHT = 0.2  # height at which SDF bodies count, as in `nics world import` [m]
 MOST_PARTS = 100
 TEXT = "resource_string"  # the place that errors in a text name
 
 
 class ModelFile(Schema):
-    """The keys of a YAML file of an entity; a single shape may stand alone, without them."""
+    """Keys of an entity's YAML file; a single shape may stand alone, without these keys."""
 
     name: str = ""
     description: str = ""
     tags: tuple[str, ...] = ()
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_PARTS)
-    # of each shape in the entity [m, m, rad]; at its origin by default
+    # pose of each shape in the entity [m, m, rad]; at its origin by default
     at: tuple[Pose, ...] = ()
 
     @model_validator(mode="after")
@@ -50,7 +50,7 @@ class Model(NamedTuple):
 
 
 def model_of_yaml(text: str, source: str = TEXT) -> Model:
-    """Read an entity of YAML: the keys of `ModelFile`, or those of one shape. ConfigError."""
+    """Read an entity from YAML: the keys of `ModelFile` or of one shape. Raises ConfigError."""
     content = parse_yaml(text, source)
     if "kind" in content:
         content = {"shapes": [content]}
@@ -62,7 +62,7 @@ def model_of_yaml(text: str, source: str = TEXT) -> Model:
 
 
 def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
-    """Read an entity of SDF, whose origin is spawned at a height z [m].
+    """Read an entity from SDF, whose origin is spawned at a height z [m].
 
     Raises ConfigError for no SDF, more than one model, or what is no shape; `AssetsError` of it
     where that is a mesh, or a file that is not there; BridgeError for too many shapes.

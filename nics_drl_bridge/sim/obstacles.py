@@ -44,13 +44,15 @@ class Patrol(Schema):
     speed: float = Field(gt=0.0, le=FASTEST)  # [m/s]
     # continue from the last waypoint to the first; otherwise back and forth
     loop: bool = True
-    pause: float = Field(default=0.0, ge=0.0, le=1e6)  # at each waypoint [s]
+    pause: float = Field(
+        default=0.0, ge=0.0, le=1e6
+    )  # waiting time at each waypoint [s]
 
     @model_validator(mode="after")
     def _apart(self) -> "Patrol":
         corners = [*self.waypoints, *self.waypoints[: int(self.loop)]]
         if any(one == other for one, other in pairwise(corners)):
-            raise ValueError("two waypoints that follow each other must differ")
+            raise ValueError("consecutive waypoints must differ")
         return self
 
 
@@ -64,9 +66,9 @@ class Pedestrian(Schema):
     """
 
     kind: Literal["pedestrian"] = "pedestrian"  # which kind of motion this is
-    # range of the desired one, per episode; its end is a limit [m/s]
+    # range of the desired speed, drawn per episode; its upper end is a limit [m/s]
     speed: Speed = (1.08, 1.6)
-    # tau, to the desired velocity [s]
+    # tau, relaxation time to the desired velocity [s]
     relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
     repulsion: Strength = 2.1  # V0 [m^2/s^2] of walkers, obstacles and robots
     range: Distance = 0.3  # sigma [m]
@@ -74,9 +76,9 @@ class Pedestrian(Schema):
     wall_range: Distance = 0.2  # R [m]
     # delta t, the time by which the others' motion is extrapolated [s]
     foresight: Strength = 1.0
-    # 2 phi [rad]
+    # 2 phi, angle of sight [rad]
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
-    # c, weight of forces from out of sight
+    # c, weight of forces from outside the angle of sight
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
     fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
 
@@ -87,7 +89,7 @@ Motion = Annotated[Patrol | Pedestrian, Field(discriminator="kind")]
 def plan_arrays(
     motions: Sequence[Patrol | Pedestrian | None],
 ) -> tuple[Array, Array]:
-    """Return the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
+    """Return the plans (K, P) of obstacles with these motions, and patrols' waypoints (Q, 2)."""
     rows = np.zeros((len(motions), at.PLAN))
     waypoints = np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):

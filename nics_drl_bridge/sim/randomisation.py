@@ -76,9 +76,9 @@ class KinematicRanges(Schema):
     """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
 
     scale: Factor = AS_IT_IS  # for every coefficient
-    # on all time constants of the state alike, one for each robot
+    # one factor per robot on all time constants of the state
     response: Factor = AS_IT_IS
-    # overrides it, by name of a rate (`wz`)
+    # overrides `scale`, by name of a rate (`wz`)
     dofs: dict[str, Factor] = Field(default_factory=dict)
     # overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`
     terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
@@ -88,11 +88,11 @@ class OdometryRanges(Schema):
     """Errors of odometry and motion: factors on the model's levels, or levels instead."""
 
     noise: Factor | None = None  # factor on the noise of the measured twist
-    # on the motion that the model does not explain, if measured
+    # factor on the motion that the model does not explain, if measured
     drift: Factor | None = None
     odom_linear: Level | None = None  # noise of velocity [m/s]
-    odom_angular: Level | None = None  # of yaw rate [rad/s]
-    position_drift: Level | None = None  # of x and y [m/sqrt(s)]
+    odom_angular: Level | None = None  # noise of yaw rate [rad/s]
+    position_drift: Level | None = None  # drift of x and y [m/sqrt(s)]
     heading_drift: Level | None = None  # [rad/sqrt(s)]
 
     @model_validator(mode="after")
@@ -110,7 +110,7 @@ class OdometryRanges(Schema):
 
 
 class LidarRanges(Schema):
-    """Noise and faults instead of the model's, see `LidarFaults`; words are all equally likely."""
+    """Noise and faults in place of the model's, see `LidarFaults`; words are equally likely."""
 
     noise_std: Level | None = None  # see `LidarSpec` [m]
     noise_proportional: Level | None = None  # added to it for each metre of range [m/m]
@@ -137,7 +137,7 @@ class ObstacleRanges(Schema):
 
     count: tuple[int, int] | None = None  # [minimum, maximum], instead of the world's
     size: Factor = AS_IT_IS  # factor on the size of every obstacle, one per episode
-    # number of sizes, evenly spaced: each is baked
+    # number of sizes, evenly spaced; each is baked
     rungs: int = Field(default=5, ge=2, le=100)
 
     @model_validator(mode="after")
@@ -150,7 +150,7 @@ class ObstacleRanges(Schema):
 
 
 class Randomisation(Schema):
-    """Ranges that are drawn from in every episode; all else stays as in model and world."""
+    """Ranges to draw from in every episode; everything else stays as in model and world."""
 
     name: str  # used in messages
     # factors on the motion of the model
@@ -171,7 +171,7 @@ class Randomisation(Schema):
         )
 
     def alone(self) -> "dict[str, Randomisation]":
-        """Each of the given ranges without the others, by the name of its field."""
+        """Each of the set ranges alone, by the name of its field."""
         given = {name: getattr(self, name) for name in type(self).model_fields}
         names = (name for name in given if name in self.model_fields_set - {"name"})
         return {
@@ -222,7 +222,7 @@ class Draws:
 
 
 class Sampler:
-    """Draws an episode's numbers, each fixed by seed, robot, group, column: alike in any batch."""
+    """Draws an episode's numbers; seed, robot, group and column fix each one in any batch."""
 
     def __init__(
         self, randomisation: Randomisation, model: SimulatorModel, robots: int = 1

@@ -36,7 +36,7 @@ X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
 
 
 class FreeSpace(NamedTuple):
-    """All that stands in every scene, and where robots fit between it."""
+    """Everything that stands in every scene, and where robots fit in between."""
 
     cells: MapField  # distances to the nearest wall or solid cell of the map
     # (rows, columns) number of the connected free space; 0 for none
@@ -129,7 +129,7 @@ def area_of(x, y, space):  # type: ignore[no-untyped-def]
 
 @kernel
 def _within(x, y, space):  # type: ignore[no-untyped-def]
-    """True if a point is in field and grid; with lower and upper bound of its distance to walls."""
+    """True if a point is in field and grid, and bounds of its distance to walls."""
     distances = space.cells.distances
     bounds = space.bounds
     i, j, off = cell_of(x, y, space.cells)
@@ -273,7 +273,7 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
 def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
     """Draw a point in one of the chosen cells, given by row-major indices; take 3 counters."""
     cell = int(uniform_of(source, counter) * chosen.shape[0])
-    # of all cells, a look-up would only miss the cache
+    # if all cells are allowed, the look-up would only miss the cache
     if chosen.shape[0] < cells.distances.size:
         cell = chosen[cell]
     i = cell // cells.distances.shape[1]
@@ -498,7 +498,7 @@ def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: 
     count = plan.group.shape[0]
     s = scratch
     cells = scratch.cells
-    # the scratch may be for the most obstacles of several worlds
+    # the scratch memory may be sized for another world with more obstacles
     found = cells.found[:count]
     cells = BodyCells(cells.first, cells.then, cells.ordered, cells.frame, found)
     scratch = SceneScratch(

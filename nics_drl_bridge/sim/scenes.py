@@ -50,13 +50,13 @@ class Scene:
 
 
 class Scenes(Scene):
-    """Scenes of n seeds, arrays (n, ...) as in `Scene`; `scenes[i]` is that of one."""
+    """Scenes of n seeds, as arrays (n, ...) of the fields of `Scene`; `scenes[i]` is one scene."""
 
     member: NDArray[np.int64]
 
     @classmethod
     def of(cls, n: int, obstacles: int, robots: int) -> "Scenes":
-        """Allocate n scenes, without anything in them."""
+        """Allocate n empty scenes."""
         starts = np.zeros((n, robots, 3))
         goals = np.zeros((n, robots, 2))
         return cls(np.zeros((n, obstacles, BODY)), starts, goals, np.zeros(n, np.int64))
@@ -75,12 +75,12 @@ class Scenes(Scene):
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Things that the worlds of a set share: all shapes in the first size, then in the next."""
+    """Data shared by the worlds of a set: all shapes in the first size, then in the next."""
 
     shapes: tuple[Shape, ...]
     place: Mapping[Shape, int]  # of each shape in the first size
     outlines: Outlines  # of the shapes, and of a disc
-    spaces: dict[str, FreeSpace]  # of worlds that differ in their obstacles alone
+    spaces: dict[str, FreeSpace]  # shared by worlds that differ only in their obstacles
 
     @classmethod
     def of(cls, world: AnyWorld, sizes: Sequence[float]) -> "Catalogue":

@@ -1,4 +1,4 @@
-"""Worlds of Gazebo, in SDF (http://sdformat.org): what stands there at a height above the ground.
+"""Gazebo worlds in SDF (http://sdformat.org): what stands at a height above the ground.
 
 Only collision geometry counts, since that is what a robot touches. Poses are composed in space, of
 models, links, frames and includes; a plane at the height of the lidar then cuts the bodies. Where
@@ -28,14 +28,14 @@ from nics_drl_bridge.sim import sections
 from nics_drl_bridge.sim.sections import Placed, ShapelessError, Solid, Standing
 from nics_drl_bridge.sim.world import MOST_OBSTACLES
 
-MOST_BYTES = 2**24  # of a file; the largest saved worlds have some megabytes
-MOST_MODELS = 20_000  # with all that are included
+MOST_BYTES = 2**24  # limit of a file; the largest saved worlds have some megabytes
+MOST_MODELS = 20_000  # including included models
 # versions of SDF
 OLDEST = (1, 4)
 NEWEST = (1, 12)
 PATHS = "GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH"
 ABSENT = "which is neither"
-HARMLESS = "sun", "ground_plane"  # included by most worlds, and nothing to run into
+HARMLESS = "sun", "ground_plane"  # most worlds include them; they are no obstacles
 MOVING = {
     "actor": "an actor, which moves by a script",
     "population": "a population of models",
@@ -45,11 +45,11 @@ NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
 
 
 class AssetsError(ConfigError):
-    """An SDF file holds what is no shape of a world, or what is not there."""
+    """An SDF file contains something that is not a shape of a world, or a missing file."""
 
     @property
     def missing(self) -> bool:
-        """True if a file is not there."""
+        """True if a file is missing."""
         return ABSENT in str(self)
 
 
@@ -63,14 +63,14 @@ def read_sdf(
     """Read what stands in a Gazebo world at a height [m] above z = 0.
 
     Args:
-        path: of a `.world` or `.sdf` file.
-        height: at which bodies count, that of the lidar [m].
+        path: path of a `.world` or `.sdf` file.
+        height: height at which bodies count, that of the lidar [m].
         without: names of models to leave out, in which `*` stands for anything.
-        skip_unknown: True to leave out what is no shape of a world: meshes, bodies that lean.
+        skip_unknown: True to leave out what can't be a shape: meshes, and bodies that lean.
         may_be_empty: True for a world in which nothing stands.
 
     Raises:
-        ConfigError: the file is damaged or no SDF, holds what is no shape, or nothing stands there.
+        ConfigError: the file is damaged or not SDF, has an unknown shape, or nothing stands there.
     """
     check_path("path", path)
     path = Path(path)
@@ -115,7 +115,7 @@ def read_sdf(
 
 
 def _section_of(body: "_Body", height: float) -> Placed | None:
-    """The shape of a body at a height [m]; None for the ground, and for what is above or below.
+    """The shape of a body at a height [m]; None for the ground and for bodies above or below.
 
     Raises ShapelessError, and ConfigError for a shape that no world takes.
     """
@@ -133,7 +133,7 @@ def _section_of(body: "_Body", height: float) -> Placed | None:
 
 
 class _Order:
-    """Names to leave out, and which files and how many models have been opened."""
+    """Names to leave out, the opened files, and the number of opened models."""
 
     def __init__(self, without: tuple[str, ...]) -> None:
         self._without = without
@@ -152,7 +152,7 @@ class _Order:
 
 
 class _Scope:
-    """A world or a model: its frames by their names, and what is in it."""
+    """A world or a model: its frames by name, and its contents."""
 
     def __init__(
         self,
@@ -177,7 +177,7 @@ class _Scope:
         states = element.iterfind("state/model")
         self._state = {one.get("name", ""): one.find("pose") for one in states}
         self._named: dict[str, Element | _Scope] = {}
-        self._open: set[str] = set()  # frames whose poses are being looked for
+        self._open: set[str] = set()  # frames whose poses are being resolved
         order.count(file)
         for child in element:
             self._add(child)
@@ -437,7 +437,7 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def _world(path: Path) -> Element:
-    """The world of a file, or its root where that holds models alone."""
+    """The world of a file, or its root if that contains only models."""
     root = root_of(path)
     worlds = root.findall("world")
     if len(worlds) > 1 or not (worlds or root.findall("model")):
@@ -463,7 +463,7 @@ def root_of(path: Path) -> Element:
 
 
 def _tree(path: Path) -> Element:
-    """Read XML. Raises ConfigError with line and column, and for declared entities, which grow."""
+    """Read XML. Raises ConfigError with line and column, and for entity declarations."""
     try:
         if check_no_device(path).stat().st_size > MOST_BYTES:
             reason = f"is larger than {MOST_BYTES // 2**20} MB, which no such file is"

@@ -1,4 +1,4 @@
-"""Solid bodies in space, and what a horizontal plane cuts out of them: shapes of a world."""
+"""Solid bodies in space, and the shapes that a horizontal plane cuts out of them."""
 
 import math
 from collections.abc import Callable
@@ -21,17 +21,17 @@ from nics_drl_bridge.sim.world import Obstacles, Region
 
 TILT = 1e-3  # up to this angle [rad] a body counts as upright: a millimetre in a metre
 DIGITS = 6  # shapes and poses are rounded to a micrometre
-AROUND = 1.0  # of the bounds, around starts and goals [m]
+AROUND = 1.0  # margin of the bounds around starts and goals [m]
 
 
 class Box(NamedTuple):
-    """Centred at its own origin."""
+    """A box centred at its own origin."""
 
     size: tuple[float, ...]  # along x, y, z [m]
 
 
 class Cylinder(NamedTuple):
-    """Along its own z, centred at its origin."""
+    """A cylinder along its own z, centred at its origin."""
 
     radius: float  # [m]
     length: float  # [m]
@@ -45,20 +45,20 @@ class Capsule(NamedTuple):
 
 
 class Sphere(NamedTuple):
-    """Around its own origin."""
+    """A sphere around its own origin."""
 
     radius: float  # [m]
 
 
 class Prism(NamedTuple):
-    """An outline that is extruded from its own z = 0 upwards."""
+    """An outline extruded upwards from its own z = 0."""
 
     points: tuple[tuple[float, ...], ...]  # x, y of the corners [m]
     height: float  # [m]
 
 
 class ShapelessError(ValueError):
-    """A body whose section is none of the shapes; its text says what it is."""
+    """A body whose section is not a shape of a world; the text names the body."""
 
 
 Solid = Box | Cylinder | Capsule | Sphere | Prism
@@ -83,7 +83,7 @@ class Standing(NamedTuple):
         )
 
     def bounds(self, *places: tuple[float, ...]) -> Region:
-        """Return the minimum field that holds all shapes, and 1 m around places x, y, ... [m]."""
+        """Return the smallest field with all shapes, and 1 m around places x, y, ... [m]."""
         around = AROUND * np.array([(-1.0, -1.0), (1.0, 1.0)])
         corners = [around + place[:2] for place in places]
         for shape, pose in self.placed:

@@ -141,7 +141,7 @@ def measure(
 
 @kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
-    """Draw ahead, aside [m], at most std sqrt(3 period), and turn [rad]; move the state."""
+    """Draw drift ahead, aside [m], at most std sqrt(3 period), and turn [rad]; move the state."""
     std = state.noise
     counter = state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
@@ -264,7 +264,7 @@ def _scan_alone(
         fault_kernels.slice_poses(
             scans.slices, spot[0, 0], drive, lidar.sweep_time, skew
         )
-    # large functions are called below: compiling them once is enough
+    # a loop, because the large functions below are then compiled only once
     for g in range(groups):
         out = scan if groups == 1 else scans.part
         for i in range(3 if groups > 1 else 0):
@@ -297,7 +297,7 @@ def _gather(
     spot = scans.spot[0, 0]
     first = velocity.shape[1]
     several = bodies.shape[1]
-    # those of a crowd are of now
+    # the cells of a crowd hold the present positions
     in_cells = members.standing or (members.crowded and lag == 0)
     if in_cells:
         several = around(n, spot[0], spot[1], reach, cells)

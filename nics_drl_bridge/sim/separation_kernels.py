@@ -40,7 +40,7 @@ STILL, PATROL, PEDESTRIAN = range(3)  # values of the column KIND
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(10)
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
-ROBOT_GAP = 0.1  # Which an obstacle keeps to a robot, as people do [m]; less may look like a touch
+ROBOT_GAP = 0.1  # gap that an obstacle keeps to a robot, like people [m]; less looks like contact
 # Number of times a displacement is bent before the remaining excess is shortened
 PASSES = 3
 FINEST = 0.25  # Minimum step along a path through a static map, in cells
@@ -48,7 +48,7 @@ HALVINGS = 8  # Number of bisections of its last step to find the end of the fre
 
 
 class Traffic(NamedTuple):
-    """All that the moving obstacles of one world keep clear of in a period."""
+    """Everything that the moving obstacles of one world keep clear of in a period."""
 
     bodies: Array  # (K + M, 7) obstacles, then robots
     first: int  # index of the first robot
@@ -208,7 +208,7 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
     if bend:
         return _hold(dx, dy, nx, ny, here, True)
     if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
-        # In contact with the map it may only move to where there is no less room.
+        # In contact with the map, it may only move where the clearance does not decrease.
         if map_distance(x + dx, y + dy, grid) - radius >= here:
             return (dx, dy)
         return (0.0, 0.0)
@@ -233,7 +233,7 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def restrain(dx, dy, k, traffic, bends):  # type: ignore[no-untyped-def]
-    """Return the displacement [m] that obstacle k can make of one; with `bends` it slides."""
+    """Return the part of a displacement [m] that obstacle k can make; with `bends` it slides."""
     body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):
         wished_x = dx

@@ -34,11 +34,11 @@ from nics_drl_bridge.threads import run_parts
 
 Indices = NDArray[np.int64]
 R = TypeVar("R")
-# Poses of robots (n, M, 3), or a function that tells them for scenes; None: as the scenes have them
+# Poses of robots (n, M, 3), or a function that returns them for scenes; None: the scenes' poses
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
 # Maximum number of robots in one world; each is tested against every other
 MOST_ROBOTS = 1_000
-# Most values in all worlds, some GB: beams of robots, states of obstacles
+# limit of the values in all worlds, some GB: beams of robots, states of obstacles
 MOST_NUMBERS = 2**30
 PER_BODY = 64
 # Beyond the range of commands that was recorded, as a fraction of their limits
@@ -72,7 +72,7 @@ def warn(message: str) -> None:
 
 
 class CommandBox:
-    """Range of commands that a model was fitted to, save those whose effect was assumed."""
+    """Range of commands to which a model was fitted, except those whose effect was assumed."""
 
     def __init__(
         self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
@@ -151,7 +151,7 @@ def _check_memory(
 
 
 class EpisodeSampler:
-    """Draws the scenes of episodes, and the numbers of a randomisation, if there is one."""
+    """Draws the scenes of episodes, and the numbers of a randomisation, if any."""
 
     def __init__(
         self,

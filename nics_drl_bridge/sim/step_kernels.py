@@ -290,7 +290,7 @@ def _measure(
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
-    """Put the robots' bodies where they now stand, and measure their odometry."""
+    """Put the robots' bodies at their present poses, and measure their odometry."""
     frame = scratch.cells.frame
     pose = state.pose
     obstacle_count = state.velocity.shape[1]
