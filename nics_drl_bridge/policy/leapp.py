@@ -51,7 +51,7 @@ class Piece(NamedTuple):
 
 
 def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
-    """Writes a policy file as a bundle; returns its YAML file. See `write_whole_folder` for errors."""
+    """Write a policy file as a bundle; return its YAML file. Errors: see `write_whole_folder`."""
     content = policy.path.read_bytes()
     place = Path(folder)
     marker = f"{place.resolve().name}.yaml"
