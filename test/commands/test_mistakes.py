@@ -117,7 +117,7 @@ MISTAKES = {
     "explain stop.jsonl": "stop.jsonl: is no JSON, line by line",
     "doctor nothing": "nothing",
     "bag info nothing": "nothing",
-    "policy import text.txt --robot differential --out p.bin": "name ends with '.onnx'; change",
+    "policy import text.txt --robot differential --out p.bin": "a policy file ends with '.onnx'",
     "world draw clutter --out clutter.jpg": "must end in .png",
     "drive --robot differential --out m --recording d.csv": "must end in .npz",
     # Places that are taken, or can't be written to.

@@ -54,7 +54,7 @@ def test_a_path_that_comes_back_is_followed_to_its_turn_first():
     ("poses", "why"),
     [
         (np.zeros((0, 3)), "empty"),
-        (np.full((2, 3), math.nan), "no number"),
+        (np.full((2, 3), math.nan), "not a number"),
         (np.full((2, 3), 1e9), "not a number, or too large"),
         (
             np.array([(0.0, 0.0), (2e5, 0.0)]),
