@@ -316,7 +316,7 @@ def changed(path, value):
 
 
 SPOILT = {
-    "kind": (changed("kind", "policy"), "no mapping of a foreign policy"),
+    "kind": (changed("kind", "policy"), "not the mapping of a foreign policy"),
     "no network": (changed("network", "nets.onnx"), "'nets.onnx' can't be read"),
     "pickle": (changed("network", "net.pt"), "must be an .onnx file or a LEAPP bundle"),
     "unknown key": (
@@ -329,7 +329,7 @@ SPOILT = {
     ),
     "missing input": (
         changed("inputs/velocity", None),
-        "'inputs.velocity': the network takes",
+        "'inputs.velocity': the network has this input",
     ),
     "unknown quantity": (
         changed("inputs/goal/parts/0/of", "goal.range"),
@@ -344,7 +344,7 @@ SPOILT = {
     "left": (changed("outputs/left", {"of": "action"}), "'outputs.left': the robot"),
     "index": (
         changed("outputs/turn/index", 2),
-        "is 2, but the output 'action' has 2 elements",
+        "is 2, but the output 'action' has only 2 elements",
     ),
     "no such command": (changed("outputs/speed", {"of": "action"}), "no such command"),
     "divide": (changed("inputs/scan/divide", 0.0), "must not be 0"),
@@ -352,7 +352,7 @@ SPOILT = {
         changed("inputs/scan/divide", [1.0, 2.0]),
         "has 2 numbers, but 24 elements are scaled",
     ),
-    "limits": (changed("inputs/scan/limits", [1.0, 0.0]), "must be [least, greatest]"),
+    "limits": (changed("inputs/scan/limits", [1.0, 0.0]), "must be [minimum, maximum]"),
     "constant": (changed("inputs/goal/parts/0/value", 1.0), "has no `value:`"),
     "period": (changed("control_period", 0.2), "is 0.2 s, but the robot's is 0.1 s"),
     "state": (
