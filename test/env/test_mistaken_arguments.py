@@ -157,7 +157,7 @@ def test_a_closed_env_refuses_what_is_called_after_close(
     env.close()
     given = (env.action_space.sample(),) if method == "step" else ()
     with pytest.raises(
-        BridgeError, match=rf"{method}\(\) after close\(\).*make another"
+        BridgeError, match=rf"{method}\(\) after close\(\).*make a new one"
     ):
         getattr(env, method)(*given)
     env.close()  # a second time does nothing

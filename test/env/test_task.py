@@ -437,12 +437,12 @@ def test_a_memory_that_update_shifts_holds_what_was_there(make):
         (
             "update",
             lambda _: {"count": np.ones(5)},
-            "its memory 'count' must stay float64 of (",
+            "its memory 'count' must stay float64 of shape (",
         ),
         (
             "update",
             lambda rows: {"count": rows + 0.5j},
-            "in `update`, not complex128 of (",
+            "in `update`, not complex128 of shape (",
         ),
         (
             "info",

@@ -157,7 +157,7 @@ def test_a_swapped_speed_and_turn_is_refused_by_what_they_move(name, ahead):
     assert check_commands(Drive(plain, spec)) == ()
     command = replace(plain.command, values=plain.command.values[:, ::-1])
     with pytest.raises(
-        RecordingError, match="_command are swapped: each moves the robot as"
+        RecordingError, match="_command are swapped: each moves the robot like"
     ):
         check_commands(Drive(replace(plain, command=command), spec))
 
@@ -270,7 +270,7 @@ def test_the_speed_and_steering_of_a_real_car_are_refused_if_they_are_swapped(na
         JUMPING.parent / name, None, TopicRoles(), swapped
     )
     with pytest.raises(
-        RecordingError, match="the column of `steering_command:` behind `speed_"
+        RecordingError, match="the column of `steering_command:` after `speed_"
     ):
         identify(drive, spec)
 

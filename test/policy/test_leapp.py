@@ -402,13 +402,13 @@ REFUSED = {
     ),
     "no kind": (
         lambda data, _: data["models"]["scaling"]["inputs"][0].pop("kind"),
-        "'pipeline.inputs.scan': kind None is not known",
+        "'pipeline.inputs.scan': kind None is not a known",
     ),
     "outputs": (
         lambda data, _: node(
             data, "policy", "outputs", 1, kind="target/joint/position"
         ),
-        "none is told to be the robot's velocity",
+        "none is marked as the robot's velocity",
     ),
     "backend": (
         lambda data, _: data["models"]["policy"]["parameters"].update(backend="jit"),
@@ -418,7 +418,7 @@ REFUSED = {
         lambda data, _: data["models"]["policy"]["parameters"].update(
             sha256sum="0" * 64
         ),
-        "does not fit 'policy.onnx', which was changed or damaged",
+        "does not match 'policy.onnx', which was changed or damaged",
     ),
     "outside": (
         lambda data, _: data["models"]["policy"]["parameters"].update(
@@ -464,10 +464,10 @@ def test_what_a_bundle_lacks_is_said_in_one_sentence(tmp_path, name):
 
 def test_a_bundle_of_others_needs_a_robot_and_a_folder_a_bundle(tmp_path):
     bundle = write_foreign(tmp_path)
-    with pytest.raises(ConfigError, match="say which with --robot"):
+    with pytest.raises(ConfigError, match="name one with --robot"):
         import_policy(bundle)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(PolicyError, match="holds 0 descriptions"):
+    with pytest.raises(PolicyError, match="contains 0 bundle descriptions"):
         import_policy(tmp_path / "empty")
 
 

@@ -117,7 +117,7 @@ def test_a_lidar_that_sees_no_full_circle_gets_the_layout_of_the_front(model):
     settings, told = fitted(load_training("own_differential"), hokuyo, inherited=True)
     assert settings.task_options["scan"] == "front"
     assert told == (
-        "the lidar 'hokuyo_ust_10lx' does not see 3 m all around: scan: front",
+        "the lidar 'hokuyo_ust_10lx' does not cover 3 m all around: scan: front",
     )
 
 
@@ -138,7 +138,7 @@ def test_a_lidar_that_fills_no_layout_gets_sectors_over_its_own_view(
     )
     assert settings.task_options["scan"] == scan
     assert told == (
-        f"the lidar {changed.name!r} does not see 3 m all around: scan: {scan}",
+        f"the lidar {changed.name!r} does not cover 3 m all around: scan: {scan}",
     )
     task = make_task("navigation", replace(model, lidar=changed), settings.task_options)
     assert task.scan.sectors == scan
