@@ -190,7 +190,7 @@ class RobotSpec(Schema):
         data: dict[str, Any] = dump(self)
         for name in ("lidar", "lidar_mount"):
             if getattr(self, name) is None:
-                del data[name]
+                data.pop(name, None)  # a partial dump may lack it
         return data
 
     @model_validator(mode="after")
