@@ -1,7 +1,7 @@
 """How long does a newcomer wait: from a clean clone and nothing compiled to the end of the demo?
 
 Clones this repository into a temporary folder and runs `make demo` there, twice. Then `nics warmup`
-compiles into an empty cache, and a script makes the README's first env and resets it, in an empty
+compiles into an empty cache, and a script makes a first env and resets it, in an empty
 cache of its own. What is not committed is not in the clone.
 """
 

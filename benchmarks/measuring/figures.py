@@ -37,7 +37,7 @@ WORLDS = (
     "room",
 )
 PERTURBATIONS = ("noise", "drop-out", "latency", "response", "drift", "footprint")
-README = told(
+FIGURES = told(
     (
         "table1_kinematics",
         "kinematics, robot-steps per second on one thread",
@@ -210,6 +210,78 @@ README = told(
         "{seconds.robot|.0f} s, success {success.robot|.1%}; report {seconds.recording|.0f} s; "
         "own task {seconds.task|.0f} s, success {success.task|.1%}",
     ),
+)
+XTARK = "drives.xtark_random_drive_45s"
+SLIPPERY = "drives.f110_ds1"
+FIRST_SCREEN = Table(
+    ("", "here", "compared with"),
+    (
+        (
+            "env_throughput",
+            "navigation steps per second, one thread, 720 beams, 10 obstacles",
+            "{single_thread_env_steps_per_s x1e-3|.0f},000",
+            "{times_as_fast_at_equal_work.irsim_x|.0f} times as fast as irsim-x, "
+            "{times_as_fast_at_equal_work.ir_sim|,.0f} times ir-sim",
+        ),
+        (
+            "env_throughput_lidar",
+            "the same with a Hokuyo UST-10LX: 1,081 noisy beams",
+            "{single_thread_env_steps_per_s x1e-3|.0f},000",
+            "{times_as_long_as_clean|.2f} times the step time without noise",
+        ),
+        (
+            "training_differential",
+            "navigation learned from scratch, worst of three seeds: success, time",
+            "; ".join(
+                f"{title} {{training_{robot}:success_rate|.1%}}, "
+                f"{{training_{robot}:wall_s|.0f}} s"
+                for robot, title in ROBOTS.items()
+            ),
+            "`dynamic_window` planner: "
+            + ", ".join(
+                f"{{baselines:circles/{robot}/dynamic_window.success.value x100|.1f}}"
+                for robot in ROBOTS
+            )
+            + " %",
+        ),
+        (
+            "barn_five_fold",
+            "250 BARN worlds without a map, five-fold cross-validation",
+            "{success|.1%} success, {collision|.1%} collisions, score {score|.3f} of 0.5",
+            "the planners score: `mppi` {barn:policies.mppi.score|.3f}, `dynamic_window` "
+            "{barn:policies.dynamic_window.score|.3f}",
+        ),
+        (
+            "real_drives",
+            "eight real drives, predicted 5 s ahead on unseen data: best, worst",
+            f"off by {{{XTARK}.share_of_path x100|.1f}} and "
+            f"{{{SLIPPERY}.share_of_path|.1%}} of the path",
+            f"fitted textbook model {{{XTARK}.yardstick_share x100|.1f}} and "
+            f"{{{SLIPPERY}.yardstick_share|.1%}}, constant twist "
+            f"{{{XTARK}.constant_twist_share x100|.1f}} and "
+            f"{{{SLIPPERY}.constant_twist_share|.1%}}",
+        ),
+        (
+            "transfer_jackal",
+            "a Jackal in MuJoCo over ROS 2, eight worlds",
+            "{min success.*.*.mujoco_dds x100|.0f} to {max success.*.*.mujoco_dds|.0%} success",
+            "the same policy in process: {min success.*.*.fast x100|.0f} to "
+            "{max success.*.*.fast|.0%}",
+        ),
+        (
+            "parity",
+            "observations over ROS 2 in lock-step, {steps|,} steps",
+            "largest difference {max_abs_observation_difference|.2g}",
+            "the same steps in process",
+        ),
+        (
+            "shield",
+            "contacts with the shield in adversarial episodes",
+            "{contacts} in {episodes|,}",
+            "without the shield: {contacts_without} in {tried_without}",
+        ),
+    ),
+    notes=False,
 )
 SAFETY = told(
     (
@@ -537,7 +609,8 @@ TABLE1 = Table(
     ),
 )
 TABLES: Mapping[str, Table] = {
-    "figures": README,
+    "first_screen": FIRST_SCREEN,
+    "figures": FIGURES,
     "safety": SAFETY,
     "lidar_peers": lidar.PEERS,
     "env_throughput": THROUGHPUT,

@@ -12,7 +12,9 @@ class Table:
     Attributes:
         head: its columns.
         rows: the run that a row is of, and its cells, with placeholders.
+        notes: explain the marks below the table.
     """
 
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    notes: bool = True

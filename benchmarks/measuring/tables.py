@@ -137,7 +137,9 @@ class Page:
             told = [self.cell(each, run) for each in cells]
             lines.append(line_of([text for text, _ in told]))
             used |= {name for _, runs in told for name in runs}
-        return "\n".join([*lines, *self.notes(used)]) + "\n"
+        if table.notes:
+            lines += self.notes(used)
+        return "\n".join(lines) + "\n"
 
     def notes(self, runs: set[str]) -> list[str]:
         """A sentence for each run that missed a bar, broke or was short."""

@@ -95,6 +95,18 @@ def test_a_table_of_a_run_that_missed_its_bar_shows_it(tables):
     assert "‡ `parity.py`: a short run" in page(tables, quick=True).table(table)
 
 
+def test_a_table_without_notes_keeps_the_marks(tables):
+    table = tables.Table(("what",), (("parity", "{rate|.1e}"),), notes=False)
+    missed = page(tables, state="missed", failures=["rate: 4.9e5, bar 9e5"])
+    assert missed.table(table) == "| what |\n|---|\n| 4.9e5 † |\n"
+
+
+def test_the_first_screen_has_eight_figures_and_all_are_measured(tables):
+    text = tables.open_page().text("first_screen")
+    assert text.count("\n") == 2 + 8
+    assert "not measured" not in text
+
+
 def test_the_machine_the_commit_and_the_load_are_told(tables):
     told = page(tables, dirty=True).text("machine")
     for words in (
@@ -153,10 +165,8 @@ def test_rows_are_of_runs_that_there_are_and_as_long_as_their_head(tables):
             assert len(cells) == len(table.head), f"{name}: {cells}"
 
 
-def test_each_table_stands_in_one_place_and_again_only_where_all_figures_or_the_papers_are(
-    tables,
-):
-    again = ("paper.md", "results.md")
+def test_each_table_stands_in_one_place_and_again_only_where_the_papers_are(tables):
+    again = ("paper.md",)
     first = []
     for path in tables.documents():
         found = [match[1] for match in tables.REGION.finditer(path.read_text())]
