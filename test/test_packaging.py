@@ -379,4 +379,4 @@ def test_the_changelog_has_a_section_for_this_version() -> None:
     manifest = (ROOT / "package.xml").read_text(encoding="utf-8")
     (version,) = re.findall("<version>(.*)</version>", manifest)
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert re.search(rf"^## \[{re.escape(version)}\]", changelog, re.MULTILINE)
+    assert re.search(rf"^## {re.escape(version)}$", changelog, re.MULTILINE)
