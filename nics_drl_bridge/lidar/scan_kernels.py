@@ -378,66 +378,58 @@ def find_all_points(padded, beam_count, shift, lanes):  # type: ignore[no-untype
 
 
 @kernel(contracts=True, inline=True)
-def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Lower the ranges of one body's beams (Eq. 4), in blocks or, where none fits, beam by beam.
+def fuse_beam(flat, place, i, is_hit, rows, points, weights, limits):  # type: ignore[no-untyped-def]
+    """Lower the range of one beam at `place`, the i-th of a body, if it hits (Eq. 4).
 
-    Ranges are compared as integers, which order positive floats alike: LLVM would mask the store of
-    a float's minimum.
+    Ranges are compared as integers, because LLVM would mask the store of a float's minimum. Both
+    orders agree: ranges are positive, or -inf, which as an integer is below all others.
     """
+    value = baked.blended(
+        rows,
+        points[0] + i,
+        points[1] + i,
+        points[2] + i,
+        points[3] + i,
+        weights[0],
+        weights[1],
+        limits[0],
+        limits[1],
+    )
+    value = value if is_hit else np.float32(np.inf)
+    flat[place] = min(flat[place], np.float32(value).view(np.int32))
+
+
+@kernel(contracts=True, inline=True)
+def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Fuse one body into its scan, in blocks of beams or, where none fits, beam by beam."""
     whole = lanes.whole
     rows = lidar.table.rows
     blocks = whole[k + BLOCKS]
     hits = whole[k + HITS]
     leading = whole[k + LEADING]
-    point_weight = lanes.single[k + POINT_WEIGHT]
-    row_weight = lanes.single[k + ROW_WEIGHT]
-    range_min = np.float32(lidar.range_min)
-    range_max = np.float32(lidar.range_max)
+    weights = (lanes.single[k + POINT_WEIGHT], lanes.single[k + ROW_WEIGHT])
+    limits = (np.float32(lidar.range_min), np.float32(lidar.range_max))
     skipped = np.int64(0 if blocks > 0 else leading)
-    near = np.uintp(whole[k + POINT] + skipped)
-    near_next = np.uintp(whole[k + NEXT_POINT] + skipped)
-    far = np.uintp(whole[k + FAR_POINT] + skipped)
-    far_next = np.uintp(whole[k + FAR_NEXT_POINT] + skipped)
+    points = (
+        np.uintp(whole[k + POINT] + skipped),
+        np.uintp(whole[k + NEXT_POINT] + skipped),
+        np.uintp(whole[k + FAR_POINT] + skipped),
+        np.uintp(whole[k + FAR_NEXT_POINT] + skipped),
+    )
     if blocks > 0:
         fused_from = np.uintp(lanes.wide[k + FUSED_FROM])
         hit = np.int32(-leading)
         for j in range(blocks * BLOCK):
             i = np.uintp(j)
-            value = baked.blended(
-                rows,
-                near + i,
-                near_next + i,
-                far + i,
-                far_next + i,
-                point_weight,
-                row_weight,
-                range_min,
-                range_max,
-            )
             # An unsigned comparison covers both ends: beams before the first hit are negative.
-            value = value if np.uint32(hit) < np.uint32(hits) else np.float32(np.inf)
+            is_hit = np.uint32(hit) < np.uint32(hits)
+            fuse_beam(flat, fused_from + i, i, is_hit, rows, points, weights, limits)
             hit = np.int32(hit + np.int32(1))  # 32 bits wide, like the ranges
-            flat[fused_from + i] = min(
-                flat[fused_from + i], np.float32(value).view(np.int32)
-            )
     else:
         fused_from = np.uintp(lanes.wide[k + FUSED_FROM] + leading)
         for j in range(hits):
             i = np.uintp(j)
-            value = baked.blended(
-                rows,
-                near + i,
-                near_next + i,
-                far + i,
-                far_next + i,
-                point_weight,
-                row_weight,
-                range_min,
-                range_max,
-            )
-            flat[fused_from + i] = min(
-                flat[fused_from + i], np.float32(value).view(np.int32)
-            )
+            fuse_beam(flat, fused_from + i, i, True, rows, points, weights, limits)
 
 
 @kernel
