@@ -57,8 +57,8 @@ OFFSET_S = 5.0
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
-# a value in more than this share of the beams is intended by the lidar
-ODD_SHARE = 0.01
+# a value in more than this fraction of the beams is intended by the lidar
+ODD_FRACTION = 0.01
 
 error = partial(Mismatch, "error")
 warning = partial(Mismatch, "warning")
@@ -85,39 +85,37 @@ def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
         check_motion,
         check_turning,
     )
-    found = [finding for check in checks for finding in check(facts, expected)]
-    named = [replace(finding, where=facts.names[finding.where]) for finding in found]
+    findings = [finding for check in checks for finding in check(facts, expected)]
+    named = [replace(finding, where=facts.names[finding.where]) for finding in findings]
     return sorted(named, key=lambda finding: finding.severity)
 
 
 def check_presence(facts: Facts, _: Expected) -> Findings:
     """Finds missing and silent topics, and wrong types."""
     for role in (SCAN, ODOM, CMD_VEL):
-        there = facts.topics.get(facts.names[role])
-        types = () if there is None else there.types
+        ends = facts.topics.get(facts.names[role])
+        types = () if ends is None else ends.types
         if len(types) > 1 or set(types) - set(KINDS[role]):
             fix = f"publish {KINDS[role][0]}, or remap the topic that is one"
             yield error("type", role, f"is of {' and '.join(types)}", fix)
         elif role == CMD_VEL:
-            if facts.live and (there is None or not there.asks):
+            if facts.live and (ends is None or not ends.asks):
                 fix = (
                     "start the base, or correct its namespace or the name of its topic"
                 )
                 yield error("missing topic", role, "nobody listens to it", fix)
         elif role not in facts.heard:
-            if there is None:
+            what = "nothing was heard on it"
+            hint = ""
+            if ends is None:
                 what = "there is no such topic"
-            else:
-                what = "nothing was heard on it"
-            near = [
-                topic
-                for topic, ends in facts.topics.items()
-                if KINDS[role][0] in ends.types
-            ]
-            if near and not there:
-                hint = f"; {', '.join(near)} is of its type: remap it"
-            else:
-                hint = ""
+                same_type = [
+                    topic
+                    for topic, its_ends in facts.topics.items()
+                    if KINDS[role][0] in its_ends.types
+                ]
+                if same_type:
+                    hint = f"; {', '.join(same_type)} is of its type: remap it"
             fix = f"start its driver, or correct namespace or ROS_DOMAIN_ID{hint}"
             yield error("missing topic", role, what, fix)
         if doctor_facts.TWIST_STAMPED_TYPE in types and not facts.live:
@@ -130,15 +128,16 @@ def check_presence(facts: Facts, _: Expected) -> Findings:
 def check_quality_of_service(facts: Facts, _: Expected) -> Findings:
     """Finds pairs of publisher and subscriber with incompatible quality of service."""
     for role, name in facts.names.items():
-        if (there := facts.topics.get(name)) is None:
+        ends = facts.topics.get(name)
+        if ends is None:
             continue
-        weak = any(not offer.reliable for offer in there.offers)
-        if role != CLOCK and weak and any(ask.reliable for ask in there.asks):
+        best_effort = any(not offer.reliable for offer in ends.offers)
+        if role != CLOCK and best_effort and any(ask.reliable for ask in ends.asks):
             what = "is sent best effort, and a subscriber asks for reliable: they never match"
             fix = "let the publisher be reliable, or the subscriber best effort"
             yield no_match(role, what, fix)
-        passing = any(not offer.transient_local for offer in there.offers)
-        if passing and any(ask.transient_local for ask in there.asks):
+        volatile = any(not offer.transient_local for offer in ends.offers)
+        if volatile and any(ask.transient_local for ask in ends.asks):
             what = "is sent volatile, and a subscriber asks for transient local: they never match"
             yield no_match(role, what, "let both be volatile")
 
@@ -146,21 +145,21 @@ def check_quality_of_service(facts: Facts, _: Expected) -> Findings:
 def check_publishers(facts: Facts, _: Expected) -> Findings:
     """Finds several publishers on topics that must have a single one."""
     for role in (CMD_VEL, ODOM, SCAN, CLOCK):
-        there = facts.topics.get(facts.names[role])
-        if there is not None and len(there.offers) > 1:
-            what = f"has {len(there.offers)} publishers, which overrule each other"
+        ends = facts.topics.get(facts.names[role])
+        if ends is not None and len(ends.offers) > 1:
+            what = f"has {len(ends.offers)} publishers, which overrule each other"
             fix = "end all but one: joystick, navigation, a second simulator"
             yield error("publishers", role, what, fix)
 
 
 def check_frames(facts: Facts, expected: Expected) -> Findings:
     """Checks names of frames against REP-105 and the lidar's frame."""
-    wanted = (
+    fields = (
         (SCAN, "frames", (expected.lidar.frame,), "header.frame_id"),
         (ODOM, "frames", ("odom",), "header.frame_id"),
         (ODOM, "children", BODY_FRAMES, "child_frame_id"),
     )
-    for role, attribute, good, place in wanted:
+    for role, attribute, good, place in fields:
         for frame in sorted(getattr(facts.heard.get(role), attribute, ())):
             if frame.rpartition("/")[2] in good and not frame.startswith("/"):
                 continue  # robots of a fleet have prefixes
@@ -180,12 +179,12 @@ def check_rates(facts: Facts, expected: Expected) -> Findings:
         slow = rate < (1 - RATE_TOLERANCE) * wanted
         fast = rate > (1 + RATE_TOLERANCE) * wanted
         if slow or (fast and role == SCAN):
-            least = "at least " if role == ODOM else ""
+            bound = "at least " if role == ODOM else ""
             finding = error if slow else warning
             fix = "set the driver's rate; on a slow network look for losses (best effort, Wi-Fi)"
             if role == SCAN:
                 fix += f", or set `rate: {rate:.3g}` in the lidar and generate the model anew"
-            what = f"comes at {rate:.3g} Hz, expected {least}{wanted:.3g} Hz"
+            what = f"comes at {rate:.3g} Hz, expected {bound}{wanted:.3g} Hz"
             yield finding("rate", role, what, fix)
 
 
@@ -243,9 +242,9 @@ def _select_present(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
 
 def check_clock(facts: Facts, _: Expected) -> Findings:
     """Checks that `/clock`, if it has a publisher, advances."""
-    there = facts.topics.get(CLOCK)
+    ends = facts.topics.get(CLOCK)
     heard = facts.heard.get(CLOCK)
-    if there is None or not there.offers:
+    if ends is None or not ends.offers:
         return
     fix = "start the simulation or its clock, or set use_sim_time to false on all nodes"
     if heard is None:
@@ -264,7 +263,7 @@ def check_clock(facts: Facts, _: Expected) -> Findings:
 def check_motion(facts: Facts, expected: Expected) -> Findings:
     """Checks odometry and commands: numbers, units and signs."""
     yield from _check_odometry(facts, expected.robot)
-    ratio = _scale(facts)
+    ratio = _estimate_scale(facts)
     if ratio is not None and ratio < 0.0:
         fix = "swap the wheels or turn the sign of angular.z: counter-clockwise is positive"
         yield error("command", CMD_VEL, "the robot turns against its commands", fix)
@@ -285,25 +284,25 @@ def check_turning(facts: Facts, expected: Expected) -> Findings:
             "says that it measures no yaw rate", "choose another topic by --imu"
         )
         return
-    found = _compare_turns(facts)
-    if found is None:
+    turning = _compare_turns(facts)
+    if turning is None:
         return
-    if found.mirrored:
+    if turning.mirrored:
         fix = "turn the sign in the driver: the z axis points up, counter-clockwise is positive"
         yield error("gyro", GYRO, "turns against odometry", fix)
-    elif found.in_degrees:
-        what = f"turns {1.0 / found.scale:.3g} times as far as odometry: degrees per second"
+    elif turning.in_degrees:
+        what = f"turns {1.0 / turning.scale:.3g} times as far as odometry: degrees per second"
         yield error("gyro", GYRO, what, "let the driver send radians per second")
-    elif not found.plausible:
-        what = f"does not turn as odometry does (correlation {found.alike:.2f})"
+    elif not turning.plausible:
+        what = f"does not turn as odometry does (correlation {turning.alike:.2f})"
         yield gyro_warning(what, "look at both while the robot turns on the spot")
-    elif found.contradicts and not expected.gyro:
+    elif turning.contradicts and not expected.gyro:
         what = (
-            f"contradicts odometry by {found.apart:.2g} rad in {found.window_s:g} s: odometry "
-            f"turns {found.scale:.2f} times as far"
+            f"contradicts odometry by {turning.apart:.2g} rad in {turning.window_s:g} s: odometry "
+            f"turns {turning.scale:.2f} times as far"
         )
         fix = (
-            "believe the gyro where wheels slip: record it and generate the model anew, which then "
+            "trust the gyro where wheels slip: record it and generate the model anew, which then "
             "uses it; or give imu:=TOPIC to the nodes, --imu to nics evaluate"
         )
         yield gyro_warning(what, fix)
@@ -325,9 +324,9 @@ def _compare_turns(facts: Facts) -> Turning | None:
     if not (np.isfinite(poses).all() and np.isfinite(rates).all()):
         return None
     for window_s in (WINDOW_S, SHORT_WINDOW_S):
-        found = compare_turning(odom_t, poses, gyro_t, rates, window_s)
-        if found is not None and found.compared:
-            return found
+        turning = compare_turning(odom_t, poses, gyro_t, rates, window_s)
+        if turning is not None and turning.compared:
+            return turning
     return None
 
 
@@ -352,10 +351,10 @@ def _check_odometry(facts: Facts, robot: RobotSpec) -> Findings:
         yield odometry_warning(what, fix)
     corners = np.array([robot.command_low, robot.command_high])
     fastest = max(float(np.hypot(*robot.to_fields(row)[:2])) for row in corners)
-    yield from _moves(facts, poses, twists, max(fastest, 0.1))
+    yield from _check_moves(facts, poses, twists, max(fastest, 0.1))
 
 
-def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Findings:
+def _check_moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Findings:
     stamps = np.array(facts.heard[ODOM].stamps_ns, dtype=np.int64)
     dt = np.diff(stamps) * S_PER_NS
     going = dt > 0.0
@@ -431,7 +430,7 @@ def _fit_slope(x: Array, y: Array) -> float:
     return float(x @ y) / power if power > 0.0 else float("inf")
 
 
-def _scale(facts: Facts) -> float | None:
+def _estimate_scale(facts: Facts) -> float | None:
     heard = facts.heard.get(CMD_VEL)
     odometry = facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
@@ -442,59 +441,59 @@ def _scale(facts: Facts) -> float | None:
     # A car turns the other way in reverse.
     forward = (place >= 0) & (np.array(facts.twists)[:-1, 0] >= 0.0)
     turn = np.asarray(wrap_angle(np.diff(np.array(facts.poses)[:, 2])))[forward]
-    wish = np.array(facts.commands)[place[forward], 2]
-    if np.abs(turn).sum() < LEAST_TURN_RAD or np.abs(wish).sum() < 1.0:
+    commanded = np.array(facts.commands)[place[forward], 2]
+    if np.abs(turn).sum() < LEAST_TURN_RAD or np.abs(commanded).sum() < 1.0:
         return None
-    alike = abs(wish @ turn) / np.sqrt((wish @ wish) * (turn @ turn))
-    return _fit_slope(wish, turn) if alike > LEAST_ALIKE else None
+    power = (commanded @ commanded) * (turn @ turn)
+    correlation = abs(commanded @ turn) / np.sqrt(power)
+    return _fit_slope(commanded, turn) if correlation > LEAST_ALIKE else None
 
 
 def check_layout(facts: Facts, expected: Expected) -> Findings:
     """Checks number and directions of the beams, and the limits of their ranges."""
     if len(facts.layouts) > 1:
-        counts = ", ".join(map(str, sorted({one.beams for one in facts.layouts})))
-        fix = (
-            "use the driver's mode of fixed angles (as `angle_compensate`), or resample"
-        )
+        counts = ", ".join(map(str, sorted({layout.beams for layout in facts.layouts})))
+        fix = "use the driver's mode of fixed angles (such as `angle_compensate`), or resample"
         yield layout_error(f"its header changes; numbers of beams are {counts}", fix)
-    for have in facts.layouts[:1]:
-        header = have.header
+    for layout in facts.layouts[:1]:
+        header = layout.header
         if (
-            abs(have.last - header.angle_max)
+            abs(layout.last - header.angle_max)
             > ANGLE_TOLERANCE * abs(header.angle_increment) + 1e-9
         ):
-            what = f"angle_max is {header.angle_max:.5f}, but its beams end at {have.last:.5f} rad"
+            end = f"its beams end at {layout.last:.5f} rad"
+            what = f"angle_max is {header.angle_max:.5f}, but {end}"
             yield warning("beam layout", SCAN, what, "correct the driver's header")
-        if have.in_degrees:
+        if layout.in_degrees:
             what = f"angles go from {header.angle_min:.4g} to {header.angle_max:.4g}: degrees"
             yield error("unit", SCAN, what, "let the driver send radians")
         try:
             if expected.scan is not None:
-                doctor_facts.fit_lidar_to_header(have, expected.lidar, expected.scan)
+                doctor_facts.fit_lidar_to_header(layout, expected.lidar, expected.scan)
         except ConfigError as fault:
             fix = "turn or set the lidar, or train a policy with what it sees"
             yield layout_error(str(fault), fix)
         else:
-            yield from _check_beams(have, expected)
+            yield from _check_beams(layout, expected)
 
 
-def _check_beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
+def _check_beams(layout: doctor_facts.Layout, expected: Expected) -> Findings:
     want = expected.lidar.header
-    header = have.header
+    header = layout.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
-    if have.beams != expected.lidar.beams:
+    if layout.beams != expected.lidar.beams:
         yield layout_error(
-            f"has {have.beams} beams, expected {expected.lidar.beams}", fix
+            f"has {layout.beams} beams, expected {expected.lidar.beams}", fix
         )
-    off = max(abs(header.angle_min - want.angle_min), abs(have.last - want.angle_max))
+    off = max(abs(header.angle_min - want.angle_min), abs(layout.last - want.angle_max))
     if header.angle_increment < 0.0:
-        if expected.scan is None and not have.in_degrees:
+        if expected.scan is None and not layout.in_degrees:
             what = "its beams go clockwise (angle_increment is negative)"
             turn = "turn the order in the driver (`inverted`): they go counter-clockwise (REP-103)"
             yield layout_error(what, turn)
-    elif not have.in_degrees and off > ANGLE_TOLERANCE * abs(want.angle_increment):
+    elif not layout.in_degrees and off > ANGLE_TOLERANCE * abs(want.angle_increment):
         wanted = f"{want.angle_min:.4f} to {want.angle_max:.4f}"
-        what = f"beams go from {header.angle_min:.4f} to {have.last:.4f} rad, expected {wanted}"
+        what = f"beams go from {header.angle_min:.4f} to {layout.last:.4f} rad, expected {wanted}"
         yield layout_error(what, fix)
     for key in ("range_min", "range_max"):
         ours = getattr(want, key)
@@ -519,7 +518,7 @@ def check_ranges(facts: Facts, expected: Expected) -> Findings:
         what = f"half of the ranges exceed {np.median(finite):.0f}: millimetres"
         yield error("unit", SCAN, what, "let the driver send metres")
         return
-    if len(finite) and beyond.mean() > ODD_SHARE:
+    if len(finite) and beyond.mean() > ODD_FRACTION:
         what = f"{100 * beyond.mean():.0f} % of the ranges exceed range_max {spec.range_max:g} m"
         fix = "set the driver's limit, or range_max of the lidar, and generate the model anew"
         yield warning("range convention", SCAN, what, fix)
@@ -530,11 +529,11 @@ def check_ranges(facts: Facts, expected: Expected) -> Findings:
         "inf": values == np.inf,
     }
     for word, hit in hits.items():
-        if hit.mean() > ODD_SHARE and word != spec.no_return:
-            share = f"{100 * hit.mean():.0f} % of the ranges are {word}"
+        if hit.mean() > ODD_FRACTION and word != spec.no_return:
+            fraction = f"{100 * hit.mean():.0f} % of the ranges are {word}"
             fix = f"set `no_return: {word}` in the lidar and generate the model anew"
             yield convention(
-                f"{share}, but no return is expected as {spec.no_return}", fix
+                f"{fraction}, but no return is expected as {spec.no_return}", fix
             )
     if np.isfinite(values[values < 0.0]).any():
         fix = (

@@ -87,24 +87,20 @@ class Facts:
     heard: dict[str, TopicFacts] = field(default_factory=dict)  # by role
     end_ns: int = 0  # end of listening, on the clock of arrivals [ns]
     layouts: list[Layout] = field(default_factory=list)  # distinct layouts of the scans
-    ranges: list[NDArray[np.float32]] = field(
-        default_factory=list
-    )  # of up to 200 scans [m]
-    poses: list[Row] = field(
-        default_factory=list
-    )  # of odometry: x, y [m], heading [rad]
-    twists: list[Row] = field(
-        default_factory=list
-    )  # of odometry: vx, vy [m/s], wz [rad/s]
+    # of up to 200 scans [m]
+    ranges: list[NDArray[np.float32]] = field(default_factory=list)
+    # of odometry: x, y [m], heading [rad]
+    poses: list[Row] = field(default_factory=list)
+    # of odometry: vx, vy [m/s], wz [rad/s]
+    twists: list[Row] = field(default_factory=list)
     lengths: list[float] = field(default_factory=list)  # of odometry's quaternions
     # number of odometry messages whose covariance of pose or twist is all zeros
     uncovered: int = 0
     commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
     clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
     gyro: GyroReader = field(default_factory=GyroReader)
-    yaw_rates: list[tuple[int, float]] = field(
-        default_factory=list
-    )  # of the gyro: stamp [ns]
+    # of the gyro: stamp [ns] and yaw rate [rad/s]
+    yaw_rates: list[tuple[int, float]] = field(default_factory=list)
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
         """Records a message from ROS or from a bag, which have the same fields."""
@@ -129,7 +125,7 @@ class Facts:
             self.twists.append(messages.read_twist(message))
             self.lengths.append(math.hypot(*messages.read_quaternion(message)))
             covariances = message.pose.covariance, message.twist.covariance
-            self.uncovered += any(not np.any(one) for one in covariances)
+            self.uncovered += any(not np.any(covariance) for covariance in covariances)
         elif role == CMD_VEL:
             self.commands.append(messages.read_command(message))
         elif role == GYRO:
@@ -158,10 +154,10 @@ def name_of_gyro(
     if imu != "auto" or IMU in types.get(usual, ()):
         return usual
     space = usual.removesuffix(GYRO)
-    there = sorted(name for name, kinds in types.items() if IMU in kinds)
-    near = [name for name in there if name.startswith(space)]
+    gyros = sorted(name for name, kinds in types.items() if IMU in kinds)
+    nearby = [name for name in gyros if name.startswith(space)]
     second = f"{space}{IMU_NAMES[1]}"
-    return second if second in near else next(iter(near), usual)
+    return second if second in nearby else next(iter(nearby), usual)
 
 
 def collect_facts_of_bag(
@@ -227,8 +223,13 @@ def expect_present_lidar(facts: Facts, expected: Expected) -> Expected:
     return replace(expected, lidar=lidar)
 
 
-def fit_lidar_to_header(have: Layout, like: LidarSpec, scan: ScanLayout) -> LidarSpec:
-    """The lidar of a scan header, mounted like another one. Raises ConfigError if it fills less."""
-    lidar = reader_of(have.header, have.beams, like).lidar
+def fit_lidar_to_header(
+    layout: Layout, mounted: LidarSpec, scan: ScanLayout
+) -> LidarSpec:
+    """Returns the lidar of a scan header, mounted like another one.
+
+    Raises ConfigError if it does not fill the sectors of the scan.
+    """
+    lidar = reader_of(layout.header, layout.beams, mounted).lidar
     plan_of(lidar, scan)
     return lidar

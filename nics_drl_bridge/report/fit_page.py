@@ -24,14 +24,16 @@ Tile = tuple[str, str, bool]
 def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and false if it is doubtful."""
     for at in usual(identified.judgement):
-        beside = {
+        errors = {
             "": at.model,
             "fitted textbook ": at.textbook,
             "constant twist ": at.kept_twist,
         }
-        told = [name + end_of(each, at.path_m) for name, each in beside.items() if each]
-        figure, *others = (text.removesuffix(OF_PATH) for text in told)
-        off = f"{OF_PATH} off".lstrip() if told[0] != figure else "off"
+        texts = [
+            name + end_of(error, at.path_m) for name, error in errors.items() if error
+        ]
+        figure, *others = (text.removesuffix(OF_PATH) for text in texts)
+        off = f"{OF_PATH} off".lstrip() if texts[0] != figure else "off"
         meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(others)}"
         return figure, meaning, not conclude(identified).doubts
     return "untested", "on unseen data, as the drive is too short", False
@@ -40,7 +42,7 @@ def fit_tile(identified: Identified) -> Tile:
 def make_verdict_blocks(
     tiles: Sequence[Tile], conclusion: Conclusion, *commands: str
 ) -> Blocks:
-    """Figures in large type, doubts, what could not be learnt, and what to do next."""
+    """Returns figures in large type, doubts, what could not be learnt, and what to do next."""
     blocks = [
         html.make_paragraph(f"This model is: {conclusion.verdict}."),
         html.make_tiles(tiles),
@@ -61,26 +63,23 @@ def make_verdict_blocks(
 
 
 def make_path_blocks(identified: Identified) -> Blocks:
-    """Predicted paths beside the measured ones, and errors beside those of the yardsticks."""
+    """Compares predicted with measured paths, and errors with those of the yardsticks."""
     if identified.held_out is None or not identified.judgement:
         return [html.make_paragraph("The drive is too short to hold data out.")]
-    drawn = [
-        (each, "")
-        for each in fit_pictures.draw_unseen_paths(identified.trial, PATHS_SHOWN)
-    ]
+    paths = fit_pictures.draw_unseen_paths(identified.trial, PATHS_SHOWN)
     caption = "Mean prediction errors on unseen data: those of a good model lie below the others."
     if any(at.band_m for at in identified.judgement):
         caption += " Bars: distances within which 95 % of its predictions should end."
     rows = html.make_table(HEADS, judgement_rows(identified.judgement))
     return [
-        html.make_gallery(drawn),
+        html.make_gallery([(png, "") for png in paths]),
         html.make_picture(fit_pictures.draw_yardsticks(identified), caption),
         html.make_details("The same in numbers", [html.make_paragraph(COMPARED), rows]),
     ]
 
 
 def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks:
-    """The equations, and folded all figures and pictures of fit and calibration."""
+    """Returns the equations and, folded, all figures and pictures of fit and calibration."""
     fit = fit_pictures.fit_pictures(spec, identified, paths=False)
     drawn = {**fit, **fit_pictures.draw_calibration(spec, identified)}
     pictures = [
@@ -101,9 +100,8 @@ def write_fit_page(
     """Writes the page of a fit to a recording from a source, with the fit report as text."""
     conclusion = conclude(identified)
     folder = file.parent
-    spec = (
-        identified.drive.spec
-    )  # of a textbook that was written, which may have another state
+    # A textbook that was written may have another state.
+    spec = identified.drive.spec
     tile = fit_tile(identified)
     model = identified.model
     terms = (

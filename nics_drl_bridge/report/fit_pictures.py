@@ -43,7 +43,7 @@ PATHS = 6
 POINTS = 40
 UNSEEN_PANEL = Panel(3.4, 3.4)  # of one of them on a page
 SETTLED_S = 1.0
-LEAST_SHARE = 1e-12
+LEAST_ERROR = 1e-12
 LEAST_RATE = 1e-6
 MOST_POINTS = 3000
 BINS = 60
@@ -66,9 +66,8 @@ def write_pictures(
     spec: RobotSpec, identified: Identified, folder: str | Path
 ) -> tuple[Path, ...]:
     """Writes the pictures of a fit and of its calibration as PNG files, and returns these."""
-    spec = (
-        identified.drive.spec
-    )  # of a textbook that was written, which may have another state
+    # A textbook that was written may have another state.
+    spec = identified.drive.spec
     drawn = {**fit_pictures(spec, identified), **draw_calibration(spec, identified)}
     files = {Path(folder) / f"{name}.png": picture for name, picture in drawn.items()}
     for file, picture in files.items():
@@ -79,7 +78,7 @@ def write_pictures(
 def fit_pictures(
     spec: RobotSpec, identified: Identified, paths: bool = True
 ) -> dict[str, bytes]:
-    """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
+    """Returns the pictures of a fit that the recording allows, by name, each a PNG."""
     by_motion = identified.findings.width is not None or bool(
         identified.findings.replaced
     )
@@ -102,11 +101,11 @@ def draw_accuracy(identified: Identified) -> bytes:
     figure, (axes,) = make_panels(1, 1, (7.5, 4.5))
     circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
     for n, curve in enumerate(identified.fit.curves):
-        share = np.maximum(curve.share, LEAST_SHARE)
+        errors = np.maximum(curve.share, LEAST_ERROR)
         line = axes.plot(
-            share, marker=MARKERS[n % len(MARKERS)], markersize=4, label=curve.dof
+            errors, marker=MARKERS[n % len(MARKERS)], markersize=4, label=curve.dof
         )[0]
-        axes.plot(curve.kept, share[curve.kept], "o", color=line.get_color(), **circle)
+        axes.plot(curve.kept, errors[curve.kept], "o", color=line.get_color(), **circle)
     axes.plot([], [], "o", color=DARK, label="kept", **circle)
     axes.set_yscale("log")
     longest = max((len(curve.error) for curve in identified.fit.curves), default=2)
@@ -163,14 +162,14 @@ def _collect_unseen_paths(identified: Identified) -> list[tuple[Array, Array, fl
 
 
 def _draw_unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
-    truth, path, apart = paths
+    truth, path, distance = paths
     axes.plot(
         *truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured"
     )
     axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
     axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_title(f"{apart:.2g} m apart after {HORIZON_S:g} s")
+    axes.set_title(f"{distance:.2g} m apart after {HORIZON_S:g} s")
     axes.set(xlabel="x [m]", ylabel="y [m]")
 
 
@@ -183,14 +182,13 @@ def draw_yardsticks(identified: Identified) -> bytes:
         ("textbook", "fitted textbook", MEASURED, "s--"),
         ("kept_twist", "constant twist", OTHER, "^:"),
     ):
-        known = [
-            (at.horizon_s, each) for at in judgement if (each := getattr(at, name))
+        points = [
+            (at.horizon_s, error) for at in judgement if (error := getattr(at, name))
         ]
-        if known:
-            error = [max(each.position_m, LEAST_SHARE) for _, each in known]
+        if points:
             axes.plot(
-                [s for s, _ in known],
-                error,
+                [horizon_s for horizon_s, _ in points],
+                [max(error.position_m, LEAST_ERROR) for _, error in points],
                 line,
                 color=colour,
                 markersize=5,
@@ -283,11 +281,11 @@ def _draw_response(
     twist = samples.dq[:, :3]
     wanted = samples.x[:, variable]
     with np.errstate(all="ignore"):
-        alike = np.abs([np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)])
-    d = int(np.argmax(np.nan_to_num(alike)))
-    other = axes.twinx()
-    other.grid(visible=False)
-    other.plot(
+        correlations = [np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)]
+    d = int(np.argmax(np.nan_to_num(np.abs(correlations))))
+    response_axes = axes.twinx()
+    response_axes.grid(visible=False)
+    response_axes.plot(
         samples.t[shown] - samples.t[0] - SETTLED_S,
         twist[shown, d],
         color=MEASURED,
@@ -295,13 +293,13 @@ def _draw_response(
         alpha=0.55,
     )
     model = identified.model
-    other.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", color=MEASURED)
+    response_axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", color=MEASURED)
 
 
 def _predict_rates(identified: Identified, chosen: Windows) -> Array:
-    shares = np.linspace(0.02, 1.0, POINTS)
     ends = [
-        chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares
+        chosen.start_t + fraction * (chosen.end_t - chosen.start_t)
+        for fraction in np.linspace(0.02, 1.0, POINTS)
     ]
     model = identified.model
     calibration = identified.calibration
@@ -313,10 +311,9 @@ def _predict_rates(identified: Identified, chosen: Windows) -> Array:
 
 
 def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
-    """The pictures of a calibration by name, as far as the recording shows them, each a PNG."""
-    found = estimates(identified)
+    """Returns the pictures of a calibration that the recording allows, by name, each a PNG."""
     drawn = {
-        "mounting": draw_mounting(identified, found),
+        "mounting": draw_mounting(identified, estimates(identified)),
         "inputs": draw_inputs(spec, identified),
         "noise": draw_noise(identified),
     }
@@ -324,12 +321,12 @@ def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes
 
 
 def draw_mounting(
-    identified: Identified, found: dict[str, CalibratedValue]
+    identified: Identified, values: dict[str, CalibratedValue]
 ) -> bytes | None:
     """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
-    rotation = found["rotation_rad"]
-    lever_x = found["lever_arm_x_m"]
-    lever_y = found["lever_arm_y_m"]
+    rotation = values["rotation_rad"]
+    lever_x = values["lever_arm_x_m"]
+    lever_y = values["lever_arm_y_m"]
     if rotation.value is None:
         return None
     tracked = identified.drive.twists.twist
@@ -441,12 +438,16 @@ def draw_noise(identified: Identified) -> bytes | None:
     if odometry is not None:
         histograms += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
         histograms += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
-    histograms = [one for one in histograms if one[1].measured and one[1].std > 0.0]
-    grown = drift_growth(drive, calibration, model)
+    histograms = [
+        (name, level, residual)
+        for name, level, residual in histograms
+        if level.measured and level.std > 0.0
+    ]
+    growth = drift_growth(drive, calibration, model)
     drifts = (
-        grown is not None
+        growth is not None
         and levels.position_drift.measured
-        and bool(grown[1].max() > 1e-9)
+        and bool(growth[1].max() > 1e-9)
     )
     if not histograms and not drifts:
         return None
@@ -470,8 +471,8 @@ def draw_noise(identified: Identified) -> bytes | None:
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
         axes.set_title(f"noise of the {name}\n{_format_value(level)}")
-    if drifts and grown is not None:
-        horizon, position, heading = grown
+    if drifts and growth is not None:
+        horizon, position, heading = growth
         after = grid[len(histograms) :]
         _draw_growth(
             after[0], horizon, "position", levels.position_drift, position, "m"

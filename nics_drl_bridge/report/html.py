@@ -59,32 +59,32 @@ def make_page(
 
 
 def make_paragraph(text: str) -> str:
-    """Returns a paragraph as HTML, as the next ones."""
+    """Returns a paragraph as HTML."""
     return f"<p>{escape(text)}</p>"
 
 
 def make_code(text: str) -> str:
-    """Preformatted text."""
+    """Returns preformatted text."""
     return f"<pre>{escape(text)}</pre>"
 
 
 def make_bullets(sentences: Sequence[str]) -> str:
-    """A list of sentences."""
-    return "<ul>" + "".join(f"<li>{escape(each)}</li>" for each in sentences) + "</ul>"
+    """Returns a list of sentences."""
+    return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in sentences) + "</ul>"
 
 
 def make_tiles(figures: Sequence[tuple[str, str, bool]]) -> str:
-    """Figures in large type, each with its meaning, and false if it is a reason for doubt."""
-    each = (
+    """Returns figures in large type, each with its meaning, and False if it raises a doubt."""
+    tiles = (
         f'<div class="tile{"" if good else " doubtful"}"><b>{"" if good else "⚠ "}{escape(figure)}'
         f"</b><span>{escape(meaning)}</span></div>"
         for figure, meaning, good in figures
     )
-    return f'<div class="tiles">{"".join(each)}</div>'
+    return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
 def make_picture(png: bytes, caption: str) -> str:
-    """A PNG with its caption."""
+    """Returns a PNG with its caption."""
     data = base64.b64encode(png).decode()
     caption = escape(caption)
     kind = ' class="wide"' if _read_width(png) > WIDE else ""
@@ -100,21 +100,20 @@ def _read_width(png: bytes) -> int:
 
 
 def make_gallery(pictures: Sequence[tuple[bytes, str]]) -> str:
-    """Pictures with captions side by side; below each other on a phone, or where they are wide."""
+    """Returns pictures with captions side by side, or in a column on a phone or if wide."""
     wide = any(_read_width(png) > WIDE for png, _ in pictures)
     kind = "gallery wide" if wide else "gallery"
-    return (
-        f'<div class="{kind}">{"".join(make_picture(*each) for each in pictures)}</div>'
-    )
+    figures = "".join(make_picture(png, caption) for png, caption in pictures)
+    return f'<div class="{kind}">{figures}</div>'
 
 
 def make_details(summary: str, blocks: Sequence[str]) -> str:
-    """Blocks that are folded below a summary, and open in print."""
+    """Returns blocks that are folded below a summary, and open in print."""
     return f"<details><summary>{escape(summary)}</summary>{''.join(blocks)}</details>"
 
 
 def make_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows of text under a heading row."""
+    """Returns rows of text under a heading row."""
 
     def cells(kind: str, row: Sequence[str]) -> str:
         return (

@@ -22,8 +22,8 @@ from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 CAN = frozenset({"pause", "speed", "step", "seek", "restart"})
-MARGIN_M = 1.0  # around what was driven and seen, where no world is given
-WITHIN = 98.0  # percentage of the hits of a scan that belong to the place that is shown
+MARGIN_M = 1.0  # around the path and the hits of the lidar, if no world is given
+WITHIN = 98.0  # percentage of the hits that belong to the place that is shown
 
 
 class BagSource:
@@ -43,10 +43,8 @@ class BagSource:
     ) -> None:
         self._times, self._shots, lidar = _read(path, model, topics)
         self._model = replace(model, lidar=lidar)
-        self._path, self._world = (
-            Path(path),
-            world or place_of(self._model, self._shots),
-        )
+        self._path = Path(path)
+        self._world = world or place_of(self._model, self._shots)
         if len(self._times) > 1:
             self.period_s = float(np.median(np.diff(self._times)))
         else:
@@ -57,14 +55,13 @@ class BagSource:
     def stage(self) -> Stage:
         """See `show.FrameSource`."""
         span = float(self._times[0]), float(self._times[-1])
-        named = self._model_name
         return Stage(
             self._path.name,
             self._model,
             (self._world,),
             CAN,
             span_s=span,
-            model_name=named,
+            model_name=self._model_name,
         )
 
     def frame(self) -> Frame:
@@ -101,19 +98,19 @@ class BagSource:
 def _read(
     path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
 ) -> tuple[list[float], list[Snapshot], Any]:
-    """Times from the first on [s], shots, and the lidar of the bag."""
+    """Returns times since the first [s], shots, and the lidar of the bag."""
     messages = read_messages(path, topics, model.gyro)
     playback = Playback(model, POSE in messages, any_lidar=True)
     stamps = list[int]()
     shots = list[Snapshot]()
     middleware = playback.middleware
-    every = SCAN if SCAN in messages else ODOM
+    frame_role = SCAN if SCAN in messages else ODOM
     command: Array | None = None
     for role, message in merge_messages(messages):
-        used = playback.take(role, message)
+        is_used = playback.take(role, message)
         if role == CMD_VEL:
             command = read_robot_command(message.content, model.robot)
-        if role != every or not used or ODOM not in middleware.cache.newest:
+        if role != frame_role or not is_used or ODOM not in middleware.cache.newest:
             continue
         stamps.append(middleware.newest_ns or 0)
         view = middleware.view(stamps[-1])
@@ -136,15 +133,15 @@ def _read(
 
 
 def place_of(model: SimulatorModel, shots: list[Snapshot]) -> World:
-    """A field without walls that holds what was driven, and most of what was seen."""
+    """Returns a field without walls that holds the path and most of what the lidar hit."""
     poses = np.concatenate([shot.poses[:, :2] for shot in shots])
-    some = shots[:: max(1, len(shots) // 50)]
-    seen = [hits_of(model.lidar, shot.poses[0], shot.ranges[0]) for shot in some]
-    ends = np.percentile(
-        np.concatenate([poses, *seen]), [100.0 - WITHIN, WITHIN], axis=0
+    samples = shots[:: max(1, len(shots) // 50)]
+    hits = [hits_of(model.lidar, shot.poses[0], shot.ranges[0]) for shot in samples]
+    hits_low, hits_high = np.percentile(
+        np.concatenate([poses, *hits]), [100.0 - WITHIN, WITHIN], axis=0
     )
-    low = np.minimum(ends[0], poses.min(axis=0)) - MARGIN_M
-    high = np.maximum(ends[1], poses.max(axis=0)) + MARGIN_M
+    low = np.minimum(hits_low, poses.min(axis=0)) - MARGIN_M
+    high = np.maximum(hits_high, poses.max(axis=0)) + MARGIN_M
     return World(
         name="bag", bounds=(*low.tolist(), *high.tolist()), goal_distance=(0.0, 1.0)
     )

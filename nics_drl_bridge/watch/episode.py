@@ -25,10 +25,9 @@ from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 Env = gymnasium.Env[Any, Any]
-Make = Callable[
-    [str, AnyWorld], tuple[Env, Policy]
-]  # for a policy and a world, see `open_env`
-HELD_S = 0.5  # without a request of the keyboard for so long, the robot stops [s]
+# for a policy and a world, see `open_env`
+Make = Callable[[str, AnyWorld], tuple[Env, Policy]]
+HELD_S = 0.5  # the robot stops after this time without a request of the keyboard [s]
 LINGER_S = 1.0  # of simulated time between the end of an episode and the next one [s]
 CAN = frozenset(
     {
@@ -76,37 +75,39 @@ class Lane:
 
     def begin(self, **options: Any) -> None:
         """Begins the episode of the seed, with options of `reset`."""
-        self._seen, _ = self._env.reset(seed=self.seed, options=options)
+        self._observation, _ = self._env.reset(seed=self.seed, options=options)
         begin(self._driver)
         self.state = ""
         self._over_s = 0.0
-        if not options:  # otherwise the way so far is still that of this episode
-            self.time_s, self.trail = 0.0, Track()
+        if not options:  # otherwise the path so far belongs to this episode
+            self.time_s = 0.0
+            self.trail = Track()
         self.trail.add(self.env.snapshot().poses, 1)
 
     def advance(self, command: NDArray[np.float64] | None) -> bool:
-        """Advances one period under a command (C,), or that of the policy; True in a new env."""
+        """Advances one period by a command (C,) or by the policy; returns True in a new env."""
         if self.over:
             return self.anew(self.seed + 1)
         if self.state:
             self._over_s += self.env.model.control_period
             return False
         if command is None:
-            action = self._driver.act(self._seen)
+            action = self._driver.act(self._observation)
         else:
-            action = self._action(command)
-        self._seen, _, terminated, truncated, info = self._env.step(action)
+            action = self._choose_action(command)
+        self._observation, _, terminated, truncated, info = self._env.step(action)
         self.time_s += self.env.model.control_period
         self.trail.add(self.env.snapshot().poses, 1)
         if terminated or truncated:
-            if np.any(info.get("collision", False)):
-                touched = "collision"
+            if np.all(info.get("is_success", False)):
+                self.state = "success"
+            elif np.any(info.get("collision", False)):
+                self.state = "collision"
             else:
-                touched = "time-out"
-            self.state = "success" if np.all(info.get("is_success", False)) else touched
+                self.state = "time-out"
         return False
 
-    def _action(self, command: NDArray[np.float64]) -> Any:
+    def _choose_action(self, command: NDArray[np.float64]) -> Any:
         if self.task.actions == "discrete":
             return int(
                 np.abs(self.task.discrete_commands - command).sum(axis=-1).argmin()
@@ -114,7 +115,10 @@ class Lane:
         return actions_of(self.task, command)
 
     def anew(self, seed: float) -> bool:
-        """Begins a seed's episode in the world as at first; True in a new env. ConfigError."""
+        """Begins the episode of a seed in the original world; returns True in a new env.
+
+        Raises ConfigError for a bad seed.
+        """
         self.seed = int(check_seeds([seed])[0])
         if changed := self.world is not self._native:
             self.close()
@@ -143,15 +147,15 @@ class Lane:
     def add(self, shape: Shape, x: float, y: float) -> None:
         """Adds an obstacle [m]. Raises ConfigError where there is a robot, or no world."""
         reach = shape.radius + self.env.model.robot.footprint_radius
-        apart = np.linalg.norm(self.env.snapshot().poses[:, :2] - (x, y), axis=1)
-        if apart.min() <= reach:
+        distances = np.linalg.norm(self.env.snapshot().poses[:, :2] - (x, y), axis=1)
+        if distances.min() <= reach:
             raise ConfigError(
                 f"an obstacle at ({x:.2f} m, {y:.2f} m) touches the robot; move it."
             )
         self._rebuild(self._policy, Obstacles(shapes=(shape,), at=((x, y, 0.0),)))
 
     def clear(self) -> None:
-        """Takes all obstacles out."""
+        """Removes all obstacles."""
         self._rebuild(self._policy, emptied=True)
 
     def _rebuild(self, policy: str, *more: Obstacles, emptied: bool = False) -> None:
@@ -168,7 +172,7 @@ class Lane:
         kept["_env"].close()
 
     def frame(self, place: int) -> WorldFrame:
-        """The world now; `place` is that of its first member."""
+        """Returns the present frame; `place` is that of the world's first member."""
         shot = self.env.snapshot()
         name = f"{self.world.name}, episode {self.seed}"
         return WorldFrame(
@@ -181,7 +185,7 @@ class Lane:
 
 
 def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
-    """The world of an env with its obstacles where they are now, or none, and more of them."""
+    """Returns the world of an env with its obstacles where they are now, or none, and more."""
     shot = env.snapshot()
     world = env.world.members[shot.member]
     shapes = env.world.shapes
@@ -251,11 +255,11 @@ class EpisodeSource:
 
     def advance(self) -> bool:
         """Advances all worlds by one control period; see `show.FrameSource`."""
-        held = time.monotonic() - self._asked_s < HELD_S
-        command = self._command if held else 0.0 * self._command
-        changed = [
-            lane.advance(command if self._by_hand else None) for lane in self.lanes
-        ]
+        command = None
+        if self._by_hand:
+            is_held = time.monotonic() - self._asked_s < HELD_S
+            command = self._command if is_held else 0.0 * self._command
+        changed = [lane.advance(command) for lane in self.lanes]
         return any(changed)
 
     def take(self, request: Request) -> bool:
@@ -266,17 +270,18 @@ class EpisodeSource:
         elif request.kind == "drive":
             self._drive(request)
         elif request.kind == "policy":
-            for each in self.lanes:
-                each.follow(request.name)
+            for follower in self.lanes:
+                follower.follow(request.name)
             self._policy = request.name
         elif request.kind in ("seed", "restart"):
-            for each in self.lanes:
-                each.anew(each.seed if request.kind == "restart" else request.value)
+            for episodes in self.lanes:
+                is_restart = request.kind == "restart"
+                episodes.anew(episodes.seed if is_restart else request.value)
         else:
-            return self._furnish(lane, request)
+            return self._change_world(lane, request)
         return request.kind in ("policy", "seed", "restart")
 
-    def _furnish(self, lane: Lane, request: Request) -> bool:
+    def _change_world(self, lane: Lane, request: Request) -> bool:
         if request.kind == "obstacle":
             shape: Shape = Circle(radius=request.size)
             if request.shape != "circle":
@@ -286,8 +291,8 @@ class EpisodeSource:
         elif request.kind == "clear":
             lane.clear()
         elif request.kind == "world":
-            known = self._given_worlds.get(request.name)
-            lane.enter(load_worlds(request.name) if known is None else known)
+            world = self._given_worlds.get(request.name)
+            lane.enter(load_worlds(request.name) if world is None else world)
         else:
             return False
         return True
@@ -300,18 +305,21 @@ class EpisodeSource:
         )
 
     def _drive(self, request: Request) -> None:
-        """Takes shares of the greatest speed forward, to the left, and turning left."""
+        """Takes fractions of the maximum speeds forward, to the left, and turning left."""
         robot = self.model.robot
         if not self._drives:
             raise ConfigError(
                 f"robot {robot.name!r} takes no cmd_vel: no keyboard drives it."
             )
-        shares = np.clip(np.array(request.twist)[list(robot.cmd_vel_places)], -1.0, 1.0)
-        ends = np.where(shares < 0.0, robot.command_low, robot.command_high)
-        self._command = np.clip(
-            np.abs(shares) * ends, robot.command_low, robot.command_high
+        fractions = np.clip(
+            np.array(request.twist)[list(robot.cmd_vel_places)], -1.0, 1.0
         )
-        self._by_hand, self._asked_s = request.on, time.monotonic()
+        ends = np.where(fractions < 0.0, robot.command_low, robot.command_high)
+        self._command = np.clip(
+            np.abs(fractions) * ends, robot.command_low, robot.command_high
+        )
+        self._by_hand = request.on
+        self._asked_s = time.monotonic()
 
     def close(self) -> None:
         """Closes all envs."""

@@ -1,4 +1,4 @@
-"""All that the page shows: a stage once, and a frame for each time, as plain data for JSON."""
+"""What the page shows: a stage once, and frames over time, as plain data for JSON."""
 
 import base64
 import math
@@ -29,30 +29,34 @@ class Stage:
 
     title: str
     model: SimulatorModel
-    worlds: tuple[
-        AnyWorld, ...
-    ]  # whose members, one after the other, are the places of the frames
-    can: frozenset[str] = (
-        frozenset()
-    )  # requests that the source takes, see `server.Request`
-    choices: Mapping[str, Sequence[str]] = field(
-        default_factory=dict
-    )  # of policies and worlds
+    # The places of the frames are the members of these worlds, one after the other.
+    worlds: tuple[AnyWorld, ...]
+    # requests that the source takes, see `server.Request`
+    can: frozenset[str] = frozenset()
+    # of policies and worlds
+    choices: Mapping[str, Sequence[str]] = field(default_factory=dict)
     chosen: Mapping[str, str] = field(default_factory=dict)
     span_s: tuple[float, float] | None = None  # of a bag [s]
-    # as whoever started the page names the model; else its robot's name
+    # name of the model on the page; if empty, the robot's name
     model_name: str = ""
 
     def plain(self) -> dict[str, Any]:
-        """The stage as plain data."""
+        """Returns the stage as plain data."""
         robot = self.model.robot
         lidar = self.model.lidar
         commands = [
-            {"name": one.name, "unit": one.unit, "min": one.min, "max": one.max}
-            for one in robot.command
+            {
+                "name": variable.name,
+                "unit": variable.unit,
+                "min": variable.min,
+                "max": variable.max,
+            }
+            for variable in robot.command
         ]
         places = [
-            _place(one, each.shapes) for each in self.worlds for one in each.members
+            _describe_place(member, world.shapes)
+            for world in self.worlds
+            for member in world.members
         ]
         return {
             "kind": "stage",
@@ -76,23 +80,23 @@ class Stage:
             "places": places,
             "span": self.span_s,
             "chosen": dict(self.chosen),
-            "choices": {name: list(some) for name, some in self.choices.items()},
+            "choices": {name: list(names) for name, names in self.choices.items()},
         }
 
 
-def _place(world: World, shapes: Sequence[Shape]) -> dict[str, Any]:
+def _describe_place(world: World, shapes: Sequence[Shape]) -> dict[str, Any]:
     outlines = [np.round(shape.outline / shape.radius, 4).tolist() for shape in shapes]
     return {
         "name": world.name,
         "extent": world.extent,
         "walls": world.all_walls().tolist(),
-        "map": None if world.grid is None else _map(world.grid),
+        "map": None if world.grid is None else _describe_map(world.grid),
         "shapes": outlines,
     }
 
 
-def _map(grid: GridMap) -> dict[str, Any]:
-    """Cells of a map, a byte each: 0 free, 1 unknown, 2 blocked."""
+def _describe_map(grid: GridMap) -> dict[str, Any]:
+    """Returns a map with one byte per cell: 0 free, 1 unknown, 2 blocked."""
     cells = np.where(grid.free, 0, np.where(grid.blocked, 2, 1)).astype(np.uint8)
     return {
         "rows": cells.shape[0],
@@ -110,18 +114,18 @@ class WorldFrame:
     shot: Snapshot
     name: str = ""
     place: int = 0  # in the `worlds` of the stage, member by member
-    trails: tuple[Array, ...] = ()  # (T, 2) way of each robot in this episode [m]
+    trails: tuple[Array, ...] = ()  # (T, 2) path of each robot in this episode [m]
     state: str = ""  # how the episode stands, in a word or two
     time_s: float | None = None  # since its episode began [s]; None: that of the frame
 
     def plain(self, velocities: Velocities | None = None) -> dict[str, Any]:
-        """The world as plain data, with the velocities in it."""
+        """Returns the world as plain data, with the velocities in it."""
         shot = self.shot
-        exist = shot.bodies[:, RADIUS] > 0.0
-        there = shot.bodies[exist]
-        moving = velocities or Velocities.unknown(shot)
-        bodies = there[:, [X, Y, HEADING, RADIUS]]
-        kinds = there[:, SHAPE].astype(int).tolist()
+        exists = shot.bodies[:, RADIUS] > 0.0
+        bodies = shot.bodies[exists]
+        kinds = bodies[:, SHAPE].astype(int).tolist()
+        if velocities is None:
+            velocities = Velocities.unknown(shot)
         ranges = np.where(np.isfinite(shot.ranges), shot.ranges, NO_RETURN / MM)
         return {
             "name": self.name,
@@ -130,11 +134,11 @@ class WorldFrame:
             "gate": shot.gate,
             "poses": round_to_thousandths(shot.poses),
             "ranges": round_to_thousandths(ranges),
-            "bodies": round_to_thousandths(bodies),
+            "bodies": round_to_thousandths(bodies[:, [X, Y, HEADING, RADIUS]]),
             "kinds": kinds,
             "goals": round_to_thousandths(shot.goals),
-            "velocities": round_to_thousandths(moving.robots),
-            "body_velocities": round_to_thousandths(moving.bodies[exist]),
+            "velocities": round_to_thousandths(velocities.robots),
+            "body_velocities": round_to_thousandths(velocities.bodies[exists]),
             "trails": [round_to_thousandths(trail) for trail in self.trails],
             "estimates": None
             if shot.estimates is None
@@ -149,7 +153,7 @@ class WorldFrame:
 
 
 def _compute_ellipse(covariance: Array) -> list[float]:
-    """Half axes [m] and turn [rad] of the ellipse that holds the position with 95 %."""
+    """Returns half axes [m] and rotation [rad] of the ellipse of 95 % confidence."""
     values, vectors = np.linalg.eigh(covariance[:2, :2])
     scale = -2.0 * math.log(0.05)  # quantile of chi squared with two degrees of freedom
     small, large = np.sqrt(np.maximum(values, 0.0) * scale).tolist()
@@ -161,7 +165,7 @@ def _compute_ellipse(covariance: Array) -> list[float]:
 
 
 def round_to_thousandths(values: ArrayLike) -> Any:
-    """Numbers as whole thousandths in lists; what is not finite becomes 0."""
+    """Returns numbers as whole thousandths in lists, with 0 for those that are not finite."""
     scaled = np.nan_to_num(np.asarray(values, np.float64) * MM, posinf=0.0, neginf=0.0)
     return np.rint(scaled).astype(np.int64).tolist()
 
@@ -172,15 +176,15 @@ class Frame:
 
     time_s: float
     worlds: tuple[WorldFrame, ...]
-    note: str = ""  # a line about all of them, as how far a training is
+    note: str = ""  # a line about all of them, such as the progress of a training
 
     def plain(self, meter: MotionMeter | None = None) -> dict[str, Any]:
-        """The frame as plain data, with velocities where a meter measures them."""
+        """Returns the frame as plain data, with velocities if a meter measures them."""
         if meter is None:
             worlds = [world.plain() for world in self.worlds]
         else:
-            each = zip(self.worlds, self.measured_by(meter), strict=True)
-            worlds = [world.plain(moving) for world, moving in each]
+            pairs = zip(self.worlds, self.measured_by(meter), strict=True)
+            worlds = [world.plain(velocities) for world, velocities in pairs]
         return {
             "kind": "frame",
             "time": self.time_s,
@@ -198,7 +202,7 @@ class Frame:
 
 
 class Track:
-    """The way of M robots in an episode, at most `MOST` points of each."""
+    """The paths of M robots in an episode, at most `MOST` points of each."""
 
     MOST = 600
 
@@ -211,9 +215,9 @@ class Track:
             self._points = []
         self._points.append(poses[:, :2].copy())
         if len(self._points) > self.MOST:
-            del self._points[::2]  # every other point: the whole way stays visible
+            del self._points[::2]  # every other point: the whole path stays visible
 
     @property
     def ways(self) -> tuple[Array, ...]:
-        """(T, 2) the way of each robot."""
+        """Paths (T, 2) of the robots."""
         return tuple(np.array(self._points).transpose(1, 0, 2)) if self._points else ()

@@ -12,11 +12,11 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import X, Y
 
 LONGEST_S = 1.0  # between two frames; a mean over a longer time says little about now
-FASTEST_M_S = 30.0  # what seems to be faster was put elsewhere
+FASTEST_M_S = 30.0  # what seems faster was moved by hand or reset
 
 
 class Velocities(NamedTuple):
-    """Velocities in one world, along the axes of `map`; zero where they are not known."""
+    """Velocities in one world, along the axes of `map`; zero where they are unknown."""
 
     robots: Array  # (M, 2) [m/s]
     bodies: Array  # (K, 2) [m/s], of the obstacles
@@ -30,8 +30,8 @@ class Velocities(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """One world as it was last seen."""
+class _Measurement:
+    """One world at its last frame, with velocities."""
 
     time_s: float
     shot: Snapshot
@@ -42,44 +42,51 @@ class MotionMeter:
     """Measures velocities as the displacement between two frames over the time between them."""
 
     def __init__(self) -> None:
-        self._seen: list[_Seen] = []
+        self._last: list[_Measurement] = []
 
     def measure(
         self, times_s: Sequence[float], shots: Sequence[Snapshot]
     ) -> list[Velocities]:
         """Returns the velocities in each world, whose times are those of its own episode [s]."""
-        if len(shots) != len(self._seen):
-            self._seen = [
-                _Seen(math.inf, shot, Velocities.unknown(shot)) for shot in shots
+        if len(shots) != len(self._last):
+            self._last = [
+                _Measurement(math.inf, shot, Velocities.unknown(shot)) for shot in shots
             ]
-        self._seen = [
-            _Seen(time_s, shot, _velocities(before, time_s, shot))
-            for before, time_s, shot in zip(self._seen, times_s, shots, strict=True)
+        self._last = [
+            _Measurement(time_s, shot, _measure_velocities(before, time_s, shot))
+            for before, time_s, shot in zip(self._last, times_s, shots, strict=True)
         ]
-        return [seen.velocities for seen in self._seen]
+        return [measurement.velocities for measurement in self._last]
 
 
-def _velocities(before: _Seen, time_s: float, shot: Snapshot) -> Velocities:
+def _measure_velocities(
+    before: _Measurement, time_s: float, shot: Snapshot
+) -> Velocities:
     passed_s = time_s - before.time_s
     last = before.shot
-    known = before.velocities
+    last_velocities = before.velocities
     if shot.member != last.member or not 0.0 <= passed_s <= LONGEST_S:
         return Velocities.unknown(shot)
     places = [X, Y]
     return Velocities(
-        _compute_rates(last.poses[:, :2], shot.poses[:, :2], passed_s, known.robots),
         _compute_rates(
-            last.bodies[:, places], shot.bodies[:, places], passed_s, known.bodies
+            last.poses[:, :2], shot.poses[:, :2], passed_s, last_velocities.robots
+        ),
+        _compute_rates(
+            last.bodies[:, places],
+            shot.bodies[:, places],
+            passed_s,
+            last_velocities.bodies,
         ),
     )
 
 
-def _compute_rates(before: Array, now: Array, passed_s: float, known: Array) -> Array:
-    """Returns velocities (n, 2) by points (n, 2); those that are known if no time has passed."""
+def _compute_rates(before: Array, now: Array, passed_s: float, last: Array) -> Array:
+    """Returns velocities (n, 2) by points (n, 2); the last ones (n, 2) if no time has passed."""
     if before.shape != now.shape:
         return np.zeros_like(now)
     if passed_s == 0.0:
-        return known
+        return last
     rates = (now - before) / passed_s
-    possible = np.hypot(rates[:, 0], rates[:, 1]) < FASTEST_M_S  # false for NaN, too
+    possible = np.hypot(rates[:, 0], rates[:, 1]) < FASTEST_M_S  # False for NaN
     return np.where(possible[:, None], rates, 0.0)

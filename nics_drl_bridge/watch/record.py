@@ -37,26 +37,26 @@ def draw_frames(stage: Stage, frames: Iterable[Frame]) -> Iterator[Pixels]:
 
 
 def join_side_by_side(row: list[Pixels]) -> Pixels:
-    """Pictures side by side, of even sides, as videos need."""
-    height = -(-max(len(each) for each in row) // 2) * 2
-    width = -(-sum(each.shape[1] for each in row) // 2) * 2
-    whole = np.full((height, width, 3), 255, np.uint8)
+    """Joins pictures side by side, with an even height and width, as videos need."""
+    height = -(-max(len(picture) for picture in row) // 2) * 2
+    width = -(-sum(picture.shape[1] for picture in row) // 2) * 2
+    joined = np.full((height, width, 3), 255, np.uint8)
     left = 0
-    for each in row:
-        whole[: len(each), left : left + each.shape[1]] = each
-        left += each.shape[1]
-    return whole
+    for picture in row:
+        right = left + picture.shape[1]
+        joined[: len(picture), left:right] = picture
+        left = right
+    return joined
 
 
 def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     """Writes a GIF that repeats for ever."""
-    every = list(shown)
-    palette = choose_palette(
-        every[:: -(-len(every) // SAMPLES)]
-    )  # one for all, or colours flicker
+    pictures = list(shown)
+    # All frames have one palette, or colours would flicker.
+    palette = choose_palette(pictures[:: -(-len(pictures) // SAMPLES)])
     first, *rest = [
-        Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE)
-        for each in every
+        Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
+        for pixels in pictures
     ]
     buffer = io.BytesIO()
     duration = round(1000.0 / fps)
@@ -66,14 +66,17 @@ def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def choose_palette(some: list[Pixels]) -> Image.Image:
-    """Palette of the most frequent colours that differ: means would lose those of small things."""
-    parts = np.concatenate([each.reshape(-1, 3) for each in some]).astype(np.int64)
+def choose_palette(samples: list[Pixels]) -> Image.Image:
+    """Returns a palette of the most frequent distinct colours.
+
+    Means of colours would lose those of small things.
+    """
+    pixels = np.concatenate([sample.reshape(-1, 3) for sample in samples])
     colours, counts = np.unique(
-        parts @ np.array([1 << 16, 1 << 8, 1]), return_counts=True
+        pixels.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1]), return_counts=True
     )
-    best = colours[np.argsort(-counts)]
-    rows = np.stack([best >> 16, best >> 8 & 255, best & 255], axis=1)
+    frequent = colours[np.argsort(-counts)]
+    rows = np.stack([frequent >> 16, frequent >> 8 & 255, frequent & 255], axis=1)
     chosen = rows[:0]
     while len(rows) and len(chosen) < COLOURS:
         chosen = np.concatenate([chosen, rows[:1]])
@@ -101,8 +104,8 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
             imageio_ffmpeg.write_frames(str(part), (width, height), **options)
         ) as video:
             video.send(None)
-            for each in chain([first], shown):
-                video.send(np.ascontiguousarray(each))
+            for pixels in chain([first], shown):
+                video.send(np.ascontiguousarray(pixels))
 
 
 LIBRARIES = {".mp4": ("imageio_ffmpeg",)}
@@ -125,7 +128,7 @@ def check_file(path: Path) -> None:
 
 
 def write(path: Path, stage: Stage, frames: Iterable[Frame], fps: float) -> None:
-    """Writes frames to a file whose suffix tells its kind. Raises ConfigError."""
+    """Writes frames to a file of the kind that its suffix names. Raises ConfigError."""
     check_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[path.suffix](path, stage, frames, fps)

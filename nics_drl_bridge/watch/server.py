@@ -23,11 +23,11 @@ HOST = "127.0.0.1"
 PORT = 8765
 MOST_REQUESTS = 256
 MOST_BYTES = 4096
-QUIET = logging.Logger(
-    "pages", logging.CRITICAL + 1
-)  # one that sleeps or errs is no news
+# Pages that sleep or fail are not logged.
+QUIET = logging.Logger("pages", logging.CRITICAL + 1)
+# The page loads nothing from other hosts, and sends nothing to them.
 POLICY = "; ".join(
-    [  # nothing comes from elsewhere, and nothing goes there
+    [
         "default-src 'none'",
         "script-src 'unsafe-inline'",
         "style-src 'unsafe-inline'",
@@ -57,31 +57,25 @@ class Request(Schema):
         "speed",
         "step",
     ]
-    world: int = Field(
-        default=0, ge=0, le=10_000
-    )  # index of the frame's world that is meant
+    # index of the world in the frame
+    world: int = Field(default=0, ge=0, le=10_000)
     x: float = Field(default=0.0, ge=-1e8, le=1e8)  # place of a goal or an obstacle [m]
     y: float = Field(default=0.0, ge=-1e8, le=1e8)
-    size: float = Field(
-        default=0.2, ge=0.01, le=10.0
-    )  # radius, or half side of a box [m]
+    # radius, or half side of a box [m]
+    size: float = Field(default=0.2, ge=0.01, le=10.0)
     shape: Literal["circle", "box"] = "circle"
     name: str = Field(default="", max_length=500)  # of a policy or a world
-    value: int | float = Field(
-        default=0.0, ge=-GREATEST_SEED, le=GREATEST_SEED
-    )  # speed, seed, [s]
+    # speed, seed, or time [s]
+    value: int | float = Field(default=0.0, ge=-GREATEST_SEED, le=GREATEST_SEED)
     on: bool = True  # of a pause, or of driving by hand
-    twist: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # shares forward, left, to the left
+    # fractions of the maximum speeds forward, to the left, and turning left
+    twist: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class PageServer:
-    """Serves the page in threads of its own; frames go to whoever keeps up.
+    """Serves the page at `url` in its own threads; slow browsers skip frames.
 
-    `url` tells where. Port 0 takes any free one. Raises ConfigError if the port or the library is
+    Port 0 takes any free one. Raises ConfigError if the port or the library is
     missing.
     """
 
@@ -138,7 +132,7 @@ class PageServer:
         )
 
     def measure(self, frame: Frame) -> None:
-        """Lets the next frame tell the velocities since this one, which is not shown."""
+        """Measures a frame without showing it, so that the next one has velocities."""
         frame.measured_by(self._meter)
 
     def tell(self, sentence: str) -> None:
@@ -152,25 +146,25 @@ class PageServer:
             self._news.notify_all()
 
     def request(self, seconds: float) -> Request | None:
-        """The next request of a page, awaited for at most so long [s]."""
+        """Returns the next request of a page, waiting for it for at most some time [s]."""
         try:
             return self._requests.get(seconds > 0.0, max(seconds, 0.0))
         except queue.Empty:
             return None
 
     def _answer(self, connection: Any, request: Any) -> Any:
-        """The page; None lets a page of ours, or a program, open its socket."""
+        """Returns the page; None lets this page, or a program, open its socket."""
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
         host = ", ".join(request.headers.get_all("Host"))
-        if host not in self._hosts:  # a foreign name that was made to point here
+        if host not in self._hosts:  # a foreign name may point to this machine
             return connection.respond(
                 403, "This page is served to this machine only.\n"
             )
         if request.path == "/socket":
             origins = request.headers.get_all("Origin")  # programs send none
-            if all(each.removeprefix("http://") in self._hosts for each in origins):
+            if all(origin.removeprefix("http://") in self._hosts for origin in origins):
                 return None
             return connection.respond(
                 403, "This socket is open to its own page only.\n"
@@ -209,7 +203,7 @@ class PageServer:
 
     def _take(self, text: str | bytes) -> None:
         try:
-            with suppress(queue.Full):  # nobody listens to what pages ask
+            with suppress(queue.Full):  # requests are dropped if nobody takes them
                 self._requests.put_nowait(Request.model_validate_json(text))
         except ValidationError as error:
             first = error.errors()[0]
@@ -221,31 +215,30 @@ class PageServer:
     def _send(self, page: Any) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        seen = [0, self._numbers[1], 0]
+        sent = [0, self._numbers[1], 0]
         with suppress(ConnectionClosed):
-            while texts := self._wait_for_news(page, seen):
+            while texts := self._wait_for_news(page, sent):
                 for text in texts:
                     page.send(text)
 
-    def _wait_for_news(self, page: Any, seen: list[int]) -> list[str]:
-        """Waits for news since the numbers `seen`, which it updates; none once a page is closed."""
+    def _wait_for_news(self, page: Any, sent: list[int]) -> list[str]:
+        """Waits for texts newer than the numbers `sent`, which it updates; none once closed."""
         with self._news:
-            while page in self._pages and self._numbers == seen:
+            while page in self._pages and self._numbers == sent:
                 self._news.wait()
             if page not in self._pages:
                 return []
-            each = zip(self._texts, self._numbers, seen, strict=True)
-            texts = [text for text, new, old in each if new > old]
-            seen[:] = self._numbers
+            rows = zip(self._texts, self._numbers, sent, strict=True)
+            texts = [text for text, new, old in rows if new > old]
+            sent[:] = self._numbers
         return texts
 
     def close(self) -> None:
-        """Ends all pages and frees the port; what waits for a frame ends, too."""
+        """Closes all pages and frees the port; threads that wait for a frame end, too."""
         self.closed = True
         for page in tuple(self._pages):
-            with suppress(
-                OSError
-            ):  # a page that reads nothing would not answer a farewell
+            # A page that reads nothing would not answer a closing handshake.
+            with suppress(OSError):
                 page.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
         self._thread.join()

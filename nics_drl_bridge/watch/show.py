@@ -21,28 +21,28 @@ Handle = Callable[[Request], None]
 
 
 class FrameSource(Protocol):
-    """Frames, and what can be done to where they come from."""
+    """A source of frames that takes requests."""
 
     period_s: float  # from one frame to the next, at a speed of 1 [s]
 
     def stage(self) -> Stage:
-        """All that stays the same for now."""
+        """Returns all that stays the same from frame to frame."""
 
     def frame(self) -> Frame:
-        """The present frame."""
+        """Returns the present frame."""
 
     def advance(self) -> bool:
-        """Goes on to the next frame; True if the stage is another now. Raises BridgeError."""
+        """Goes on to the next frame; returns True if the stage changed. Raises BridgeError."""
 
     def take(self, request: Request) -> bool:
-        """Does what a page asks for; True if the stage is another now. Raises BridgeError."""
+        """Serves a request of a page; returns True if the stage changed. Raises BridgeError."""
 
     def close(self) -> None:
         """Frees all resources."""
 
 
 class Tempo:
-    """Tells when the next frame is due: at a speed, after a pause, or one by one."""
+    """Determines when the next frame is due: at a speed, after a pause, or one by one."""
 
     def __init__(self) -> None:
         self.speed = 1.0
@@ -51,7 +51,7 @@ class Tempo:
         self._due = 0.0
 
     def take(self, request: Request) -> None:
-        """Changes the pace, if that is what a page asks for."""
+        """Changes the pace, if a request asks for it."""
         if request.kind == "speed":
             self.speed = min(max(request.value, SLOWEST), FASTEST)
         elif request.kind in ("pause", "step"):
@@ -59,7 +59,7 @@ class Tempo:
             self.paused = self._single or request.on
 
     def wait(self, server: PageServer, period_s: float, handle: Handle) -> bool:
-        """Returns once the next frame is due, with requests handled; False once nobody serves."""
+        """Handles requests until the next frame is due; returns False once the server is closed."""
         while not server.closed:
             now = time.monotonic()
             going = self._single or not (self.paused and server.watched)
@@ -75,15 +75,15 @@ class Tempo:
         return False
 
     def plain(self) -> dict[str, object]:
-        """The pace as plain data."""
+        """Returns the pace as plain data."""
         return {"speed": self.speed, "paused": self.paused}
 
 
 def check_listed(request: Request, stage: Stage) -> None:
     """Raises ConfigError for a policy or a world that the page does not offer.
 
-    Any program of this machine may speak to the page's socket. It chooses among what whoever
-    started the page may choose from, and opens no other file.
+    Any program on this machine may write to the page's socket. So a request may only choose from
+    the lists that the page shows, and opens no other file.
     """
     if request.kind in stage.choices:
         offered = stage.choices[request.kind]
@@ -126,9 +126,9 @@ def show(source: FrameSource, server: PageServer) -> None:
 
 
 def open_page(url: str, browser: bool = True) -> None:
-    """Opens the page in a browser where there is a display, and else says where it is."""
-    seen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if browser and (seen or sys.platform in ("darwin", "win32")):
+    """Opens the page in a browser if there is a display, or prints its address."""
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if browser and (has_display or sys.platform in ("darwin", "win32")):
         with suppress(webbrowser.Error):
             if webbrowser.open(url):
                 return

@@ -1,4 +1,4 @@
-"""Some of the worlds of a training, shown now and then; free of cost while nobody looks."""
+"""Shows some of the worlds of a training now and then, at no cost while no page is open."""
 
 import time
 from typing import Protocol
@@ -23,12 +23,12 @@ class TrainingView:
     def __init__(self, server: PageServer, training: Envs) -> None:
         self._server = server
         envs = training.envs
-        each = max(1, MOST_WORLDS // len(envs))
+        worlds_per_env = max(1, MOST_WORLDS // len(envs))
         sizes = [len(env.world.members) for env in envs]
         self._worlds = [  # with the place of the first member of their world set
             (env, n, sum(sizes[:k]), Track())
             for k, env in enumerate(envs[:MOST_WORLDS])
-            for n in range(min(each, env.num_envs))
+            for n in range(min(worlds_per_env, env.num_envs))
         ]
         self._shown_s = 0.0
         self._steps = 0
@@ -51,14 +51,13 @@ class TrainingView:
             return
         if self._measured == self._steps - 1:
             self._shown_s = now
-            self._server.publish(self._frame())
+            self._server.publish(self._make_frame())
         else:
-            self._server.measure(
-                self._frame()
-            )  # the next step tells how fast all moves
+            # Velocities are known after the next step.
+            self._server.measure(self._make_frame())
         self._measured = self._steps
 
-    def _frame(self) -> Frame:
+    def _make_frame(self) -> Frame:
         worlds = []
         for env, n, first, trail in self._worlds:
             shot = env.snapshot(n)
