@@ -293,7 +293,7 @@ def imports_of(file: Path) -> tuple[Path, ...]:
             place = root.joinpath(*name.split("."))
             places += [
                 place,
-                *(place / name_ for name_ in re.findall(r"\w+", _ALIAS.sub("", names))),
+                *(place / word for word in re.findall(r"\w+", _ALIAS.sub("", names))),
             ]
             places += (
                 [place / "__init__"] if root != PACKAGE.parent and not is_own else []

@@ -545,7 +545,7 @@ def test_a_manifest_that_lists_other_files_is_refused_without_reading_them(
 ):
     with (listed / SUMS).open("a") as manifest:
         manifest.write(f"{hash_bytes(b'')}  {name}\n")
-    with pytest.raises(ModelError, match="is of no file of a model; remove it"):
+    with pytest.raises(ModelError, match="names no file of a model; remove it"):
         check_sums(listed, NAMES)
 
 

@@ -345,7 +345,7 @@ def test_kinematics_that_lack_a_degree_of_freedom_are_refused(saved, dof):
 def test_kinematics_of_another_robot_are_refused():
     car = builtin_model("ackermann")
     mecanum = builtin_model("mecanum")
-    with pytest.raises(ModelError, match="the robot 'ackermann' needs"):
+    with pytest.raises(ModelError, match="robot 'ackermann' needs"):
         replace(car, kinematics=mecanum.kinematics)
 
 

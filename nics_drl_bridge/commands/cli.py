@@ -47,9 +47,9 @@ class OneWordForARobot(TyperGroup):
         """Parses the words of a command line; UsageError for two robots by two words."""
         robots = [value for word in ROBOT_OPTIONS for value in read_option(word, args)]
         if len(set(robots)) > 1:
-            told = " and ".join(map(repr, robots))
+            names = " and ".join(map(repr, robots))
             ctx.fail(
-                f"--robot and --model are one option, and name {told}; give one of them"
+                f"--robot and --model are one option, and name {names}; give one of them"
             )
         return super().parse_args(ctx, args)
 

@@ -27,27 +27,26 @@ WIDEST = 10_000
 # silence before the first line about work, and between lines
 PATIENCE_S = 2.0
 REPEATED_S = 10.0
-Tell = Callable[
-    [str, int, int], None
-]  # what is done, how much of it, of how much (0: unknown)
+# what is done, how much of it, and of how much (0: unknown)
+Tell = Callable[[str, int, int], None]
 
 
-def print_line(as_json: bool, line: str, **facts: Any) -> None:
-    """Prints a line, or the facts that it tells as one JSON object."""
-    typer.echo(format_json(facts) if as_json else line)
+def print_line(as_json: bool, text: str, **facts: Any) -> None:
+    """Prints a text, or its facts as one JSON object."""
+    typer.echo(format_json(facts) if as_json else text)
 
 
 def complete_names(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[str]]:
-    """Completion of a shell for an option that takes a name in `config/KIND`, or a path."""
+    """Makes the shell completion of an option that takes a name in `config/KIND`, or a path."""
 
     def complete(incomplete: str) -> list[str]:
         from nics_drl_bridge.config import list_shipped
 
-        places = (Path(one) for one in sorted(glob(f"{incomplete}*")))
+        places = (Path(path) for path in sorted(glob(f"{incomplete}*")))
         paths = [
-            str(one)
-            for one in places
-            if one.is_dir() or one.suffix in (".yaml", ".onnx")
+            str(path)
+            for path in places
+            if path.is_dir() or path.suffix in (".yaml", ".onnx")
         ]
         names = (*(name for kind in kinds for name in list_shipped(kind)), *also)
         return [name for name in names if name.startswith(incomplete)] + paths
@@ -77,6 +76,15 @@ DrivenRobotOption = Annotated[
         "--model",
         autocompletion=ROBOTS,
         help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.",
+    ),
+]
+PolicyModelOption = Annotated[
+    str | None,
+    Option(
+        "--model",
+        "--robot",
+        autocompletion=ROBOTS,
+        help="A model's folder, or a shipped robot; else the policy's own.",
     ),
 ]
 LidarOption = Annotated[
@@ -144,16 +152,14 @@ HARDWARE_OPTIONS = (
     "goal_frame",
     "confirm_beyond",
 )
-NEEDED: dict[
-    str, dict[str, tuple[str, ...]]
-] = {  # options that do nothing without another
+# command -> option -> options of which it needs one to have an effect
+NEEDED: dict[str, dict[str, tuple[str, ...]]] = {
     "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
 }
-APART: dict[
-    str, dict[str, tuple[str, ...]]
-] = {  # options that leave others nothing to do
+# command -> option -> options that have no effect beside it
+APART: dict[str, dict[str, tuple[str, ...]]] = {
     "evaluate": {
         "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
         "shadow": ("places", "lidar", "randomisation", "gate", "task"),
@@ -166,39 +172,43 @@ APART: dict[
 
 
 def check_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that refuses numbers that are not finite, and options that would do nothing.
+    """Makes a command refuse numbers that are not finite, and options that would do nothing.
 
-    All user errors in it end as `report_in_one_sentence`.
+    Its user errors are reported by `report_in_one_sentence`.
     """
-    usual, needed = signature(command).parameters, NEEDED.get(command.__name__, {})
+    parameters = signature(command).parameters
+    needed_options = NEEDED.get(command.__name__, {})
+    conflicting_options = APART.get(command.__name__, {})
 
     @wraps(command)
-    def run(**given: Any) -> Any:
-        told = {
-            one: value
-            for one, value in given.items()
-            if value and value != usual[one].default
+    def run(**options: Any) -> Any:
+        given_options = {
+            name: value
+            for name, value in options.items()
+            if value and value != parameters[name].default
         }
         with report_in_one_sentence():
-            for name, value in told.items():
-                for each in value if isinstance(value, tuple | list) else (value,):
-                    if isinstance(each, float) and not math.isfinite(each):
+            for name, value in given_options.items():
+                items = value if isinstance(value, tuple | list) else (value,)
+                for item in items:
+                    if isinstance(item, float) and not math.isfinite(item):
                         raise ConfigError(
-                            f"{_format_option(name)} {each}: must be a finite number."
+                            f"{_format_option(name)} {item}: must be a finite number."
                         )
-                others = needed.get(name, ())
-                if others and not told.keys() & others:
-                    fix = f"{' or '.join(map(_format_option, others))}; add that, or leave it out."
+                needed_names = needed_options.get(name, ())
+                if needed_names and not given_options.keys() & needed_names:
+                    alternatives = " or ".join(map(_format_option, needed_names))
+                    fix = f"{alternatives}; add that, or leave it out."
                     raise ConfigError(f"{_format_option(name)}: belongs to {fix}")
-                for other in APART.get(command.__name__, {}).get(name, ()):
-                    if other in told:
-                        refused = _format_option(other)
+                for conflicting in conflicting_options.get(name, ()):
+                    if conflicting in given_options:
+                        refused = _format_option(conflicting)
                         partner = _format_option(name)
                         fix = f"leave out {refused}, or {partner}."
                         raise ConfigError(
                             f"{refused} does not go with {partner}; {fix}"
                         )
-            return command(**given)
+            return command(**options)
 
     return run
 
@@ -258,7 +268,7 @@ def report_in_one_sentence() -> Iterator[None]:
 
 
 def tell_replaced(file: Path) -> None:
-    """Says so if a file that is there will be replaced."""
+    """Tells the user if an existing file will be replaced."""
     if file.exists():
         typer.echo(
             f"{file.parent}: the {file.name} that is there will be replaced", err=True
@@ -267,7 +277,7 @@ def tell_replaced(file: Path) -> None:
 
 @contextmanager
 def needs_ros(what: str) -> Iterator[None]:
-    """Turns a failed import of the nodes, for lack of ROS 2, into a one-sentence error."""
+    """Turns an import of the nodes that fails without ROS 2 into a one-sentence error."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -283,23 +293,23 @@ def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     from rich.table import Column, Table
     from rich.text import Text
 
-    made = Table(
+    table = Table(
         *(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False
     )  # no markup
     for row in rows:
-        made.add_row(*(Text(cell, overflow="fold") for cell in row))
+        table.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()
     if not console.is_terminal:
         wide = Console(width=WIDEST, color_system=None)
-        console = Console(width=wide.measure(made).maximum, color_system=None)
+        console = Console(width=wide.measure(table).maximum, color_system=None)
     with console.capture() as captured:
-        console.print(made)
+        console.print(table)
     return captured.get().rstrip()
 
 
 @contextmanager
 def show_progress(begin: str = "starting") -> Iterator[Tell]:
-    """Yields an updater of a bar on a terminal, of a line now and then on standard error else."""
+    """Yields a function that updates a progress bar, or, without a terminal, occasional lines."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

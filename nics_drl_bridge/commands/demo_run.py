@@ -143,12 +143,12 @@ def run(plan: DemoPlan, say: Say) -> str:
         f"  the paths are drawn in {plan.out / paths}"
     )  # while the report takes a while
     there = timed("driving over DDS", _drive, DDS, learned.policy) if topics else []
-    given = (
+    deployment = (
         model,
         learned.policy,
         next((e.seed for e in there if e.result == "success"), 0),
     )
-    live = timed("deploying", _deploy, *given) if topics else None
+    live = timed("deploying", _deploy, *deployment) if topics else None
     times = [
         (part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()
     ]
@@ -233,8 +233,8 @@ def derive_settings(plan: DemoPlan, model: SimulatorModel) -> Fitted:
 def _train_policy(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
 
-    (settings, told), curve = derive_settings(plan, model), list[pictures.Point]()
-    for line in told:
+    (settings, notes), curve = derive_settings(plan, model), list[pictures.Point]()
+    for line in notes:
         say(line)
     say(
         f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once"
@@ -267,8 +267,8 @@ def _evaluate(
     say(f"evaluating {name} in {MANY} unseen episodes, all at once, then perturbed")
     policy, task = open_policy(name, model)
     limit = pace_of(model, [load_world(plan.world)]).steps
-    found = {}
-    for what, drawn in {
+    summaries = {}
+    for condition, drawn in {
         AS_IT_IS: None,
         **load_randomisation(PERTURBED).alone(),
     }.items():
@@ -277,13 +277,15 @@ def _evaluate(
         outcomes = evaluation.drive_worlds(
             env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY)
         )
-        found[what] = summary = evaluation.summarise(outcomes, model.control_period)
+        summaries[condition] = summary = evaluation.summarise(
+            outcomes, model.control_period
+        )
         rates = (
             f"{result} {100 * each.value:.1f} %"
             for result, each in summary.shares.items()
         )
-        say(f"  {what.replace('_', ' ')}: {', '.join(rates)}")
-    return found
+        say(f"  {condition.replace('_', ' ')}: {', '.join(rates)}")
+    return summaries
 
 
 def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
@@ -312,15 +314,24 @@ def _deploy(
 ) -> Episode:
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
-    given = {"model": str(plan.model)}
+    model_parameter = {"model": str(plan.model)}
     limits = _write_limits(model.robot, plan.out / "limits.yaml")
     boxes = str(plan.out / "black_box")
     gate = {"use_sim_time": True, "e_stop_required": False}
     nodes: dict[str, dict[str, Any]] = {
-        "simulator_node": {**given, "world": plan.world, "episode_seed": seed},
-        "middleware_node": given,
-        "command_gate": {**given, **gate, "limits": str(limits), "black_box": boxes},
-        "policy_node": {**given, "policy": policy, "goal": goal},
+        "simulator_node": {
+            **model_parameter,
+            "world": plan.world,
+            "episode_seed": seed,
+        },
+        "middleware_node": model_parameter,
+        "command_gate": {
+            **model_parameter,
+            **gate,
+            "limits": str(limits),
+            "black_box": boxes,
+        },
+        "policy_node": {**model_parameter, "policy": policy, "goal": goal},
     }
     say(f"deploying {', '.join(nodes)} in real time")
     # The policy stops where it believes the goal is; its odometry drifts.
@@ -387,47 +398,49 @@ def make_sections(
     model: SimulatorModel,
     identified: Identified,
     learned: Learned,
-    of: DemoEpisodes,
+    episodes: DemoEpisodes,
 ) -> list[tuple[str, Sequence[str]]]:
     """Sections of the report, the verdict first, each a heading and HTML blocks."""
     return [
-        ("Verdict", _make_verdict(plan, learned, identified, of)),
-        ("Paths in the world", _format_episodes(plan, model, of)),
-        ("The policy", _make_policy_lines(plan, learned, of)),
+        ("Verdict", _make_verdict(plan, learned, identified, episodes)),
+        ("Paths in the world", _format_episodes(plan, model, episodes)),
+        ("The policy", _make_policy_lines(plan, learned, episodes)),
         ("Paths of the model", make_path_blocks(identified)),
         ("The model", model_blocks(model.robot, identified, model.report)),
     ]
 
 
 def _make_verdict(
-    plan: DemoPlan, learned: Learned, identified: Identified, of: DemoEpisodes
+    plan: DemoPlan, learned: Learned, identified: Identified, episodes: DemoEpisodes
 ) -> Sequence[str]:
-    summary = of.summary
-    here = of.here
-    there = of.there
-    share = summary.success
-    same = successes(there)
-    arrived = of.live is not None and of.live.result == "success"
-    between = f"95 % confidence: {100 * share.low:.1f} to {100 * share.high:.1f} %"
+    summary = episodes.summary
+    here = episodes.here
+    there = episodes.there
+    success = summary.success
+    dds_successes = successes(there)
+    arrived = episodes.live is not None and episodes.live.result == "success"
+    between = f"95 % confidence: {100 * success.low:.1f} to {100 * success.high:.1f} %"
     tiles = [
         fit_tile(identified),
         (
-            f"{100 * share.value:.1f} %",
+            f"{100 * success.value:.1f} %",
             f"of {summary.episodes} unseen episodes succeed in the fast simulator ({between})",
-            share.value >= GOOD,
+            success.value >= GOOD,
         ),
         (
-            f"{same} of {len(there)}",
+            f"{dds_successes} of {len(there)}",
             f"episodes succeed over DDS; in process, {successes(here)} of the same {len(here)}",
-            same >= GOOD * len(there),
+            dds_successes >= GOOD * len(there),
         ),
         ("arrived" if arrived else "did not arrive", "deployed, in real time", arrived),
     ]
     conclusion = conclude(identified)
-    tiles = tiles if of.live else tiles[:2]
+    tiles = tiles if episodes.live else tiles[:2]
     if conclusion.ready:
         more = "drive more episodes, or use a recording of your own robot"
-        next_step = more if share.value >= GOOD else "train longer, with --train-steps"
+        next_step = (
+            more if success.value >= GOOD else "train longer, with --train-steps"
+        )
         conclusion = conclusion._replace(advice=f"Next: {next_step}.")
     return make_verdict_blocks(
         tiles,
@@ -438,24 +451,26 @@ def _make_verdict(
     )
 
 
-def _make_policy_lines(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
-    summary = of.summary
+def _make_policy_lines(
+    plan: DemoPlan, learned: Learned, episodes: DemoEpisodes
+) -> list[str]:
+    summary = episodes.summary
     drawn = list[tuple[bytes, str]]()
     if learned.curve:
         caption = "Success and collisions during exploration; every episode is new."
         drawn.append((pictures.draw_training_curve(learned.curve), caption))
     caption = f"Success unperturbed, and with each perturbation of {PERTURBED!r} alone (95 %)."
-    shares = {what: each.success for what, each in of.summaries.items()}
+    shares = {what: each.success for what, each in episodes.summaries.items()}
     drawn.append((pictures.draw_robustness(shares), caption))
     blocks = [html.make_paragraph(learned.how), html.make_gallery(drawn)]
     rows = list[tuple[str, ...]]()
-    for name, share in summary.shares.items():
-        rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
+    for name, fraction in summary.shares.items():
+        rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(fraction))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
-        known = (
+        texts = (
             f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount)
         )
-        rows.append((name, *known))
+        rows.append((name, *texts))
     text = (
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, in parallel in the fast "
         "simulator, without exploration; path and time are means of the successful ones."
@@ -477,18 +492,18 @@ def _draw_paths(
 
 
 def _format_episodes(
-    plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes
+    plan: DemoPlan, model: SimulatorModel, episodes: DemoEpisodes
 ) -> list[str]:
-    here = of.here
-    there = of.there
-    live = of.live
-    both = (LABELS[FAST], LABELS[DDS])
-    each = ("steps", "path [m]")
+    here = episodes.here
+    there = episodes.there
+    live = episodes.live
+    labels = (LABELS[FAST], LABELS[DDS])
+    columns = ("steps", "path [m]")
     world = load_world(plan.world)
     radius = model.robot.footprint_radius
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
-        alone = [{both[0]: episode} for episode in here[:PANELS]]
+        alone = [{labels[0]: episode} for episode in here[:PANELS]]
         return [html.make_paragraph(text), _draw_paths(alone, world, radius)]
     rows = [
         (
@@ -505,7 +520,7 @@ def _format_episodes(
     ]
     shown = []
     for a, b in list(zip(here, there, strict=True))[:PANELS]:
-        runs = {both[0]: a, both[1]: b}
+        runs = {labels[0]: a, labels[1]: b}
         if a.seed == live.seed:
             runs["deployed"] = live
         shown.append(runs)
@@ -518,7 +533,7 @@ def _format_episodes(
     )
     about = "Deviation is the greatest distance between the two true paths at the same step."
     table = html.make_table(
-        ("seed", both[0], *each, both[1], *each, "deviation [m]"), rows
+        ("seed", labels[0], *columns, labels[1], *columns, "deviation [m]"), rows
     )
     return [
         html.make_paragraph(text),

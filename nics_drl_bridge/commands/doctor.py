@@ -75,13 +75,13 @@ def doctor(
         with console.show_progress(f"listening for {duration:g} s"):
             facts = listen(duration, namespace, imu=imu)
     findings = examine(facts, expected)
-    told = f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}."
+    text = f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}."
     if findings:
         heads = ("", "check", "where", "what does not fit", "what to do")
         rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
-        told = console.format_table(heads, rows)
+        text = console.format_table(heads, rows)
     console.print_line(
-        as_json, told, source=facts.source, findings=list(map(asdict, findings))
+        as_json, text, source=facts.source, findings=list(map(asdict, findings))
     )
     if findings:
         raise typer.Exit(EXIT_FINDINGS)
@@ -90,16 +90,16 @@ def doctor(
 def _tell_installation(as_json: bool) -> None:
     from nics_drl_bridge.commands.installation import checks
 
-    found = checks()
+    results = checks()
     heads = ("", "part", "what there is", "what to do")
     rows = [
         ("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix)
-        for c in found
+        for c in results
     ]
     console.print_line(
         as_json,
         console.format_table(heads, rows),
-        checks=[each._asdict() for each in found],
+        checks=[each._asdict() for each in results],
     )
 
 
@@ -110,10 +110,10 @@ def explain(
     """Explains why command_gate stopped a robot, from its black box."""
     from nics_drl_bridge.gate import black_box
 
-    again = black_box.replay(file)
-    story = list(again.story)
+    replay = black_box.replay(file)
+    story = list(replay.story)
     console.print_line(
-        as_json, "\n".join(story), story=story, differing=again.differing
+        as_json, "\n".join(story), story=story, differing=replay.differing
     )
-    if again.differing:
+    if replay.differing:
         raise typer.Exit(EXIT_FINDINGS)

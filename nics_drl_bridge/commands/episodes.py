@@ -94,8 +94,10 @@ def drive_in(
     drawn = conditions.ranges
     check_place(place, model.robot)
     if place == FAST:
-        given = {"estimator": True, "randomisation": drawn}
-        env, opened = open_env(policy, model, world, "sim", conditions, **given)
+        backend_options = {"estimator": True, "randomisation": drawn}
+        env, opened = open_env(
+            policy, model, world, "sim", conditions, **backend_options
+        )
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
@@ -137,10 +139,10 @@ def open_env(
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     field = load_worlds(world) if isinstance(world, str) else world
     given = {name: value for name, value in options.items() if value is not None}
-    made = make_backend(backend, model, field, **given)
+    driven = make_backend(backend, model, field, **given)
     if conditions.gate is not None:
-        made = GatedBackend(made, model, conditions.gate)
-    return make_env(made, policy, model, field, conditions)
+        driven = GatedBackend(driven, model, conditions.gate)
+    return make_env(driven, policy, model, field, conditions)
 
 
 def make_env(
@@ -281,10 +283,12 @@ def limit_time(
 ) -> Conditions:
     """Conditions with a time limit, the policies' own or one for robot and world; tells it."""
     pace = pace_of(model, [world])
-    known = [
-        one.max_episode_steps for one in contracts.values() if one.max_episode_steps
+    limits = [
+        contract.max_episode_steps
+        for contract in contracts.values()
+        if contract.max_episode_steps
     ]
-    steps = conditions.steps or max(known, default=pace.steps)
+    steps = conditions.steps or max(limits, default=pace.steps)
     if (short := pace.shortfall(steps)) is not None:
         say(short)
     return replace(conditions, steps=steps)
@@ -292,7 +296,7 @@ def limit_time(
 
 def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
     """Returns the places of an order; without any those that work here, and why no more do."""
-    found = list[str]()
+    places = list[str]()
     for place in (
         order.places or PLACES
     ):  # whatever one of `PLACES` lacks, the next lacks, too
@@ -301,10 +305,10 @@ def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]
         except ConfigError as error:
             if order.places:
                 raise
-            say(f"{' and '.join(LABELS[each] for each in found)} alone: {error}")
+            say(f"{' and '.join(LABELS[place] for place in places)} alone: {error}")
             break
-        found.append(place)
-    return found
+        places.append(place)
+    return places
 
 
 def judge_runs(
@@ -362,14 +366,14 @@ def write_evaluation(
 ) -> None:
     """Writes `evaluation.json` of an order, driven with a model of a name."""
     policies = {
-        one.policy: {
+        result.policy: {
             place: {
-                **one.tallies[place].figures(),
-                "each": [episode.plain() for episode in some],
+                **result.tallies[place].figures(),
+                "each": [episode.plain() for episode in drives],
             }
-            for place, some in one.runs.items()
+            for place, drives in result.runs.items()
         }
-        for one in evaluated
+        for result in evaluated
     }
     data = {
         "model": name,
@@ -387,7 +391,7 @@ def format_rows(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     """Rows of the table with the columns `HEADS`, as text."""
     return [
         (
-            one.policy,
+            result.policy,
             LABELS[place],
             _format_percent(tally.success.value),
             f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
@@ -396,30 +400,30 @@ def format_rows(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
                 for rate in (tally.believed, tally.collision, tally.time_out)
             ),
             *(
-                "-" if isnan(of.value) else f"{of.value:.2f}"
-                for of in (tally.length, tally.time)
+                "-" if isnan(estimate.value) else f"{estimate.value:.2f}"
+                for estimate in (tally.length, tally.time)
             ),
             _format_percent(tally.same),
             f"{tally.deviation.value:.2g}",
             f"{tally.greatest_deviation:.2g}",
         )
-        for one in evaluated
-        for place, tally in one.tallies.items()
+        for result in evaluated
+        for place, tally in result.tallies.items()
     ]
 
 
-def _format_percent(share: float) -> str:
-    return f"{100 * share:.4g} %"
+def _format_percent(fraction: float) -> str:
+    return f"{100 * fraction:.4g} %"
 
 
-def summarize(one: Evaluated) -> str:
+def summarize(result: Evaluated) -> str:
     """Summarises a policy in one line."""
     each = ", ".join(
         f"{LABELS[place]}{', as believed,' if place == VEHICLE else ''}"
         f" {_format_percent(tally.success.value)}"
-        for place, tally in one.tallies.items()
+        for place, tally in result.tallies.items()
     )
-    return f"{one.policy}: success {each}"
+    return f"{result.policy}: success {each}"
 
 
 def drive_vehicle(

@@ -22,15 +22,7 @@ def evaluate(
             autocompletion=console.POLICIES,
         ),
     ],
-    model: Annotated[
-        str | None,
-        Option(
-            "--model",
-            "--robot",
-            autocompletion=console.ROBOTS,
-            help="A model's folder, or a shipped robot; else the policy's own.",
-        ),
-    ] = None,
+    model: console.PolicyModelOption = None,
     task: console.TaskOption = None,
     world: Annotated[
         str,
@@ -184,8 +176,8 @@ def evaluate(
         typer.echo((out / driving.EVALUATION).read_text().rstrip())
         return
     typer.echo(console.format_table(driving.HEADS, driving.format_rows(evaluated)))
-    for one in evaluated:
-        typer.echo(driving.summarize(one))
+    for result in evaluated:
+        typer.echo(driving.summarize(result))
     typer.echo(f"pictures and evaluation.json: {out}")
 
 
@@ -237,39 +229,43 @@ def _replay_shadow(
 
     rows = list[tuple[str, ...]]()
     lines = list[str]()
-    told = list[dict[str, Any]]()
+    facts = list[dict[str, Any]]()
     for policy in policies:
         name = model_name(model, read_contracts([policy], model))
-        made = shadow(
+        comparison = shadow(
             bag, open_model(name), policy, console.parse_roles(topics), goal, ahead
         )
         place = out / f"shadow_{shorten_name(policy, policies)}"
-        differences = made.differences()
-        write_bytes(place.with_suffix(".png"), draw_shadow(made))
+        differences = comparison.differences()
+        write_bytes(place.with_suffix(".png"), draw_shadow(comparison))
         data = {
             "bag": str(bag),
             "policy": policy,
             "model": name,
             "goal": goal,
             "ahead_s": None if goal else ahead,
-            "compared": len(made.time),
-            "skipped": dict(made.skipped),
-            "resets": made.resets,
+            "compared": len(comparison.time),
+            "skipped": dict(comparison.skipped),
+            "resets": comparison.resets,
             "commands": differences,
         }
         write_text(place.with_suffix(".json"), format_json(data) + "\n")
-        told.append(data)
+        facts.append(data)
         for (command, figures), unit in zip(
-            differences.items(), made.units, strict=True
+            differences.items(), comparison.units, strict=True
         ):
             *amounts, opposite = figures.values()
             cells = (f"{value:.3g}" for value in amounts)
             rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
-        compared = f"{policy}: compared at {len(made.time)} times"
+        compared = f"{policy}: compared at {len(comparison.time)} times"
         left_out = ", ".join(
-            f"{count} {why}" for why, count in made.skipped.items() if count
+            f"{count} {why}" for why, count in comparison.skipped.items() if count
         )
-        anew = f"; its state began anew after {made.resets} gaps" if made.resets else ""
+        anew = (
+            f"; its state began anew after {comparison.resets} gaps"
+            if comparison.resets
+            else ""
+        )
         lines.append(f"{compared}; left out: {left_out or 'none'}{anew}")
     heads = (
         "policy",
@@ -286,4 +282,4 @@ def _replay_shadow(
         *lines,
         f"pictures and shadow_*.json: {out}",
     ]
-    console.print_line(as_json, "\n".join(lines), policies=told)
+    console.print_line(as_json, "\n".join(lines), policies=facts)

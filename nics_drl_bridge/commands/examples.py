@@ -66,11 +66,11 @@ def complete(app: typer.Typer, group: str = "") -> None:
     for command in app.registered_commands:
         command.callback = check_options(command.callback) if command.callback else None
         name = command.name or str(getattr(command.callback, "__name__", ""))
-        if found := EXAMPLES.get(f"{group}{name}"):
+        if examples := EXAMPLES.get(f"{group}{name}"):
             # A line with this character alone keeps the lines below as they are.
             command.epilog = "\b\nExamples:\n" + "\n".join(
-                f"  {line}" for line in found
+                f"  {line}" for line in examples
             )
-    for each in app.registered_groups:
-        if each.typer_instance is not None:
-            complete(each.typer_instance, f"{each.name} ")
+    for subcommand in app.registered_groups:
+        if subcommand.typer_instance is not None:
+            complete(subcommand.typer_instance, f"{subcommand.name} ")

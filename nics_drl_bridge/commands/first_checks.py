@@ -12,7 +12,7 @@ GREATEST_TRAINING_SEED = 2**32 - 1
 
 
 def check_writable(path: Path) -> None:
-    """Raises ConfigError unless a file could be written at a path; leaves nothing there."""
+    """Raises ConfigError unless a file can be written at a path; leaves nothing there."""
     from nics_drl_bridge.files import check_above
 
     check_above(path)
@@ -49,7 +49,7 @@ def check_robot(name: str) -> None:
 
 
 def check_task(name: str) -> None:
-    """Raises ConfigError unless a task, shipped or of the user's own file, is there."""
+    """Raises ConfigError unless a task exists, shipped or in the user's own file."""
     file = Path(name.rpartition(":")[0] or name)
     if file.suffix == ".py" and not file.is_file():
         raise ConfigError(
@@ -104,14 +104,20 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
     chosen_settings(task, settings, changes)
 
 
-def check_drive(given: dict[str, Any]) -> None:
+def check_drive(parameters: dict[str, Any]) -> None:
     """Raises BridgeError for a name, place or number with which `nics record` could not drive."""
     from nics_drl_bridge.recording.excite import DrivePlan
     from nics_drl_bridge.recording.topic_roles import load_topic_roles
     from nics_drl_bridge.recording.write import check_out
     from nics_drl_bridge.robot.spec import load_robot
 
-    robot = load_robot(given["robot"])
-    check_writable(check_out(Path(given["out"])))
-    load_topic_roles(given["topics"] or None)
-    DrivePlan(robot, given["bound"], given["duration"], given["speed"], given["seed"])
+    robot = load_robot(parameters["robot"])
+    check_writable(check_out(Path(parameters["out"])))
+    load_topic_roles(parameters["topics"] or None)
+    DrivePlan(
+        robot,
+        parameters["bound"],
+        parameters["duration"],
+        parameters["speed"],
+        parameters["seed"],
+    )

@@ -74,13 +74,13 @@ def _check_python() -> Check:
 
 
 def _check_extras() -> list[Check]:
-    found = []
+    results = []
     for extra, (what, modules) in EXTRAS.items():
         missing = find_lacking(modules)
-        told = what if missing is None else f"{what}: the module {missing!r} is missing"
+        text = what if missing is None else f"{what}: the module {missing!r} is missing"
         fix = f"pip install '{PACKAGE}[{extra}]'"
-        found.append(Check(f"extra {extra}", missing is None, told, fix))
-    return found
+        results.append(Check(f"extra {extra}", missing is None, text, fix))
+    return results
 
 
 def _check_ros() -> list[Check]:
@@ -100,13 +100,13 @@ def _check_ros() -> list[Check]:
         release = "of unknown version"
     distribution = os.environ.get("ROS_DISTRO") or "from wheels"
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
-    told = f"{distribution}, rclpy {release}, ROS_DOMAIN_ID {domain}"
+    text = f"{distribution}, rclpy {release}, ROS_DOMAIN_ID {domain}"
     messages = []
-    for name, what in MESSAGES.items():
+    for name, purpose in MESSAGES.items():
         messages.append(
-            Check(name, find_spec(name) is not None, what, how_to_install(name))
+            Check(name, find_spec(name) is not None, purpose, how_to_install(name))
         )
-    return [Check("ROS 2", True, told), *messages]
+    return [Check("ROS 2", True, text), *messages]
 
 
 def _check_kernels() -> Check:
@@ -115,7 +115,7 @@ def _check_kernels() -> Check:
     from nics_drl_bridge.kernels import KERNELS, SECONDS_EACH
 
     cold = sum(not each.is_warm for each in KERNELS)
-    told = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
+    text = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
     seconds = max(1, round(cold * SECONDS_EACH))
     fix = f"nics warmup, about {seconds} s; else each is compiled at its first use"
-    return Check("kernels", cold == 0, told, fix)
+    return Check("kernels", cold == 0, text, fix)

@@ -39,12 +39,12 @@ def robots() -> list[Row]:
         {
             "name": name,
             "commands": ", ".join(
-                f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in one.command
+                f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in robot.command
             ),
-            "lidar": mount_lidar(one).name,
-            "description": one.description,
+            "lidar": mount_lidar(robot).name,
+            "description": robot.description,
         }
-        for name, one in ((name, load_robot(name)) for name in list_shipped("robots"))
+        for name, robot in ((name, load_robot(name)) for name in list_shipped("robots"))
     ]
 
 
@@ -59,8 +59,8 @@ def worlds() -> list[Row]:
         world = load_world(name)
         x1, y1, x2, y2 = world.extent
         counts = [group.counts for group in world.obstacles]
-        low = sum(least for least, _ in counts)
-        high = sum(most for _, most in counts)
+        low = sum(minimum for minimum, _ in counts)
+        high = sum(maximum for _, maximum in counts)
         obstacles = f"{low}" if low == high else f"{low} to {high}"
         rows.append(
             _describe_world(

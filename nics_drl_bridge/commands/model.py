@@ -61,7 +61,7 @@ def record(
 ) -> None:
     """Drives a robot through its full range of motion and records it."""
     arguments = make_node_arguments(namespace, remap or ())
-    given = {
+    parameters = {
         "robot": robot,
         "out": str(out),
         "bound": bound,
@@ -72,31 +72,31 @@ def record(
         "use_sim_time": use_sim_time,
         "imu": imu,
     } | ({} if stamped is None else {"stamped": stamped})
-    check_drive(given)
+    check_drive(parameters)
     if not preview:
         # First: with ROS 2 from wheels it restarts Python.
         with console.needs_ros("nics record"):
             from nics_drl_bridge.nodes.record_node import record as drive
-    lines = draw_preview(given)
-    told: dict[str, Any] = {"out": str(out), "robot": robot}
+    lines = draw_preview(parameters)
+    facts: dict[str, Any] = {"out": str(out), "robot": robot}
     if preview:
-        console.print_line(as_json, "\n".join(lines), **told, told=lines)
+        console.print_line(as_json, "\n".join(lines), **facts, told=lines)
         return
     typer.echo("\n".join(lines), err=as_json)
     if not yes and not typer.confirm("Drive the robot now?", err=as_json):
         console.print_line(
-            as_json, "nothing was driven or recorded.", **told, recorded=False
+            as_json, "nothing was driven or recorded.", **facts, recorded=False
         )
         return
-    driven = drive(given, arguments)
+    driven = drive(parameters, arguments)
     if driven.failure is not None:
         raise BackendError(driven.line)
     recording = driven.recording
     lines = (driven.line,)
     if recording is not None:
-        lines += drive_summary(recording, given)
-    told |= {"recorded": recording is not None, "complete": driven.complete}
-    console.print_line(as_json, "\n".join(lines), **told, told=lines)
+        lines += drive_summary(recording, parameters)
+    facts |= {"recorded": recording is not None, "complete": driven.complete}
+    console.print_line(as_json, "\n".join(lines), **facts, told=lines)
     if not driven.complete:
         raise typer.Exit(console.EXIT_INTERRUPTED)
 
@@ -114,7 +114,7 @@ def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     return ["nics", "--ros-args", *flags] if flags else ["nics"]
 
 
-def draw_preview(given: dict[str, Any]) -> tuple[str, ...]:
+def draw_preview(parameters: dict[str, Any]) -> tuple[str, ...]:
     """Draws the drive that `record_node` would make of its parameters; returns lines."""
     from nics_drl_bridge.files import write_bytes
     from nics_drl_bridge.recording.excite import DrivePlan
@@ -123,13 +123,13 @@ def draw_preview(given: dict[str, Any]) -> tuple[str, ...]:
     from nics_drl_bridge.report.pictures import drive_picture
     from nics_drl_bridge.robot.spec import load_robot
 
-    robot = load_robot(given["robot"])
-    out = check_out(Path(given["out"]))
+    robot = load_robot(parameters["robot"])
+    out = check_out(Path(parameters["out"]))
     load_topic_roles(
-        given["topics"] or None
+        parameters["topics"] or None
     )  # reports a wrong file before the robot moves
     plan = DrivePlan(
-        robot, *(given[name] for name in ("bound", "duration", "speed", "seed"))
+        robot, *(parameters[name] for name in ("bound", "duration", "speed", "seed"))
     )
     pattern = plan.preview()
     picture = out.parent / f"{out.stem}_preview.png"
@@ -137,21 +137,21 @@ def draw_preview(given: dict[str, Any]) -> tuple[str, ...]:
     return (*pattern.describe(), f"its path is drawn in {picture}")
 
 
-def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
+def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]:
     """Returns lines about the robot's path, the coverage of each command, and the next step."""
     import numpy as np
 
     from nics_drl_bridge.identify.excitation import coverage
     from nics_drl_bridge.robot.spec import load_robot
 
-    out = Path(given["out"])
+    out = Path(parameters["out"])
     place = recording.pose.values[:, :2] - recording.pose.values[0, :2]
     path = np.hypot(*np.diff(place, axis=0).T).sum()
     reach = np.hypot(*place.T).max()
     return (
         f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
-        *(each.line() for each in coverage(recording, load_robot(given["robot"]))),
-        f"next: nics generate {out} --robot {given['robot']} --out {out.stem}_model",
+        *(each.line() for each in coverage(recording, load_robot(parameters["robot"]))),
+        f"next: nics generate {out} --robot {parameters['robot']} --out {out.stem}_model",
     )
 
 
@@ -198,10 +198,10 @@ def inspect(
     for line in (*([needless] if needless else ()), *doubts):
         typer.echo(line)
     for table in tables:
-        found = "".join(
+        findings = "".join(
             f"\n  {finding}" for finding in table.regularity + table.findings
         )
-        typer.echo(f"{table.name}: {table.rows} rows{found}")
+        typer.echo(f"{table.name}: {table.rows} rows{findings}")
         rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
         if rows:
             typer.echo(console.format_table(("column", "least", "greatest"), rows))
@@ -334,7 +334,7 @@ def generate(
     terms = parse_order(order)
     if lidar is not None:  # a wrong name is told before the drive is read
         load_lidar(lidar)
-    further = tuple(load_sensor(file) for file in sensor or ())
+    sensors = tuple(load_sensor(file) for file in sensor or ())
     shapes = load_world(world).shapes
     named = ", ".join(map(str, recording))
     roles = load_topic_roles(topics, topic or ())
@@ -353,7 +353,7 @@ def generate(
             assume_textbook,
             strict,
             anyway,
-            further,
+            sensors,
         )
         save_model(model, out)
     from nics_drl_bridge.identify.report import opening
@@ -431,19 +431,21 @@ def drive(
 
     spec = load_robot(robot)
     check_place(out := out or Path(f"{Path(robot).stem}_model"))
-    seen = mount_lidar(spec, lidar)
+    lidar_spec = mount_lidar(spec, lidar)
     if recording is not None and recording.suffix != ".npz":
         raise ConfigError(f"--recording {recording}: must end in .npz.")
     with console.show_progress(f"driving and generating {spec.name!r}"):
         driven = record_textbook(spec, np.random.default_rng(seed), duration)
         if recording is not None:
             write_drive(driven, check_out(recording), spec)
-        model, _ = generate(driven, spec, seen, ())
+        model, _ = generate(driven, spec, lidar_spec, ())
     save_model(model, out)
     kept = () if recording is None else (f"recording written to {recording}",)
-    made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
+    made = (
+        f"model of the textbook {spec.name!r} with the lidar {lidar_spec.name!r}: {out}"
+    )
     lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
-    facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
+    facts = {"model": str(out), "robot": spec.name, "lidar": lidar_spec.name}
     console.print_line(
         as_json, "\n".join(lines), **facts, recording=recording and str(recording)
     )

@@ -101,7 +101,7 @@ def import_(
 def _format_lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lidar = facts["lidar"]
     scan = facts["scan"]
-    seen = facts["observation"]
+    observation = facts["observation"]
     steps = facts["max_episode_steps"]
     limits = "{name} {min:g} to {max:g} {unit}"
     commands = [limits.format(**command) for command in facts["robot"]["command"]]
@@ -118,7 +118,7 @@ def _format_lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
         "actions": facts["actions"],
         "scan": observed,
         "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
-        "observation": f"{seen['size']} parts, {seen['scan_parts']} of them the scan",
+        "observation": f"{observation['size']} parts, {observation['scan_parts']} of them the scan",
         "control period": f"{facts['control_period']:g} s",
         "time limit": "not told"
         if steps is None

@@ -33,15 +33,15 @@ def was_interrupted(error: BaseException | None) -> bool:
     """
     if _interrupts:
         return True
-    seen = set[int]()
+    visited = set[int]()
     waiting = [error]
     while waiting:
-        known = waiting.pop()
-        if isinstance(known, KeyboardInterrupt):
+        link = waiting.pop()
+        if isinstance(link, KeyboardInterrupt):
             return True
-        if known is not None and id(known) not in seen:
-            seen.add(id(known))
-            waiting += [known.__cause__, known.__context__]
+        if link is not None and id(link) not in visited:
+            visited.add(id(link))
+            waiting += [link.__cause__, link.__context__]
     return False
 
 

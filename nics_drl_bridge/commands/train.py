@@ -92,9 +92,9 @@ def train(
     ] = False,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
-    given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
-    given["engine"] = engine if engine in OWN else None
-    named = {name: value for name, value in given.items() if value}
+    choices = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
+    choices["engine"] = engine if engine in OWN else None
+    named = {name: value for name, value in choices.items() if value}
     if resume and (settings or named):
         option = next(iter(named), "settings")
         raise ConfigError(
@@ -117,23 +117,23 @@ def train(
     with console.show_progress("loading PyTorch"):
         from nics_drl_bridge.policy import train as train_run
 
-    own_task = task if ":" in task else None
+    task_of_user = task if ":" in task else None
     if resume and out is not None:
-        resumed = train_run.settings_of(out, own_task)
+        resumed = train_run.settings_of(out, task_of_user)
     else:
         resumed = None
     chosen = resumed or _load_settings(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])
-    if begun := train_run.seeds_of(folder) if resume and not seeds else []:
-        typer.echo(f"seeds that were begun: {begun}; --seeds names others", err=True)
-    every = [*(seeds or begun or [0]), *further_seeds]
-    order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
-    again = ResumeCommand(
-        folder, every, episodes, own_task, engine, address, env_runners
+    if started := train_run.seeds_of(folder) if resume and not seeds else []:
+        typer.echo(f"seeds that were begun: {started}; --seeds names others", err=True)
+    all_seeds = [*(seeds or started or [0]), *further_seeds]
+    order = train_run.TrainOrder(chosen, all_seeds, folder, episodes, resume, command)
+    resume_command = ResumeCommand(
+        folder, all_seeds, episodes, task_of_user, engine, address, env_runners
     )
     with (
-        report_interruption(again, train_run.seeds_of),
+        report_interruption(resume_command, train_run.seeds_of),
         _open_learner(engine, address, env_runners, chosen.num_envs) as learn,
     ):
         (_run_watched if watch else _run)(train_run, order, learn, as_json)

@@ -55,11 +55,11 @@ def up(
     if show_args:
         typer.echo(format_arguments(launch))
         return
-    given = parse_values(arguments or ())
-    complete(launch.arguments, given)
+    values = parse_values(arguments or ())
+    complete(launch.arguments, values)
     if find_spec("rclpy") is None:
         raise ConfigError(f"nics up {MISSING_ROS.format(module='rclpy')}")
-    nodes = launch.nodes(given)
+    nodes = launch.nodes(values)
     if not nodes:
         raise ConfigError(f"nics up {what}: there is nothing to start; say rviz:=true.")
     run(nodes)

@@ -85,18 +85,18 @@ class GoalOrder:
     def episode(self, scene: Scene, present: Array | None = None) -> "VehicleEpisode":
         """Returns start and goal of an episode, for a robot at a pose (3,) in `map`, if known."""
         start = np.array(scene.starts[0])
-        own_goal = geometry.between(start, (*scene.goals[0][:2], 0.0))[:2]
+        scene_goal = geometry.between(start, (*scene.goals[0][:2], 0.0))[:2]
         if self.start == PRESENT and present is not None:
             start = np.array(present)
         elif self.lays_map and self.point is not None:
             start = np.zeros(3)
         if self.relative:
-            seen = np.array(own_goal if self.point is None else self.point)
-            goal = geometry.compose(start, (*seen, 0.0))[:2]
+            relative_goal = np.array(scene_goal if self.point is None else self.point)
+            goal = geometry.compose(start, (*relative_goal, 0.0))[:2]
         else:
             goal = np.array(scene.goals[0] if self.point is None else self.point)
-            seen = geometry.between(start, (*goal, 0.0))[:2]
-        return VehicleEpisode(self, start, goal, seen)
+            relative_goal = geometry.between(start, (*goal, 0.0))[:2]
+        return VehicleEpisode(self, start, goal, relative_goal)
 
 
 @dataclass(frozen=True)

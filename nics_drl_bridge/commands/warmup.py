@@ -27,12 +27,12 @@ def warmup(as_json: JsonOption = False) -> None:
         ) as pool,
     ):
         *first, model = pool.apply(_compile_by, (_model,))
-        others = [
+        jobs = [
             pool.apply_async(_compile_by, (part, model)) for part in (_simulate, _drive)
         ]
-        done = [first, *(each.get()[:2] for each in others)]
-    count = sum(each[0] for each in done)
-    cpu_s = sum(each[1] for each in done)
+        done = [first, *(job.get()[:2] for job in jobs)]
+    count = sum(result[0] for result in done)
+    cpu_s = sum(result[1] for result in done)
     took = time.monotonic() - begin
     if as_json:
         typer.echo(format_json({"kernels": count, "cpu_s": cpu_s, "seconds": took}))

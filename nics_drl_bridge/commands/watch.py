@@ -23,15 +23,7 @@ def watch(
             autocompletion=console.POLICIES,
         ),
     ] = None,
-    model: Annotated[
-        str | None,
-        Option(
-            "--model",
-            "--robot",
-            autocompletion=console.ROBOTS,
-            help="A model's folder, or a shipped robot; else the policy's own.",
-        ),
-    ] = None,
+    model: console.PolicyModelOption = None,
     world: Annotated[
         list[str] | None,
         Option(
@@ -72,7 +64,12 @@ def watch(
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:
     """Shows a policy, live topics or a bag on a page in the browser."""
-    given = {"lidar": lidar, "randomisation": randomisation, "gate": gate, "task": task}
+    conditions = {
+        "lidar": lidar,
+        "randomisation": randomisation,
+        "gate": gate,
+        "task": task,
+    }
     if record is None:  # before the source is opened, which may take a while
         extensions.require("the page", "websockets")
     else:
@@ -85,7 +82,7 @@ def watch(
         source = _watch_ros(model, world, namespace)
     else:
         source = _watch_episodes(
-            policy or DEFAULT_ROBOT, model, world or ["circles"], seed, given
+            policy or DEFAULT_ROBOT, model, world or ["circles"], seed, conditions
         )
     with closing(source):
         if record is not None:
@@ -110,10 +107,10 @@ def _watch_episodes(
     under = Conditions(
         given["lidar"], given["randomisation"], given["gate"], kind=given["task"]
     )
-    own = [
-        driving.find_robot(*each) for each in driving.read_contracts([policy]).items()
+    robots = [
+        driving.find_robot(*entry) for entry in driving.read_contracts([policy]).items()
     ]
-    model = open_model(name or (own or [DEFAULT_ROBOT])[0], under.lidar)
+    model = open_model(name or (robots or [DEFAULT_ROBOT])[0], under.lidar)
 
     def make(policy: str, world: Any) -> Any:
         options = {"estimator": True, "randomisation": under.ranges}
@@ -123,7 +120,7 @@ def _watch_episodes(
         return driving.open_env(policy, model, world, "sim", within, **options)
 
     return EpisodeSource(
-        make, policy, [load_worlds(each) for each in worlds], seed, name or ""
+        make, policy, [load_worlds(world) for world in worlds], seed, name or ""
     )
 
 

@@ -134,34 +134,34 @@ def import_(
         "goals": goal and {"at": [goal]},
     }
     keys = {key: value for key, value in keys.items() if value is not None}
-    made = list[Written]()
+    written = list[Written]()
     for file, place in _places(files, out, name).items():
         if file.suffix.lower() in SDF:
             standing = read_sdf(file, height, tuple(without or ()), skip_unknown)
-            made.append(_read_standing(file, place, standing, keys, height))
+            written.append(_read_standing(file, place, standing, keys, height))
         else:
-            made += _read_mapped(file, place, keys, resolution)
-    for each in made:
-        if each.path.exists():
+            written += _read_mapped(file, place, keys, resolution)
+    for output in written:
+        if output.path.exists():
             fix = "remove it, or give another place as --out"
-            raise ConfigError(f"{each.path}: is there already; {fix}.")
-    for each in made:
-        write_text(each.path, each.text)
+            raise ConfigError(f"{output.path}: is there already; {fix}.")
+    for output in written:
+        write_text(output.path, output.text)
         if not as_json:
-            typer.echo(f"{each.path}: {each.line}")
+            typer.echo(f"{output.path}: {output.line}")
     if as_json:
-        told = [{"file": str(each.path), "holds": each.line} for each in made]
-        typer.echo(format_json({"worlds": told}))
+        facts = [{"file": str(output.path), "holds": output.line} for output in written]
+        typer.echo(format_json({"worlds": facts}))
 
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
     """The file to write for each one to read."""
-    one = out is not None and out.suffix in MAPS
-    if len(files) > 1 and (one or name is not None):
-        given = f"--out {out}" if one else f"--name {name}"
-        told = f"{given}: is for one file, not for {len(files)}"
-        raise ConfigError(f"{told}; give a folder as --out.")
-    if out is not None and one:
+    is_file = out is not None and out.suffix in MAPS
+    if len(files) > 1 and (is_file or name is not None):
+        option = f"--out {out}" if is_file else f"--name {name}"
+        problem = f"{option}: is for one file, not for {len(files)}"
+        raise ConfigError(f"{problem}; give a folder as --out.")
+    if out is not None and is_file:
         return {files[0]: out}
     ends = [".yaml" if file.suffix.lower() in SDF else "_world.yaml" for file in files]
     places = [
@@ -187,8 +187,8 @@ def _read_standing(
     ]
     head = [f"What stands in {file.name} at a height of {height:g} m."]
     head += [f"Left out: {each}." for each in standing.left_out]
-    known = {"name": file.stem, "bounds": field, "obstacles": groups}
-    text = _format_world(file, head, known | keys, (x2 - x1, y2 - y1))
+    derived = {"name": file.stem, "bounds": field, "obstacles": groups}
+    text = _format_world(file, head, derived | keys, (x2 - x1, y2 - y1))
     line = (
         f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
     )
@@ -206,13 +206,13 @@ def _read_mapped(
         kinds = ", ".join((*SDF, *MAPS, *PICTURES))
         raise ConfigError(f"{file}: unknown kind of file; give one of {kinds}.")
     map_file = file.with_suffix(".yaml") if file.suffix.lower() in PICTURES else file
-    made = []
+    files = []
     if file.suffix.lower() in PICTURES and resolution is not None:
         map_file = place.with_name(f"{place.stem}_map.yaml")
         about = {"image": _locate_from(place, file), "resolution": resolution, **NAV2}
         validate(about, MapFile, f"--resolution {resolution:g}")
         rows, columns = read_image(file, str(file))[0].shape
-        made = [Written(map_file, dump_yaml(about), f"the map of {file.name}")]
+        files = [Written(map_file, dump_yaml(about), f"the map of {file.name}")]
     elif map_file.is_file() or file.suffix in MAPS:
         grid = load_map(map_file)
         (rows, columns), resolution = grid.cells.shape, grid.resolution
@@ -223,9 +223,9 @@ def _read_mapped(
         )
     x = columns * resolution
     y = rows * resolution
-    known = {"name": file.stem, "map": _locate_from(place, map_file)}
-    text = _format_world(file, [f"The map {map_file.name}."], known | keys, (x, y))
-    return [*made, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
+    derived = {"name": file.stem, "map": _locate_from(place, map_file)}
+    text = _format_world(file, [f"The map {map_file.name}."], derived | keys, (x, y))
+    return [*files, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
 
 
 def _locate_from(place: Path, file: Path) -> str:
@@ -233,7 +233,7 @@ def _locate_from(place: Path, file: Path) -> str:
 
 
 def _format_world(
-    file: Path, head: list[str], known: Keys, size: tuple[float, float]
+    file: Path, head: list[str], values: Keys, size: tuple[float, float]
 ) -> str:
     """Returns the text of a world file, which is read back to see that it is one.
 
@@ -243,26 +243,26 @@ def _format_world(
     from nics_drl_bridge.sim.world import World, check_places
 
     far = round(math.hypot(*size), 3)
-    if {"starts", "goals"} <= set(known):
+    if {"starts", "goals"} <= set(values):
         least = 0.0
     else:
         least = min(NEAREST, round(far / 4.0, 3))
-    known = {"goal_distance": (least, far), **known}
+    values = {"goal_distance": (least, far), **values}
     lines = [f"# {' '.join(line.split())}" for line in head]
     for key in ("name", "map"):
-        lines += [dump_yaml({key: known[key]}).rstrip()] if key in known else []
+        lines += [dump_yaml({key: values[key]}).rstrip()] if key in values else []
     lines += [
-        f"{key}: {_format_flow(known[key])}" for key in ("bounds",) if key in known
+        f"{key}: {_format_flow(values[key])}" for key in ("bounds",) if key in values
     ]
-    for g, group in enumerate(known.get("obstacles", ())):
+    for g, group in enumerate(values.get("obstacles", ())):
         lines += [] if g else ["obstacles:"]
         lines += [f"  - shapes: {_format_flow(group['shapes'])}", "    at:"]
         lines += [f"      - {_format_flow(pose)}" for pose in group["at"]]
     for key in ("clearance", "goal_distance", "starts", "goals"):
-        lines += [f"{key}: {_format_flow(known[key])}"] if key in known else []
+        lines += [f"{key}: {_format_flow(values[key])}"] if key in values else []
     text = "\n".join(lines) + "\n"
     made = f"{file}: the world made of it"
-    obstacles = sum(len(group["at"]) for group in known.get("obstacles", ()))
+    obstacles = sum(len(group["at"]) for group in values.get("obstacles", ()))
     try:
         data = parse_yaml(text, made)
     except ConfigError:
@@ -336,10 +336,14 @@ def _check_overwrite(worlds: Any, given: Path, *written: Path) -> None:
     """Raises ConfigError for a file that would replace one of which a world is made."""
     from nics_drl_bridge.lidar.maps import files_of
 
-    for one in worlds.members:
-        own = given, Path(one.source), *(files_of(one.map) if one.map else ())
+    for member in worlds.members:
+        sources = (
+            given,
+            Path(member.source),
+            *(files_of(member.map) if member.map else ()),
+        )
         for file in {each.resolve() for each in written} & {
-            each.resolve() for each in own
+            each.resolve() for each in sources
         }:
             raise ConfigError(
                 f"{file}: the world itself is made of it; name another as --out."

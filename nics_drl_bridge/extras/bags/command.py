@@ -64,10 +64,10 @@ def info(
     """Shows a bag's topics, rates, gaps, and the clock of its stamps."""
     from nics_drl_bridge.extras.bags.info import read_bag_info
 
-    told = read_bag_info(path)
-    span = f"{told.duration_s:.3f} s"
-    size = f"{told.size_bytes / 1e6:.2f} MB"
-    line = f"{path}: {told.messages} messages in {span}, {size}"
+    contents = read_bag_info(path)
+    span = f"{contents.duration_s:.3f} s"
+    size = f"{contents.size_bytes / 1e6:.2f} MB"
+    line = f"{path}: {contents.messages} messages in {span}, {size}"
     heads = (
         "topic",
         "type",
@@ -78,9 +78,9 @@ def info(
         "clock",
         "delay [ms]",
     )
-    table = console.format_table(heads, [_format_row(each) for each in told.topics])
+    table = console.format_table(heads, [_format_row(each) for each in contents.topics])
     console.print_line(
-        as_json, f"{line}\n{table}", **asdict(told) | {"path": str(path)}
+        as_json, f"{line}\n{table}", **asdict(contents) | {"path": str(path)}
     )
 
 
@@ -133,21 +133,21 @@ def replay(
         from nics_drl_bridge.generator import open_model
         from nics_drl_bridge.middleware import playback
 
-        made = playback.estimate(
+        estimates = playback.estimate(
             path, open_model(model), console.parse_roles(topic or [])
         )
         if out is not None:
-            playback.write_estimate(made, out)
-        rejected = dict(sorted(made.rejected.items()))
-        number = len(made.stamp_ns)
-        x, y, heading = last = made.pose[-1].tolist()
+            playback.write_estimate(estimates, out)
+        rejected = dict(sorted(estimates.rejected.items()))
+        number = len(estimates.stamp_ns)
+        x, y, heading = last = estimates.pose[-1].tolist()
         lines = [f"not used: {count} of {reason}" for reason, count in rejected.items()]
         lines.append(
             f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}"
         )
-        told = {"estimates": number, "last": last, "not_used": rejected}
-        line = "\n".join((*lines, f"sha256 {made.digest}"))
-        console.print_line(as_json, line, **told, sha256=made.digest)
+        facts = {"estimates": number, "last": last, "not_used": rejected}
+        line = "\n".join((*lines, f"sha256 {estimates.digest}"))
+        console.print_line(as_json, line, **facts, sha256=estimates.digest)
         return
     with needs_ros("nics bag replay"):
         from nics_drl_bridge.extras.bags.live import play_bag
@@ -192,15 +192,24 @@ def _choose_storage(name: str) -> Any:
     return name
 
 
-def _format_row(each: Any) -> tuple[str, ...]:
-    span = "" if each.first_s is None else f"{each.first_s:.2f}, {each.last_s:.2f}"
-    if each.longest_gap_s is None:
+def _format_row(topic: Any) -> tuple[str, ...]:
+    span = "" if topic.first_s is None else f"{topic.first_s:.2f}, {topic.last_s:.2f}"
+    if topic.longest_gap_s is None:
         gaps = ""
     else:
-        gaps = f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
-    if each.delay_s is None:
+        gaps = f"{topic.gaps}, longest {topic.longest_gap_s:.2f} s"
+    if topic.delay_s is None:
         delay = ""
     else:
-        delay = f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"
-    rate = "" if each.rate_hz is None else f"{each.rate_hz:.2f}"
-    return each.topic, each.type, str(each.count), rate, span, gaps, each.clock, delay
+        delay = f"{1e3 * topic.delay_s:.1f} ± {5e2 * topic.jitter_s:.1f}"
+    rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.2f}"
+    return (
+        topic.topic,
+        topic.type,
+        str(topic.count),
+        rate,
+        span,
+        gaps,
+        topic.clock,
+        delay,
+    )

@@ -36,14 +36,14 @@ def convert(
                 topic, kind, bag.offers(topic), definition=bag.get_definition(topic)
             )
             rows += ((topic, ns, data) for ns, data in bag.read_serialized(topic))
-        made = [
+        transforms = [
             *_convert_moving(bag, sink.store),
             *_convert_fixed(bag, sink.store, model),
         ]
-        added = list(dict.fromkeys(topic for topic, _, _ in made))
+        added = list(dict.fromkeys(topic for topic, _, _ in transforms))
         for topic in added:
             sink.add_topic(topic, topic_roles.TRANSFORMS, OFFERS.get(topic, ()))
-        for row in sorted(rows + made, key=lambda row: row[1]):
+        for row in sorted(rows + transforms, key=lambda row: row[1]):
             sink.write(*row)
     return added
 
@@ -54,13 +54,13 @@ def _convert_moving(bag: BagFile, store: Any) -> Iterator[Row]:
         if MOVING in bag.types
         else _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
     ):
-        told = message.content
-        where = told.pose.pose
-        place = where.position.x, where.position.y, where.position.z
-        made = _transform(
-            store, told.header, told.child_frame_id, place, where.orientation
+        odometry = message.content
+        pose = odometry.pose.pose
+        place = pose.position.x, pose.position.y, pose.position.z
+        transform = _transform(
+            store, odometry.header, odometry.child_frame_id, place, pose.orientation
         )
-        yield MOVING, message.receive_ns, made
+        yield MOVING, message.receive_ns, transform
 
 
 def _convert_fixed(

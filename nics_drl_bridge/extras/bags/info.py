@@ -101,8 +101,8 @@ def _describe_topic(
             clock = FOREIGN
     if not len(since):
         return BagTopic(topic, kind, 0, clock=clock)
-    apart = np.diff(since) * S_PER_NS
-    usual = float(np.median(apart)) if len(apart) else 0.0
+    intervals = np.diff(since) * S_PER_NS
+    usual = float(np.median(intervals)) if len(intervals) else 0.0
     return BagTopic(
         topic,
         kind,
@@ -110,8 +110,8 @@ def _describe_topic(
         rate_hz=1.0 / usual if usual > 0.0 else None,
         first_s=float(since[0] * S_PER_NS),
         last_s=float(since[-1] * S_PER_NS),
-        gaps=int((apart > GAP * usual).sum()) if usual > 0.0 else 0,
-        longest_gap_s=float(apart.max()) if len(apart) else None,
+        gaps=int((intervals > GAP * usual).sum()) if usual > 0.0 else 0,
+        longest_gap_s=float(intervals.max()) if len(intervals) else None,
         clock=clock,
         delay_s=delay,
         jitter_s=jitter,

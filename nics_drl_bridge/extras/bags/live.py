@@ -97,11 +97,11 @@ class BagRecorder(QosWatch):
         sink: BagSink,
         say: Callable[[str], None],
     ) -> None:
-        given = [Parameter("use_sim_time", value=order.use_sim_time)]
+        overrides = [Parameter("use_sim_time", value=order.use_sim_time)]
         super().__init__(
             "bag_recorder",
             context=context,
-            parameter_overrides=given,
+            parameter_overrides=overrides,
             start_parameter_services=False,
         )
         self._order = order
@@ -135,8 +135,8 @@ class BagRecorder(QosWatch):
         offers = [offer_of(info.qos_profile) for info in publishers]
         lasting = all(each.transient_local for each in offers)
         wanted = Offer(QUEUE, all(each.reliable for each in offers), lasting)
-        known = self._heard.get(topic)
-        if known is not None and known[0] in (wanted, Offer(QUEUE, False)):
+        subscribed = self._heard.get(topic)
+        if subscribed is not None and subscribed[0] in (wanted, Offer(QUEUE, False)):
             return
         kind = message_type(kinds[0])
         if len(kinds) > 1 or kind is None:
@@ -146,11 +146,11 @@ class BagRecorder(QosWatch):
             self.skipped[topic] = f"{topic} {why}."
             self._say(f"not recorded: {self.skipped[topic]}")
             return
-        if known is None:
+        if subscribed is None:
             self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
             self._say(f"{topic} ({kinds[0]})")
         else:
-            self.destroy_subscription(known[1])
+            self.destroy_subscription(subscribed[1])
         take = partial(self._take, topic)
         profile = profile_of(wanted)
         self._heard[topic] = (
@@ -210,8 +210,8 @@ class _Player:
             self._barrier = node.create_client(GetParameters, service)
 
     def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
-        found = message_type(kind)
-        if found is None:
+        message_class = message_type(kind)
+        if message_class is None:
             return False
         if topic in (CLOCK, "/tf", "/tf_static"):
             name = topic
@@ -223,20 +223,21 @@ class _Player:
             any(offer.transient_local for offer in offers),
         )
         self.publishers[topic] = self._node.create_publisher(
-            found, name, profile_of(best)
+            message_class, name, profile_of(best)
         )
         return True
 
     def ready(self) -> None:
         publishers = self.publishers.values()
-        known = self._node.count_subscribers
+        count_subscribers = self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
         self._wait(
             lambda: any(each.get_subscription_count() for each in publishers), ALONE_S
         )
         self._wait(  # for all known subscribers to find their topic
             lambda: all(
-                p.get_subscription_count() >= known(p.topic_name) for p in publishers
+                p.get_subscription_count() >= count_subscribers(p.topic_name)
+                for p in publishers
             ),
             PATIENCE_S,
         )
@@ -321,8 +322,8 @@ def play_bag(
         # In the order of receipt, at equal times in that of their topics.
         timed = [
             (ns, topic, data)
-            for topic, some in sorted(played.items())
-            for ns, data in some
+            for topic, rows in sorted(played.items())
+            for ns, data in rows
         ]
         timed.sort(key=lambda one: one[:2])
         if not timed:

@@ -173,8 +173,12 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
         steepest = max(
             (max(-v.min, v.max) for v in spec.state if v.unit == "rad"), default=0.0
         )
-        given = {**spec.parameters, "steepest": steepest}, step, physics or Physics()
-        return _BUILDERS[kind](*given)
+        arguments = (
+            {**spec.parameters, "steepest": steepest},
+            step,
+            physics or Physics(),
+        )
+        return _BUILDERS[kind](*arguments)
     except KeyError as error:
         reason = f"the {kind} machine needs the parameter {error}; add it under `parameters:`."
         raise ConfigError(f"robot {spec.name!r}: {reason}") from None
@@ -257,9 +261,9 @@ def _make_tie_rod(half_ratio: float, steepest: float) -> str:
     row = polynomial.polyfit(left, right, [1, 2, 3, 4])
     if np.abs(polynomial.polyval(left, row) - right).max() > MISFIT:
         return ""
-    given = " ".join(f"{each:.8g}" for each in row)
+    terms = " ".join(f"{each:.8g}" for each in row)
     return f"""
-  <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{given}"/></equality>"""
+  <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{terms}"/></equality>"""
 
 
 def _make_car_actuators(engine: str) -> str:
@@ -351,9 +355,11 @@ def _make_skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
         names, inertia, p["wheel_lag"], radius, step, physics, STIFF_SERVO_LAG_S
     )
     xml = _make_document("skid_steer", physics, radius, body, motors, SKIDDING)
-    both = lambda _, speed: 0.5 * (speed[:2] + speed[2:])  # noqa: E731
+    measure_sides = lambda _, speed: 0.5 * (speed[:2] + speed[2:])  # noqa: E731
     # How far it skids differs with speed and curve; such robots' odometry turns by their gyro.
-    return Machine(xml, names, lambda state: np.tile(state, 2), both, gyro=True)
+    return Machine(
+        xml, names, lambda state: np.tile(state, 2), measure_sides, gyro=True
+    )
 
 
 def _make_motors(names: tuple[str, ...], *servo: Any) -> str:

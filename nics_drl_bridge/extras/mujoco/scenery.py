@@ -64,11 +64,11 @@ def find_bumpers(model: Any, robots: int) -> NDArray[np.int64]:
     """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
     heads = [f"{make_prefix(m)}{BUMPER_NAME}" for m in range(robots)]
-    found = [
+    owners = [
         next((m for m, head in enumerate(heads) if n.startswith(head)), -1)
         for n in names
     ]
-    return np.array(found, dtype=np.int64)
+    return np.array(owners, dtype=np.int64)
 
 
 class _Maker:
@@ -80,15 +80,17 @@ class _Maker:
     def bumper(self, base: Any, footprint: Shape) -> None:
         # Without mass, which belongs to the chassis.
         half = 0.5 * float(base.pos[2])
-        own = {"contype": BUMPER, "mass": 0.0}
+        contact = {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
             # Its round edge touches a wall in one point, at the height of the axles.
             size = [footprint.radius, footprint.radius, half]
             kind = self._kinds.mjGEOM_ELLIPSOID
-            self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **own)
+            self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **contact)
         else:
             for i, part in enumerate(split_convex(footprint.outline)):
-                self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
+                self._prism(
+                    base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **contact
+                )
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
         middle = 0.5 * (start + end)
@@ -173,13 +175,13 @@ def split_convex(outline: Array) -> list[Array]:
         return [outline]
     rest = list(range(len(outline)))
     parts = []
-    least = SLIVER * float(np.ptp(outline, axis=0).max()) ** 2
+    minimum_area = SLIVER * float(np.ptp(outline, axis=0).max()) ** 2
     while len(rest) > 3:
         at = next((i for i in range(len(rest)) if _is_ear(outline, rest, i)), 0)
         parts.append(outline[[rest[at - 1], rest[at], rest[(at + 1) % len(rest)]]])
         del rest[at]
     parts.append(outline[rest])
-    return [part for part in parts if _compute_area(*part) > least]
+    return [part for part in parts if _compute_area(*part) > minimum_area]
 
 
 def _compute_area(a: Array, b: Array, c: Array) -> float:

@@ -69,16 +69,16 @@ class Rig:
     def put(self, data: Any, rest: Array, pose: ArrayLike) -> None:
         """Places the robot at a pose (3,), with its parts as at rest (nq,) on the floor."""
         x, y, heading = np.asarray(pose, dtype=np.float64)
-        own = data.qpos[self._place : self._place + len(rest)]
-        own[:] = rest
-        own[:2] = x, y
-        own[3:7] = np.cos(0.5 * heading), 0.0, 0.0, np.sin(0.5 * heading)
+        positions = data.qpos[self._place : self._place + len(rest)]
+        positions[:] = rest
+        positions[:2] = x, y
+        positions[3:7] = np.cos(0.5 * heading), 0.0, 0.0, np.sin(0.5 * heading)
 
     def launch(self, data: Any, rest: Array, twist: Array, heading: float) -> None:
         """Gives the body a twist (3,), and all its parts no speed of their own."""
-        own = data.qvel[self._drift : self._drift + len(rest) - 1]
-        own[:] = 0.0
-        own[:2], own[5] = geometry.rotate(twist[:2], heading), twist[2]
+        speeds = data.qvel[self._drift : self._drift + len(rest) - 1]
+        speeds[:] = 0.0
+        speeds[:2], speeds[5] = geometry.rotate(twist[:2], heading), twist[2]
 
     def motion(self, data: Any, rest: Array) -> tuple[Array, Array]:
         """Returns copies of positions (nq,) and speeds (nq - 1,) of the body and all its parts."""
@@ -327,11 +327,11 @@ class MujocoSimulator(DrivenSimulator):
             turned = [rig.encoders(data) for rig in rigs]
             faced = facing
             facing = [rig.heading(data) for rig in rigs]
-            both = zip(before, turned, strict=True)
+            pairs = zip(before, turned, strict=True)
             mean = self._machine.state
             means = [
                 mean(0.5 * (first + last), (last - first) / part_s)
-                for first, last in both
+                for first, last in pairs
             ]
             counted = self._twist(np.array(means)) * self._machine.calibrated
             if self._machine.gyro:

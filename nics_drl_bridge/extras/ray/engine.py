@@ -127,8 +127,8 @@ class WorldsRunner(SingleAgentEnvRunner):
         steps = int(self.config.env_config["rollout"])
         busy = self.env.stepping_s
         *arrays, finals = zip(*(self._step(t) for t in range(steps)), strict=True)
-        seen, actions, logits, logp, rewards = (np.stack(one) for one in arrays)
-        final = {place: end for one in finals for place, end in one.items()}
+        seen, actions, logits, logp, rewards = (np.stack(column) for column in arrays)
+        final = {place: end for column in finals for place, end in column.items()}
         whole = np.concatenate([seen, self._seen[None]])
         ended = len(final)
         count = steps * self.num_envs
@@ -139,8 +139,10 @@ class WorldsRunner(SingleAgentEnvRunner):
         return list(Rollout(whole, actions, logits, logp, rewards, final).episodes())
 
     def _step(self, t: int) -> tuple[Any, ...]:
-        seen = self._seen
-        out = self.module.forward_exploration({Columns.OBS: torch.as_tensor(seen)})
+        observations = self._seen
+        out = self.module.forward_exploration(
+            {Columns.OBS: torch.as_tensor(observations)}
+        )
         logits = out[Columns.ACTION_DIST_INPUTS]
         distribution = self.module.get_exploration_action_dist_cls().from_logits(logits)
         chosen = distribution.sample()
@@ -157,7 +159,7 @@ class WorldsRunner(SingleAgentEnvRunner):
             for name, metric in (("is_success", SUCCESS), ("collision", COLLISION)):
                 self.metrics.log_value(metric, int(info.get(name, False)), reduce="sum")
             final[t, int(n)] = info["terminal_observation"], info["TimeLimit.truncated"]
-        return seen, actions, logits.numpy(), logp, rewards, final
+        return observations, actions, logits.numpy(), logp, rewards, final
 
 
 Batch = dict[str, Any]
@@ -258,8 +260,10 @@ def train_on_ray(
 ) -> train.Trained:
     """`policy.train.train` on the connected cluster; ConfigError also if no runner answers."""
     if settings.algorithm != "ppo":
-        given = settings.algorithm
-        raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
+        algorithm_name = settings.algorithm
+        raise ConfigError(
+            f"--engine ray learns with ppo, not {algorithm_name!r}; leave it out."
+        )
     if settings.stop is not None:
         raise ConfigError(
             "--engine ray does not stop early; leave out --engine, or stop."
@@ -416,9 +420,9 @@ def select_worlds(
 ) -> TrainVecEnv:
     """The worlds of env runner number `runner`: every `runners`-th."""
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
-    share = dict(Counter(names[runner::runners]))
+    counts = dict(Counter(names[runner::runners]))
     return train.make_train_env(
-        settings.model_copy(update={"worlds": share}), model, scenes
+        settings.model_copy(update={"worlds": counts}), model, scenes
     )
 
 
