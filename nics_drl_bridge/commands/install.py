@@ -5,7 +5,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
@@ -13,6 +13,9 @@ from typer import Argument, Option
 from nics_drl_bridge.commands.console import JsonOption, print_line
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
 from nics_drl_bridge.nodes.message_packages import shipped_packages, wheels_here
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.commands.message_build import Source
 
 
 def install(
@@ -39,19 +42,18 @@ def install(
     from nics_drl_bridge.commands.message_build import (
         Generators,
         check_programs,
+        sort_by_use,
         write_setup,
     )
 
     sources = [find_source(name) for name in packages]
     if prefix is None:
-        present = [
-            source.name for source in sources if find_spec(source.name) is not None
-        ]
-        for name in present:
+        installed = [source.name for source in sources if is_installed(source.name)]
+        for name in installed:
             print_line(
                 as_json, f"{name} is installed already", package=name, prefix=None
             )
-        sources = [source for source in sources if source.name not in present]
+        sources = [source for source in sources if source.name not in installed]
     if not sources:
         return
     wheels = wheels_here()
@@ -70,11 +72,11 @@ def install(
     place = check_prefix(prefix or Path(sys.prefix))
     check_programs()
     with Generators(wheels, _tell) as generators:
-        for source in sources:
-            interfaces = generators.interfaces(source)
+        for source in sort_by_use(sources):
+            interfaces = generators.find_interfaces(source)
             for file, missing in interfaces.left_out.items():
                 _tell(
-                    f"{source.name}: {file} is left out, as there is no wheel of {missing}"
+                    f"{source.name}: {file} is left out, because {missing} has no wheel"
                 )
             _tell(f"building {source.name}")
             generators.build(interfaces, place)
@@ -86,14 +88,16 @@ def install(
         _tell(f"to use what is there: source {write_setup(place)}")
 
 
-def find_source(name: str) -> Path:
-    """Returns the folder with the files of a message package. Raises ConfigError."""
+def find_source(name: str) -> "Source":
+    """Returns a message package, shipped or in a folder. Raises ConfigError."""
+    from nics_drl_bridge.commands.message_build import Source, read_source
+
     shipped = shipped_packages()
     if name in shipped:
-        return shipped[name]
+        return Source(name, shipped[name])
     folder = Path(name)
     if folder.is_dir():
-        return folder.resolve()
+        return read_source(folder.resolve())
     fix = "or give the folder of a package with its msg, srv and action"
     raise ConfigError(
         f"unknown message package {name!r}; {suggest(name, shipped)} ({fix})."
@@ -116,6 +120,18 @@ def check_prefix(prefix: Path) -> Path:
     return prefix.resolve()
 
 
+def is_installed(name: str) -> bool:
+    """True if a message package is there and works; a broken build is built again."""
+    if find_spec(name) is None:
+        return False
+    try:
+        check_import(name)
+    except ConfigError as error:
+        _tell(f"{error}; building it again")
+        return False
+    return True
+
+
 def check_import(name: str) -> None:
     """Raises ConfigError unless a new process can use the messages of a package."""
     ask = f"import importlib as i; {name} = i.import_module('{name}.msg')\n"
@@ -124,7 +140,7 @@ def check_import(name: str) -> None:
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
-        raise ConfigError(f"{name} was built, but it can't be imported: {reason}")
+        raise ConfigError(f"{name} is installed, but can't be imported: {reason}")
 
 
 def _tell(line: str) -> None:

@@ -1,23 +1,26 @@
-"""Building of message packages over the wheels of ROS 2, which have no wheels of their own.
+"""Builds message packages that have no wheels, on top of the wheels of ROS 2.
 
-The generators of code are wheels, too. They are installed into an environment apart, as they need
-older libraries than others do, and removed afterwards; cmake and a C++ compiler compile what they
-wrote. Python's messages are C below, so that the C++ ones are left out, which would take most of
-the time.
+The code generators are wheels, too. They need older libraries than the rest, so they get a
+temporary environment of their own; cmake and a C++ compiler compile what they write. Python's
+messages need only the C code, so the C++ code, most of the work, is left out.
 """
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
+from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError, shorten
 from nics_drl_bridge.nodes.message_packages import Wheels
 
@@ -47,7 +50,11 @@ PROGRAMS = {
     "make": "make",
 }  # and the wheel, or Debian's package, of each
 FOLDERS = ("msg", "srv", "action")
+NAME_ELEMENT = re.compile(r"<name>\s*([^<]*?)\s*</name>")
+PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]*")
 USED_PACKAGE = re.compile(r"^([a-z][a-z0-9_]*)/", re.MULTILINE)
+# a type of the same package, at the start of a line, with or without its package
+USED_TYPE = re.compile(r"^(?:([a-z][a-z0-9_]*)/(?:msg/)?)?([A-Z]\w*)", re.MULTILINE)
 BUILT_ON = re.compile(r"/opt/python/[^;\"]*?/(site-packages|include/python[0-9.]*)")
 REASON_LINES = 3  # last lines of a failed command that are told
 # What the wheels' bootstrapper leaves to children, where the generators' libraries must be found.
@@ -80,10 +87,65 @@ PACKAGE_XML = """\
 <export><build_type>ament_cmake</build_type></export></package>
 """
 SETUP = """\
-export PYTHONPATH={modules}${{PYTHONPATH:+:$PYTHONPATH}}
-export LD_LIBRARY_PATH={libraries}${{LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}}
+export PYTHONPATH={modules}"${{PYTHONPATH:+:$PYTHONPATH}}"
+export LD_LIBRARY_PATH={libraries}"${{LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}}"
 """
 Say = Callable[[str], None]
+
+
+class Source(NamedTuple):
+    """A message package to build."""
+
+    name: str
+    folder: Path  # with its msg, srv and action
+
+    def list_files(self) -> list[Path]:
+        """Return the files of its messages, services and actions."""
+        return sorted(
+            file for kind in FOLDERS for file in self.folder.glob(f"{kind}/*.{kind}")
+        )
+
+    def find_used_packages(self, file: Path) -> set[str]:
+        """Return the other packages whose messages a file uses."""
+        used = set(USED_PACKAGE.findall(file.read_text(encoding="utf-8")))
+        return used - {self.name}
+
+    def find_used_types(self, file: Path) -> set[str]:
+        """Return the messages of this package that a file uses."""
+        types = USED_TYPE.findall(file.read_text(encoding="utf-8"))
+        return {name for package, name in types if package in ("", self.name)}
+
+
+def read_source(folder: Path) -> Source:
+    """Return the package in a folder, named by its package.xml, if any. Raises ConfigError."""
+    manifest = folder / "package.xml"
+    name = folder.name
+    if manifest.is_file():
+        match = NAME_ELEMENT.search(read_text(manifest))
+        name = match[1] if match else ""
+    if not PACKAGE_NAME.fullmatch(name):
+        fix = "name the package in its package.xml, in lower case, as my_messages"
+        raise ConfigError(f"{folder}: {name!r} is no name of a package; {fix}.")
+    return Source(name, folder)
+
+
+def sort_by_use(sources: Sequence[Source]) -> list[Source]:
+    """Return packages with each after those that it uses. Raises ConfigError for a circle."""
+    by_name = {source.name: source for source in sources}
+    uses = {
+        source.name: {
+            name
+            for file in source.list_files()
+            for name in source.find_used_packages(file)
+        }
+        for source in sources
+    }
+    try:
+        order = list(TopologicalSorter(uses).static_order())
+    except CycleError as error:
+        circle = " and ".join(sorted(set(error.args[1])))
+        raise ConfigError(f"{circle} need each other; break the circle.") from None
+    return [by_name[name] for name in order if name in by_name]
 
 
 @dataclass(frozen=True)
@@ -95,7 +157,7 @@ class Interfaces:
     needed: Sequence[str]  # other message packages
     left_out: Mapping[
         str, str
-    ]  # package that a file needs and that is missing, by file
+    ]  # file -> missing package that it needs, maybe indirectly
 
 
 def check_programs() -> None:
@@ -129,6 +191,7 @@ class Generators(AbstractContextManager["Generators", None]):
         self._folder = TemporaryDirectory(prefix="nics_messages_")
         self._work = Path(self._folder.name)
         self._prefix = self._work / "env"
+        self._built = set[str]()
         self._environment = {
             k: value for k, value in os.environ.items() if k not in UNSET
         }
@@ -177,31 +240,39 @@ class Generators(AbstractContextManager["Generators", None]):
             if "/opt/python/" in text:
                 file.write_text(BUILT_ON.sub(here, text), encoding="utf-8")
 
-    def interfaces(self, source: Path) -> Interfaces:
-        """Returns what can be built of the folder of a message package. Raises ConfigError."""
-        files = []
-        needed = set[str]()
-        left_out = {}
-        for file in sorted(
-            file for kind in FOLDERS for file in source.glob(f"{kind}/*.{kind}")
-        ):
-            used = set(USED_PACKAGE.findall(file.read_text(encoding="utf-8"))) - {
-                source.name
-            }
-            missing = [name for name in sorted(used) if not self._has(name)]
-            if missing:
-                left_out[file.name] = missing[0]
-                continue
-            if file.suffix == ".action":
-                used.add("action_msgs")
-            files.append(file.resolve())
-            needed |= used
-        if not files:
+    def find_interfaces(self, source: Source) -> Interfaces:
+        """Return what can be built of a message package. Raises ConfigError."""
+        files = source.list_files()
+        left_out = dict[Path, str]()
+        for file in files:
+            used = sorted(source.find_used_packages(file))
+            missing = next((name for name in used if not self._has(name)), None)
+            if missing is not None:
+                left_out[file] = missing
+        is_complete = False
+        while not is_complete:  # a file that uses a message that is left out
+            is_complete = True
+            types = {file.stem: missing for file, missing in left_out.items()}
+            for file in files:
+                broken = sorted(source.find_used_types(file) & types.keys())
+                if broken and file not in left_out:
+                    left_out[file] = types[broken[0]]
+                    is_complete = False
+        kept = [file.resolve() for file in files if file not in left_out]
+        if not kept:
             needed_files = "msg/*.msg, srv/*.srv or action/*.action"
-            raise ConfigError(f"{source}: holds no {needed_files} that could be built.")
-        return Interfaces(source.name, files, sorted(needed), left_out)
+            raise ConfigError(
+                f"{source.folder}: holds no {needed_files} that could be built."
+            )
+        needed = {name for file in kept for name in source.find_used_packages(file)}
+        if any(file.suffix == ".action" for file in kept):
+            needed.add("action_msgs")
+        names = {file.name: missing for file, missing in left_out.items()}
+        return Interfaces(source.name, kept, sorted(needed), names)
 
     def _has(self, package: str) -> bool:
+        if package in self._built:
+            return True
         return (self._prefix / "share" / package).is_dir()
 
     def build(self, interfaces: Interfaces, prefix: Path) -> None:
@@ -237,6 +308,12 @@ class Generators(AbstractContextManager["Generators", None]):
         self._run(
             ["cmake", "--install", build], f"{interfaces.name} can't be installed"
         )
+        self._built.add(interfaces.name)
+        for variable in ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"):
+            folders = self._environment[variable].split(os.pathsep)
+            if str(prefix) not in folders:  # last: the generators' own packages win
+                folders.append(str(prefix))
+                self._environment[variable] = os.pathsep.join(folders)
 
     def _run(self, command: Sequence[str], failed: str) -> None:
         done = subprocess.run(
@@ -258,8 +335,11 @@ class Generators(AbstractContextManager["Generators", None]):
 
 
 def write_setup(prefix: Path) -> Path:
-    """Writes a file to be sourced, for a prefix that is not that of this environment."""
+    """Write a file to be sourced, for a prefix outside of this environment; return its path."""
     file = prefix / "setup.bash"
-    text = SETUP.format(modules=find_modules_folder(prefix), libraries=prefix / "lib")
+    text = SETUP.format(
+        modules=shlex.quote(str(find_modules_folder(prefix))),
+        libraries=shlex.quote(str(prefix / "lib")),
+    )
     file.write_text(text, encoding="utf-8")
     return file
