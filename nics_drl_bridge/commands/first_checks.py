@@ -101,7 +101,7 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
         raise ConfigError(f"--settings {file}: no such file; check the path.")
     from nics_drl_bridge.policy.training_settings import chosen_settings
 
-    chosen_settings(task, settings, changes)
+    check_task(chosen_settings(task, settings, changes).task)
 
 
 def check_drive(parameters: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
 
 EXIT_NODE_ENDED = 1
 POLL_S = 0.1
+SIMULATORS = ("simulator_node", "mujoco_node")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
@@ -102,7 +103,8 @@ def run(nodes: Sequence[NodeStart]) -> None:
         typer.echo(
             f"starting {', '.join(map(name_of, nodes))}; Ctrl-C ends all of them"
         )
-        typer.echo(describe_next_step(nodes))
+        if next_step := describe_next_step(nodes):
+            typer.echo(next_step)
         try:
             for node, command in zip(nodes, commands, strict=True):
                 processes.append(ChildProcess(name_of(node), command))
@@ -123,8 +125,10 @@ def name_of(node: NodeStart) -> str:
 
 
 def describe_next_step(nodes: Sequence[NodeStart]) -> str:
-    """Returns what to do once the nodes run."""
+    """Return what to do once the nodes run; empty if they neither drive nor simulate a robot."""
     gates = [node for node in nodes if node.executable == "command_gate"]
+    if not gates and not any(node.executable in SIMULATORS for node in nodes):
+        return ""
     if not gates:
         return "next: send commands on cmd_vel, or watch it with `nics watch --ros`"
     space = f" --namespace {gates[0].namespace}" if gates[0].namespace else ""

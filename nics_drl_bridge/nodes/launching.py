@@ -76,6 +76,9 @@ def action_of(node: NodeStart) -> Node:
     """Return the `launch` action that starts a node."""
     files = [node.params_file] if node.params_file else []
     parameters = {name: parameter_of(value) for name, value in node.parameters.items()}
+    log_arguments = []
+    if node.log_level:
+        log_arguments = ["--ros-args", "--log-level", node.log_level]
     return Node(
         package=node.package,
         executable=node.executable,
@@ -83,7 +86,7 @@ def action_of(node: NodeStart) -> Node:
         namespace=node.namespace,
         parameters=[*files, parameters],
         remappings=list(node.remappings),
-        arguments=[*node.arguments, "--ros-args", "--log-level", node.log_level],
+        arguments=[*node.arguments, *log_arguments],
         output="screen",
     )
 

@@ -88,13 +88,16 @@ class Operator(AbstractContextManager["Operator", None]):
     """A node that calls gates and sends goals; a context manager. Raises BackendError."""
 
     def __init__(self, domain_id: int | None = None) -> None:
-        self._policies: dict[
-            str, tuple[str, dict[str, str]]
-        ] = {}  # name: condition, values
+        # policy node -> its condition, and the values of its diagnostics; written by the thread
+        self._policies: dict[str, tuple[str, dict[str, str]]] = {}
         self._context = open_context([], domain_id)
-        self._node = Node(
-            "nics_operator", context=self._context, start_parameter_services=False
-        )
+        try:
+            self._node = Node(
+                "nics_operator", context=self._context, start_parameter_services=False
+            )
+        except BaseException:
+            self._context.try_shutdown()
+            raise
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS
         )
@@ -115,9 +118,10 @@ class Operator(AbstractContextManager["Operator", None]):
         if reset:
             self._call(gate, "reset")
         answer = self._call(gate, "arm")
-        if not answer.granted and time.monotonic() < deadline:
+        left_s = deadline - time.monotonic()
+        if not answer.granted and left_s > 0.0:
             tell(
-                f"{gate} does not arm yet ({answer.told}), asking again for {seconds:g} s"
+                f"{gate} does not arm yet ({answer.told}); asking again for {left_s:.0f} s"
             )
         while not answer.granted and time.monotonic() < deadline:
             time.sleep(ASK_AGAIN_S)
@@ -158,7 +162,7 @@ class Operator(AbstractContextManager["Operator", None]):
         answer = self._send(topic, goal, name, deadline)
         if not answer.taken and time.monotonic() < deadline:
             tell(f"{name} does not take the goal yet ({answer.told}), sending it again")
-        while not answer.taken and time.monotonic() < deadline:
+        while not answer.taken and time.monotonic() + SEND_AGAIN_S < deadline:
             time.sleep(SEND_AGAIN_S)
             answer = self._send(topic, goal, name, deadline)
         return answer
@@ -167,7 +171,7 @@ class Operator(AbstractContextManager["Operator", None]):
         self, topic: Publisher, goal: GoalRequest, name: str, deadline: float
     ) -> GoalAnswer:
         stamp_ns = time.time_ns()
-        wait_s = max(ANSWER_S, deadline - time.monotonic())
+        wait_s = max(deadline - time.monotonic(), 0.0)
         topic.publish(goal.to_ros(stamp_ns))
 
         def answered() -> bool:
@@ -180,19 +184,20 @@ class Operator(AbstractContextManager["Operator", None]):
                 return answer
         condition = self._policies[name][0]
         return GoalAnswer(
-            stamp_ns, False, f"no answer within {wait_s:.0f} s, {condition}"
+            stamp_ns, False, f"no answer within {wait_s:.1f} s, {condition}"
         )
 
     def _wait_for_policy(self, topic: Publisher, space: str, seconds: float) -> str:
         """Waits for the policy node of a namespace, and returns its name."""
 
         def found() -> list[str]:
-            return [name for name in self._policies if name.rpartition("/")[0] == space]
+            names = list(self._policies)
+            return [name for name in names if name.rpartition("/")[0] == space]
 
         holds(lambda: topic.get_subscription_count() and found(), seconds, POLL_S)
         names = found()
         if not names:
-            spaces = {name.rpartition("/")[0] for name in self._policies}
+            spaces = {name.rpartition("/")[0] for name in list(self._policies)}
             raise BackendError(
                 f"{self._nobody('policy_node', seconds, space, spaces)}."
             )

@@ -7,6 +7,9 @@ from pathlib import Path
 import pytest
 from command_line import nics
 
+from nics_drl_bridge.commands import first_checks
+from nics_drl_bridge.errors import ConfigError
+
 HEAVY = ("torch", "stable_baselines3", "rclpy", "matplotlib", "onnxruntime")
 PROGRAM = f"""
 import sys
@@ -95,3 +98,11 @@ def test_robot_and_model_are_one_option_of_every_command(
         shown = nics(*command.split(), word, "jackal", "--help", cwd=tmp_path)
         assert "No such option" not in shown.stderr
         assert word in shown.stdout
+
+
+@pytest.mark.parametrize("task", ["evil.py\n", "navigaton"])
+def test_settings_for_an_unknown_task_are_refused_at_once(tmp_path, task):
+    file = tmp_path / "settings.yaml"
+    file.write_text(f"task: {task!r}\n".replace("'", '"'))
+    with pytest.raises(ConfigError, match="unknown task"):
+        first_checks.check_settings("navigation", str(file), {})

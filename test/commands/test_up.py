@@ -13,6 +13,7 @@ import pytest
 from command_line import nics
 from domains import claimed_domain
 
+from nics_drl_bridge.commands import up
 from nics_drl_bridge.nodes import starting
 from nics_drl_bridge.nodes.starting import LAUNCHES, NodeStart
 
@@ -50,6 +51,23 @@ def test_a_wrong_argument_is_one_sentence_and_starts_nothing(words, sentence, tm
     assert done.returncode == 2
     assert sentence in done.stderr
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("executables", "step"),
+    [
+        (("robot_state_publisher", "rviz2"), ""),
+        (("simulator_node",), "next: send commands on cmd_vel"),
+        (("simulator_node", "command_gate"), "next, in another terminal: `nics arm`"),
+    ],
+)
+def test_the_next_step_is_one_that_these_nodes_can_take(executables, step):
+    nodes = [
+        NodeStart("nics_drl_bridge", executable, "", {}) for executable in executables
+    ]
+    told = up.describe_next_step(nodes)
+    assert told.startswith(step)
+    assert bool(told) == bool(step)
 
 
 @pytest.mark.process
