@@ -1,6 +1,7 @@
 """`nics install`: message packages that ROS 2's wheels lack."""
 
 import os
+import shlex
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -85,7 +86,7 @@ def install(
             line = f"{source.name} is installed in {place}"
             print_line(as_json, line, package=source.name, prefix=str(place))
     if prefix is not None:
-        _tell(f"to use what is there: source {write_setup(place)}")
+        _tell(f"to use it: source {shlex.quote(str(write_setup(place)))}")
 
 
 def find_source(name: str) -> "Source":

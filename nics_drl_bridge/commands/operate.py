@@ -13,9 +13,11 @@ EXIT_REFUSED = 1
 
 WaitOption = Annotated[
     float,
-    Option(min=0.0, help="Longest time to wait for the node, and for its consent [s]."),
+    Option(min=0.0, help="Maximum time to wait for the node and for its consent [s]."),
 ]
-NamespaceOption = Annotated[str, Option(help="Namespace of the robot, as robot1.")]
+NamespaceOption = Annotated[
+    str, Option(help="Namespace of the robot, for example robot1.")
+]
 _tell = partial(typer.echo, err=True)
 
 
@@ -23,12 +25,14 @@ def arm(
     namespace: NamespaceOption = "",
     reset: Annotated[
         bool,
-        Option("--reset", help="Release a latched stop first, as that of nics stop."),
+        Option(
+            "--reset", help="First release a latched stop, for example of nics stop."
+        ),
     ] = False,
     wait: WaitOption = 60.0,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Arms command_gate; tells why it refuses."""
+    """Arms command_gate, or explains why it refuses."""
     parse_namespace(namespace)
     with console.needs_ros("nics arm"):
         from nics_drl_bridge.nodes.operator import Operator
@@ -43,12 +47,15 @@ def arm(
 
 def stop(
     namespace: Annotated[
-        str | None, Option(help="Of one robot; else every robot is stopped.")
+        str | None,
+        Option(
+            help="Namespace of the robot to stop; by default all robots are stopped."
+        ),
     ] = None,
     wait: WaitOption = 5.0,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Stops one robot, or all, by the e-stop of its gate."""
+    """Stops one robot, or all, through the emergency stop of its gate."""
     parse_namespace(namespace or "")
     with console.needs_ros("nics stop"):
         from nics_drl_bridge.nodes.operator import Operator
@@ -57,10 +64,10 @@ def stop(
     lines = []
     for answer in answers:
         space = answer.gate.rpartition("/")[0].strip("/")
-        again = f"nics arm --reset{f' --namespace {space}' if space else ''}"
+        rearm = f"nics arm --reset{f' --namespace {space}' if space else ''}"
         if answer.granted:
             lines.append(
-                f"{answer.gate} has stopped its robot; `{again}` lets it drive again"
+                f"{answer.gate} has stopped its robot; `{rearm}` lets it drive again"
             )
         else:
             typer.echo(f"nics: {answer.gate} was NOT stopped: {answer.told}", err=True)
@@ -75,19 +82,20 @@ def goal(
     x: Annotated[float, Argument(help="Ahead, along the x axis of the frame [m].")],
     y: Annotated[float, Argument(help="To the left, along its y axis [m].")],
     yaw: Annotated[
-        float, Option(help="Heading, which the policies here do not use [rad].")
+        float, Option(help="Heading at the goal [rad]; the shipped policies ignore it.")
     ] = 0.0,
     frame: Annotated[
         str,
         Option(
-            metavar="FRAME", help="map, odom, base_link or another frame; else the map."
+            metavar="FRAME",
+            help="Frame of the goal: map (default), odom, base_link, ...",
         ),
     ] = "",
     namespace: NamespaceOption = "",
     wait: WaitOption = 60.0,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Sends a goal; tells whether policy_node takes it."""
+    """Sends a goal, and reports whether policy_node accepts it."""
     parse_namespace(namespace)
     with console.needs_ros("nics goal"):
         from nics_drl_bridge.nodes.operator import GoalRequest, Operator
@@ -96,7 +104,7 @@ def goal(
             namespace, GoalRequest(x, y, yaw, frame), wait, _tell
         )
     if not answer.taken:
-        typer.echo(f"nics: policy_node does not take the goal: {answer.told}", err=True)
+        typer.echo(f"nics: policy_node rejects the goal: {answer.told}", err=True)
         raise typer.Exit(EXIT_REFUSED)
-    line = f"policy_node drives to {answer.told}, while command_gate is armed"
+    line = f"policy_node drives to {answer.told} as long as command_gate is armed"
     console.print_line(as_json, line, taken=True, goal=answer.told)

@@ -1,0 +1,85 @@
+"""What a person asks of a running robot keeps to the time that was given."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from nics_drl_bridge.nodes import operator as module
+from nics_drl_bridge.nodes.goal_answer import GoalAnswer
+from nics_drl_bridge.nodes.operator import GateAnswer, GoalRequest, Operator
+
+pytestmark = pytest.mark.ros
+
+
+class Clock:
+    """Time that passes only while somebody sleeps."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def monotonic(self):
+        return self.now
+
+    def time_ns(self):
+        return round(self.now * 1e9)
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+def test_a_node_that_can_not_be_made_leaves_no_context(monkeypatch):
+    ended = []
+    context = SimpleNamespace(try_shutdown=lambda: ended.append(True))
+
+    def fail(*_, **__):
+        raise RuntimeError("no node")
+
+    monkeypatch.setattr(module, "open_context", lambda *_: context)
+    monkeypatch.setattr(module, "Node", fail)
+    with pytest.raises(RuntimeError, match="no node"):
+        Operator()
+    assert ended == [True]
+
+
+def test_the_time_left_to_arm_is_told_and_kept(clock, monkeypatch):
+    operator = Operator.__new__(Operator)
+
+    def wait_for_gate(namespace, seconds):
+        clock.sleep(7.0)
+        return "/command_gate"
+
+    monkeypatch.setattr(operator, "_wait_for_gate", wait_for_gate)
+    monkeypatch.setattr(operator, "_call", lambda gate, _: GateAnswer(gate, False, "x"))
+    told = []
+    answer = operator.arm("", 10.0, False, told.append)
+    assert told == ["/command_gate does not arm yet (x); asking again for 3 s"]
+    assert not answer.granted
+    assert clock.now == 10.0
+
+
+def test_a_goal_without_an_answer_takes_no_longer_than_was_given(clock, monkeypatch):
+    operator = Operator.__new__(Operator)
+    operator._policies = {"/policy_node": ("active", {})}
+    operator._node = SimpleNamespace(create_publisher=lambda *_: topic)
+    topic = SimpleNamespace(publish=lambda _: None, get_subscription_count=lambda: 1)
+
+    def holds(condition, seconds, _):
+        if not condition():
+            clock.sleep(seconds)
+        return condition()
+
+    monkeypatch.setattr(module, "holds", holds)
+    answer = operator.send_goal("", GoalRequest(1.0, 0.0), 2.0, lambda _: None)
+    assert answer == GoalAnswer(0, False, "no answer within 2.0 s, active")
+    assert clock.now == 2.0
