@@ -82,7 +82,8 @@ def goal(
     x: Annotated[float, Argument(help="Ahead, along the x axis of the frame [m].")],
     y: Annotated[float, Argument(help="To the left, along its y axis [m].")],
     yaw: Annotated[
-        float, Option(help="Heading at the goal [rad]; the shipped policies ignore it.")
+        float,
+        Option(help="Heading at the goal [rad]; policies of this package ignore it."),
     ] = 0.0,
     frame: Annotated[
         str,
