@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from nics_drl_bridge import files
+from nics_drl_bridge import defaults, files
 from nics_drl_bridge.arguments import check_arguments, check_path, format_value
 from nics_drl_bridge.config import (
     Schema,
@@ -22,6 +22,7 @@ from nics_drl_bridge.config import (
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError, suggest
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Settings
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.joined import join_recordings
 from nics_drl_bridge.identify.report import fit_report, why_useless
@@ -58,7 +59,7 @@ PICTURES = (
     "wheels",
 )
 DRAWN_FILES = (REPORT_PAGE, *(f"{PICTURES_FOLDER}/{name}.png" for name in PICTURES))
-CONTROL_PERIOD_S = 0.1
+CONTROL_PERIOD_S = Settings.control_period_s
 MOTORS = "inputs", "limits"  # of a calibration
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
@@ -163,10 +164,10 @@ def generate(
     robot: RobotSpec | SimulatorModel | str | Path,
     lidar: LidarSpec | str | Path | None = None,
     shapes: Sequence[Shape] = (),
-    order: fit.Order = "auto",
-    alpha: fit.Alpha = "auto",
-    assume: bool = False,
-    strict: bool = False,
+    order: fit.Order = defaults.TAYLOR_ORDER,
+    alpha: fit.Alpha = defaults.PRUNING,
+    assume: bool = Settings.assume,
+    strict: bool = Settings.strict,
     anyway: bool = False,
     sensors: Sequence[Sensor] = (),
 ) -> tuple[SimulatorModel, Identified]:

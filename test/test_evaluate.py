@@ -12,7 +12,7 @@ import pytest
 from command_line import nics
 from domains import claimed_domain
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.policies import shipped_policies
@@ -328,7 +328,7 @@ def far_from_the_origin(tmp_path, monkeypatch):
     monkeypatch.setattr(
         vehicle, "examine", lambda facts, expected: []
     )  # of a busy machine
-    monkeypatch.setattr(vehicle, "LISTEN_S", 0.1)
+    monkeypatch.setattr(defaults, "LISTEN_S", 0.1)
     with claimed_domain() as domain_id:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")

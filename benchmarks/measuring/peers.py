@@ -30,8 +30,8 @@ from typing import IO, Any
 import numpy as np
 
 from measuring.environments import NotInstalledError, clean, python_with
+from nics_drl_bridge.defaults import EPISODE_STEPS
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World
@@ -160,7 +160,7 @@ def task_of(drawn: Sequence[Scene], alone: str) -> dict[str, Any]:
             "period": MODEL.control_period,
             "substeps": MODEL.timing[1],
             "goal_radius": Navigation(MODEL.robot, lidar).goal_radius,
-            "limit": MAX_EPISODE_STEPS,
+            "limit": EPISODE_STEPS,
         },
         "scenes": [
             {

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 from typer import Option
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
 
 
@@ -18,10 +19,10 @@ def demo(
         "runs/demo"
     ),
     robot: console.DrivenRobotOption = None,
-    world: console.WorldOption = "arena",
+    world: console.WorldOption = defaults.WORLD,
     episodes: Annotated[
         int, Option(min=1, help="Episodes in process, and again over DDS.")
-    ] = 5,
+    ] = defaults.DEMO_EPISODES,
     policy: Annotated[
         str | None,
         Option(

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, START_S, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
@@ -74,10 +74,12 @@ class DemoPlan:
     out: Path  # output folder
     # name or YAML file, as the world; None: as the recording tells
     robot: str | None = None
-    world: str = "arena"
+    world: str = defaults.WORLD
     # of a drive; None makes one with the robot's textbook kinematics
     recording: Path | None = None
-    episodes: int = 5  # number of episodes, in process and again over DDS
+    episodes: int = (
+        defaults.DEMO_EPISODES
+    )  # number of episodes, in process and again over DDS
     # a policy file or a name, to drive with instead of training one
     policy: str | None = None
     # environment steps of the training; None: as in `demo.yaml`

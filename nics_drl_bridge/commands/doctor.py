@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -33,14 +34,14 @@ def doctor(
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[
         float, Option(min=1.0, help="How long to listen to a robot [s].")
-    ] = 5.0,
+    ] = defaults.LISTEN_S,
     imu: Annotated[
         str,
         Option(
             metavar="TOPIC",
             help="Topic of the gyro; auto: the one that is there; none.",
         ),
-    ] = "auto",
+    ] = defaults.IMU_TOPIC,
     install: Annotated[
         bool, Option("--install", help="Check this machine instead: what works here.")
     ] = False,

@@ -13,9 +13,9 @@ from typing import Any
 
 import gymnasium
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
-from nics_drl_bridge.commands.vehicle_goals import FAR_M, NEAR_M, WAIT, GoalOrder
+from nics_drl_bridge.commands.vehicle_goals import NEAR_M, GoalOrder
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
@@ -55,7 +55,6 @@ LABELS = {
 EVALUATION = "evaluation.json"
 GATE = "command_gate"
 RAW = "cmd_vel_raw"
-LISTEN_S = 5.0
 ARM_S = 60.0
 # time that a node may take to start [s]; its kernels may have to be compiled
 START_S = 180.0
@@ -220,9 +219,9 @@ class EvaluationOrder:
     out: Path  # output folder
     # folder of a model or a shipped robot; None: the policies' own robot
     model: str | None = None
-    world: str = "circles"  # YAML file or name of the world
-    episodes: int = 20
-    seed: int = evaluation.FIRST_SEED
+    world: str = defaults.EVALUATION_WORLD  # YAML file or name of the world
+    episodes: int = defaults.EVALUATION_EPISODES
+    seed: int = defaults.EVALUATION_SEED
     places: Sequence[
         str
     ] = ()  # some of `PLACES`, compared with the first; none: all that work
@@ -434,7 +433,7 @@ def drive_vehicle(
     ask: Say,
     goal_frame: str | None = None,
     confirm: Say | None = None,
-    confirm_beyond_m: float = FAR_M,
+    confirm_beyond_m: float = defaults.CONFIRMED_BEYOND_M,
     **options: Any,
 ) -> Evaluated:
     """Drives episodes on the vehicle by `cmd_vel_raw`, so through an armed gate, and compares.
@@ -451,8 +450,8 @@ def drive_vehicle(
     namespace = options.get("namespace", "")
     model = open_model(name)
     world = load_worlds(order.world)
-    localised = options.get("pose_type", NO_POSE) != NO_POSE
-    start = options.get("start", WAIT)
+    localised = options.get("pose_type", defaults.POSE_TYPE) != NO_POSE
+    start = options.get("start", defaults.VEHICLE_START)
     wanted = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
     radius = model.robot.footprint_radius
     if not wanted.needs_pose:  # refused before anybody waits for anything
@@ -465,9 +464,11 @@ def drive_vehicle(
     open_policy(policy, model, order.conditions.kind)
     from nics_drl_bridge.nodes.listen import listen
 
-    say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
+    say(f"listening to the vehicle for {defaults.LISTEN_S:g} s, as nics doctor does")
     errors = []
-    heard = listen(LISTEN_S, namespace, imu=options.get("imu", "auto"))
+    heard = listen(
+        defaults.LISTEN_S, namespace, imu=options.get("imu", defaults.IMU_TOPIC)
+    )
     for finding in examine(heard, derive_expected(model)):
         sentence = f"{finding.where}: {finding.what} ({finding.fix})"
         say(f"  {finding.severity}: {sentence}")

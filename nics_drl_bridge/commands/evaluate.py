@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
@@ -30,9 +31,9 @@ def evaluate(
             "--world",
             "--scene",
             autocompletion=console.WORLDS,
-            help="A shipped world (circles) or a YAML file.",
+            help=f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file.",
         ),
-    ] = "circles",
+    ] = defaults.EVALUATION_WORLD,
     places: Annotated[
         list[str] | None,
         Option(
@@ -41,9 +42,15 @@ def evaluate(
         ),
     ] = None,
     episodes: Annotated[
-        int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")
+        int | None,
+        Option(
+            min=1,
+            help=f"How many; {defaults.EVALUATION_EPISODES}, or 1 on a vehicle.",
+        ),
     ] = None,
-    seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 1_000_000,
+    seed: Annotated[
+        int, Option(min=0, help="Seed of the first episode.")
+    ] = defaults.EVALUATION_SEED,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
@@ -62,7 +69,7 @@ def evaluate(
         Option(
             help="For --shadow without --goal: goal: where the robot is this much later [s]."
         ),
-    ] = 4.0,
+    ] = defaults.SHADOW_AHEAD_S,
     backend: Annotated[
         str | None, Option(help="dds, which --hardware implies.", metavar="dds")
     ] = None,
@@ -74,7 +81,7 @@ def evaluate(
         Option(
             help="For --hardware: wait until it stands at the start, or start where it is."
         ),
-    ] = "wait",
+    ] = defaults.VEHICLE_START,
     goal: Annotated[
         str | None,
         Option(
@@ -96,13 +103,13 @@ def evaluate(
             metavar="METRES",
             help="For --hardware: a goal that is farther away is confirmed.",
         ),
-    ] = 5.0,
+    ] = defaults.CONFIRMED_BEYOND_M,
     namespace: Annotated[
         str, Option(help="For --hardware: namespace of its topics.")
     ] = "",
     pose_type: Annotated[
         str, Option(help="For --hardware: type of `pose`, in map.")
-    ] = "none",
+    ] = defaults.POSE_TYPE,
     imu: Annotated[
         str,
         Option(
@@ -110,7 +117,7 @@ def evaluate(
             help="For --hardware: topic of the gyro that turns "
             "odometry; auto: imu or imu/data, if the model was made with one; none.",
         ),
-    ] = "auto",
+    ] = defaults.IMU_TOPIC,
     yes: Annotated[
         bool, Option("--yes", help="For --hardware: ask no questions.")
     ] = False,
@@ -140,7 +147,7 @@ def evaluate(
         from nics_drl_bridge.commands import episodes as driving
         from nics_drl_bridge.commands.conditions import Conditions
 
-    count = episodes or (1 if hardware else 20)
+    count = episodes or (1 if hardware else defaults.EVALUATION_EPISODES)
     tell = partial(typer.echo, err=True)
     under = Conditions(lidar, randomisation, gate, kind=task)
     order = driving.EvaluationOrder(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_drive
 from nics_drl_bridge.config import parse_namespace
@@ -27,8 +28,10 @@ def record(
     robot: console.RobotOption = DEFAULT_ROBOT,
     bound: Annotated[
         float, Option(help="Radius around the start to keep within [m].")
-    ] = 2.0,
-    duration: Annotated[float, Option(help="Duration of the drive [s].")] = 60.0,
+    ] = defaults.DRIVE_BOUND_M,
+    duration: Annotated[
+        float, Option(help="Duration of the drive [s].")
+    ] = defaults.DRIVE_S,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
     seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
@@ -47,7 +50,7 @@ def record(
             metavar="TOPIC",
             help="Topic of an IMU to record; auto: imu or imu/data, if there is one; none.",
         ),
-    ] = "auto",
+    ] = defaults.IMU_TOPIC,
     use_sim_time: Annotated[
         bool, Option("--use-sim-time", help="Take time from /clock.")
     ] = False,
@@ -285,7 +288,7 @@ def generate(
     ] = None,
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
-    world: console.WorldOption = "arena",
+    world: console.WorldOption = defaults.WORLD,
     lidar: console.LidarOption = None,
     sensor: Annotated[
         list[Path] | None,
@@ -293,14 +296,14 @@ def generate(
     ] = None,
     order: Annotated[
         str, Option(help="Order of the Taylor model, 1 to 4, or auto.")
-    ] = "auto",
+    ] = defaults.TAYLOR_ORDER,
     alpha: Annotated[
         str,
         Option(
             help="Pruning of Eq. 2, 0 to 1, or auto for the knee; "
             "no effect where the motion is the state."
         ),
-    ] = "auto",
+    ] = defaults.PRUNING,
     assume_textbook: Annotated[
         bool, Option(help="Fill in from the textbook what the drive did not show.")
     ] = False,
@@ -414,7 +417,7 @@ def drive(
     lidar: console.LidarOption = None,
     duration: Annotated[
         float, Option(min=5.0, max=3600.0, help="Duration [s].")
-    ] = 60.0,
+    ] = defaults.DRIVE_S,
     seed: Annotated[int, Option(min=0, help="Seed of the random commands.")] = 0,
     as_json: console.JsonOption = False,
 ) -> None:

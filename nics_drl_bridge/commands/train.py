@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_settings, check_training
 from nics_drl_bridge.commands.start import was_interrupted
@@ -32,7 +32,7 @@ def train(
     more_seeds: Annotated[list[str] | None, Argument(hidden=True)] = None,
     task: Annotated[
         str, Option(help="A task, or path/to/file.py:ClassName.")
-    ] = "navigation",
+    ] = defaults.TASK,
     robot: Annotated[
         str | None,
         Option(

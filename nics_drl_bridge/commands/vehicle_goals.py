@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.sim.scenes import Scene
@@ -20,7 +20,6 @@ GOAL_FRAMES = (ROBOT, MAP)
 # where episodes start: see `RealtimeOptions.start`
 WAIT = "wait"
 PRESENT = "present"
-FAR_M = 5.0  # a goal that is farther away is confirmed [m]
 NEAR_M = 0.5  # a vehicle that was moved by less since it was asked for is not asked about again [m]
 MARGIN_M = 10.0  # of the open ground beyond a goal [m]
 Say = Callable[[str], None]
@@ -39,9 +38,9 @@ class GoalOrder:
     point: Point | None = None  # x, y [m]; None: the world's own, of each episode
     # None: `robot` where the start is the present place, else `map`
     frame: str | None = None
-    start: str = WAIT  # or PRESENT
+    start: str = defaults.VEHICLE_START  # or PRESENT
     localised: bool = False  # a pose sensor tells where the robot is in `map`
-    confirm_beyond_m: float = FAR_M
+    confirm_beyond_m: float = defaults.CONFIRMED_BEYOND_M
 
     def __post_init__(self) -> None:
         if self.frame not in (None, *GOAL_FRAMES):

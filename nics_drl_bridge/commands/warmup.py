@@ -12,8 +12,6 @@ from nics_drl_bridge.commands.console import JsonOption, show_progress
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
-WORLD = "arena"
-
 
 def warmup(as_json: JsonOption = False) -> None:
     """Compiles all kernels in advance, once per machine, on two cores."""
@@ -62,7 +60,10 @@ def _simulate(model: Any) -> None:
     from nics_drl_bridge.env.bridge_env import BridgeEnv
     from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
-    for env in (BridgeVectorEnv(2, model, WORLD), BridgeEnv(model=model, world=WORLD)):
+    for env in (
+        BridgeVectorEnv(2, model),
+        BridgeEnv(model=model),
+    ):
         env.reset(seed=0)
         env.step(env.action_space.sample())
         env.close()

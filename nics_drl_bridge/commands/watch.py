@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -29,12 +29,14 @@ def watch(
         Option(
             "--world",
             "--scene",
-            help="A shipped world (circles) or a YAML file; several times: side "
-            "by side.",
+            help=f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file; several "
+            "times: side by side.",
             autocompletion=console.WORLDS,
         ),
     ] = None,
-    seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 1_000_000,
+    seed: Annotated[
+        int, Option(min=0, help="Seed of the first episode.")
+    ] = defaults.EVALUATION_SEED,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
@@ -82,7 +84,11 @@ def watch(
         source = _watch_ros(model, world, namespace)
     else:
         source = _watch_episodes(
-            policy or DEFAULT_ROBOT, model, world or ["circles"], seed, conditions
+            policy or DEFAULT_ROBOT,
+            model,
+            world or [defaults.EVALUATION_WORLD],
+            seed,
+            conditions,
         )
     with closing(source):
         if record is not None:

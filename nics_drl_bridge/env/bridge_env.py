@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_options, format_value
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.guard import give, halts_on_error, refused_after_close
@@ -113,8 +113,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self,
         backend: str | Backend = "sim",
         model: str | SimulatorModel | None = None,
-        world: str | AnyWorld = "arena",
-        task: str | type[Task] | Task = "navigation",
+        world: str | AnyWorld = defaults.WORLD,
+        task: str | type[Task] | Task = defaults.TASK,
         task_options: dict[str, Any] | None = None,
         estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.arguments import (
     check_count,
     format_value,
@@ -25,7 +26,7 @@ GYMNASIUM_ARGUMENTS = (
 
 
 def make(
-    task: str | type[Task] | Task = "navigation", **arguments: Any
+    task: str | type[Task] | Task = defaults.TASK, **arguments: Any
 ) -> gymnasium.Env[Any, Any]:
     """Makes an env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
     rename_robot_argument("make", "model", arguments)
@@ -39,7 +40,7 @@ def make(
 
 
 def make_vec(
-    task: str | type[Task] | Task = "navigation", num_envs: int = 1, **arguments: Any
+    task: str | type[Task] | Task = defaults.TASK, num_envs: int = 1, **arguments: Any
 ) -> Any:
     """Makes a `BridgeVectorEnv`: a task in many worlds at once, for training."""
     first: object = task

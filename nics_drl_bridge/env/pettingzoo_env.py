@@ -7,11 +7,10 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_count
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
 from nics_drl_bridge.env.guard import halts_on_error
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
@@ -55,10 +54,10 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     def __init__(
         self,
         model: str | SimulatorModel | None = None,
-        world: str | AnyWorld = "arena",
+        world: str | AnyWorld = defaults.WORLD,
         task: str | type[Task] | Task = "cooperative_reaching",
         task_options: dict[str, Any] | None = None,
-        max_episode_steps: int = MAX_EPISODE_STEPS,
+        max_episode_steps: int = defaults.EPISODE_STEPS,
         randomisation: str | Randomisation | None = None,
         render_mode: str | None = None,
     ) -> None:

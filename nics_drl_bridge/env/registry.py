@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_kind, check_options, format_value
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, suggest
@@ -156,7 +156,6 @@ ENVIRONMENTS = {  # id -> arguments that define the environment
     PURSUIT_EVASION: {"task": "pursuit_evasion"},
     TASK: {},
 }
-MAX_EPISODE_STEPS = 300
 
 
 def register_envs() -> None:
@@ -167,7 +166,7 @@ def register_envs() -> None:
                 name,
                 entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
                 vector_entry_point="nics_drl_bridge.env.vector_env:BridgeVectorEnv",
-                max_episode_steps=MAX_EPISODE_STEPS,
+                max_episode_steps=defaults.EPISODE_STEPS,
                 kwargs=dict(arguments),
             )
 

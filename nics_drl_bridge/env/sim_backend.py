@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_count
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
@@ -20,7 +20,6 @@ from nics_drl_bridge.interface import (
     Start,
     stack_views,
 )
-from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -47,7 +46,6 @@ class SimBackend:
         self,
         model: SimulatorModel,
         world: AnyWorld,
-        renderer: Renderer = "baked",
         estimator: bool = False,
         robots: int = 1,
         **simulation: Any,
@@ -55,9 +53,8 @@ class SimBackend:
         check_count("robots", robots)
         check_count("threads", simulation.get("threads", 1))
         self._robot = model.robot
-        self.simulator = FastSimulator(
-            model, world, robots=robots, renderer=renderer, **simulation
-        )
+        simulation = {"renderer": defaults.RENDERER, **simulation}
+        self.simulator = FastSimulator(model, world, robots=robots, **simulation)
         self._middlewares = [
             Middleware(model) for _ in range(robots if estimator else 0)
         ]

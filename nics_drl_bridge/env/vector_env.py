@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.arguments import check_arguments, check_count, format_value
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
@@ -89,10 +90,10 @@ class BridgeVectorEnv(
         self,
         num_envs: int = 1,
         model: str | SimulatorModel | None = None,
-        world: str | AnyWorld = "arena",
-        task: str | type[Task] | Task = "navigation",
+        world: str | AnyWorld = defaults.WORLD,
+        task: str | type[Task] | Task = defaults.TASK,
         task_options: dict[str, Any] | None = None,
-        max_episode_steps: int = 300,
+        max_episode_steps: int = defaults.EPISODE_STEPS,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         copy: bool = True,
         *,
@@ -129,7 +130,7 @@ class BridgeVectorEnv(
         self.single_action_space = team_space(self.task.action_space, self.robots)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        simulation = {"renderer": "baked", **simulation}
+        simulation = {"renderer": defaults.RENDERER, **simulation}
         self.simulator = FastSimulator(
             self.model, self.world, num_envs, self.robots, **simulation
         )

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import (
@@ -842,11 +843,11 @@ class Identified:
 def identify(
     recording: Recording,
     spec: RobotSpec,
-    order: fitting.Order = "auto",
+    order: fitting.Order = defaults.TAYLOR_ORDER,
     alpha: fitting.Alpha = fitting.ALPHA,
     train_until: float | None = None,
-    assume: bool = False,
-    strict: bool = False,
+    assume: bool = Settings.assume,
+    strict: bool = Settings.strict,
 ) -> Identified:
     """Learns a model up to `train_until` [s], and tests it on the rest; see `Settings`."""
     # Default: two thirds. RecordingError: unusable for this robot. FitError: too little excitation.

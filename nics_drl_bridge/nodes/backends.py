@@ -18,7 +18,7 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge import interface
+from nics_drl_bridge import defaults, interface
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, suggest
@@ -188,8 +188,8 @@ class DdsBackend:
         model: SimulatorModel,
         world: AnyWorld,
         namespace: str = "",
-        simulator: str = "simulator_node",
-        timeout_s: float = 30.0,
+        simulator: str = defaults.SIMULATOR_NODE,
+        timeout_s: float = defaults.ANSWER_S,
         truth: bool = False,
         domain_id: int | None = None,
         randomisation: Randomisation | None = None,
@@ -379,7 +379,7 @@ class FleetBackend:
         model: SimulatorModel,
         world: AnyWorld,
         namespaces: Sequence[str],
-        simulator: str = "/simulator_node",
+        simulator: str = f"/{defaults.SIMULATOR_NODE}",
         **options: Any,
     ) -> None:
         if len(set(namespaces)) < max(2, len(namespaces)):

@@ -7,6 +7,7 @@ from typing import Any
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.nodes.conversions import message_type
 from nics_drl_bridge.nodes.qos import offer_of, profile_of
 from nics_drl_bridge.nodes.runner import open_context
@@ -29,7 +30,10 @@ ANY_PUBLISHER = profile_of(Offer(100, reliable=False))
 
 
 def listen(
-    seconds: float, namespace: str = "", domain_id: int | None = None, imu: str = "auto"
+    seconds: float,
+    namespace: str = "",
+    domain_id: int | None = None,
+    imu: str = defaults.IMU_TOPIC,
 ) -> Facts:
     """Listen for a time [s] after the first message, awaited for at most 10 s; send nothing."""
     context = open_context([], domain_id)

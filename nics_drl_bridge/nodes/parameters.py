@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import shorten
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 MODES = ("realtime", "lockstep", "as_fast_as_possible")
-NO_POSE = "none"
+NO_POSE = defaults.POSE_TYPE
 POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
 OWN = -1.0  # value of a delay: take the model's
 HIGHEST_PRIORITY = 99
@@ -55,7 +56,6 @@ def stamped(what: str) -> Row:
 
 
 IMU = "imu"
-AUTO = "auto"
 ABOUT_IMU = (
     "Topic of the gyro that replaces the yaw rate of the wheels. auto: imu or imu/data, if the "
     "model was made with a gyro; none: wheels only."
@@ -120,7 +120,7 @@ def sensors() -> list[Row]:
             f"Message type of `pose`, a pose in the map frame: {types}.",
         ),
         Row("lidar_upside_down", False, upside_down),
-        Row(IMU, AUTO, ABOUT_IMU),
+        Row(IMU, defaults.IMU_TOPIC, ABOUT_IMU),
         stamped("cmd_vel"),
     ]
 
@@ -307,7 +307,7 @@ STANDARD = Row(
 def device(laser_frame: str = "") -> list[Row]:
     """Return the parameters of all simulators except `robots`, which is a count or names."""
     return [
-        Row("world", "arena", "Name of a shipped world, or a world file."),
+        Row("world", defaults.WORLD, "Name of a shipped world, or a world file."),
         STANDARD,
         Row(
             "randomisation",
@@ -570,14 +570,18 @@ def drive() -> list[Row]:
         ),
         Row(
             "bound",
-            2.0,
+            defaults.DRIVE_BOUND_M,
             "Radius of the circle around the start that the robot stays within [m].",
         ),
-        Row("duration", 60.0, "Duration of the drive [s]."),
+        Row("duration", defaults.DRIVE_S, "Duration of the drive [s]."),
         Row("speed", 1.0, "Fraction of the maximum speeds to use."),
         Row("seed", 0, "Seed of the pattern."),
         Row("topics", "", "YAML file that names the joints; empty: none."),
-        Row(IMU, AUTO, "IMU topic to record. auto: imu or imu/data; none: no IMU."),
+        Row(
+            IMU,
+            defaults.IMU_TOPIC,
+            "IMU topic to record. auto: imu or imu/data; none: no IMU.",
+        ),
         Row("odom_timeout", 0.5, "Stop after this silence of odom [s].", (0.05, 10.0)),
         stamped("cmd_vel")._replace(name="stamped"),
     ]
@@ -625,7 +629,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         DRIVEN_BY,
         TOLD,
         SERVED,
-        [MODEL, ROBOTS, *device(), renderer("baked")],
+        [MODEL, ROBOTS, *device(), renderer(defaults.RENDERER)],
         "-p world:=corridor -p odom_rate:=50.0",
     ),
     "mujoco_node": lambda: NodeFacts(
@@ -633,7 +637,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         DRIVEN_BY,
         TOLD,
         SERVED,
-        [MODEL, ROBOTS, *device(), renderer("exact"), FRICTION],
+        [MODEL, ROBOTS, *device(), renderer(defaults.MUJOCO_RENDERER), FRICTION],
         "-p model:=mecanum -p world:=empty",
     ),
     "middleware_node": lambda: NodeFacts(

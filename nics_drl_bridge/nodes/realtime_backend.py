@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, PositiveFloat
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, StaleDataError
@@ -37,15 +37,15 @@ class RealtimeOptions(Schema):
     """Options of `RealtimeBackend`."""
 
     namespace: str = ""  # of the robot
-    simulator: str = "simulator_node"  # name of its node in that namespace
+    simulator: str = defaults.SIMULATOR_NODE  # name of its node in that namespace
     domain_id: int | None = Field(None, ge=0, le=232)  # the environment's by default
-    timeout_s: PositiveFloat = 30.0  # longest wait for a peer or an answer
+    timeout_s: PositiveFloat = defaults.ANSWER_S  # longest wait for a peer or an answer
     vehicle: bool | None = None  # a vehicle has no services; None: detected
     # duration of a step; the model's control period by default
     period_s: PositiveFloat | None = None
     stale_after_s: PositiveFloat = 0.5  # age above which data are too old for a view
     # On a vehicle, wait until it stands at the requested pose, or start at the present one.
-    start: Literal["wait", "present"] = "wait"
+    start: Literal["wait", "present"] = defaults.VEHICLE_START
     # Lay `map` so that the robot's present place is the start; not possible with a pose sensor.
     lays_map: bool = False
     # tolerance of the start pose [m, rad]
@@ -58,9 +58,11 @@ class RealtimeOptions(Schema):
     command_topic: str = Field("cmd_vel", min_length=1)
     # use TwistStamped for `cmd_vel`; None: the type to which the robot subscribes
     stamped: bool | None = None
-    pose_type: str = "none"  # message type of `pose`, a pose sensor in `map`
+    pose_type: str = (
+        defaults.POSE_TYPE
+    )  # message type of `pose`, a pose sensor in `map`
     # Topic of the gyro for the yaw rate; `auto`: the usual topics, if the model was made with one
-    imu: str = Field("auto", min_length=1)
+    imu: str = Field(defaults.IMU_TOPIC, min_length=1)
 
     @property
     def gated(self) -> bool:

@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
@@ -30,7 +30,6 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.command_types import CommandListener
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.nodes.parameters import (
-    AUTO,
     IMU,
     NO_POSE,
     POSE_TYPES,
@@ -148,7 +147,7 @@ class RobotTopics:
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
         self.hoped_for: tuple[str, ...] = ()
-        if wanted == AUTO and topics:
+        if wanted == defaults.IMU_TOPIC and topics:
             self.hoped_for = (measurement.IMU,)
         elif topics:
             self.expected = (*self.expected, measurement.IMU)

@@ -22,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
@@ -669,7 +670,7 @@ def fast_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> FastSimulator:
     """Make the fast simulator with the lidar renderer that the parameter `renderer` names."""
-    renderer = declare_renderer(node, "baked")
+    renderer = declare_renderer(node, defaults.RENDERER)
     tell = node.get_logger().warning
     drawn = device_parameters.randomisation(node)
     given: Any = {"renderer": renderer, "randomisation": drawn, "tell": tell}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.env.navigation import Navigation
@@ -24,8 +25,7 @@ Flags = NDArray[np.bool_]
 # actions (N, C) for observations (N, O)
 Act = Callable[[NDArray[np.float32]], NDArray[Any]]
 
-# first seed of an evaluation, far from the seeds of any training
-FIRST_SEED = 1_000_000
+FIRST_SEED = defaults.EVALUATION_SEED
 # allowance for odometry drift: a robot stops where it believes its goal is [m]
 DRIFT_M = 0.1
 ELSEWHERE = "elsewhere"

@@ -5,8 +5,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.config import list_shipped
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, class_for
+from nics_drl_bridge.env.registry import class_for
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import LAYOUTS, covers, sectors_over
@@ -140,14 +141,14 @@ def fitted(
         )
     if (
         "max_episode_steps" not in settings.model_fields_set
-        and pace.steps != MAX_EPISODE_STEPS
+        and pace.steps != defaults.EPISODE_STEPS
     ):
         changed["max_episode_steps"] = pace.steps
         limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"
         told.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
-        if inherited and pace.steps > MAX_EPISODE_STEPS:
+        if inherited and pace.steps > defaults.EPISODE_STEPS:
             changed |= _stretched(
-                settings, options, pace.steps / MAX_EPISODE_STEPS, told
+                settings, options, pace.steps / defaults.EPISODE_STEPS, told
             )
     made = settings.model_copy(update={**changed, "task_options": options})
     short = pace.shortfall(made.max_episode_steps)

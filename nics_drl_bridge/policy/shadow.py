@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
@@ -78,7 +79,7 @@ def shadow(
     policy: str,
     topics: Mapping[str, str],
     goal: ArrayLike | None = None,
-    ahead_s: float = 4.0,
+    ahead_s: float = defaults.SHADOW_AHEAD_S,
 ) -> Shadow:
     """Runs a policy on a recorded drive, in process and deterministically.
 

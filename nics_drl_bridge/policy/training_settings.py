@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.config import (
     Schema,
     find_config,
@@ -73,7 +74,7 @@ class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`; `worlds` maps names or files to copies."""
 
     # a shipped task, or `path/to/file.py:ClassName` if the caller also names it, as with `--task`
-    task: str = "navigation"
+    task: str = defaults.TASK
     # arguments of the task's class
     task_options: dict[str, Any] = Field(default_factory=dict)
     robot: str = DEFAULT_ROBOT  # a shipped robot, or the folder of a model
@@ -89,7 +90,7 @@ class TrainingSettings(Schema):
     stop: StopSettings | None = None  # early stop; None: train for all steps
     # time limit of an episode [steps]; by default `nics train` sets 30 s, or 1.8 times what the
     # longest straight path to a goal in the worlds takes at top speed, if that is longer
-    max_episode_steps: Count = 300
+    max_episode_steps: Count = defaults.EPISODE_STEPS
     # learning algorithm; its settings are in the section of its name
     algorithm: Literal["ppo", "sac"] = "ppo"
     # sizes of the hidden layers, the same for actor and critic

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.messages import POSITION_UNITS
@@ -374,8 +374,8 @@ class DrivePlan:
 
     robot: RobotSpec  # the robot that drives
     # radius of the circle around the start that contains the whole robot [m]
-    bound: float = 2.0
-    duration: float = 60.0  # [s]
+    bound: float = defaults.DRIVE_BOUND_M
+    duration: float = defaults.DRIVE_S  # [s]
     speed: float = 1.0  # fraction of the maximum speeds and rates to use
     seed: int = 0  # of the pattern
 

@@ -2,13 +2,15 @@
 
 import numpy as np
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import Textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
 INTEGRATION_STEP_S = 1e-3
+ROW_S = 0.01  # between two rows of a recording
+HOLD_S = 0.5  # duration of a command
 
 
 def _integrate_substep(
@@ -35,9 +37,9 @@ def _integrate_substep(
 def record(
     spec: RobotSpec,
     rng: np.random.Generator,
-    duration: float = 60.0,
-    dt: float = 0.01,
-    hold: float = 0.5,
+    duration: float = defaults.DRIVE_S,
+    dt: float = ROW_S,
+    hold: float = HOLD_S,
 ) -> Recording:
     """Records a textbook robot without noise; commands last `hold`, rows are `dt` apart [s]."""
     book = textbook(spec)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.files import (
     begin_folder,
@@ -68,7 +69,10 @@ def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None
 
 
 def write_bag(
-    recording: Recording, path: str | Path, spec: RobotSpec, storage: Storage = "mcap"
+    recording: Recording,
+    path: str | Path,
+    spec: RobotSpec,
+    storage: Storage = defaults.BAG_STORAGE,
 ) -> None:
     """Writes a recording as a bag that `load_bag` reads back; for errors see `open_bag_sink`."""
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
@@ -277,7 +281,7 @@ class BagSink:
 
 @contextmanager
 def open_bag_sink(
-    path: str | Path, storage: Storage = "mcap", keep: bool = False
+    path: str | Path, storage: Storage = defaults.BAG_STORAGE, keep: bool = False
 ) -> Iterator[BagSink]:
     """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
 

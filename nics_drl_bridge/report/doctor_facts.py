@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
@@ -137,7 +138,7 @@ class Facts:
             )
 
 
-def names_in(namespace: str, imu: str = "auto") -> dict[str, str]:
+def names_in(namespace: str, imu: str = defaults.IMU_TOPIC) -> dict[str, str]:
     """Role -> topic of a robot in a namespace; none of a gyro if `imu` is none."""
     space = parse_namespace(namespace)
     names = {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
@@ -151,7 +152,7 @@ def name_of_gyro(
 ) -> str:
     """Returns the topic of the gyro: the wanted one, or that which is there, by its type."""
     usual = names[GYRO]
-    if imu != "auto" or IMU in types.get(usual, ()):
+    if imu != defaults.IMU_TOPIC or IMU in types.get(usual, ()):
         return usual
     space = usual.removesuffix(GYRO)
     gyros = sorted(name for name, kinds in types.items() if IMU in kinds)
@@ -161,7 +162,7 @@ def name_of_gyro(
 
 
 def collect_facts_of_bag(
-    path: str | Path, namespace: str = "", imu: str = "auto"
+    path: str | Path, namespace: str = "", imu: str = defaults.IMU_TOPIC
 ) -> Facts:
     """Collects the facts of a robot from a bag. Raises RecordingError if it is damaged."""
     facts = Facts(str(path), False, names_in(namespace, imu))

@@ -111,7 +111,7 @@ def record_messages(model: SimulatorModel, seed: int) -> list[Message]:
             "goal_distance": [1.0, 3.0],
         }
     )
-    simulator = FastSimulator(model, world)
+    simulator = FastSimulator(model, world, renderer="auto")
     simulator.reset([seed], starts=np.zeros((1, 1, 3)))
     data = simulator.data
     messages = []

@@ -146,7 +146,7 @@ def identified() -> Found:
             given = {key: value for key, value in disturbed.items() if key != "lever"}
             if robot == "ackermann":
                 given = disturbed
-            result = identify(drive(spec, **given), spec)
+            result = identify(drive(spec, **given), spec, alpha=0.99)
             for each, of in ((result.trial, ""), (result, ", all data")):
                 numbers = [
                     *each.model.coefficients.ravel(),

@@ -23,7 +23,7 @@ def identify_robot(name: str) -> Identified:
     robot = ROBOTS[name]
     drive = foreign_drive(robot, SEED, DURATIONS_S[name])
     spec = build_robot(robot.robot, robot.commands)
-    return identify(drive.recording(), spec)
+    return identify(drive.recording(), spec, alpha=0.99)
 
 
 def motion_state_errors() -> Found:

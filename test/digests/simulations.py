@@ -36,7 +36,7 @@ def barn() -> Found:
     model = builtin_model("jackal")
     found: Found = {}
     for number in BARN_NUMBERS:
-        simulator = FastSimulator(model, barn_world(number), worlds=2)
+        simulator = FastSimulator(model, barn_world(number), worlds=2, renderer="auto")
         commands = forward_commands(model, (2, 1), BARN_STEPS, seed=number)
         found[f"world {number}"] = drive(simulator, commands, episode_steps=100)
     return found
@@ -56,7 +56,9 @@ def crowd_in_cells() -> list[float]:
     assert sizes.crowded, "so few robots and obstacles are not sorted into cells"
     model = builtin_model("differential")
     world = field(size=16.0, obstacles=CROWD_OBSTACLES)
-    simulator = FastSimulator(model, world, worlds=1, robots=CROWD_ROBOTS)
+    simulator = FastSimulator(
+        model, world, worlds=1, robots=CROWD_ROBOTS, renderer="auto"
+    )
     commands = forward_commands(model, (1, CROWD_ROBOTS), CROWD_STEPS, seed=4)
     return drive(simulator, commands, episode_steps=CROWD_STEPS)
 

@@ -11,9 +11,10 @@ from gymnasium.utils.env_checker import check_env
 from robots import FOOTPRINT, circles, direct_model, field, lidar
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.defaults import EPISODE_STEPS
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, ModelError
@@ -74,7 +75,7 @@ def test_registering_twice_changes_nothing():
     spec = gymnasium.spec(NAVIGATION)
     register_envs()
     assert gymnasium.spec(NAVIGATION) is spec
-    assert spec.max_episode_steps == MAX_EPISODE_STEPS
+    assert spec.max_episode_steps == EPISODE_STEPS
 
 
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
@@ -173,10 +174,10 @@ def test_driving_into_a_wall_ends_in_a_collision(env):
 def test_a_time_limit_truncates_and_never_terminates():
     env = made(model=direct_model(), world=field())
     env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (2.0, 0.0)})
-    for step in range(1, MAX_EPISODE_STEPS + 1):
+    for step in range(1, EPISODE_STEPS + 1):
         _, _, terminated, truncated, info = env.step(STILL)
         assert not terminated
-        assert truncated == (step == MAX_EPISODE_STEPS)
+        assert truncated == (step == EPISODE_STEPS)
     assert not info["is_success"]
 
 

@@ -10,8 +10,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
 
+from nics_drl_bridge.defaults import EPISODE_STEPS
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, NAVIGATION
+from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
@@ -72,7 +73,7 @@ def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robo
         NAVIGATION, backend="dds", backend_options=options(node), **arguments
     )
     here = gymnasium.wrappers.TimeLimit(
-        BridgeEnv(MujocoBackend(model, world), **arguments), MAX_EPISODE_STEPS
+        BridgeEnv(MujocoBackend(model, world), **arguments), EPISODE_STEPS
     )
     policy = make_policy("dynamic_window", there.unwrapped.task)
     try:

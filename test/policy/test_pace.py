@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.config import list_shipped
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, make_task
+from nics_drl_bridge.defaults import EPISODE_STEPS
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
@@ -43,7 +44,7 @@ def test_the_shipped_robots_keep_the_time_limit_that_their_policies_were_learnt_
 ):
     worlds = [load_worlds(world) for world in list_shipped("worlds")]
     known = SimpleNamespace(robot=load_robot(name), control_period=0.1)
-    assert pace_of(known, worlds).steps == MAX_EPISODE_STEPS
+    assert pace_of(known, worlds).steps == EPISODE_STEPS
 
 
 def test_a_slow_robot_has_the_time_that_its_way_takes(model):
@@ -96,7 +97,7 @@ def test_settings_that_are_inherited_keep_their_meaning_over_a_longer_episode(mo
         update={"worlds": {"doorway": 4}}
     )
     settings, told = fitted(base, slow(model), inherited=True)
-    factor = settings.max_episode_steps / MAX_EPISODE_STEPS
+    factor = settings.max_episode_steps / EPISODE_STEPS
     assert settings.task_options["time_reward"] * factor == pytest.approx(
         -0.02, rel=1e-3
     )

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import needs_ros
 from nics_drl_bridge.config import parse_namespace
@@ -35,7 +36,7 @@ def record(
     duration: Annotated[
         float | None, Option(min=0.0, help="Stop after this time [s]; else at Ctrl-C.")
     ] = None,
-    storage: StorageOption = "mcap",
+    storage: StorageOption = defaults.BAG_STORAGE,
     use_sim_time: Annotated[
         bool, Option("--use-sim-time", help="Take time from /clock.")
     ] = False,

@@ -19,6 +19,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, RecordingError, suggest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
@@ -73,7 +74,7 @@ class BagOrder:
     everything: bool = False
     namespace: str = ""  # of the robot; prefix of topic names without a leading slash
     duration: float | None = None  # stops after this time [s]; None for never
-    storage: Storage = "mcap"  # format of the file
+    storage: Storage = defaults.BAG_STORAGE  # format of the file
     use_sim_time: bool = False  # takes times of receipt from `/clock`
 
     def wants(self, topic: str) -> bool:

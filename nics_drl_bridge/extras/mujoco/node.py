@@ -6,6 +6,7 @@ from functools import partial
 from rclpy.context import Context
 from rclpy.node import Node
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.extras.mujoco.machines import Physics, build_machine, load_mujoco
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import SimulatorModel
@@ -27,7 +28,7 @@ def mujoco_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> MujocoSimulator:
     """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
-    renderer = declare_renderer(node, "exact")
+    renderer = declare_renderer(node, defaults.MUJOCO_RENDERER)
     physics = replace(Physics(), friction=declare_row(node, FRICTION))
     return MujocoSimulator(model, world, robots, renderer, physics, randomisation(node))
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco import scenery
 from nics_drl_bridge.extras.mujoco.machines import (
@@ -22,6 +22,7 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.textbook import HOLD_S, ROW_S
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import DrivenSimulator
@@ -354,9 +355,9 @@ def divide(period: float, longest: float) -> tuple[int, int, float]:
 def record(
     robot: MujocoRobot,
     rng: np.random.Generator,
-    duration: float = 60.0,
-    dt: float = 0.01,
-    hold: float = 0.5,
+    duration: float = defaults.DRIVE_S,
+    dt: float = ROW_S,
+    hold: float = HOLD_S,
 ) -> Recording:
     """Drives at random, a new command each `hold` [s], and records each `dt` [s]; BackendError."""
     spec = robot.spec
