@@ -7,7 +7,7 @@ import numpy as np
 from nics_drl_bridge import FastSimulator, generate, load_robot, load_world, save_model
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.report.pictures import panels, png
+from nics_drl_bridge.style import make_panels, render_png
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
     driven = np.hypot(*(paths[-1] - paths[0])[:, :2].T)
     print(f"mean distance driven: {driven.mean():.2f} m")
 
-    figure, (axes,) = panels(1, 1, (5.0, 5.0))
+    figure, (axes,) = make_panels(1, 1, (5.0, 5.0))
     axes.plot(*np.stack(paths)[..., :2].transpose(2, 0, 1))
     axes.set(
         title="64 worlds, one robot each",
@@ -36,7 +36,7 @@ def main() -> None:
         xlabel="x [m]",
         ylabel="y [m]",
     )
-    Path("generate_from_recording.png").write_bytes(png(figure))
+    Path("generate_from_recording.png").write_bytes(render_png(figure))
 
 
 if __name__ == "__main__":

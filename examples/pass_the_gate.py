@@ -8,8 +8,8 @@ from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.report.pictures import panels, png
 from nics_drl_bridge.sim.world import load_world
+from nics_drl_bridge.style import make_panels, render_png
 
 FULL_SPEED = np.array([0.5, 0.0])  # m/s, rad/s
 
@@ -32,7 +32,7 @@ def main() -> None:
     )
     print(f"a NaN command is stopped by the rule {stopped!r}")
 
-    figure, (axes,) = panels(1, 1, (6.5, 3.6))
+    figure, (axes,) = make_panels(1, 1, (6.5, 3.6))
     time = np.arange(len(rows)) * model.control_period
     axes.plot(time, np.full(len(rows), FULL_SPEED[0]), "--", label="requested [m/s]")
     axes.plot(time, speed, label="driven [m/s]")
@@ -40,7 +40,7 @@ def main() -> None:
     axes.fill_between(time, 0.0, 3.0, where=shielded > 0, alpha=0.15, label="shielded")
     axes.set_xlabel("time [s]")
     axes.legend()
-    Path("pass_the_gate.png").write_bytes(png(figure))
+    Path("pass_the_gate.png").write_bytes(render_png(figure))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import drive_worlds, rate
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.report.pictures import panels, png
+from nics_drl_bridge.style import make_panels, render_png
 
 EPISODES = range(1_000_000, 1_000_100)
 CONDITIONS = {
@@ -30,7 +30,7 @@ def main() -> None:
             f"{name}: {found[-1].value:.0%} ({found[-1].low:.0%} to {found[-1].high:.0%})"
         )
 
-    figure, (axes,) = panels(1, 1, (5.5, 3.6))
+    figure, (axes,) = make_panels(1, 1, (5.5, 3.6))
     value, low, high = (
         100.0 * np.array([(one.value, one.low, one.high) for one in found]).T
     )
@@ -38,7 +38,7 @@ def main() -> None:
         list(CONDITIONS), value, yerr=[value - low, high - value], fmt="o", capsize=6
     )
     axes.set(title="100 episodes in circles", ylabel="success [%]", ylim=(0, 105))
-    Path("perturb.png").write_bytes(png(figure))
+    Path("perturb.png").write_bytes(render_png(figure))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle
 from nics_drl_bridge.lidar.spec import load_lidar
-from nics_drl_bridge.report.pictures import panels, png
+from nics_drl_bridge.style import make_panels, render_png
 
 SHAPES = [
     Circle(radius=0.2),
@@ -36,14 +36,14 @@ def main() -> None:
     off = np.sqrt(np.mean((scans["auto"] - scans["exact"]) ** 2))
     print(f"{len(poses)} scans of {lidar.beams} beams, RMSE {1000.0 * off:.1f} mm")
 
-    figure, grid = panels(1, 3, (9.0, 3.4))
+    figure, grid = make_panels(1, 3, (9.0, 3.4))
     rays = np.stack([np.cos(lidar.angles), np.sin(lidar.angles)], axis=1)
     for axes, at, ranges in zip(grid, robots, scans["auto"], strict=False):
         hits = (at + ranges[:, None] * rays)[ranges < lidar.range_max]
         axes.plot(*hits.T, ".", markersize=1.5)
         axes.plot(*at, "o")
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    Path("scan_shapes.png").write_bytes(png(figure))
+    Path("scan_shapes.png").write_bytes(render_png(figure))
 
 
 if __name__ == "__main__":

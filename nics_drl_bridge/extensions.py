@@ -92,7 +92,7 @@ def import_class(group: str, place: str, base: type) -> type:
     loaded = getattr(load_module(path, kind), name, None)
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
         needed = f"{base.__module__.removeprefix(f'{PACKAGE}.')}.{base.__name__}"
-        raise ConfigError(f"{kind} kind {place!r}: is no subclass of {needed}.")
+        raise ConfigError(f"{kind} kind {place!r}: is not a subclass of {needed}.")
     if name in find_extensions(group):
         fix = "is installed under this name already; rename the class"
         raise ConfigError(f"{kind} {place!r}: another {kind} {fix}.")

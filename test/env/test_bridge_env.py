@@ -295,7 +295,7 @@ def test_a_backend_that_does_not_take_what_it_is_told_is_named():
         patch.setattr(extensions, "find_extensions", lambda group: {"mine": Point})
         BridgeEnv("mine", direct_model(), field()).reset(seed=0)
         with pytest.raises(
-            ConfigError, match=r"'mine': got an unexpected .*'randomisation'; look"
+            ConfigError, match=r"'mine': got an unexpected .*'randomisation'; check"
         ):
             BridgeEnv("mine", direct_model(), field(), randomisation="mild")
 

@@ -108,7 +108,7 @@ def test_the_frame_of_the_robot_is_its_own_and_a_footprint_may_be_none():
     told = frame_fault(given(good) + given({"base_frame": "odom"}))
     assert (
         told
-        == "parameter 'base_frame': is 'odom', as 'odom_frame' is; they must differ."
+        == "parameter 'base_frame': is 'odom', like 'odom_frame'; they must differ."
     )
 
 

@@ -53,7 +53,7 @@ def test_a_second_node_in_the_same_namespace_refuses_to_start(
     code, told = ended(launch(node, domain_id, "one"))
     assert code == 2
     assert told.startswith(
-        f"a node '/one/{node}' runs already in ROS domain {domain_id}; end it"
+        f"a node '/one/{node}' already runs in ROS domain {domain_id}; end it"
     )
     assert told.count("\n") == 1
     first.check()
@@ -100,7 +100,7 @@ def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(
     try:
         other.until(lambda: asked.service_is_ready(), "it in the graph")
         with (
-            pytest.raises(BackendError, match="runs already"),
+            pytest.raises(BackendError, match="already runs"),
             sole(other.context, name),
         ):
             pass

@@ -240,7 +240,7 @@ def test_sac_is_refused_for_discrete_actions_and_a_batch_that_no_rollout_fills(
     with pytest.raises(ConfigError, match="'sac' needs continuous actions; use 'ppo'"):
         train(settings("sac", task_options={"actions": "discrete"}), 0, tmp_path)
     with pytest.raises(
-        ConfigError, match=r"ppo\.batch 999: is more than the 128 transitions"
+        ConfigError, match=r"ppo\.batch 999: exceeds the 128 transitions"
     ):
         train(settings(ppo={"rollout": 16, "batch": 999}), 0, tmp_path)
 

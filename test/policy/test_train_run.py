@@ -104,7 +104,7 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
             ["--resume", "--steps", "5", "--out", "x"],
             "--steps: a resumed run has its own settings",
         ),
-        (["--resume", "--out", "nowhere"], "nowhere: holds no settings.yaml"),
+        (["--resume", "--out", "nowhere"], "nowhere: contains no settings.yaml"),
         (["--seeds", "1", "1", "--out", "run"], "give one or more, none twice"),
         (["--engine", "rai"], "unknown engine 'rai'; did you mean 'ray'"),
         (
@@ -225,7 +225,7 @@ def test_a_batch_of_more_than_a_rollout_is_refused_before_a_folder_is_begun(
     done = nics("--settings", settings, "--out", tmp_path / "run")
     assert done.exit_code == 2
     assert (
-        "ppo.batch 4096: is more than the 128 transitions of a rollout" in done.output
+        "ppo.batch 4096: exceeds the 128 transitions of a rollout" in done.output
     )
     assert not (tmp_path / "run").exists()
 
