@@ -131,9 +131,7 @@ def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
 
     names = gate_rules.names()
     assert len(names) == len(set(names)) > 30
-    assert {"stop/disarmed", "refusal/command_not_finite", "shaping/bounded"} <= set(
-        names
-    )
+    assert {"stop/disarmed", "refusal/check_finite", "shaping/bound"} <= set(names)
     with pytest.raises(SystemExit, match="there is no rule 'stop/nothing'"):
         gate_rules.take_out("stop/nothing")
 

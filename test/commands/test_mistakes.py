@@ -242,8 +242,9 @@ def test_a_run_with_other_settings_is_not_overwritten(folder):
         "robot: ackermann\n", encoding="utf-8"
     )
     done = nics("train", "--robot", "differential", "--out", "run", cwd=folder)
-    assert "run: contains a run with other settings; choose another --out" in sentence_of(
-        done
+    assert (
+        "run: contains a run with other settings; choose another --out"
+        in sentence_of(done)
     )
 
 

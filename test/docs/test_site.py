@@ -50,7 +50,8 @@ def test_a_key_has_its_type_default_range_and_the_comment_at_its_field():
     found = reference.rows(World, schema["properties"], schema["required"])
     rows = {row.split("|")[1].strip(): row for row in found}
     assert (
-        "| number | `0.3` | ≥ 0 | free space around the footprint" in rows["`clearance`"]
+        "| number | `0.3` | ≥ 0 | free space around the footprint"
+        in rows["`clearance`"]
     )
     assert "| text | required |" in rows["`name`"]
 

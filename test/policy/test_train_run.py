@@ -224,9 +224,7 @@ def test_a_batch_of_more_than_a_rollout_is_refused_before_a_folder_is_begun(
     settings.write_text(SETTINGS.replace("batch: 64", "batch: 4096"))
     done = nics("--settings", settings, "--out", tmp_path / "run")
     assert done.exit_code == 2
-    assert (
-        "ppo.batch 4096: exceeds the 128 transitions of a rollout" in done.output
-    )
+    assert "ppo.batch 4096: exceeds the 128 transitions of a rollout" in done.output
     assert not (tmp_path / "run").exists()
 
 
