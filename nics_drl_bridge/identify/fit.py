@@ -1,4 +1,13 @@
-"""Eqs. 1 and 2 on one page (Sec. IV-A): features, least squares, pruning, least squares again."""
+"""Fits a Taylor model to rates of motion: least squares, pruning, least squares again (Sec. IV-A).
+
+For each degree of freedom d and features chi(X), products of state and commands up to an order:
+
+    Eq. 1   dQ_d/dt = sum_k A_dk chi_k(X)            least squares over the rows of a drive
+    Eq. 2   keep the fewest, largest terms with  sum |beta_kept| >= alpha sum |beta|
+
+beta is A in units of the features' standard deviations, so that the sizes of terms can be compared.
+`regress` is Eq. 1 on all features; `prune_and_refit` is Eq. 2, and Eq. 1 again on the kept terms.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,15 +29,18 @@ from nics_drl_bridge.threads import one_blas_thread
 
 Alpha = float | Literal["auto"]
 Order = int | Literal["auto"]
-# selects terms (D, K) by their powers
-Library = Callable[[NDArray[np.int64], RobotSpec], NDArray[np.bool_]]
+# From the exponents (K, V) of features, selects the terms (D, K) that a model may have.
+TermFilter = Callable[[NDArray[np.int64], RobotSpec], NDArray[np.bool_]]
 
 ALPHA: Alpha = 0.99
 ORDER = 2
-# standardised coefficients below this fraction of the rates are rounding errors
+TWIST_ROWS = slice(3)  # rows of dQ/dt: vx, vy, wz; the rates of the states follow
+# Standardised coefficients below this fraction of the largest rate are rounding errors.
 ROUNDING = 1e-9
-SAME_STEP = 1e-3
-ROUNDING_S = 1e-6
+LEAST_RATE = 1e-9  # that rate is at least so large [unit of the rate]
+# A row is one step after the previous one if it is within this fraction of a step, and this time.
+STEP_TOLERANCE = 1e-3
+STEP_TOLERANCE_S = 1e-6
 
 
 def parse_alpha(text: str) -> Alpha:
@@ -50,20 +62,31 @@ def parse_order(text: str) -> Order:
 
 @dataclass(frozen=True)
 class Regression:
-    """Least squares of dQ/dt on all features (Eq. 1)."""
+    """Least squares of dQ/dt on all features (Eq. 1).
 
-    samples: Samples  # T rows, without implausible ones
-    # (K, V) exponents of the features that moved, without copies
+    Attributes:
+        samples: the T rows, without implausible ones.
+        powers: (K, V) exponents of the independent features of the variables that moved.
+        chi: (T, K) features.
+        beta: (D, K) standardised coefficients; zero for a term that is not allowed or significant.
+        inliers: (D, T) rows that are not outliers.
+        moving: degrees of freedom that move; the others have no terms.
+        excitation: of the variables by the drive.
+        dependent: terms that are multiples of others on this drive.
+        terms_total: number of coefficients before any selection.
+        left_out: fraction of the rows that were implausible.
+    """
+
+    samples: Samples
     powers: NDArray[np.int64]
-    chi: Array  # (T, K) features
-    # (D, K) standardised coefficients; zero where not allowed or insignificant
+    chi: Array
     beta: Array
-    inliers: NDArray[np.bool_]  # (D, T) rows that are not outliers
-    moving: tuple[int, ...]  # degrees of freedom that move; the others have no terms
-    excitation: excitation.Excitation  # of the variables by the drive
-    dependent: tuple[str, ...]  # terms that duplicate others on this drive
-    terms_total: int  # D x K before any selection
-    left_out: float  # fraction of the rows that were implausible
+    inliers: NDArray[np.bool_]
+    moving: tuple[int, ...]
+    excitation: excitation.Excitation
+    dependent: tuple[str, ...]
+    terms_total: int
+    left_out: float
 
     def rows(self, d: int) -> tuple[Array, Array]:
         """Returns features (n, K) and rates (n,) of a degree of freedom without its outliers."""
@@ -73,34 +96,53 @@ class Regression:
             return (self.chi, target)
         return (self.chi[inside], target[inside])
 
+    def noise_floor(self, d: int) -> float:
+        """Returns the standardised coefficient up to which a term is a rounding error."""
+        largest_rate = float(np.abs(self.rows(d)[1]).max())
+        return ROUNDING * max(largest_rate, LEAST_RATE)
+
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model and its goodness of fit."""
+    """A fitted model and its goodness of fit.
 
-    model: TaylorModel  # the pruned model, with standard errors
-    regression: Regression  # on all features
-    rmse: Array  # (D,) root mean square residual of dQ/dt, in the dof's unit, without outliers
-    r2: Array  # (D,) fraction of the variance explained; 1 if the dof does not move
-    alpha: Alpha  # threshold used for pruning
-    outliers: Array  # (D,) fraction of the rows dropped as outliers
-    condition: Array  # (D,) condition number of the standardised kept features
+    Attributes:
+        model: the pruned model, with standard errors.
+        regression: on all features.
+        rmse: (D,) root mean square residual of dQ/dt without outliers, in units of dQ/dt.
+        r2: (D,) fraction of the variance that the model explains.
+        alpha: threshold used for pruning.
+        outliers: (D,) fraction of the rows left out, as implausible or as outliers.
+        condition: (D,) condition number of the kept standardised features.
+    """
+
+    model: TaylorModel
+    regression: Regression
+    rmse: Array
+    r2: Array
+    alpha: Alpha
+    outliers: Array
+    condition: Array
 
     @cached_property
     @np.errstate(over="ignore", invalid="ignore")
     def curves(self) -> tuple[statistics.Curve, ...]:
         """Accuracy against the number of terms, for the degrees of freedom that move."""
-        found = self.regression
-        names = (self.model.dofs, self.model.variables)
-        kept = {d: _kept(found, d, self.alpha, *names) for d in found.moving}
-        return tuple(
-            replace(_curve(found, d, *names), kept=int(keep.sum()))
-            for d, keep in kept.items()
-        )
+        curves = []
+        for d in self.regression.moving:
+            curve = _cross_validate(
+                self.regression, d, self.model.dofs, self.model.variables
+            )
+            if self.alpha != "auto":
+                beta = self.regression.beta[d]
+                kept = prune(beta, self.alpha, self.regression.noise_floor(d))
+                curve = replace(curve, kept=int(kept.sum()))
+            curves.append(curve)
+        return tuple(curves)
 
     @property
     def unmoved(self) -> tuple[str, ...]:
-        """Variables that the drive never moved, so no term contains them."""
+        """Variables that never changed during the drive; no term uses them."""
         return self.regression.excitation.unmoved
 
 
@@ -112,8 +154,8 @@ def fit(
     alpha: Alpha = ALPHA,
     noisy: bool = False,
 ) -> Fit:
-    """Fits and prunes a Taylor model; see `regress` and `pruned` for arguments and errors."""
-    return pruned(regress(samples, spec, order, noisy), spec, alpha)
+    """Fits and prunes a Taylor model; for arguments and errors see `regress`, `prune_and_refit`."""
+    return prune_and_refit(regress(samples, spec, order, noisy), spec, alpha)
 
 
 def regress(
@@ -121,109 +163,139 @@ def regress(
     spec: RobotSpec,
     order: int = ORDER,
     noisy: bool = False,
-    allowed: Library | None = None,
+    term_filter: TermFilter | None = None,
 ) -> Regression:
-    """Fits all features of order 1 to 4 (Eq. 1); FitError: too few samples, or nothing moved."""
-    # `allowed`, if given, selects the features of each degree of freedom.
-    # `noisy` is True unless a recording is exact: insignificant terms are dropped before Eq. 2, and
-    # the body twist depends on the state alone, if there is one, and is zero at zero speed: within
-    # a step a command acts through the state, and in noise the two can't be separated.
-    believed = excitation.plausible(samples.x, spec)
-    samples = samples.rows(believed)
-    excited = excitation.Excitation.of(samples, spec)
+    """Fits all features up to an order (Eq. 1).
+
+    Args:
+        samples: rows of X and dQ/dt.
+        spec: the robot.
+        order: maximum order of a feature, 1 to 4.
+        noisy: leave out terms that are not significant. Without a `term_filter`, the twist of a
+            robot with a state then has terms of the state only, and no constant if a speed changed:
+            within a step a command acts through the state, and noise hides any direct effect.
+        term_filter: selects the terms of each degree of freedom.
+
+    Raises:
+        FitError: too few samples, or no command changed.
+    """
+    plausible = excitation.plausible(samples.x, spec)
+    samples = samples.rows(plausible)
     names = spec.variable_names
-    every = taylor.list_exponents(len(names), order)
-    powers = excitation.moved_terms(samples, every, names, excited.unmoved)
-    chi = taylor.evaluate(samples.x, powers)
+    excited = excitation.Excitation.of(samples, spec)
+    all_powers = taylor.list_exponents(len(names), order)
+    moved_powers = excitation.moved_terms(samples, all_powers, names, excited.unmoved)
+    chi = taylor.evaluate(samples.x, moved_powers)
     independent, dependent = excitation.independent_columns(chi)
     chi = chi[:, independent]
-    kept = powers[independent]
-    beta = np.zeros((samples.dq.shape[1], len(kept)))
-    used = np.ones(samples.dq.T.shape, dtype=np.bool_)
-    if allowed is None:
-        terms = np.ones((beta.shape[0], len(kept)), dtype=np.bool_)
-        if noisy:
-            terms[:3] = excitation.terms_through_state(kept, spec, excited.unmoved)
+    powers = moved_powers[independent]
+
+    dofs = samples.dq.shape[1]
+    if term_filter is not None:
+        allowed = term_filter(powers, spec)
     else:
-        terms = allowed(kept, spec)
-    usual = excitation.usual_ranges(samples.dq)
-    moving = excitation.moving_dofs(samples.dq)
-    for d in moving:
-        some = chi[:, terms[d]]
-        target = samples.dq[:, d]
-        used[d] = excitation.inliers(some / _scale(some), target, float(usual[d]))
-        if not used[d].all():
-            some = some[used[d]]
-            target = target[used[d]]
-        unit = some / _scale(some)
-        used_terms = np.flatnonzero(terms[d])
+        allowed = np.ones((dofs, len(powers)), dtype=np.bool_)
         if noisy:
-            candidates = statistics.significant(unit, target)
-            unit = unit[:, candidates]
-            used_terms = used_terms[candidates]
-        if len(used_terms):
-            beta[d, used_terms] = np.linalg.lstsq(unit, target, rcond=None)[0]
+            allowed[TWIST_ROWS] = excitation.terms_through_state(
+                powers, spec, excited.unmoved
+            )
+    beta = np.zeros((dofs, len(powers)))
+    inliers = np.ones((dofs, len(samples.dq)), dtype=np.bool_)
+    moving = excitation.moving_dofs(samples.dq)
+    usual_ranges = excitation.usual_ranges(samples.dq)
+    for d in moving:
+        terms = np.flatnonzero(allowed[d])
+        features = chi[:, terms]
+        target = samples.dq[:, d]
+        inliers[d] = excitation.inliers(
+            features / _spreads(features), target, float(usual_ranges[d])
+        )
+        if not inliers[d].all():
+            features = features[inliers[d]]
+            target = target[inliers[d]]
+        standardised = features / _spreads(features)
+        if noisy:
+            significant = statistics.significant(standardised, target)
+            standardised = standardised[:, significant]
+            terms = terms[significant]
+        if len(terms):
+            beta[d, terms] = np.linalg.lstsq(standardised, target, rcond=None)[0]
     return Regression(
-        samples,
-        kept,
-        chi,
-        beta,
-        used,
-        moving,
-        excited,
-        dependent=tuple(taylor.format_term(row, names) for row in powers[dependent]),
-        terms_total=samples.dq.shape[1] * len(every),
-        left_out=1.0 - float(believed.mean()),
+        samples=samples,
+        powers=powers,
+        chi=chi,
+        beta=beta,
+        inliers=inliers,
+        moving=moving,
+        excitation=excited,
+        dependent=tuple(
+            taylor.format_term(row, names) for row in moved_powers[dependent]
+        ),
+        terms_total=dofs * len(all_powers),
+        left_out=1.0 - float(plausible.mean()),
     )
 
 
-def _scale(chi: Array) -> Array:
-    spread = chi.std(axis=0)
+def _spreads(features: Array) -> Array:
+    """Returns the standard deviation (K,) of each feature; 1 for a constant one."""
+    spread = features.std(axis=0)
     return np.where(spread > 0.0, spread, 1.0)
 
 
-def by_weight(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
-    """Returns indices of standardised coefficients (K,), largest first, without rounding errors."""
+def rank(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
+    """Returns the indices of standardised coefficients (K,), largest first.
+
+    Those up to `noise_floor` are left out.
+    """
     size = np.where(np.abs(beta) > noise_floor, np.abs(beta), 0.0)
-    order = np.argsort(-size, kind="stable")
-    return np.asarray(order[size[order] > 0.0])
+    ranking = np.argsort(-size, kind="stable")
+    return np.asarray(ranking[size[ranking] > 0.0])
 
 
 def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.bool_]:
-    """Selects the standardised coefficients (K,) to keep: the largest, up to a fraction `alpha`."""
-    # Includes the one that crosses it (Eq. 2); those up to `noise_floor` are rounding errors.
-    order = by_weight(beta, noise_floor)
-    size = np.abs(beta[order])
-    return np.isin(
-        np.arange(len(beta)), order[np.cumsum(size) - size < alpha * size.sum()]
-    )
+    """Returns a mask (K,) of the standardised coefficients that are kept (Eq. 2).
+
+    These are the fewest, largest ones whose sum reaches `alpha` of the total: the term that crosses
+    the threshold is kept, else a robot with two wheels could lose one of them. Coefficients up to
+    `noise_floor` never count.
+    """
+    ranking = rank(beta, noise_floor)
+    size = np.abs(beta[ranking])
+    sum_of_larger = np.cumsum(size) - size
+    kept = ranking[sum_of_larger < alpha * size.sum()]
+    return np.isin(np.arange(len(beta)), kept)
 
 
-def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:
-    """Keeps the fraction `alpha` of a regression (Eq. 2), or `auto`; refits the kept terms."""
-    # The term that crosses the threshold is kept, else a differential robot would lose a wheel.
-    # `auto` keeps as many terms, in the same order, as improve the cross-validated error.
+def prune_and_refit(
+    regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA
+) -> Fit:
+    """Prunes a regression (Eq. 2) and fits the terms that are kept again (Eq. 1).
+
+    With `auto` in place of a threshold, terms are taken in the order of their size, as many as
+    lower the cross-validated error.
+    """
     samples = regression.samples
-    shape = regression.beta.shape
-    coefficients = np.zeros(shape)
-    errors = np.zeros(shape)
-    conditions = np.ones(shape[0])
-    noisy_state = excitation.states_are_noisy(samples, spec)
+    coefficients = np.zeros(regression.beta.shape)
+    errors = np.zeros(regression.beta.shape)
+    conditions = np.ones(len(regression.beta))
+    noisy_states = excitation.states_are_noisy(samples, spec)
     for d in regression.moving:
-        chi, target = regression.rows(d)
-        scale = _scale(chi)
-        unit = chi / scale
-        keep = _kept(regression, d, alpha, spec.dof_names, spec.variable_names)
-        if keep.any():
-            beta = np.linalg.lstsq(unit[:, keep], target, rcond=None)[0]
-            rest = target - unit[:, keep] @ beta
-            coefficients[d, keep] = beta / scale[keep]
-            errors[d, keep] = (
-                statistics.standard_errors(unit[:, keep], rest) / scale[keep]
-            )
-        if noisy_state and d >= 3:
-            _reestimate(coefficients[d], errors[d], d, regression, len(spec.state))
-        conditions[d] = statistics.condition(chi[:, keep])
+        features, target = regression.rows(d)
+        spreads = _spreads(features)
+        standardised = features / spreads
+        kept = _select_terms(regression, d, spec, alpha)
+        if kept.any():
+            beta = np.linalg.lstsq(standardised[:, kept], target, rcond=None)[0]
+            residual = target - standardised[:, kept] @ beta
+            beta_errors = statistics.standard_errors(standardised[:, kept], residual)
+            coefficients[d, kept] = beta / spreads[kept]
+            errors[d, kept] = beta_errors / spreads[kept]
+        if noisy_states and d >= TWIST_ROWS.stop:
+            found = _fit_by_instruments(regression, d, coefficients[d], len(spec.state))
+            if found is not None:
+                terms = np.flatnonzero(coefficients[d])
+                coefficients[d, terms], errors[d, terms] = found
+        conditions[d] = statistics.condition(features[:, kept])
     used = np.abs(coefficients).sum(axis=0) > 0.0
     model = TaylorModel(
         spec.variable_names,
@@ -238,67 +310,61 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
     )
     rmse, r2 = statistics.errors_of(model, samples)
     for d in regression.moving:
-        if not (inside := regression.inliers[d]).all():
-            rmse[d], r2[d] = (
-                each[d] for each in statistics.errors_of(model, samples.rows(inside))
-            )
+        inside = regression.inliers[d]
+        if not inside.all():
+            rmse_inside, r2_inside = statistics.errors_of(model, samples.rows(inside))
+            rmse[d] = rmse_inside[d]
+            r2[d] = r2_inside[d]
     outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
     return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
 
 
-def _kept(
-    regression: Regression,
-    d: int,
-    alpha: Alpha,
-    dofs: tuple[str, ...],
-    variables: tuple[str, ...],
+def _select_terms(
+    regression: Regression, d: int, spec: RobotSpec, alpha: Alpha
 ) -> NDArray[np.bool_]:
     """Returns a mask (K,) of the terms that a degree of freedom keeps."""
     beta = regression.beta[d]
-    floor = _floor(regression, d)
+    noise_floor = regression.noise_floor(d)
     if alpha != "auto":
-        return prune(beta, alpha, floor)
-    order = by_weight(beta, floor)[: _curve(regression, d, dofs, variables).kept]
-    return np.isin(np.arange(len(beta)), order)
+        return prune(beta, alpha, noise_floor)
+    curve = _cross_validate(regression, d, spec.dof_names, spec.variable_names)
+    kept = rank(beta, noise_floor)[: curve.kept]
+    return np.isin(np.arange(len(beta)), kept)
 
 
-def _floor(regression: Regression, d: int) -> float:
-    return ROUNDING * max(float(np.abs(regression.rows(d)[1]).max()), ROUNDING)
-
-
-def _curve(
+def _cross_validate(
     regression: Regression, d: int, dofs: tuple[str, ...], variables: tuple[str, ...]
 ) -> statistics.Curve:
-    """Returns the accuracy of a degree of freedom by its number of terms; `kept` is the knee."""
-    order, (chi, target) = (
-        by_weight(regression.beta[d], _floor(regression, d)),
-        regression.rows(d),
-    )
-    names = tuple(
-        taylor.format_term(row, variables) for row in regression.powers[order]
-    )
-    return statistics.curve(dofs[d], names, (chi / _scale(chi))[:, order], target)
+    """Returns the error of a degree of freedom by its number of terms; `kept` is at the knee."""
+    ranking = rank(regression.beta[d], regression.noise_floor(d))
+    features, target = regression.rows(d)
+    standardised = features / _spreads(features)
+    names = [taylor.format_term(row, variables) for row in regression.powers[ranking]]
+    return statistics.curve(dofs[d], tuple(names), standardised[:, ranking], target)
 
 
-def _reestimate(
-    coefficients: Array, errors: Array, d: int, regression: Regression, states: int
-) -> None:
-    """Replaces a state's coefficients (K,) and errors by instrumental ones, unless weak."""
-    # The noise of a state is in both X and its rate, which least squares would mistake for a fast
-    # decay. The noise one step earlier is independent, so the earlier state is an instrument for X.
+def _fit_by_instruments(
+    regression: Regression, d: int, coefficients: Array, state_count: int
+) -> tuple[Array, Array] | None:
+    """Returns coefficients (n,) and errors of a state's nonzero terms; None if they stay uncertain.
+
+    The noise of a state is in both X and its rate, which least squares would mistake for a fast
+    decay. The noise one step earlier is independent, so the earlier state is an instrument for X.
+    """
     samples = regression.samples
     inside = regression.inliers[d]
-    kept = np.flatnonzero(coefficients)
-    follows = (
-        np.abs(np.diff(samples.t) - samples.dt) < SAME_STEP * samples.dt + ROUNDING_S
+    terms = np.flatnonzero(coefficients)
+    step_error = np.abs(np.diff(samples.t) - samples.dt)
+    is_next = step_error < STEP_TOLERANCE * samples.dt + STEP_TOLERANCE_S
+    rows = np.flatnonzero(is_next & inside[1:] & inside[:-1]) + 1
+    if len(terms) == 0 or len(rows) <= len(terms):
+        return None
+    x = samples.x[rows]
+    x_earlier = x.copy()
+    x_earlier[:, :state_count] = samples.x[rows - 1, :state_count]
+    powers = regression.powers[terms]
+    return statistics.instrumental(
+        taylor.evaluate(x, powers),
+        taylor.evaluate(x_earlier, powers),
+        samples.dq[rows, d],
     )
-    now = np.flatnonzero(follows & inside[1:] & inside[:-1]) + 1
-    if len(kept) == 0 or len(now) <= len(kept):
-        return
-    earlier = samples.x[now].copy()
-    powers = regression.powers[kept]
-    earlier[:, :states] = samples.x[now - 1, :states]
-    chi, instruments = (taylor.evaluate(x, powers) for x in (samples.x[now], earlier))
-    found = statistics.instrumental(chi, instruments, samples.dq[now, d])
-    if found is not None:
-        coefficients[kept], errors[kept] = found

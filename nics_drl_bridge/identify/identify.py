@@ -337,7 +337,7 @@ def prune(drive: Drive, findings: Findings) -> Findings:
     # keeps what mirror symmetry allows, because predictions weight these terms
     if findings.width is not None:
         return findings
-    linear = fitting.pruned(regression, drive.spec, drive.settings.alpha)
+    linear = fitting.prune_and_refit(regression, drive.spec, drive.settings.alpha)
     limits = followers.scaled_limits(findings.calibration, drive.spec)
     model = replace(linear.model, inputs=findings.calibration.inputs, limits=limits)
     return replace(findings, linear=replace(linear, model=model), model=model)

@@ -12,7 +12,7 @@ from scipy.linalg import orth
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import excitation
-from nics_drl_bridge.identify.fit import Fit, pruned, regress
+from nics_drl_bridge.identify.fit import Fit, prune_and_refit, regress
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kinds import compute_steady_twist
@@ -176,8 +176,10 @@ def linear_fit(
         if v.name in unmoved
     }
     held = tuple(c.name for c in spec.command if at.get(c.name))
-    found = pruned(
-        regress(samples, spec, order, allowed=partial(allowed, held=held)), spec, 1.0
+    found = prune_and_refit(
+        regress(samples, spec, order, term_filter=partial(allowed, held=held)),
+        spec,
+        1.0,
     )
     still = samples.dq.std(axis=0) <= NOTHING
     still[3:] |= np.array([v.name in at for v in spec.state], dtype=np.bool_)
