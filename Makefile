@@ -12,6 +12,8 @@ PYTEST_ARGS ?=
 PARALLEL ?= -n auto --dist loadfile
 # Tests of `make test` often wait for processes, so three workers keep two cores busy.
 WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) * 3 / 2)))
+# The slowest tests are printed, and the time of each is written.
+DURATIONS := --durations 50 --durations-min 1 --junitxml runs/tests.xml
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
@@ -151,7 +153,7 @@ types: setup ## mypy
 
 # Tests that wait for other processes may fail on a busy machine, so failed tests run again, alone.
 pytest: setup
-	@status=0; $(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(PYTEST_ARGS) || status=$$?; \
+	@status=0; $(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(DURATIONS) $(PYTEST_ARGS) || status=$$?; \
 	if [ $$status = 1 ]; then \
 		echo "make: once more, alone, the tests that failed:"; \
 		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none --maxfail 5 -m "not campaign" $(PYTEST_ARGS); \
