@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from nics_drl_bridge import defaults, files
+from nics_drl_bridge import files
 from nics_drl_bridge.arguments import check_arguments, check_path, format_value
 from nics_drl_bridge.config import (
     Schema,
@@ -164,8 +164,8 @@ def generate(
     robot: RobotSpec | SimulatorModel | str | Path,
     lidar: LidarSpec | str | Path | None = None,
     shapes: Sequence[Shape] = (),
-    order: fit.Order = defaults.TAYLOR_ORDER,
-    alpha: fit.Alpha = defaults.PRUNING,
+    order: fit.Order = Settings.order,
+    alpha: fit.Alpha = Settings.alpha,
     assume: bool = Settings.assume,
     strict: bool = Settings.strict,
     anyway: bool = False,

@@ -108,7 +108,9 @@ class Place:
         lidar = model.lidar.model_copy(update={"rate": 1.0 / (SCAN_STEPS * STEP_S)})
         self.model = replace(model, lidar=lidar)
         self._sim = FastSimulator(
-            replace(self.model, control_period=STEP_S), load_world(world)
+            replace(self.model, control_period=STEP_S),
+            load_world(world),
+            renderer="auto",  # right also beside an obstacle
         )
         self._walls = self._sim.world.all_walls()
         self._drivers: dict[str, Driver] = {}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import defaults, extensions
+from nics_drl_bridge import extensions
 from nics_drl_bridge.arguments import check_arguments, check_count
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
@@ -53,7 +53,6 @@ class SimBackend:
         check_count("robots", robots)
         check_count("threads", simulation.get("threads", 1))
         self._robot = model.robot
-        simulation = {"renderer": defaults.RENDERER, **simulation}
         self.simulator = FastSimulator(model, world, robots=robots, **simulation)
         self._middlewares = [
             Middleware(model) for _ in range(robots if estimator else 0)

@@ -130,7 +130,6 @@ class BridgeVectorEnv(
         self.single_action_space = team_space(self.task.action_space, self.robots)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        simulation = {"renderer": defaults.RENDERER, **simulation}
         self.simulator = FastSimulator(
             self.model, self.world, num_envs, self.robots, **simulation
         )

@@ -6,9 +6,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Order
+from nics_drl_bridge.identify.fit import Alpha, Order
 from nics_drl_bridge.identify.signals import (
     DIFFERENCE,
     DIFFERENCE_GAIN,
@@ -38,8 +38,8 @@ MAX_GAP_S = 0.25
 class Settings:
     """Options of an identification."""
 
-    order: Order = ORDER  # of the Taylor expansion (Eq. 1), or `auto`
-    alpha: Alpha = ALPHA  # of the pruning (Eq. 2), or `auto`
+    order: Order = defaults.TAYLOR_ORDER  # of the Taylor expansion (Eq. 1), or `auto`
+    alpha: Alpha = defaults.PRUNING  # of the pruning (Eq. 2), or `auto`
     # end of the training part, measured from the first pose
     train_until_s: float = float("inf")
     # complete the model by the textbook for inputs that never moved

@@ -7,7 +7,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import (
@@ -843,8 +842,8 @@ class Identified:
 def identify(
     recording: Recording,
     spec: RobotSpec,
-    order: fitting.Order = defaults.TAYLOR_ORDER,
-    alpha: fitting.Alpha = fitting.ALPHA,
+    order: fitting.Order = Settings.order,
+    alpha: fitting.Alpha = Settings.alpha,
     train_until: float | None = None,
     assume: bool = Settings.assume,
     strict: bool = Settings.strict,

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.geometry import Array
@@ -197,7 +198,7 @@ class FastSimulator:
         world: AnyWorld,
         worlds: int = 1,
         robots: int = 1,
-        renderer: Renderer = "auto",
+        renderer: Renderer = defaults.RENDERER,
         threads: int = 1,
         randomisation: str | Randomisation | None = None,
         longest_delay: int | None = None,

@@ -199,7 +199,7 @@ class MujocoSimulator(DrivenSimulator):
         model: SimulatorModel,
         world: AnyWorld,
         robots: int = 1,
-        renderer: Renderer = "auto",
+        renderer: Renderer = defaults.MUJOCO_RENDERER,
         physics: Physics | None = None,
         randomisation: Randomisation | None = None,
     ) -> None:
