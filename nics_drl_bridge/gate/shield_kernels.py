@@ -374,11 +374,17 @@ def mark_entered(
         for i in range(middle - neighbours, middle + neighbours + 1):
             index = i % whole_circle
             old_range = old[index] if index < beams else np.nan
-            # Not `min`: with NaN, or an old beam that was too close, the beam must stay unmarked.
-            if not old_range >= free:
-                free = old_range
+            free = _take_shorter(free, old_range)
         if distance < free - tolerance.constant - tolerance.proportional * distance:
             out[b] = True
+
+
+@kernel
+def _take_shorter(length: float, other: float) -> float:
+    """Returns the shorter of two ranges; NaN as soon as either of them is unknown."""
+    if math.isnan(length) or other >= length:
+        return length
+    return other
 
 
 class Cells(NamedTuple):
@@ -477,9 +483,7 @@ def mark_seen_cells(
                 is_seen[i, j] = True
                 free = look.range_max
                 for b in range(first, last + 1):
-                    # Not `min`: an unknown beam shows nothing.
-                    if not ranges[b] >= free:
-                        free = ranges[b]
+                    free = _take_shorter(free, ranges[b])
                 if free > distance + look.tolerance:
                     times[i, j] = look.now
             if not times[i, j] >= look.oldest:

@@ -10,7 +10,17 @@ import shapely
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.gate.shield import get_body
-from nics_drl_bridge.gate.shield_kernels import compute_clearance, fill_grid, is_free
+from nics_drl_bridge.gate.shield_kernels import (
+    Cells,
+    Look,
+    MountedBeams,
+    Tolerance,
+    compute_clearance,
+    fill_grid,
+    is_free,
+    mark_entered,
+    mark_seen_cells,
+)
 from nics_drl_bridge.gate.state import ShieldConfig
 
 BRAKE = 1.5
@@ -177,3 +187,41 @@ def test_a_body_is_kept_as_long_as_its_shield_is():
     assert get_body(shield) is get_body(replace(shield))
     assert get_body(shield).reach == pytest.approx(np.hypot(0.25, 0.2))
     assert get_body(replace(shield, outline=())).reach == 0.0
+
+
+DEGREE_BEAMS = MountedBeams(np.deg2rad(-20.0), np.deg2rad(1.0), 0.0, 0.0, 0.0)
+UNKNOWN_AMONG_OTHERS = [(19,), (20,), (21,), (19, 21)]
+
+
+@pytest.mark.parametrize("unknown", UNKNOWN_AMONG_OTHERS)
+def test_an_unknown_beam_among_far_ones_marks_no_ground_as_free(unknown):
+    """A cell of 5 cm at a distance of 1 m is as wide as five of these beams."""
+    cells = Cells(0.975, -0.025, 0.05, 1.0, 0.0)  # a single one, straight ahead
+
+    def see(ranges):
+        times = np.full((1, 1), -np.inf, np.float32)
+        look = Look(1.0, -30.0, 10.0, 0.03)
+        mark_seen_cells(times, cells, ranges, DEGREE_BEAMS, 0.1, look)
+        return times[0, 0]
+
+    ranges = np.full(41, 5.0, np.float32)
+    assert see(ranges) == 1.0
+    ranges[list(unknown)] = np.nan
+    assert see(ranges) == -np.inf
+
+
+@pytest.mark.parametrize("unknown", UNKNOWN_AMONG_OTHERS)
+def test_an_unknown_beam_of_an_old_scan_tells_nothing_about_what_moved(unknown):
+    new = np.full(41, np.nan, np.float32)
+    new[20] = 1.0
+
+    def mark(old):
+        entered = np.zeros(41, np.bool_)
+        tolerance = Tolerance(0.03, 0.0)
+        mark_entered(entered, new, old, DEGREE_BEAMS, np.zeros(3), 10.0, tolerance)
+        return entered[20]
+
+    old = np.full(41, 5.0, np.float32)
+    assert mark(old)
+    old[list(unknown)] = np.nan
+    assert not mark(old)
