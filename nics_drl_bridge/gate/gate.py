@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from nics_drl_bridge.gate.state import (
 )
 from nics_drl_bridge.gate.stops import ODOM, SCAN, reset_envelope
 from nics_drl_bridge.geometry import between
-from nics_drl_bridge.interface import S_PER_NS, Array
+from nics_drl_bridge.interface import S_PER_NS
 
 Taken = tuple[GateState, str]  # and the reason why an input is not taken, or ""
 # maximum speed that the odometry of a mobile robot can show [m/s, rad/s]
@@ -77,7 +76,7 @@ def decide(
             state = _stop(config, replace(state, latched=cause), now, disarm=True)
         else:
             value = motion.value
-            recent = _append_recent(config, state, motion.value, now)
+            recent = shield.append_command(config, state, motion.value, now)
             state = replace(
                 state,
                 value=value,
@@ -145,7 +144,7 @@ def _stop(
     zero = np.zeros_like(state.value)
     recent = state.recent
     if moved_s > state.moved_s:  # the stop is published
-        recent = _append_recent(config, state, zero, moved_s)
+        recent = shield.append_command(config, state, zero, moved_s)
     return replace(
         state,
         value=zero,
@@ -155,20 +154,6 @@ def _stop(
         shielded=False,
         recent=recent,
         armed=state.armed and not disarm,
-    )
-
-
-def _append_recent(
-    config: GateConfig, state: GateState, value: Array, now: float
-) -> tuple[tuple[float, Array], ...]:
-    """Returns a new command after those since the newest scan, or within the latency before it."""
-    if config.shield is None:
-        return ()
-    since = now - config.shield.latency_s - config.scan_age_s
-    sent = (*state.recent, (now, value))
-    # A command from before `since` was in force until the next one.
-    return tuple(
-        command for command, (until, _) in pairwise((*sent, sent[-1])) if until >= since
     )
 
 

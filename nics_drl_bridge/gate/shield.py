@@ -32,6 +32,7 @@ from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.sim.collision_kernels import Outline
 
 Flags = NDArray[np.bool_]
+TimedCommand = tuple[float, Array]  # time of its publication [s], and its values (C,)
 BISECTIONS = 6  # of the scale by which a motion is reduced
 # A robot that turns on the spot does not approach an obstacle slower than this [m/s]: it would use
 # up the space that a turn on the spot needs.
@@ -383,21 +384,46 @@ def _compute_data_age(state: GateState, now: float) -> float:
     return max(0.0, *(compute_age(topic, now) for topic in arrivals))
 
 
+def append_command(
+    config: GateConfig, state: GateState, command: Array, now: float
+) -> tuple[TimedCommand, ...]:
+    """Returns a new command (C,) after those that the shield may still need."""
+    shield = config.shield
+    if shield is None:
+        return ()
+    # No data are older than this when a motion is decided.
+    oldest_s = now - config.scan_age_s - _get_longest_reaction(shield)
+    return _select_in_force((*state.recent, (now, command)), oldest_s, now)
+
+
 def _list_unshown_commands(
     shield: ShieldConfig, state: GateState, now: float, data_age_s: float
 ) -> list[Array]:
-    """Returns the commands (C,) in force since the scan was taken, or within the latency before."""
-    latency_s = shield.latency_s
-    if shield.turn is not None:
-        latency_s = max(latency_s, shield.turn.reaction_s)
-    since = now - data_age_s - latency_s
-    # A command is in force until the next one.
-    ends = [*(time for time, _ in state.recent[1:]), now]
-    return [
+    """Returns the commands (C,) in force since the oldest data, or within a reaction before."""
+    since_s = now - data_age_s - _get_longest_reaction(shield)
+    return [command for _, command in _select_in_force(state.recent, since_s, now)]
+
+
+def _get_longest_reaction(shield: ShieldConfig) -> float:
+    """Returns the longest time after which the robot still follows an earlier command [s]."""
+    if shield.turn is None:
+        return shield.latency_s
+    return max(shield.latency_s, shield.turn.reaction_s)
+
+
+def _select_in_force(
+    commands: tuple[TimedCommand, ...], since_s: float, now: float
+) -> tuple[TimedCommand, ...]:
+    """Returns those of the commands, oldest first, that were in force at `since_s` or later.
+
+    A command is in force until the next one.
+    """
+    ends_s = [*(time for time, _ in commands[1:]), now]
+    return tuple(
         command
-        for (_, command), end in zip(state.recent, ends, strict=False)
-        if end >= since
-    ]
+        for command, end_s in zip(commands, ends_s, strict=False)
+        if end_s >= since_s
+    )
 
 
 class Stop(NamedTuple):

@@ -25,6 +25,7 @@ from nics_drl_bridge.gate.shield import (
 from nics_drl_bridge.gate.shield_kernels import is_free, mark_entered, place
 from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.robot.braking import TurnBraking
 
 CAR = ShieldConfig(
     latency_s=0.15,
@@ -300,6 +301,15 @@ def test_a_stop_in_between_does_not_make_it_forget_what_the_robot_was_told():
     told = [told for told, _ in rig.state.recent]
     reach = CAR.latency_s + rig.config.scan_age_s
     assert rig.now - reach - 0.05 < told[0] <= rig.now - reach + 0.02
+
+
+def test_commands_are_kept_for_as_long_as_a_slow_turn_follows_them():
+    slow_turn = replace(CAR, wheelbase=0.0, turn=TurnBraking(0.6, 2.0))
+    rig = Faced(FAR, slow_turn, robot="differential")
+    rig.settles(2.0)
+    reach = 0.6 + rig.config.scan_age_s
+    oldest = rig.state.recent[0][0]
+    assert rig.now - reach - 0.05 < oldest <= rig.now - reach + 0.02
 
 
 def test_what_was_told_before_a_pause_of_the_gate_counts_as_long_as_it_was_in_force():
