@@ -52,16 +52,14 @@ def decide(
     state, refused = take(config, state, given, now)
     state, answer, granted = _serve(config, state, given, now)
     was_moving = bool(state.value.any())
-    judged = ((rule.judge(config, state, now), rule.latches) for rule in STOPS)
-    cause, latches = next(
-        (found for found in judged if found[0] is not None), (None, False)
-    )
+    cause, latching_cause = _find_causes(config, state, now)
     publish = shielded = False
     if cause is not None:
-        if latches and state.armed:
-            state = replace(state, latched=cause)
+        if latching_cause is not None and state.armed:
+            state = replace(state, latched=latching_cause)
         publish = was_moving or isinstance(given, inputs.Tick)
-        state = _stop(config, state, now if publish else state.moved_s, disarm=latches)
+        stopped_s = now if publish else state.moved_s
+        state = _stop(config, state, stopped_s, disarm=latching_cause is not None)
     elif isinstance(given, inputs.Tick) and not now - state.moved_s < limits.MIN_STEP_S:
         publish = True
         zero = np.zeros(len(config.fields))
@@ -91,6 +89,22 @@ def decide(
     return state, records.Decision(
         twist, publish, cause, refused, answer, granted, shielded
     )
+
+
+def _find_causes(
+    config: GateConfig, state: GateState, now: float
+) -> tuple[Cause | None, Cause | None]:
+    """Returns the first cause of a stop, which names it, and the first one that latches."""
+    first = None
+    # A fault may live for one input only, so a latching rule counts behind any other one.
+    for rule in STOPS:
+        if rule.needs_clock and state.clock_fault:
+            continue
+        cause = rule.judge(config, state, now)
+        if cause is not None and rule.latches:
+            return first or cause, cause
+        first = first or cause
+    return first, None
 
 
 def _serve(
@@ -540,6 +554,8 @@ class Rule(NamedTuple):
 
     judge: Callable[[GateConfig, GateState, float], Cause | None]
     latches: bool = False  # the stop stays until a reset
+    # Judges a time that has passed, which is not known while the gate's clock is at fault.
+    needs_clock: bool = False
 
 
 def latched(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -559,11 +575,11 @@ STOPS: tuple[Rule, ...] = (
     Rule(latched),
     Rule(disarmed),
     Rule(stops.own_clock),
-    Rule(stops.e_stop_silent, latches=True),
+    Rule(stops.e_stop_silent, latches=True, needs_clock=True),
     Rule(stops.stamps_jumped, latches=True),
     Rule(frozen.odom_jumped, latches=True),
     Rule(frozen.scan_frozen, latches=True),
-    Rule(frozen.no_motion, latches=True),
+    Rule(frozen.no_motion, latches=True, needs_clock=True),
     Rule(scan_motion.body_held, latches=True),
     Rule(estimates.estimate_lost, latches=True),
     Rule(stops.two_policies, latches=True),
@@ -576,7 +592,7 @@ STOPS: tuple[Rule, ...] = (
     Rule(stops.scan_behind_unknown),
     Rule(stops.scan_behind_old),
 )
-"""In order of evaluation; the first rule that returns a cause names the stop."""
+"""The first rule that returns a cause names the stop; the first latching one latches it."""
 
 
 def saturate(

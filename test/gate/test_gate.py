@@ -6,6 +6,7 @@ import pytest
 from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.gate.inputs import (
     Command,
+    Estimate,
     EStop,
     Odometry,
     Press,
@@ -299,6 +300,50 @@ def test_the_first_word_of_a_gate_that_was_asleep_is_a_zero_whatever_wakes_it(fi
     assert not rig.moves
     rig.run(0.5)
     assert rig.moves
+
+
+def give_fault(rig, fault):
+    """One input that shows a fault, which the next input no longer does."""
+    later = rig.stamp + round(10.0 * NS_PER_S)
+    if fault == "stamps_jumped":
+        rig.scan(stamp_ns=later)
+    elif fault == "odom_jumped":
+        rig.odom(stamp_ns=rig.stamp + 1, pose=rig.pose + 50.0)
+    elif fault == "estimate_lost":
+        rig.give(Estimate(np.zeros(3), rig.pose + 50.0, rig.covariance.copy()))
+    else:
+        rig.give(Command(rig.stamp, rig.wish, "/one"))
+        rig.give(Command(rig.stamp, rig.wish, "/two"))
+
+
+@pytest.mark.parametrize(
+    "fault", ["stamps_jumped", "odom_jumped", "estimate_lost", "two_policies"]
+)
+def test_a_fault_that_latches_does_so_while_the_gates_clock_is_at_fault(fault):
+    rig = driving()
+    rig.now += 0.25  # the gate was asleep
+    rig.stamp += round(0.25 * NS_PER_S)
+    assert rig.tick().cause.rule == "own_clock"
+    assert rig.state.latched is None
+    give_fault(rig, fault)
+    assert rig.rule == "own_clock"
+    assert rig.state.latched.rule == fault
+    rig.speed = 0.0
+    rig.run(1.0)
+    assert rig.rule == fault
+    assert not rig.moves
+
+
+@pytest.mark.parametrize("rule", ["e_stop_silent", "no_motion"])
+def test_a_gate_that_was_asleep_does_not_judge_how_long_the_others_were_silent(rule):
+    rig = driving()
+    rig.now += 1.5
+    rig.tick()
+    assert rig.state.latched is None
+    rig.give(EStop(False))
+    rig.speed = 0.0
+    rig.run(0.5)
+    assert rig.state.latched is None
 
 
 def test_the_e_stop_stops_at_once_and_stays():
