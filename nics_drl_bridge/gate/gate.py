@@ -252,7 +252,8 @@ def take(
     for kind, judge in REFUSALS:
         reason = judge(config, given) if isinstance(given, kind) else ""
         if reason and kind is inputs.Command:
-            state = replace(state, malformed=reason)
+            # An earlier command that waits for its scan must not come into force any more.
+            state = replace(state, malformed=reason, pending=None, pending_s=None)
         if reason:
             return state, reason
     if isinstance(given, inputs.Scan):
@@ -277,17 +278,21 @@ def take(
     return state, ""
 
 
-def _take_command(state: GateState, command: inputs.Command, now: float) -> GateState:
+def _take_command(
+    state: GateState, command: inputs.Command, arrival_s: float
+) -> GateState:
     """Takes a command once its scan has arrived; until then the previous one stays in force."""
     scans = state.scans
     if command.stamp_ns not in scans.stamps_ns:
-        since = now if state.pending_s is None else state.pending_s
-        return replace(state, pending=command, pending_s=since)
+        since = arrival_s if state.pending_s is None else state.pending_s
+        return replace(
+            state, pending=command, pending_s=since, pending_arrival_s=arrival_s
+        )
     behind = scans.stamps_ns.index(command.stamp_ns)
     return replace(
         state,
         command=command,
-        command_s=now,
+        command_s=arrival_s,
         behind_s=scans.times[behind] - scans.late[behind],
         malformed="",
         pending=None,
@@ -319,7 +324,7 @@ def _take_scan(
         obstacles=shield.find_obstacles(config, scan.ranges, views, ground),
     )
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
-        state = _take_command(state, state.pending, now)
+        state = _take_command(state, state.pending, state.pending_arrival_s)
     return state, ""
 
 

@@ -298,6 +298,7 @@ class GateState:
     pending: Command | None = None  # whose scan has not arrived yet
     # since when commands name such scans; None: the newest does not
     pending_s: float | None = None
+    pending_arrival_s: float = -INF  # arrival of the pending command
     # recent ones, for the detection of motion; empty without shield
     views: tuple[View, ...] = ()
     # None if the lidar sees all around, and without shield

@@ -156,6 +156,33 @@ def test_a_command_whose_scan_never_came_does_not_undo_a_malformed_one():
     assert rig.rule == "command_malformed"
 
 
+def test_a_command_that_waits_for_its_scan_does_not_undo_a_later_malformed_one():
+    rig = driving()
+    rig.run(0.06, without="scan command")
+    rig.stamp += 1
+    rig.command([0.3, 0.0, 0.0])
+    rig.command([np.nan, 0.0, 0.0])
+    rig.scan()
+    assert rig.rule == "command_malformed"
+    assert rig.state.command.twist[0] == 0.5
+    rig.command([0.2, 0.0, 0.0])
+    rig.now += TICK_S
+    assert rig.tick().cause is None
+    assert rig.state.command.twist[0] == 0.2
+
+
+def test_the_age_of_a_command_counts_from_its_arrival_although_its_scan_came_later():
+    rig = driving()
+    rig.run(0.06, without="scan command")
+    rig.stamp += 1
+    arrival_s = rig.now
+    rig.command()
+    rig.now += 2.0 * TICK_S
+    rig.scan()
+    assert rig.state.pending is None
+    assert rig.state.command_s == arrival_s
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_a_command_that_is_no_number_stops_the_robot_at_once(bad, place):
