@@ -110,11 +110,7 @@ def watch_scan(
 ) -> ScanMotion:
     """Returns what recent scans show of the motion, after a new scan."""
     before = state.scan_motion
-    if (
-        not config.stop_when_held
-        or state.odometry is None
-        or len(config.beam_angles) < 2
-    ):
+    if not _can_judge(config) or state.odometry is None:
         return ScanMotion()
     newest = ReducedScan(
         scan.stamp_ns,
@@ -137,6 +133,11 @@ def watch_scan(
     if not kept or newest.stamp_ns - kept[-1].stamp_ns >= spacing_ns:
         kept = (*kept, newest)
     return ScanMotion(kept, since_ns, held, verdict.share)
+
+
+def _can_judge(config: GateConfig) -> bool:
+    """True if the rule is on, and the lidar has the two beams at least that give directions."""
+    return config.stop_when_held and len(config.beam_angles) >= 2
 
 
 def _compute_memory_s(config: GateConfig, settings: Settings) -> float:
@@ -313,6 +314,8 @@ def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 def warm_up(config: GateConfig) -> None:
     """Compiles the kernels for a scan; that takes seconds, which a moving robot does not have."""
+    if not _can_judge(config):
+        return
     view = ReducedScan(
         0,
         np.zeros(3),

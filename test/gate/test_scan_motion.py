@@ -10,7 +10,7 @@ import pytest
 from gate.rig import PERIOD_S, TICK_S, Rig, config
 from nics_drl_bridge.gate.black_box import BlackBox, Entry, replay, write
 from nics_drl_bridge.gate.inputs import Reset, Scan
-from nics_drl_bridge.gate.scan_motion import SETTINGS, get_directions
+from nics_drl_bridge.gate.scan_motion import SETTINGS, get_directions, warm_up
 from nics_drl_bridge.gate.scan_motion_kernels import (
     Noise,
     Thresholds,
@@ -376,6 +376,7 @@ def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
         rate=10.0,
     )
     scene = Scene(lidar)
+    warm_up(scene.config)
     scene.run(1.5)
     assert scene.arm().granted
     assert scene.run(1.0).cause is None
