@@ -119,7 +119,7 @@ def _serve(
             replace(sensor, arrivals=reset_envelope(sensor.arrivals))
             for sensor in state.sensors
         )
-        # Ground that was known is forgotten: somebody may have carried the robot here.
+        # Earlier views and known ground are forgotten: somebody may have carried the robot here.
         ground = shield.update_ground(config, state.views, None)
         if ground is not None:
             obstacles = shield.find_obstacles(
@@ -134,6 +134,7 @@ def _serve(
                 odometries=reset_envelope(state.odometries),
                 sensors=sensors,
                 seen=(),
+                views=state.views[-1:],
                 frozen="",
                 push=None,
                 scan_motion=ScanMotion(),
@@ -337,9 +338,19 @@ def _take_odometry(
     if fault:
         return _refuse_stamp(replace(state, odometries=arrivals), ODOM, fault)
     leap = _find_leap(config, state, odometry, now)
-    if leap:  # later poses are judged relative to this one
-        state = replace(state, odometry=odometry, leap=leap, push=None, seen=())
-        return replace(state, scan_motion=ScanMotion()), f"odom: {leap}"
+    if leap:
+        # Later poses are judged relative to this one, and earlier ones say nothing any more.
+        state = replace(
+            state,
+            odometry=odometry,
+            leap=leap,
+            push=None,
+            seen=(),
+            views=(),
+            ground=None,
+            scan_motion=ScanMotion(),
+        )
+        return state, f"odom: {leap}"
     restless = state.restless_s if frozen.is_at_rest(config, odometry.twist) else now
     return replace(
         state, odometries=arrivals, odometry=odometry, restless_s=restless

@@ -118,7 +118,9 @@ def watch_scan(
         _reduce(config, scan.ranges, settings),
     )
     oldest_ns = scan.stamp_ns - round(_compute_memory_s(config, settings) / S_PER_NS)
-    kept = tuple(view for view in before.views if view.stamp_ns >= oldest_ns)
+    kept = tuple(
+        view for view in before.views if oldest_ns <= view.stamp_ns < scan.stamp_ns
+    )
     verdict = UNDECIDED
     since_ns = None
     # Only a robot that is commanded to move can be held. Each push is judged alone: tyres that

@@ -65,7 +65,9 @@ def add_view(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
     pose = extrapolate_pose(state.odometry, scan.stamp_ns, MEMORY_S)
     kept: list[View] = []
     for view in state.views:
-        if (scan.stamp_ns - view.stamp_ns) * S_PER_NS > MEMORY_S:
+        age_s = (scan.stamp_ns - view.stamp_ns) * S_PER_NS
+        # The stamps of the lidar may have jumped back since the view.
+        if not 0.0 < age_s <= MEMORY_S:
             continue
         if not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S:
             kept.append(view)

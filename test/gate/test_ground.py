@@ -260,6 +260,20 @@ def test_what_was_known_is_forgotten_when_the_gate_is_armed():
     ).all()
 
 
+def test_what_was_known_is_forgotten_when_odometry_leaps():
+    part = slice(90, LIDAR.beams)
+    given = config(
+        shield=replace(SHIELD, range_max=3.0), beam_angles=LIDAR.angles[part]
+    )
+    rig = HalfBlind(given)
+    rig.run(1.0)
+    assert rig.state.ground.since_ns < rig.state.views[-1].stamp_ns
+    rig.odom(stamp_ns=rig.stamp + 1, pose=rig.pose + 50.0)
+    assert rig.state.ground is None
+    rig.run(0.1)
+    assert rig.state.ground.since_ns == rig.state.views[-1].stamp_ns
+
+
 class HalfBlind(Rig):
     """A robot that stands, whose lidar sees three quarters of a circle."""
 

@@ -239,6 +239,16 @@ def test_wheels_that_slip_in_each_of_many_short_pushes_do_not_stop_the_robot():
         assert scene.run(0.35).cause is None
 
 
+def test_scans_from_before_the_stamps_jumped_back_are_not_compared():
+    scene = Scene()
+    scene.run(1.0)
+    scene.stamp -= 100 * NS_PER_S
+    scene.run(1.0)
+    stamps = [view.stamp_ns for view in scene.state.scan_motion.views]
+    assert len(stamps) > 2
+    assert max(stamps) <= scene.stamp
+
+
 @pytest.mark.parametrize(
     "walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"]
 )

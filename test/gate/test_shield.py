@@ -458,6 +458,30 @@ def test_the_views_of_the_last_moments_are_kept_apart_from_each_other():
     assert 4 <= len(stamps) <= 6
 
 
+def test_views_from_before_the_stamps_jumped_back_are_dropped():
+    state = begin(GIVEN)
+    for stamp in (100 * NS_PER_S, NS_PER_S, 11 * NS_PER_S // 10):
+        state = replace(state, odometry=Odometry(stamp, np.zeros(3), np.zeros(3)))
+        scan = Scan(stamp, np.full(LIDAR.beams, 1.0, np.float32), (0.0, 0.01))
+        state = replace(state, views=add_view(GIVEN, state, scan))
+    assert [view.stamp_ns for view in state.views] == [NS_PER_S, 11 * NS_PER_S // 10]
+
+
+def test_views_are_forgotten_when_the_gate_is_armed_and_when_odometry_leaps():
+    """Their poses may be those of another place."""
+    rig = Rig(config(shield=CAR))
+    rig.run(1.5)
+    newest = rig.state.views[-1]
+    assert len(rig.state.views) > 2
+    assert rig.arm().granted
+    assert rig.state.views == (newest,)
+    rig.run(0.3)
+    assert len(rig.state.views) > 2
+    rig.odom(stamp_ns=rig.stamp + 1, pose=rig.pose + 50.0)
+    assert rig.rule == "odom_jumped"
+    assert rig.state.views == ()
+
+
 def test_a_view_is_from_where_the_robot_was_when_it_was_scanned():
     odometry = Odometry(
         5 * NS_PER_S, np.array([1.0, 2.0, np.pi / 2]), np.array([1.0, 0.0, 0.0])
