@@ -123,18 +123,19 @@ def watch_scan(
     )
     verdict = UNDECIDED
     since_ns = None
+    push_s = None
     # Only a robot that is commanded to move can be held. Each push is judged alone: tyres that
     # slip whenever the robot starts say nothing about the time in between.
     if state.push is not None:
+        push_s = state.push.since_s
         verdict = judge_motion(config, kept, newest, settings)
-        since_ns = _update_held_since(
-            before.held_since_ns, verdict, scan.stamp_ns, settings
-        )
+        before_ns = before.held_since_ns if before.push_s == push_s else None
+        since_ns = _update_held_since(before_ns, verdict, scan.stamp_ns, settings)
     held = _explain_contradiction(newest, verdict, since_ns, settings)
     spacing_ns = round(settings.kept_every_s / S_PER_NS)
     if not kept or newest.stamp_ns - kept[-1].stamp_ns >= spacing_ns:
         kept = (*kept, newest)
-    return ScanMotion(kept, since_ns, held, verdict.share)
+    return ScanMotion(kept, since_ns, held, verdict.share, push_s)
 
 
 def _can_judge(config: GateConfig) -> bool:

@@ -221,6 +221,7 @@ class ScanMotion:
     held: str = ""  # what the newest scan contradicts, once others have before
     # fraction of the motion by odometry that the newest scan shows; NaN: undecided
     share: float = NAN
+    push_s: float | None = None  # start of the push that was judged; None without one
 
 
 @dataclass(frozen=True)

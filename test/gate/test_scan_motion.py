@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -237,6 +238,21 @@ def test_wheels_that_slip_in_each_of_many_short_pushes_do_not_stop_the_robot():
         scene.run(0.45)
         scene.wish = push
         assert scene.run(0.35).cause is None
+
+
+def test_contradictions_of_two_pushes_do_not_add_up_though_no_scan_came_in_between():
+    scene = started()
+    scene.held = True
+    while scene.state.scan_motion.held_since_ns is None:
+        scene.run(TICK_S)
+    first_ns = scene.state.scan_motion.held_since_ns
+    assert scene.moves
+    push = scene.state.push
+    another = replace(push, since_s=scene.now - 0.01)
+    scene.state = replace(scene.state, push=another)
+    while scene.state.scans.stamps_ns[-1] == first_ns:
+        scene.run(TICK_S)
+    assert scene.state.scan_motion.held_since_ns > first_ns
 
 
 def test_scans_from_before_the_stamps_jumped_back_are_not_compared():
