@@ -313,7 +313,8 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     is_creep = turns_on_the_spot and 0.0 < speed < CREEP_SPEED
     if can_stop(1.0, 1.0) and (not is_creep or can_stop_from_creep_speed(1.0)):
         return motion
-    slope = np.zeros_like(motion.slope)
+    # A steering angle is not scaled, so it goes on changing.
+    slope = np.where(is_speed | is_turn_rate, 0.0, motion.slope)
     if turns and can_stop(0.0, 1.0):
         turn_scale = 1.0
         slope[is_turn_rate] = motion.slope[is_turn_rate]

@@ -104,6 +104,24 @@ def test_the_speed_is_such_that_the_robot_stops_before_what_lies_ahead(distance)
     assert np.ptp(last) < 0.1 * speed  # and does not jerk
 
 
+def test_a_car_whose_speed_is_reduced_steers_as_fast_as_any_other():
+    def steer(distance):
+        rig = Faced(ranges(distance), wish=(1.0, 0.0, 0.0))
+        rig.settles()
+        rig.wish = np.array([1.0, 0.0, 0.3])
+        before = len(rig.published)
+        rig.run(0.5)
+        steps = [twist[2] for _, twist in rig.published[before:]]
+        return rig.decision.shielded, np.array(steps)
+
+    is_shielded, slowed = steer(0.6)
+    assert is_shielded
+    is_shielded, free = steer(3.0)
+    assert not is_shielded
+    assert free[-1] > 0.25
+    assert slowed == pytest.approx(free)
+
+
 def test_a_robot_stands_before_what_it_must_not_come_nearer_to():
     assert Faced(ranges(0.19)).settles() == 0.0
 
