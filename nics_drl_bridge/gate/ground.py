@@ -12,7 +12,9 @@ from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.sim.collision_kernels import Outline
 
 CELL = 0.05  # width of a cell [m]
-CELLS = 48  # cells along each side of the ground that is remembered
+CELLS = 48  # minimum number of cells along each side of the ground that is remembered
+# Ground is remembered at least this far beyond the robot and its margin [m].
+REACH_BEYOND = 0.6
 # time after which ground is forgotten, except beside the robot [s]
 REMEMBERED_S = 30.0
 
@@ -36,14 +38,15 @@ def look(
         tolerance: margin before a return that is not free [m].
     """
     x, y, heading = view.pose.tolist()
-    corner = (math.floor(x / CELL) - CELLS // 2, math.floor(y / CELL) - CELLS // 2)
+    kept_radius = body.radius + body.margin + CELL
+    count = max(CELLS, 2 * math.ceil((kept_radius + REACH_BEYOND) / CELL))
+    corner = (math.floor(x / CELL) - count // 2, math.floor(y / CELL) - count // 2)
     corner_x = corner[0] * CELL - x
     corner_y = corner[1] * CELL - y
     cells = Cells(corner_x, corner_y, CELL, math.cos(heading), math.sin(heading))
-    kept_radius = body.radius + body.margin + CELL
     if before is None:
         since_ns = view.stamp_ns
-        times = np.full((CELLS, CELLS), -np.inf, np.float32)
+        times = np.full((count, count), -np.inf, np.float32)
         point = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0), radius=0.0)
         free_radius = min(kept_radius, _find_nearest(view.ranges, lidar))
         shield_kernels.cover(times, cells, point, free_radius, 0.0)

@@ -80,7 +80,7 @@ def find_movers(
     """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
     newest = views[-1]
     entered = np.zeros(len(newest.ranges), np.bool_)
-    if len(config.beam_angles) < 2 or shield.obstacle_speed == 0.0:
+    if shield.obstacle_speed == 0.0:
         return entered
     lidar = _get_beams(config)
     constant, proportional = shield.range_noise
@@ -199,7 +199,7 @@ def update_ground(
     """Returns the ground known after the newest view; None for a lidar that sees all around."""
     shield = config.shield
     beams = len(config.beam_angles)
-    if shield is None or not views or beams < 2:
+    if shield is None or not views:
         return None
     lidar = _get_beams(config)
     blind_angle = 2.0 * np.pi - abs(lidar.step) * beams

@@ -201,6 +201,21 @@ def test_a_circle_whose_lidar_is_blind_behind_backs_up_as_far_as_it_came_too():
     assert robot.may(BACK)
 
 
+@pytest.mark.parametrize("length", [1.0, 3.6, 16.0])
+def test_a_long_robot_may_go_where_a_short_one_may(length):
+    """Ground is remembered beyond its footprint, however far that reaches."""
+    half = length / 2.0
+    outline = ((half, 0.4), (-half, 0.4), (-half, -0.4), (half, -0.4))
+    radius = float(np.hypot(half, 0.4))
+    shield = replace(SHIELD, outline=outline, footprint_radius=radius, range_max=30.0)
+    robot = Robot(given=replace(BLIND, shield=shield))
+    assert robot.may(TURN)
+    assert not robot.may(BACK)
+    robot.moves((0.3, 0.0, 0.0), 3.0)
+    assert robot.may(BACK)
+    assert robot.may(TURN)
+
+
 def drive(seed, remembers):
     """Drives at random, mostly backwards, where the shield lets it; the way back, and a touch."""
     rng = np.random.default_rng(seed)
