@@ -10,8 +10,10 @@ import shapely
 
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate.ground import CELL, CELLS, REMEMBERED_S
-from nics_drl_bridge.gate.shield import STEP, find_obstacles, get_body, update_ground
+from nics_drl_bridge.gate.evidence import find_obstacles
+from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.ground import CELL, CELLS, REMEMBERED_S, update_ground
+from nics_drl_bridge.gate.shield import STEP
 from nics_drl_bridge.gate.shield_kernels import is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
 from nics_drl_bridge.interface import NS_PER_S

@@ -9,20 +9,20 @@ from shapely.geometry import LineString, Point
 
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate import shield_kernels
-from nics_drl_bridge.gate.gate import decide
-from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
-from nics_drl_bridge.gate.shield import (
-    CREEP_SPEED,
+from nics_drl_bridge.gate import evidence_kernels, shield_kernels
+from nics_drl_bridge.gate.evidence import (
     MEMORY_S,
     SPACING_S,
     add_view,
     find_movers,
     find_obstacles,
-    get_body,
-    warm_up,
 )
-from nics_drl_bridge.gate.shield_kernels import is_free, mark_entered, place
+from nics_drl_bridge.gate.evidence_kernels import mark_entered
+from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
+from nics_drl_bridge.gate.shield import CREEP_SPEED, warm_up
+from nics_drl_bridge.gate.shield_kernels import follow_arc, is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.robot.braking import TurnBraking
@@ -82,7 +82,7 @@ def test_without_a_shield_nothing_is_cut():
 def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase, monkeypatch):
     fresh = {"free": njit(is_free.py_func), "entered": njit(mark_entered.py_func)}
     monkeypatch.setattr(shield_kernels, "is_free", fresh["free"])
-    monkeypatch.setattr(shield_kernels, "mark_entered", fresh["entered"])
+    monkeypatch.setattr(evidence_kernels, "mark_entered", fresh["entered"])
     warm_up()
     known = {name: list(kernel.signatures) for name, kernel in fresh.items()}
     assert all(known.values())
@@ -237,7 +237,7 @@ def test_the_sweep_agrees_with_geometry():
         point = rng.uniform(-1.2, 1.2, 2)
         duration = blind + np.hypot(*twist[:2]) / (2.0 * BRAKE)
         path = LineString(
-            [place(twist, t)[:2] for t in np.linspace(0.0, duration, 400)]
+            [follow_arc(twist, t)[:2] for t in np.linspace(0.0, duration, 400)]
         )
         away = path.distance(Point(point))
         if abs(away - room) < step or np.hypot(*point) <= room:

@@ -9,18 +9,14 @@ import pytest
 import shapely
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate.shield import get_body
-from nics_drl_bridge.gate.shield_kernels import (
-    Cells,
-    Look,
+from nics_drl_bridge.gate.evidence_kernels import (
     MountedBeams,
     Tolerance,
-    compute_clearance,
-    fill_grid,
-    is_free,
     mark_entered,
-    mark_seen_cells,
 )
+from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.ground_kernels import Grid, mark_seen
+from nics_drl_bridge.gate.shield_kernels import compute_clearance, fill_grid, is_free
 from nics_drl_bridge.gate.state import ShieldConfig
 
 BRAKE = 1.5
@@ -185,8 +181,8 @@ def test_a_margin_is_kept_around_the_outline():
 def test_a_body_is_kept_as_long_as_its_shield_is():
     shield = ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=LONG)
     assert get_body(shield) is get_body(replace(shield))
-    assert get_body(shield).reach == pytest.approx(np.hypot(0.25, 0.2))
-    assert get_body(replace(shield, outline=())).reach == 0.0
+    assert get_body(shield).farthest_corner == pytest.approx(np.hypot(0.25, 0.2))
+    assert get_body(replace(shield, outline=())).farthest_corner == 0.0
 
 
 DEGREE_BEAMS = MountedBeams(np.deg2rad(-20.0), np.deg2rad(1.0), 0.0, 0.0, 0.0)
@@ -196,12 +192,11 @@ UNKNOWN_AMONG_OTHERS = [(19,), (20,), (21,), (19, 21)]
 @pytest.mark.parametrize("unknown", UNKNOWN_AMONG_OTHERS)
 def test_an_unknown_beam_among_far_ones_marks_no_ground_as_free(unknown):
     """A cell of 5 cm at a distance of 1 m is as wide as five of these beams."""
-    cells = Cells(0.975, -0.025, 0.05, 1.0, 0.0)  # a single one, straight ahead
+    grid = Grid(0.975, -0.025, 0.05, 1.0, 0.0)  # a single cell, straight ahead
 
     def see(ranges):
         times = np.full((1, 1), -np.inf, np.float32)
-        look = Look(1.0, -30.0, 10.0, 0.03)
-        mark_seen_cells(times, cells, ranges, DEGREE_BEAMS, 0.1, look)
+        mark_seen(times, grid, ranges, DEGREE_BEAMS, 10.0, 0.03, 1.0)
         return times[0, 0]
 
     ranges = np.full(41, 5.0, np.float32)
