@@ -39,15 +39,15 @@ from nics_drl_bridge.gate.state import (
 
 
 def decide(
-    config: GateConfig, state: GateState, given: inputs.Input, now: float
+    config: GateConfig, state: GateState, event: inputs.Input, now: float
 ) -> tuple[GateState, Decision]:
     """Decides on an input at a steady time [s]; returns the state after it, and the decision."""
-    state = stops.take_time(config, state, given, now)
+    state = stops.take_time(config, state, event, now)
     if state.clock_fault:
         now = state.now_s  # the last plausible time
-    state, refused = intake.take(config, state, given, now)
-    state, answer, granted = _serve(config, state, given, now)
-    is_tick = isinstance(given, inputs.Tick)
+    state, refused = intake.take(config, state, event, now)
+    state, answer, granted = _serve(config, state, event, now)
+    is_tick = isinstance(event, inputs.Tick)
     publish = False
     is_shielded = False
     cause, latching_cause = _find_causes(config, state, now)
@@ -64,12 +64,12 @@ def decide(
 
 
 def _serve(
-    config: GateConfig, state: GateState, given: inputs.Input, now: float
+    config: GateConfig, state: GateState, event: inputs.Input, now: float
 ) -> tuple[GateState, str, bool]:
     """Arms or resets, if requested; returns also the answer, and whether it was granted."""
-    if isinstance(given, inputs.Arm):
-        return arming.arm(config, state, given, now)
-    if isinstance(given, inputs.Reset):
+    if isinstance(event, inputs.Arm):
+        return arming.arm(config, state, event, now)
+    if isinstance(event, inputs.Reset):
         return arming.reset(state)
     return state, "", False
 

@@ -46,7 +46,7 @@ def update_ground(
     shield = config.shield
     if shield is None or not views or _looks_all_around(config, shield):
         return None
-    return look(
+    return observe_ground(
         before, views[-1], get_beams(config), get_body(shield), shield.range_max
     )
 
@@ -57,7 +57,7 @@ def _looks_all_around(config: GateConfig, shield: ShieldConfig) -> bool:
     return bool(blind_angle < shield.unknown_share * shield.unknown_width)
 
 
-def look(
+def observe_ground(
     before: Ground | None,
     view: View,
     lidar: MountedBeams,

@@ -33,49 +33,49 @@ Taken = tuple[GateState, str]
 MAX_SPEED = 100.0
 # maximum deviation of the last beam from its declared angle [rad]
 ANGLE_TOLERANCE = 1e-3
-# Downhill or pushed, a robot may exceed its limits by this factor, plus [m/s] and [rad/s].
-SLIP = 2.0
-SLIP_SPEED = 0.5
-SLIP_TURN = 1.0
-# jump of an odometry pose that may come from imprecision [m, rad]
-LEAP = 0.1
-LEAP_TURN = 0.2
+# Downhill or pushed, a robot may exceed its limits by this factor, and by this [m/s], [rad/s].
+EXCESS_FACTOR = 2.0
+EXCESS_SPEED = 0.5
+EXCESS_TURN_RATE = 1.0
+# jump of an odometry pose that may come from imprecision [m], [rad]
+SMALL_JUMP = 0.1
+SMALL_JUMP_TURN = 0.2
 
 
 def take(
-    config: GateConfig, state: GateState, given: inputs.Input, now: float
+    config: GateConfig, state: GateState, event: inputs.Input, now: float
 ) -> Taken:
     """Takes an input at a steady time [s] into the state, or returns the reason why not."""
     state = _clear_faults(state)
-    if isinstance(given, inputs.Command):
-        state = stops.watch_source(state, given, now)
-    reason = _find_refusal(config, given)
+    if isinstance(event, inputs.Command):
+        state = stops.watch_source(state, event, now)
+    reason = _find_refusal(config, event)
     if reason:
-        if isinstance(given, inputs.Command):
+        if isinstance(event, inputs.Command):
             # An earlier command that waits for its scan must not come into force any more.
             state = replace(state, malformed=reason, pending=None, pending_s=None)
         return state, reason
-    if isinstance(given, inputs.Scan):
-        return _take_scan(config, state, given, now)
-    if isinstance(given, inputs.Odometry):
-        return _take_odometry(config, state, given, now)
-    if isinstance(given, inputs.SensorReading):
-        return _take_reading(config, state, given, now)
-    if isinstance(given, inputs.Estimate):
-        track = estimates.track_estimate(config, state, given, now)
-        state = replace(state, estimate=given, estimate_s=now, estimates=track)
-    elif isinstance(given, inputs.Command):
-        state = _take_command(state, given, now)
-    elif isinstance(given, inputs.EStop):
+    if isinstance(event, inputs.Scan):
+        return _take_scan(config, state, event, now)
+    if isinstance(event, inputs.Odometry):
+        return _take_odometry(config, state, event, now)
+    if isinstance(event, inputs.SensorReading):
+        return _take_reading(config, state, event, now)
+    if isinstance(event, inputs.Estimate):
+        track = estimates.track_estimate(config, state, event, now)
+        state = replace(state, estimate=event, estimate_s=now, estimates=track)
+    elif isinstance(event, inputs.Command):
+        state = _take_command(state, event, now)
+    elif isinstance(event, inputs.EStop):
         stop = replace(
             state.e_stop,
-            latched=state.e_stop.latched or given.pressed,
-            held=given.pressed,
+            latched=state.e_stop.latched or event.pressed,
+            held=event.pressed,
             heard_s=now,
         )
         state = replace(state, e_stop=stop)
-    elif isinstance(given, inputs.Press):
-        stop = replace(state.e_stop, latched=True, reason=given.reason)
+    elif isinstance(event, inputs.Press):
+        stop = replace(state.e_stop, latched=True, reason=event.reason)
         state = replace(state, e_stop=stop)
     return state, ""
 
@@ -88,10 +88,10 @@ def _clear_faults(state: GateState) -> GateState:
     return replace(state, estimates=replace(state.estimates, fault=""))
 
 
-def _find_refusal(config: GateConfig, given: inputs.Input) -> str:
+def _find_refusal(config: GateConfig, event: inputs.Input) -> str:
     """Returns the first reason to refuse an input, or ""."""
     for kind, judge in REFUSALS:
-        reason = judge(config, given) if isinstance(given, kind) else ""
+        reason = judge(config, event) if isinstance(event, kind) else ""
         if reason:
             return reason
     return ""
@@ -128,7 +128,7 @@ def _take_scan(
     if fault:
         return _refuse_stamp(replace(state, scans=arrivals), SCAN, fault)
     pose = None if state.odometry is None else state.odometry.pose
-    seen, frozen_fault = frozen.look(config, state.seen, scan.ranges, pose)
+    seen, frozen_fault = frozen.watch_pictures(config, state.seen, scan.ranges, pose)
     views = evidence.add_view(config, state, scan)
     ground = grounds.update_ground(config, views, state.ground)
     state = replace(
@@ -169,10 +169,10 @@ def _take_odometry(
             scan_motion=ScanMotion(),
         )
         return state, f"odom: {leap}"
-    restless = state.restless_s if frozen.is_at_rest(config, odometry.twist) else now
-    return replace(
-        state, odometries=arrivals, odometry=odometry, restless_s=restless
-    ), ""
+    state = replace(state, odometries=arrivals, odometry=odometry)
+    if not frozen.is_at_rest(config, odometry.twist):
+        state = replace(state, restless_s=now)
+    return state, ""
 
 
 def _take_reading(
@@ -206,7 +206,7 @@ def _refuse_stamp(state: GateState, topic: str, fault: str) -> Taken:
 def _find_leap(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
 ) -> str:
-    """Returns what is wrong with a pose that the robot can't have reached; empty if nothing is."""
+    """Returns what is wrong with a pose that the robot can't have driven to; else empty."""
     before = state.odometry
     bounds = config.limits
     if before is None or bounds is None:
@@ -215,8 +215,10 @@ def _find_leap(
     passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
     path_noise, turn_noise = (frozen.NOISE * std * passed for std in config.odom_std)
     speed, turn_rate = limits.get_maximum_speeds(bounds)
-    max_path = LEAP + (SLIP * speed + SLIP_SPEED) * passed + path_noise
-    max_turn = LEAP_TURN + (SLIP * turn_rate + SLIP_TURN) * passed + turn_noise
+    max_speed = EXCESS_FACTOR * speed + EXCESS_SPEED
+    max_turn_rate = EXCESS_FACTOR * turn_rate + EXCESS_TURN_RATE
+    max_path = SMALL_JUMP + max_speed * passed + path_noise
+    max_turn = SMALL_JUMP_TURN + max_turn_rate * passed + turn_noise
     x, y, heading = between(before.pose, odometry.pose)
     path = float(np.hypot(x, y))
     if path <= max_path and abs(heading) <= max_turn:
@@ -228,7 +230,8 @@ def _find_leap(
 
 def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
     """The scan is from another lidar than the declared one, or every range is NaN."""
-    angles, (first, step) = config.beam_angles, scan.angles
+    angles = config.beam_angles
+    first, step = scan.angles
     if scan.ranges.shape != angles.shape:
         return f"scan: {scan.ranges.size} beams, not {len(angles)}"
     increment = float(angles[1] - angles[0]) if len(angles) > 1 else step

@@ -324,4 +324,4 @@ def warm_up() -> None:
     view = View(0, np.zeros(3), ranges)
     before: Ground | None = None
     for _ in range(2):
-        before = ground.look(before, view, lidar, body, 1.0)
+        before = ground.observe_ground(before, view, lidar, body, 1.0)
