@@ -79,7 +79,7 @@ def _find_causes(
 ) -> tuple[Cause | None, Cause | None]:
     """Returns the first cause of a stop, which names it, and the first one that latches."""
     first = None
-    # A fault may live for one input only, so a latching rule counts behind any other one.
+    # A latching rule counts behind any other one, because its fault may show at one input only.
     for rule in STOPS:
         if rule.needs_clock and state.clock_fault:
             continue
@@ -118,7 +118,7 @@ def _stop(
 def _move(
     config: GateConfig, state: GateState, now: float
 ) -> tuple[GateState, Cause | None]:
-    """Returns the state after the newest command passed; with a cause if it came out unfit."""
+    """Returns the state after the newest command passed, or a stop and its cause if unfit."""
     zero = np.zeros(len(config.fields))
     target = zero
     if state.command is not None:
@@ -141,11 +141,16 @@ def _move(
 
 
 class Rule(NamedTuple):
-    """A reason to stop; its name is that of the function that returns the cause, or None."""
+    """A reason to stop.
+
+    Attributes:
+        judge: returns the cause of a stop at a time [s], or None; its name is that of the rule.
+        latches: the stop stays until a reset.
+        needs_clock: it measures elapsed time, which is unknown while the gate's clock is at fault.
+    """
 
     judge: Callable[[GateConfig, GateState, float], Cause | None]
-    latches: bool = False  # the stop stays until a reset
-    # Judges a time that has passed, which is not known while the gate's clock is at fault.
+    latches: bool = False
     needs_clock: bool = False
 
 
@@ -227,10 +232,10 @@ def bound(config: GateConfig, state: GateState, motion: Motion, now: float) -> M
     )
 
 
-# Stages that a passing command goes through.
 SHAPERS: tuple[Callable[[GateConfig, GateState, Motion, float], Motion], ...] = (
     saturate,
     follow,
     shield.shield,
     bound,
 )
+"""Stages that a command goes through before it is published, in order."""

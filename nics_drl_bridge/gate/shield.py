@@ -56,6 +56,14 @@ CURVATURE_COUNT = 18
 CURVATURE_SPEED = 0.1
 
 
+class Stop(NamedTuple):
+    """A stop to be swept: the robot keeps its twist for a reaction time, then brakes."""
+
+    body: Body
+    reaction_s: float
+    deceleration: float  # [m/s^2]
+
+
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
     """Reduces a motion until the robot can stop before every obstacle.
 
@@ -137,33 +145,66 @@ def _can_stop(config: GateConfig, state: GateState, value: Array, now: float) ->
         return True
     sensor_points = [make_static(sensor.points) for sensor in state.sensors]
     obstacles = np.concatenate([state.obstacles, *sensor_points])
-    static_obstacles = make_static(obstacles[:, :2])
-    # Calm: by the command alone, once the next scan has shown the obstacles.
-    reaction_s = shield.hold_s + shield.latency_s
+    return _can_stop_calmly(config, shield, value, obstacles) and _can_stop_suddenly(
+        config, shield, state, value, obstacles, now
+    )
+
+
+def _can_stop_calmly(
+    config: GateConfig, shield: ShieldConfig, value: Array, obstacles: Array
+) -> bool:
+    """True if the robot can stop from a command (C,) after the next scan, before what stands."""
     twists = _span_twists(config, shield, value[None], None)
-    calm_s = 1.0 / config.scan_rate + reaction_s + shield.latency_s
-    for stop in list_stops(shield, calm_s, CALM_BRAKING, latencies=2.0):
-        if not shield_kernels.is_free(static_obstacles, twists, *stop, STEP):
-            return False
-    # Sudden: by whatever the robot may do already, on data as old as they are.
+    # Until the command is followed, the next scan comes, and the stop is decided and followed.
+    reaction_s = (
+        1.0 / config.scan_rate + (shield.hold_s + shield.latency_s) + shield.latency_s
+    )
+    stops = list_stops(shield, reaction_s, CALM_BRAKING, latencies=2.0)
+    static_obstacles = make_static(obstacles[:, :2])
+    return all(_is_free(static_obstacles, twists, stop) for stop in stops)
+
+
+def _can_stop_suddenly(
+    config: GateConfig,
+    shield: ShieldConfig,
+    state: GateState,
+    value: Array,
+    obstacles: Array,
+    now: float,
+) -> bool:
+    """True if the robot can stop, whatever it does already, before what may approach."""
     data_age_s = _compute_data_age(state, now)
-    commands = _list_unshown_commands(shield, state, now, data_age_s)
+    unshown = _list_unshown_commands(shield, state, now, data_age_s)
+    commands = np.array([*unshown, state.value, value])
     odometry = np.zeros(3)
     if state.odometry is not None:
         odometry = state.odometry.twist
-    twists = _span_twists(
-        config, shield, np.array([*commands, state.value, value]), odometry
+    twists = _span_twists(config, shield, commands, odometry)
+    reaction_s = data_age_s + (shield.hold_s + shield.latency_s)
+    stops = list_stops(shield, reaction_s, 1.0, latencies=1.0)
+    return all(_is_free(obstacles, twists, stop) for stop in stops)
+
+
+def _is_free(obstacles: Array, twists: Array, stop: Stop) -> bool:
+    """True if no obstacle (P, 3) comes too near in a stop from any of the twists (K, 3)."""
+    is_free: bool = shield_kernels.is_free(
+        obstacles, twists, stop.body, stop.reaction_s, stop.deceleration, STEP
     )
-    for stop in list_stops(shield, data_age_s + reaction_s, 1.0, latencies=1.0):
-        if not shield_kernels.is_free(obstacles, twists, *stop, STEP):
-            return False
-    return True
+    return is_free
 
 
 def _compute_data_age(state: GateState, now: float) -> float:
     """Returns the age of the oldest data that show obstacles [s], at least 0."""
     arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
     return max(0.0, *(compute_age(topic, now) for topic in arrivals))
+
+
+def _list_unshown_commands(
+    shield: ShieldConfig, state: GateState, now: float, data_age_s: float
+) -> list[Array]:
+    """Returns the commands (C,) in force since the oldest data, or within a reaction before."""
+    since_s = now - data_age_s - _get_longest_reaction(shield)
+    return [command for _, command in _select_in_force(state.recent, since_s, now)]
 
 
 def append_command(
@@ -176,14 +217,6 @@ def append_command(
     # No data are older than this when a motion is decided.
     oldest_s = now - config.scan_age_s - _get_longest_reaction(shield)
     return _select_in_force((*state.recent, (now, command)), oldest_s, now)
-
-
-def _list_unshown_commands(
-    shield: ShieldConfig, state: GateState, now: float, data_age_s: float
-) -> list[Array]:
-    """Returns the commands (C,) in force since the oldest data, or within a reaction before."""
-    since_s = now - data_age_s - _get_longest_reaction(shield)
-    return [command for _, command in _select_in_force(state.recent, since_s, now)]
 
 
 def _get_longest_reaction(shield: ShieldConfig) -> float:
@@ -208,14 +241,6 @@ def _select_in_force(
     )
 
 
-class Stop(NamedTuple):
-    """A stop to be swept: the robot keeps its twist for a reaction time, then brakes."""
-
-    body: Body
-    reaction_s: float
-    deceleration: float  # [m/s^2]
-
-
 def list_stops(
     shield: ShieldConfig, reaction_s: float, braking: float, latencies: float
 ) -> list[Stop]:
@@ -232,6 +257,7 @@ def list_stops(
     turn = shield.turn
     if turn is None:
         return [Stop(body, reaction_s, deceleration)]
+    # Fractions of the bounds on path and turn by which the robot moves.
     fractions = [(1.0, 1.0)]
     if turn.least_turn < SHORT_STOP:
         fractions.append((1.0, turn.least_turn))
@@ -270,7 +296,7 @@ def _span_twists(
 
 
 def _add_drift(shield: ShieldConfig, twists: Array) -> Array:
-    """Returns twists (n, 3), and those of the arcs between which the robot leaves theirs."""
+    """Returns twists (n, 3), and those between which a robot drifts off its arc while it brakes."""
     drift = shield.drift
     if drift.is_none:
         return twists
