@@ -81,7 +81,8 @@ def account_for_arrival(
     envelope = max(mark[3] for mark in marks)
     if armed:
         fall = SIMULATED_LAG if config.simulated else DRIFT
-        lowest = arrivals.envelope - fall * passed
+        # A longer gap may be one of the gate itself, and data that queued meanwhile are late.
+        lowest = arrivals.envelope - fall * min(passed, gap_s)
         highest = arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
     kept = slice(1 - KEPT_STAMPS, None)

@@ -361,8 +361,26 @@ def test_a_fault_that_latches_does_so_while_the_gates_clock_is_at_fault(fault):
     assert not rig.moves
 
 
-@pytest.mark.parametrize("rule", ["e_stop_silent", "no_motion"])
-def test_a_gate_that_was_asleep_does_not_judge_how_long_the_others_were_silent(rule):
+@pytest.mark.parametrize("simulated", [False, True])
+def test_data_that_queued_up_while_the_gate_was_asleep_latch_nothing(simulated):
+    """The first of them are late, but not because the simulator lost time."""
+    rig = driving(simulated=simulated)
+    slept = 10
+    rig.now += 0.1 * slept
+    before = rig.stamp
+    for queued in range(5):
+        rig.stamp = before + (slept - 4 + queued) * NS_PER_S // 10
+        rig.odom()
+        rig.scan()
+    rig.give(EStop(False))
+    rig.command()
+    assert rig.tick().cause.rule == "own_clock"
+    assert rig.state.latched is None
+    rig.speed = 0.0
+    assert rig.run(0.5).cause is None
+
+
+def test_a_gate_that_was_asleep_does_not_judge_how_long_the_others_were_silent():
     rig = driving()
     rig.now += 1.5
     rig.tick()
