@@ -13,7 +13,7 @@ from pathlib import Path
 
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.gate import gate, shield
+from nics_drl_bridge.gate import arming, evidence, gate, intake
 
 CONTROLS = {
     "no_tests": "no test that looks at the gate's rules is run",
@@ -26,10 +26,10 @@ OTHER_TEST = "test/gate/test_stopping.py"
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = {
     "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
-    "refusal": (gate, "REFUSALS", lambda rule: rule[1].__name__),
-    "arming": (gate, "CHECKS", lambda check: check[0]),
+    "refusal": (intake, "REFUSALS", lambda rule: rule[1].__name__),
+    "arming": (arming, "CHECKS", lambda check: check[0]),
     "shaping": (gate, "SHAPERS", lambda shaper: shaper.__name__),
-    "evidence": (shield, "EVIDENCE", lambda evidence: evidence.__name__),
+    "evidence": (evidence, "EVIDENCE", lambda place: place.__name__),
 }
 
 

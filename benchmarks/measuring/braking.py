@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.shield import get_body
 from nics_drl_bridge.gate.stopping import shield_config
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.geometry import between
@@ -34,7 +34,7 @@ def braking_used(robot: str, given: Mapping[str, float] | None) -> float:
     shield, _ = shield_config(model, limits, robot, given)
     sim = FastSimulator(model, load_world("empty"))
     most = 0.0
-    reach = get_body(shield).reach
+    reach = get_body(shield).farthest_corner
     for index, (low, high) in enumerate(zip(limits.low, limits.high, strict=True)):
         arm = 1.0 if limits.linear[index] else reach * limits.turn[index]
         if arm == 0.0:

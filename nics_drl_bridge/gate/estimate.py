@@ -101,8 +101,8 @@ def _explain_uncertainty(
     )
 
 
-def begin_anew(state: GateState) -> EstimateTrack:
-    """Returns the track of which the newest estimate is the origin, as at arming."""
+def restart_track(state: GateState) -> EstimateTrack:
+    """Returns a track that begins at the newest estimate, as at arming."""
     if state.estimate is None:
         return EstimateTrack()
     newest = EstimateMark(

@@ -36,7 +36,7 @@ REST_TURN_RATE = 0.1
 NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
 
 
-def look(
+def watch_pictures(
     config: GateConfig, seen: tuple[Sameness, ...], ranges: Ranges, pose: Array | None
 ) -> tuple[tuple[Sameness, ...], str]:
     """Returns the pictures with a scan (B,), newest last, and why it is an old one, or ""."""

@@ -1,70 +1,112 @@
-"""Ground where the lidar never looks: free as far as it was seen, or the robot stood there."""
+"""Ground where the lidar never looks: free as far as it was seen, or the robot stood there.
+
+It is kept in square cells, in the frame of odometry, each with the time when it was last known to
+be free. A new scan changes them in these steps:
+
+1. Shift the cells, so that the robot is in the middle again.
+2. Forget what was seen too long ago, except beside the robot.
+3. Mark as free what the scan shows, and as not free where its beams end.
+4. Mark as free where the robot stands.
+5. Find the border of what is known, which counts as an obstacle.
+"""
 
 import math
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from nics_drl_bridge.gate import shield_kernels
-from nics_drl_bridge.gate.shield_kernels import Body, Cells, Look, MountedBeams
-from nics_drl_bridge.gate.state import Ground, Ranges, View
+from nics_drl_bridge.gate import ground_kernels
+from nics_drl_bridge.gate.evidence import TOLERANCE, get_beams
+from nics_drl_bridge.gate.evidence_kernels import MountedBeams
+from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.ground_kernels import Grid
+from nics_drl_bridge.gate.shield_kernels import Body
+from nics_drl_bridge.gate.state import GateConfig, Ground, Ranges, ShieldConfig, View
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.sim.collision_kernels import Outline
 
 CELL = 0.05  # width of a cell [m]
-CELLS = 48  # cells along each side of the ground that is remembered
+CELLS = 48  # minimum number of cells along each side of the ground that is remembered
+# Ground is remembered at least this far beyond the robot and its margin [m].
+REACH_BEYOND = 0.6
 # time after which ground is forgotten, except beside the robot [s]
 REMEMBERED_S = 30.0
+MEDIAN_BEAMS = 5  # neighbouring beams whose median counts, because a single one may err
+# A body without corners and extent, from which distances are those from the robot's origin.
+ORIGIN = Body(Outline(np.zeros((0, 2)), 0, 0), 0.0, 0.0, 0.0)
 
 
-def look(
+def update_ground(
+    config: GateConfig, views: tuple[View, ...], before: Ground | None
+) -> Ground | None:
+    """Returns the ground known after the newest view; None if the lidar looks all around.
+
+    Without earlier ground, that around the robot may be free.
+    """
+    shield = config.shield
+    if shield is None or not views or _looks_all_around(config, shield):
+        return None
+    return observe_ground(
+        before, views[-1], get_beams(config), get_body(shield), shield.range_max
+    )
+
+
+def _looks_all_around(config: GateConfig, shield: ShieldConfig) -> bool:
+    """True if the angle without beams is too small to count as unknown."""
+    blind_angle = 2.0 * np.pi - abs(get_beams(config).step) * len(config.beam_angles)
+    return bool(blind_angle < shield.unknown_share * shield.unknown_width)
+
+
+def observe_ground(
     before: Ground | None,
     view: View,
     lidar: MountedBeams,
     body: Body,
     range_max: float,
-    tolerance: float,
 ) -> Ground:
-    """Returns the ground after a view; without earlier ground, that around the robot may be free.
+    """Returns the ground after a view.
 
     Args:
-        before: the ground after the view before.
+        before: the ground after the view before; None at the first one.
         view: of the newest scan.
         lidar: its beams.
         body: footprint of the robot, and the margin around it.
         range_max: of the lidar [m].
-        tolerance: margin before a return that is not free [m].
     """
     x, y, heading = view.pose.tolist()
-    corner = (math.floor(x / CELL) - CELLS // 2, math.floor(y / CELL) - CELLS // 2)
-    corner_x = corner[0] * CELL - x
-    corner_y = corner[1] * CELL - y
-    cells = Cells(corner_x, corner_y, CELL, math.cos(heading), math.sin(heading))
     kept_radius = body.radius + body.margin + CELL
+    count = max(CELLS, 2 * math.ceil((kept_radius + REACH_BEYOND) / CELL))
+    corner = (math.floor(x / CELL) - count // 2, math.floor(y / CELL) - count // 2)
+    grid = Grid(
+        x=corner[0] * CELL - x,
+        y=corner[1] * CELL - y,
+        width=CELL,
+        cosine=math.cos(heading),
+        sine=math.sin(heading),
+    )
     if before is None:
         since_ns = view.stamp_ns
-        times = np.full((CELLS, CELLS), -np.inf, np.float32)
-        point = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0), radius=0.0)
+        times = np.full((count, count), -np.inf, np.float32)
         free_radius = min(kept_radius, _find_nearest(view.ranges, lidar))
-        shield_kernels.cover(times, cells, point, free_radius, 0.0)
+        ground_kernels.mark_covered(times, grid, ORIGIN, free_radius, 0.0)
     else:
         since_ns = before.since_ns
         columns_moved, rows_moved = np.subtract(corner, before.corner).tolist()
-        times = shield_kernels.shift_cells(before.times, columns_moved, rows_moved)
+        times = ground_kernels.shift_cells(before.times, columns_moved, rows_moved)
     now = (view.stamp_ns - since_ns) * S_PER_NS
-    terms = Look(now, now - REMEMBERED_S, range_max, tolerance)
-    is_seen = shield_kernels.mark_seen_cells(
-        times, cells, view.ranges, lidar, kept_radius, terms
+    ground_kernels.forget_old(times, grid, kept_radius, now, now - REMEMBERED_S)
+    is_seen = ground_kernels.mark_seen(
+        times, grid, view.ranges, lidar, range_max, TOLERANCE, now
     )
-    shield_kernels.cover(times, cells, body, 0.0, now)
-    unseen = shield_kernels.find_unseen(times, is_seen, cells)
+    ground_kernels.mark_covered(times, grid, body, 0.0, now)
+    unseen = ground_kernels.find_unseen(times, is_seen, grid)
     return Ground(since_ns, corner, times, unseen)
 
 
 def _find_nearest(ranges: Ranges, lidar: MountedBeams) -> float:
-    """Returns the distance [m] to the nearest end of the beams (B,).
+    """Returns the distance [m] from the robot to the nearest end of the beams (B,).
 
-    It is the smallest median of five neighbours, because a single beam may err.
+    It is the smallest median of neighbours, so that a single beam may err.
     """
     angles = lidar.first + lidar.step * np.arange(len(ranges)) + lidar.heading
     # Beams that are too close to measure end at the lidar.
@@ -73,5 +115,6 @@ def _find_nearest(ranges: Ranges, lidar: MountedBeams) -> float:
         lidar.x + lengths * np.cos(angles), lidar.y + lengths * np.sin(angles)
     )
     ends[np.isnan(ends)] = np.inf
-    windows = sliding_window_view(np.pad(ends, 2, constant_values=np.inf), 5)
+    padded = np.pad(ends, MEDIAN_BEAMS // 2, constant_values=np.inf)
+    windows = sliding_window_view(padded, MEDIAN_BEAMS)
     return float(np.median(windows, axis=1).min(initial=np.inf))

@@ -1,9 +1,15 @@
 """Detects a held body: odometry shows motion, but the scans show none.
 
-A recent scan and the motion by odometry predict the newest scan. Where the prediction differs
-clearly from the recent scan, the newest scan must have changed; if it has not, the wheels spin but
-the body stands. A scene that looks the same after the motion, such as a long corridor, decides
-nothing.
+`watch_scan` judges each new scan while the robot is commanded to move:
+
+1. Reduce it to the median ranges in a few directions.
+2. Choose an earlier scan as the reference, since which odometry shows enough motion.
+3. Predict the new scan from the reference and that motion.
+4. Compare it sector by sector. Where the prediction differs clearly from the reference, the new
+   scan must have changed. If it has not in most sectors, the scans contradict odometry: the wheels
+   spin but the body stands. A scene that looks the same after the motion, such as a long corridor,
+   decides nothing.
+5. Report a held body (rule `body_held`) once scans have contradicted odometry for some time.
 """
 
 import math
@@ -30,53 +36,75 @@ from nics_drl_bridge.geometry import between, compose, exp
 from nics_drl_bridge.interface import S_PER_NS, Array
 
 FULL_CIRCLE = 2.0 * np.pi
+ROUNDING = 1e-6  # tolerance of a number of beams
+# standard deviation of the median of n normal numbers, times sqrt(n): about sqrt(pi / 2)
+MEDIAN_FACTOR = 1.25
+TINY = 1e-9  # instead of a minimum motion that is set to zero
 
 
 @dataclass(frozen=True)
 class Settings:
-    """When scans contradict odometry."""
+    """When scans contradict odometry.
 
-    # Reduced scan: a direction is the median of the beams within `window` on each side of it.
+    A skid-steer robot whose odometry turns 30 % too far shows a share of 0.77 of its motion, and
+    one on ice 0.5. One that begins to turn in DART shows a tenth of the turn for half a second, but
+    is not held: its ranges change because it also drives.
+
+    Attributes:
+        spacing: angle between the directions of a reduced scan [rad].
+        window: angle on each side of a direction over which the median is taken [rad].
+        sector: angle of a sector [rad]. A person nearby fills one or two of them.
+        longest_s: time for which scans are kept as references [s].
+        slow_periods: periods of a slow lidar that should fit into that time.
+        slow_factor: maximum factor by which the time is prolonged for them.
+        min_periods: periods that must fit, whatever the factor.
+        kept_every_s: minimum time between scans that are kept [s].
+        min_path: minimum path by odometry since the reference [m], unless the turn suffices.
+        min_turn: minimum turn by odometry since the reference [rad], unless the path suffices.
+        min_half: minimum fraction of the motion in either half of that time. With less, a robot
+            that has just started would look held if its scans were up to a quarter of a second
+            older than their stamps.
+        usual_turn: a younger reference is preferred if the robot turned further than this [rad].
+        max_turn: no reference is used if it turned further: a room may repeat itself [rad].
+        min_change: root mean square of the predicted changes of a sector that is compared [m].
+        min_deviations: the same, in standard deviations of the lidar's noise.
+        visible_change: change of a range that is more than noise [m].
+        visible_deviations: the same, in standard deviations of the lidar's noise.
+        gap: neighbours are on two surfaces if their ranges differ by more than this fraction.
+        min_sectors: minimum number of compared sectors.
+        min_agreeing: minimum fraction of them that show less than `sector_share` of the motion.
+        sector_share: share of the motion below which a sector contradicts odometry.
+        held_share: share of the motion below which the median of the sectors does so.
+        max_changed: fraction of its ranges that changed visibly, below which a sector contradicts
+            odometry; the median of the sectors counts.
+        confirmed_s: time for which scans must contradict odometry, without one that agrees [s].
+        forgotten_s: time after which an unconfirmed contradiction is forgotten [s].
+    """
+
     spacing: float = math.radians(2.0)
     window: float = math.radians(3.0)
-    sector: float = math.radians(20.0)  # a person nearby fills one or two of them
-    # Scans are kept `kept_every_s` apart; the newest one is compared with one that is at most
-    # about `longest_s` older.
+    sector: float = math.radians(20.0)
     longest_s: float = 0.56
+    slow_periods: float = 3.1
+    slow_factor: float = 1.15
+    min_periods: float = 2.2
     kept_every_s: float = 0.08
-    # Minimum motion by odometry between the two scans [m], [rad], and its minimum fraction in
-    # either half of that time. With less, a robot that has just started would look held if its
-    # scans were up to a quarter of a second older than their stamps.
     min_path: float = 0.04
     min_turn: float = 0.05
     min_half: float = 0.25
-    # If the robot turned by more than the first since a scan, a younger scan is preferred; if by
-    # more than the second, the scan is never used, because a room may repeat itself.
     usual_turn: float = 0.6
     max_turn: float = 1.4
-    # A sector is compared if the root mean square of the changes of its ranges must be this [m],
-    # and this many standard deviations of the lidar's noise.
     min_change: float = 0.03
-    deviations: float = 1.8
-    # A range changed visibly if it did by this [m] and by so many of these deviations.
+    min_deviations: float = 1.8
     visible_change: float = 0.05
     visible_deviations: float = 3.0
-    # Neighbours whose ranges differ by more than this fraction are on two surfaces.
     gap: float = 0.25
-    # A body is held if, of at least `min_sectors` compared sectors, the fraction `agreeing` shows
-    # less than `sector_share` of the motion, the median shows less than `held_share`, and in the
-    # median less than `max_changed` of a sector's ranges changed visibly. A skid-steer robot whose
-    # odometry turns 30 % too far shows 0.77, and one on ice 0.5. One that begins to turn in DART
-    # shows a tenth of the turn for half a second, but is not held: its ranges change because it
-    # also drives.
     min_sectors: int = 5
-    agreeing: float = 0.6
+    min_agreeing: float = 0.6
     sector_share: float = 0.45
     held_share: float = 0.2
     max_changed: float = 0.5
-    # time for which scans must contradict odometry, without one that agrees
     confirmed_s: float = 0.15
-    # time after which an unconfirmed contradiction is forgotten
     forgotten_s: float = 1.0
 
 
@@ -84,19 +112,66 @@ SETTINGS = Settings()
 
 
 class Verdict(NamedTuple):
-    """What two scans say about the motion in between."""
+    """What two scans say about the motion in between.
 
-    sectors: int  # number of compared sectors
-    share: (
-        float  # median fraction of the motion that they show; NaN if there are too few
-    )
-    held: bool  # they contradict odometry
-    reference: ReducedScan | None = (
-        None  # the older of the two scans, if they were compared
-    )
+    Attributes:
+        sectors: number of compared sectors.
+        share: median fraction of the motion that they show; NaN if there are too few of them.
+        held: they contradict odometry.
+        reference: the older of the two scans; None if they were not compared.
+    """
+
+    sectors: int
+    share: float
+    held: bool
+    reference: ReducedScan | None = None
 
 
 UNDECIDED = Verdict(0, math.nan, False)
+
+
+def watch_scan(
+    config: GateConfig, state: GateState, scan: Scan, settings: Settings = SETTINGS
+) -> ScanMotion:
+    """Returns what recent scans show of the motion, after a new scan."""
+    before = state.scan_motion
+    if not _can_judge(config) or state.odometry is None:
+        return ScanMotion()
+    newest = ReducedScan(
+        scan.stamp_ns,
+        extrapolate_pose(state.odometry, scan.stamp_ns, settings.longest_s),
+        _reduce_scan(config, scan.ranges, settings),
+    )
+    oldest_ns = scan.stamp_ns - round(_compute_memory_s(config, settings) / S_PER_NS)
+    kept = tuple(
+        view for view in before.views if oldest_ns <= view.stamp_ns < scan.stamp_ns
+    )
+    verdict = UNDECIDED
+    held_since_ns = None
+    push_s = None
+    # Only a robot that is commanded to move can be held. Each push is judged alone: tyres that
+    # slip whenever the robot starts say nothing about the time in between.
+    if state.push is not None:
+        push_s = state.push.since_s
+        verdict = judge_motion(config, kept, newest, settings)
+        before_ns = before.held_since_ns if before.push_s == push_s else None
+        held_since_ns = _update_held_since(before_ns, verdict, scan.stamp_ns, settings)
+    held = _explain_contradiction(newest, verdict, held_since_ns, settings)
+    spacing_ns = round(settings.kept_every_s / S_PER_NS)
+    if not kept or newest.stamp_ns - kept[-1].stamp_ns >= spacing_ns:
+        kept = (*kept, newest)
+    return ScanMotion(
+        views=kept,
+        held_since_ns=held_since_ns,
+        held=held,
+        share=verdict.share,
+        push_s=push_s,
+    )
+
+
+def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The scans show none of the motion that odometry shows: the body is held, its wheels spin."""
+    return make_cause("body_held", SCAN, state.scan_motion.held)
 
 
 def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Array:
@@ -105,47 +180,18 @@ def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Arr
     return compose(odometry.pose, exp(seconds * odometry.twist))
 
 
-def watch_scan(
-    config: GateConfig, state: GateState, scan: Scan, settings: Settings = SETTINGS
-) -> ScanMotion:
-    """Returns what recent scans show of the motion, after a new scan."""
-    before = state.scan_motion
-    if (
-        not config.stop_when_held
-        or state.odometry is None
-        or len(config.beam_angles) < 2
-    ):
-        return ScanMotion()
-    newest = ReducedScan(
-        scan.stamp_ns,
-        extrapolate_pose(state.odometry, scan.stamp_ns, settings.longest_s),
-        _reduce(config, scan.ranges, settings),
-    )
-    oldest_ns = scan.stamp_ns - round(_compute_memory_s(config, settings) / S_PER_NS)
-    kept = tuple(view for view in before.views if view.stamp_ns >= oldest_ns)
-    verdict = UNDECIDED
-    since_ns = None
-    # Only a robot that is commanded to move can be held. Each push is judged alone: tyres that
-    # slip whenever the robot starts say nothing about the time in between.
-    if state.push is not None:
-        verdict = judge_motion(config, kept, newest, settings)
-        since_ns = _update_held_since(
-            before.held_since_ns, verdict, scan.stamp_ns, settings
-        )
-    held = _explain_contradiction(newest, verdict, since_ns, settings)
-    spacing_ns = round(settings.kept_every_s / S_PER_NS)
-    if not kept or newest.stamp_ns - kept[-1].stamp_ns >= spacing_ns:
-        kept = (*kept, newest)
-    return ScanMotion(kept, since_ns, held, verdict.share)
+def _can_judge(config: GateConfig) -> bool:
+    """True if the rule is on, and the lidar has the two beams at least that give directions."""
+    return config.stop_when_held and len(config.beam_angles) >= 2
 
 
 def _compute_memory_s(config: GateConfig, settings: Settings) -> float:
-    """Returns for how long scans are kept [s].
-
-    At least `longest_s`; up to 15 % longer to hold three periods of a slow lidar, and always two.
-    """
-    three_periods = min(3.1 / config.scan_rate, 1.15 * settings.longest_s)
-    return max(settings.longest_s, three_periods, 2.2 / config.scan_rate)
+    """Returns for how long scans are kept [s], which is longer for a slow lidar."""
+    slow_s = min(
+        settings.slow_periods / config.scan_rate,
+        settings.slow_factor * settings.longest_s,
+    )
+    return max(settings.longest_s, slow_s, settings.min_periods / config.scan_rate)
 
 
 def _update_held_since(
@@ -198,7 +244,7 @@ def judge_motion(
     sector = round(settings.sector / directions.step) or 1
     thresholds = Thresholds(
         settings.min_change,
-        settings.deviations,
+        settings.min_deviations,
         settings.visible_change,
         settings.visible_deviations,
     )
@@ -211,9 +257,9 @@ def judge_motion(
     if sectors < max(settings.min_sectors, 1):
         return UNDECIDED._replace(sectors=sectors)
     share = float(np.median(observed[is_compared]))
-    unmoved = np.count_nonzero(np.abs(observed[is_compared]) < settings.sector_share)
+    agreeing = np.count_nonzero(np.abs(observed[is_compared]) < settings.sector_share)
     held = (
-        unmoved >= settings.agreeing * sectors
+        agreeing >= settings.min_agreeing * sectors
         and abs(share) < settings.held_share
         and np.median(changed[is_compared]) < settings.max_changed
     )
@@ -224,6 +270,8 @@ def _select_reference(
     kept: tuple[ReducedScan, ...], newest: ReducedScan, settings: Settings
 ) -> ReducedScan | None:
     """Returns the scan to compare the newest one with; None if odometry shows too little motion."""
+    # The oldest scan since which the robot has not turned further than usual; without one, the
+    # youngest that is of any use. The last one is left out: a scan has to lie in between.
     chosen = None
     for index, scan in enumerate(kept[:-1]):
         turn = abs(_measure_turn(scan, newest))
@@ -250,8 +298,7 @@ def _measure_motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> f
     """Returns the motion that odometry shows between two scans, in multiples of the minimum."""
     path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
     turn = abs(_measure_turn(old, new))
-    tiny = 1e-9  # the minimum may be set to zero
-    return max(path / max(settings.min_path, tiny), turn / max(settings.min_turn, tiny))
+    return max(path / max(settings.min_path, TINY), turn / max(settings.min_turn, TINY))
 
 
 def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
@@ -259,9 +306,10 @@ def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
     return math.remainder(float(new.pose[2] - old.pose[2]), FULL_CIRCLE)
 
 
-def _reduce(config: GateConfig, ranges: Ranges, settings: Settings) -> Ranges:
+def _reduce_scan(config: GateConfig, ranges: Ranges, settings: Settings) -> Ranges:
+    """Returns the median ranges (K,) of a scan (B,) around its directions."""
     directions = get_directions(config, settings)
-    reduced = np.empty(round(len(ranges) / directions.beams), np.float32)
+    reduced = np.empty(directions.size, np.float32)
     kernels.reduce_scan(ranges, directions, reduced)
     return reduced
 
@@ -282,42 +330,42 @@ def get_directions(config: GateConfig, settings: Settings = SETTINGS) -> Directi
 def _make_directions(
     beams: int, first: float, step: float, spacing: float, window: float
 ) -> Directions:
-    count = min(beams, max(1, round(beams * step / spacing)))
-    beams_per_direction = beams / count
-    reach = min(
-        int(window / step + 1e-6), (kernels.LARGEST_WINDOW - 1) // 2, (beams - 1) // 2
+    """Returns directions about a spacing apart, for beams from `first` on at every `step` [rad]."""
+    size = min(beams, max(1, round(beams * step / spacing)))
+    beams_per_direction = beams / size
+    half_window = min(
+        int(window / step + ROUNDING),
+        (kernels.LARGEST_WINDOW - 1) // 2,
+        (beams - 1) // 2,
     )
-    full_circle = beams * step > FULL_CIRCLE - 0.5 * step
     return Directions(
+        size=size,
         first=first + int(0.5 * beams_per_direction) * step,
         step=beams_per_direction * step,
-        beams=beams_per_direction,
-        reach=reach,
-        full_circle=full_circle,
+        beams_per_direction=beams_per_direction,
+        half_window=half_window,
+        full_circle=beams * step > FULL_CIRCLE - 0.5 * step,
     )
 
 
 def compute_noise(config: GateConfig, directions: Directions) -> Noise:
-    """Returns the standard deviation of the change of a reduced range."""
-    # That of the difference of two medians, each of `count` normal numbers.
-    count = 2 * directions.reach + 1
-    factor = math.sqrt(2.0) * min(1.0, 1.25 / math.sqrt(count))
+    """Returns the standard deviation of the change of a reduced range.
+
+    The change is the difference of two medians, each of n ranges with normal noise: its standard
+    deviation is sqrt(2) * sqrt(pi / 2) / sqrt(n) times theirs, and at most sqrt(2) times.
+    """
+    count = 2 * directions.half_window + 1
+    factor = math.sqrt(2.0) * min(1.0, MEDIAN_FACTOR / math.sqrt(count))
     constant, proportional = config.range_noise
     return Noise(factor * constant, factor * proportional)
 
 
-def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The scans show none of the motion that odometry shows: the body is held, its wheels spin."""
-    return make_cause("body_held", SCAN, state.scan_motion.held)
-
-
 def warm_up(config: GateConfig) -> None:
-    """Compiles the kernels for a scan; that takes seconds, which a moving robot does not have."""
-    view = ReducedScan(
-        0,
-        np.zeros(3),
-        _reduce(config, np.ones(len(config.beam_angles), np.float32), SETTINGS),
-    )
+    """Compiles the kernels for a scan; a moving robot does not have the seconds it takes."""
+    if not _can_judge(config):
+        return
+    ranges = np.ones(len(config.beam_angles), np.float32)
+    view = ReducedScan(0, np.zeros(3), _reduce_scan(config, ranges, SETTINGS))
     views = tuple(
         replace(view, stamp_ns=k, pose=np.array([0.1 * k, 0.0, 0.0])) for k in range(3)
     )

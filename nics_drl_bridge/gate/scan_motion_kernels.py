@@ -1,4 +1,12 @@
-"""Compiled: reduces a scan to few directions, predicts its change by a motion, and compares."""
+"""Compiled: reduces scans, predicts how a motion changes them, and compares that with what changed.
+
+A reduced scan has one range (K,) for each of a few evenly spaced directions, NaN where few beams
+return. `scan_motion` calls these kernels in order:
+
+1. `reduce_scan`: the median of the beams around each direction.
+2. `predict_scan`: the reduced scan after a motion, if nothing but the lidar moves.
+3. `compare_sectors`: the fraction of the predicted change that was observed, sector by sector.
+"""
 
 import math
 from typing import NamedTuple
@@ -10,46 +18,66 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.kernels import kernel
 
 Ranges = NDArray[np.float32]
-# Maximum number of beams in a window; in a denser lidar's the median is that of some of its beams.
+# Maximum number of beams in a window. A denser lidar's medians are those of the middle ones.
 LARGEST_WINDOW = 129
 
 
 class Directions(NamedTuple):
-    """The directions of a reduced scan, evenly spaced in the frame of the lidar."""
+    """The directions of a reduced scan, evenly spaced in the frame of the lidar.
 
-    first: float  # [rad]
-    step: float  # between neighbours, greater than 0 [rad]
-    beams: float  # of the lidar per direction
-    reach: int  # beams beside the middle one whose median is taken, on each side
-    full_circle: bool  # the last direction is a neighbour of the first
+    Attributes:
+        size: number of directions, K.
+        first: angle of the first one [rad].
+        step: angle between neighbours, greater than 0 [rad].
+        beams_per_direction: beams of the lidar for each direction.
+        half_window: beams on each side of the middle one whose median is taken.
+        full_circle: the last direction is a neighbour of the first.
+    """
+
+    size: int
+    first: float
+    step: float
+    beams_per_direction: float
+    half_window: int
+    full_circle: bool
 
 
 class Noise(NamedTuple):
-    """Change of a reduced range that noise can explain, as a + b * range."""
+    """Standard deviation of the change of a reduced range, as constant + proportional * range."""
 
     constant: float  # [m]
     proportional: float
 
 
 class Thresholds(NamedTuple):
-    """Changes of a range that count: the larger of a length and a number of deviations."""
+    """Changes of a range that count: the larger of a length and a number of deviations.
 
-    predicted: float  # change that the motion must cause for a comparison [m]
+    Attributes:
+        predicted: change that the motion must cause in a sector that is compared [m].
+        predicted_deviations: the same in standard deviations.
+        visible: observed change that is more than noise [m].
+        visible_deviations: the same in standard deviations.
+    """
+
+    predicted: float
     predicted_deviations: float
-    visible: float  # observed change that is no noise [m]
+    visible: float
     visible_deviations: float
 
 
 @kernel(allocates=True)
 def reduce_scan(ranges: Ranges, directions: Directions, out: Ranges) -> None:
-    """Writes the median range around each direction (K,) to `out`; NaN where few beams return."""
+    """Writes the median range around each direction (K,) to `out`.
+
+    It is NaN unless more than half of the beams in the window of a direction return.
+    """
     beams = ranges.shape[0]
-    window = np.empty(LARGEST_WINDOW)
+    returns = np.empty(LARGEST_WINDOW)  # of a window, in ascending order
     for k in range(out.shape[0]):
-        middle = int((k + 0.5) * directions.beams)
-        size = 0
+        middle = int((k + 0.5) * directions.beams_per_direction)
+        returned = 0
         total = 0
-        for offset in range(-directions.reach, directions.reach + 1):
+        for offset in range(-directions.half_window, directions.half_window + 1):
             beam = middle + offset
             if directions.full_circle:
                 beam = (beam + beams) % beams
@@ -59,15 +87,15 @@ def reduce_scan(ranges: Ranges, directions: Directions, out: Ranges) -> None:
             value = ranges[beam]
             if not math.isfinite(value):
                 continue
-            index = size  # sort by insertion
-            while index > 0 and window[index - 1] > value:
-                window[index] = window[index - 1]
+            index = returned
+            while index > 0 and returns[index - 1] > value:
+                returns[index] = returns[index - 1]
                 index -= 1
-            window[index] = value
-            size += 1
+            returns[index] = value
+            returned += 1
         out[k] = math.nan
-        if 2 * size > total:
-            out[k] = window[size // 2]
+        if 2 * returned > total:
+            out[k] = returns[returned // 2]
 
 
 @kernel
@@ -76,9 +104,15 @@ def predict_scan(
 ) -> None:
     """Writes the ranges (K,) that a lidar sees after a motion, from the surfaces it saw before.
 
-    `moved` (3,) is the motion of the lidar, x, y [m] and heading [rad], in its old frame. Ends of
-    neighbouring beams are one surface if their ranges differ by at most `gap`, a fraction of the
-    shorter one. Directions that no surface covers are NaN.
+    Neighbouring ends a and b of the old scan are one surface, a straight line, unless there is a
+    gap between them. It is moved into the new frame, and cut with all directions that it covers.
+
+    Args:
+        ranges: (K,) of the old scan [m].
+        directions: of both scans.
+        moved: (3,) motion of the lidar in its old frame: x, y [m], heading [rad].
+        gap: fraction of the shorter range by which the ranges of one surface differ at most.
+        out: (K,) ranges to the nearest surface [m]; NaN in directions that none covers.
     """
     count = ranges.shape[0]
     out[:] = math.nan
@@ -102,27 +136,29 @@ def predict_scan(
         ax, ay = cosine * ax + sine * ay, cosine * ay - sine * ax
         bx, by = cosine * bx + sine * by, cosine * by - sine * bx
         cross = ax * by - ay * bx
-        if cross <= 0.0 or ax * bx + ay * by <= 0.0:
+        dot = ax * bx + ay * by
+        if cross <= 0.0 or dot <= 0.0:
             continue  # seen from behind, or around the lidar itself
+        # The directions that it covers, as fractions of the spacing from the first one.
         begin = (math.atan2(ay, ax) - directions.first) / directions.step
-        end = begin + math.atan2(cross, ax * bx + ay * by) / directions.step
+        end = begin + math.atan2(cross, dot) / directions.step
         shift = circle * math.floor(begin / circle)
         begin -= shift
         end -= shift
         direction = math.ceil(begin)
         while direction <= end:
-            wrapped = direction
+            index = direction
             if direction >= circle - 0.5:
-                wrapped = round(direction - circle)
-            if wrapped < count:
-                angle = directions.first + wrapped * directions.step
+                index = round(direction - circle)
+            if index < count:
+                angle = directions.first + index * directions.step
                 ux = math.cos(angle)
                 uy = math.sin(angle)
                 across = ux * (by - ay) - uy * (bx - ax)
                 if across > 0.0:
                     length = cross / across
-                    if not out[wrapped] <= length:
-                        out[wrapped] = length
+                    if not out[index] <= length:  # also if it is NaN
+                        out[index] = length
             direction += 1
 
 
@@ -137,9 +173,16 @@ def compare_sectors(
 ) -> tuple[Array, Array]:
     """Compares the observed changes of ranges with the predicted ones, sector by sector.
 
-    Ranges (K,) are those of an old scan, of a new one, and what the motion in between predicts.
-    A sector of `sector` directions is undecided if at most a third of them have finite ranges in
-    all three scans, or if the root mean square of its predicted changes is below the threshold.
+    A sector is undecided if at most a third of its directions have finite ranges in all three
+    scans, or if the root mean square of its predicted changes is below the threshold.
+
+    Args:
+        old: ranges (K,) of the old scan [m].
+        new: ranges (K,) of the new one [m].
+        predicted: ranges (K,) that the motion in between predicts for the new one [m].
+        sector: number of directions in a sector.
+        noise: of the ranges.
+        thresholds: of the changes.
 
     Returns:
         observed: fraction of the predicted change that was observed (S,), by least squares, with

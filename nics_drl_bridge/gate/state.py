@@ -221,6 +221,7 @@ class ScanMotion:
     held: str = ""  # what the newest scan contradicts, once others have before
     # fraction of the motion by odometry that the newest scan shows; NaN: undecided
     share: float = NAN
+    push_s: float | None = None  # start of the push that was judged; None without one
 
 
 @dataclass(frozen=True)
@@ -298,6 +299,7 @@ class GateState:
     pending: Command | None = None  # whose scan has not arrived yet
     # since when commands name such scans; None: the newest does not
     pending_s: float | None = None
+    pending_arrival_s: float = -INF  # arrival of the pending command
     # recent ones, for the detection of motion; empty without shield
     views: tuple[View, ...] = ()
     # None if the lidar sees all around, and without shield

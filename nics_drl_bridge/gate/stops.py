@@ -43,17 +43,27 @@ def account_for_arrival(
     gap_s: float,
     armed: bool,
 ) -> tuple[Arrivals, str]:
-    """Accounts for a datum; returns arrivals, and `repeated`, `jumped` or ""."""
-    # If the gate is armed, the envelope is fixed; after a jump only the new datum is kept.
+    """Returns the arrivals with a new datum, and `repeated`, `jumped` or "".
+
+    After a jump only the new datum is kept.
+
+    Args:
+        config: of the gate.
+        arrivals: of the earlier data of this topic.
+        stamp_ns: of the new datum's header.
+        now: its arrival [s].
+        gap_s: time between two data that counts as a gap [s].
+        armed: the gate is armed, so the envelope may only drift.
+    """
     fresh = Arrivals(
-        (stamp_ns,),
-        (now,),
-        (0.0,),
-        (stamp_ns, now),
-        1,
-        0.0,
-        now,
-        ((now, stamp_ns, 1, 0.0),),
+        stamps_ns=(stamp_ns,),
+        times=(now,),
+        late=(0.0,),
+        origin=(stamp_ns, now),
+        count=1,
+        envelope=0.0,
+        unbroken_s=now,
+        marks=((now, stamp_ns, 1, 0.0),),
     )
     if not arrivals.times:
         return fresh, ""
@@ -71,19 +81,22 @@ def account_for_arrival(
     envelope = max(mark[3] for mark in marks)
     if armed:
         fall = SIMULATED_LAG if config.simulated else DRIFT
-        lowest = arrivals.envelope - fall * passed
+        # A longer gap may be one of the gate itself, and data that queued meanwhile are late.
+        lowest = arrivals.envelope - fall * min(passed, gap_s)
         highest = arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
-    return Arrivals(
-        (*arrivals.stamps_ns[1 - KEPT_STAMPS :], stamp_ns),
-        (*arrivals.times[1 - KEPT_STAMPS :], now),
-        (*arrivals.late[1 - KEPT_STAMPS :], max(0.0, envelope - lead)),
-        arrivals.origin,
-        arrivals.count + 1,
-        envelope,
-        now if passed > gap_s else arrivals.unbroken_s,
-        marks,
-    ), ""
+    kept = slice(1 - KEPT_STAMPS, None)
+    continued = Arrivals(
+        stamps_ns=(*arrivals.stamps_ns[kept], stamp_ns),
+        times=(*arrivals.times[kept], now),
+        late=(*arrivals.late[kept], max(0.0, envelope - lead)),
+        origin=arrivals.origin,
+        count=arrivals.count + 1,
+        envelope=envelope,
+        unbroken_s=now if passed > gap_s else arrivals.unbroken_s,
+        marks=marks,
+    )
+    return continued, ""
 
 
 def _append_mark(
@@ -177,7 +190,7 @@ def measure_creep(arrivals: Arrivals) -> float:
 
 
 def take_time(
-    config: GateConfig, state: GateState, given: Input, now: float
+    config: GateConfig, state: GateState, event: Input, now: float
 ) -> GateState:
     """Records the time of an input, and what is wrong with it."""
     if not math.isfinite(now) or now < state.now_s:
@@ -201,7 +214,7 @@ def take_time(
     return replace(
         state,
         now_s=now,
-        tick_s=now if isinstance(given, Tick) else ticked,
+        tick_s=now if isinstance(event, Tick) else ticked,
         awake_s=awake,
         still_ticks=still,
         clock_fault=fault,

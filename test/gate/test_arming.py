@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gate.rig import TICK_S, Rig, config
-from nics_drl_bridge.gate.gate import CHECKS
+from nics_drl_bridge.gate.arming import CHECKS
 from nics_drl_bridge.gate.inputs import Estimate, EStop, Reset
 from nics_drl_bridge.interface import NS_PER_S
 

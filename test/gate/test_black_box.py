@@ -81,6 +81,20 @@ def test_a_stop_replays_to_the_same_decisions_bit_for_bit(tmp_path):
         assert (held.now, type(held.given)) == (read.now, type(read.given))
 
 
+def test_a_fault_that_latched_behind_a_fault_of_the_clock_is_replayed(tmp_path):
+    rig = Recorded(config(), 30.0).drive()
+    rig.now += 0.25  # the gate was asleep
+    rig.tick()
+    rig.scan(stamp_ns=rig.stamp + 5 * NS_PER_S)
+    rig.run(0.5)
+    write(rig.config, rig.box.copy(), tmp_path / "stop.jsonl")
+    again = replay(tmp_path / "stop.jsonl")
+    assert again.differing == ()
+    told = [line.partition("stopped by ")[2] for line in again.story[-3:-1]]
+    assert told[0].startswith("own_clock: ")
+    assert told[1].startswith("stamps_jumped: topic=scan")
+
+
 def test_the_story_of_a_replay_names_each_stop_and_when_it_was(tmp_path):
     stopped(tmp_path / "stop.jsonl")
     story = replay(tmp_path / "stop.jsonl").story

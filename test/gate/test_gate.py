@@ -6,6 +6,7 @@ import pytest
 from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.gate.inputs import (
     Command,
+    Estimate,
     EStop,
     Odometry,
     Press,
@@ -155,6 +156,33 @@ def test_a_command_whose_scan_never_came_does_not_undo_a_malformed_one():
     assert rig.rule == "command_malformed"
 
 
+def test_a_command_that_waits_for_its_scan_does_not_undo_a_later_malformed_one():
+    rig = driving()
+    rig.run(0.06, without="scan command")
+    rig.stamp += 1
+    rig.command([0.3, 0.0, 0.0])
+    rig.command([np.nan, 0.0, 0.0])
+    rig.scan()
+    assert rig.rule == "command_malformed"
+    assert rig.state.command.twist[0] == 0.5
+    rig.command([0.2, 0.0, 0.0])
+    rig.now += TICK_S
+    assert rig.tick().cause is None
+    assert rig.state.command.twist[0] == 0.2
+
+
+def test_the_age_of_a_command_counts_from_its_arrival_although_its_scan_came_later():
+    rig = driving()
+    rig.run(0.06, without="scan command")
+    rig.stamp += 1
+    arrival_s = rig.now
+    rig.command()
+    rig.now += 2.0 * TICK_S
+    rig.scan()
+    assert rig.state.pending is None
+    assert rig.state.command_s == arrival_s
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_a_command_that_is_no_number_stops_the_robot_at_once(bad, place):
@@ -299,6 +327,68 @@ def test_the_first_word_of_a_gate_that_was_asleep_is_a_zero_whatever_wakes_it(fi
     assert not rig.moves
     rig.run(0.5)
     assert rig.moves
+
+
+def give_fault(rig, fault):
+    """One input that shows a fault, which the next input no longer does."""
+    later = rig.stamp + round(10.0 * NS_PER_S)
+    if fault == "stamps_jumped":
+        rig.scan(stamp_ns=later)
+    elif fault == "odom_jumped":
+        rig.odom(stamp_ns=rig.stamp + 1, pose=rig.pose + 50.0)
+    elif fault == "estimate_lost":
+        rig.give(Estimate(np.zeros(3), rig.pose + 50.0, rig.covariance.copy()))
+    else:
+        rig.give(Command(rig.stamp, rig.wish, "/one"))
+        rig.give(Command(rig.stamp, rig.wish, "/two"))
+
+
+@pytest.mark.parametrize(
+    "fault", ["stamps_jumped", "odom_jumped", "estimate_lost", "two_policies"]
+)
+def test_a_fault_that_latches_does_so_while_the_gates_clock_is_at_fault(fault):
+    rig = driving()
+    rig.now += 0.25  # the gate was asleep
+    rig.stamp += round(0.25 * NS_PER_S)
+    assert rig.tick().cause.rule == "own_clock"
+    assert rig.state.latched is None
+    give_fault(rig, fault)
+    assert rig.rule == "own_clock"
+    assert rig.state.latched.rule == fault
+    rig.speed = 0.0
+    rig.run(1.0)
+    assert rig.rule == fault
+    assert not rig.moves
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_data_that_queued_up_while_the_gate_was_asleep_latch_nothing(simulated):
+    """The first of them are late, but not because the simulator lost time."""
+    rig = driving(simulated=simulated)
+    slept = 10
+    rig.now += 0.1 * slept
+    before = rig.stamp
+    for queued in range(5):
+        rig.stamp = before + (slept - 4 + queued) * NS_PER_S // 10
+        rig.odom()
+        rig.scan()
+    rig.give(EStop(False))
+    rig.command()
+    assert rig.tick().cause.rule == "own_clock"
+    assert rig.state.latched is None
+    rig.speed = 0.0
+    assert rig.run(0.5).cause is None
+
+
+def test_a_gate_that_was_asleep_does_not_judge_how_long_the_others_were_silent():
+    rig = driving()
+    rig.now += 1.5
+    rig.tick()
+    assert rig.state.latched is None
+    rig.give(EStop(False))
+    rig.speed = 0.0
+    rig.run(0.5)
+    assert rig.state.latched is None
 
 
 def test_the_e_stop_stops_at_once_and_stays():

@@ -10,8 +10,10 @@ import shapely
 
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate.ground import CELL, CELLS, REMEMBERED_S
-from nics_drl_bridge.gate.shield import STEP, find_obstacles, get_body, update_ground
+from nics_drl_bridge.gate.evidence import find_obstacles
+from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.ground import CELL, CELLS, REMEMBERED_S, update_ground
+from nics_drl_bridge.gate.shield import STEP
 from nics_drl_bridge.gate.shield_kernels import is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
 from nics_drl_bridge.interface import NS_PER_S
@@ -201,6 +203,21 @@ def test_a_circle_whose_lidar_is_blind_behind_backs_up_as_far_as_it_came_too():
     assert robot.may(BACK)
 
 
+@pytest.mark.parametrize("length", [1.0, 3.6, 16.0])
+def test_a_long_robot_may_go_where_a_short_one_may(length):
+    """Ground is remembered beyond its footprint, however far that reaches."""
+    half = length / 2.0
+    outline = ((half, 0.4), (-half, 0.4), (-half, -0.4), (half, -0.4))
+    radius = float(np.hypot(half, 0.4))
+    shield = replace(SHIELD, outline=outline, footprint_radius=radius, range_max=30.0)
+    robot = Robot(given=replace(BLIND, shield=shield))
+    assert robot.may(TURN)
+    assert not robot.may(BACK)
+    robot.moves((0.3, 0.0, 0.0), 3.0)
+    assert robot.may(BACK)
+    assert robot.may(TURN)
+
+
 def drive(seed, remembers):
     """Drives at random, mostly backwards, where the shield lets it; the way back, and a touch."""
     rng = np.random.default_rng(seed)
@@ -258,6 +275,20 @@ def test_what_was_known_is_forgotten_when_the_gate_is_armed():
         rig.state.obstacles[-len(rig.state.ground.unseen) :, :2]
         == rig.state.ground.unseen
     ).all()
+
+
+def test_what_was_known_is_forgotten_when_odometry_leaps():
+    part = slice(90, LIDAR.beams)
+    given = config(
+        shield=replace(SHIELD, range_max=3.0), beam_angles=LIDAR.angles[part]
+    )
+    rig = HalfBlind(given)
+    rig.run(1.0)
+    assert rig.state.ground.since_ns < rig.state.views[-1].stamp_ns
+    rig.odom(stamp_ns=rig.stamp + 1, pose=rig.pose + 50.0)
+    assert rig.state.ground is None
+    rig.run(0.1)
+    assert rig.state.ground.since_ns == rig.state.views[-1].stamp_ns
 
 
 class HalfBlind(Rig):

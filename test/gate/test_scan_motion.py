@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from gate.rig import PERIOD_S, TICK_S, Rig, config
 from nics_drl_bridge.gate.black_box import BlackBox, Entry, replay, write
 from nics_drl_bridge.gate.inputs import Reset, Scan
-from nics_drl_bridge.gate.scan_motion import SETTINGS, get_directions
+from nics_drl_bridge.gate.scan_motion import SETTINGS, get_directions, warm_up
 from nics_drl_bridge.gate.scan_motion_kernels import (
     Noise,
     Thresholds,
@@ -239,6 +240,31 @@ def test_wheels_that_slip_in_each_of_many_short_pushes_do_not_stop_the_robot():
         assert scene.run(0.35).cause is None
 
 
+def test_contradictions_of_two_pushes_do_not_add_up_though_no_scan_came_in_between():
+    scene = started()
+    scene.held = True
+    while scene.state.scan_motion.held_since_ns is None:
+        scene.run(TICK_S)
+    first_ns = scene.state.scan_motion.held_since_ns
+    assert scene.moves
+    push = scene.state.push
+    another = replace(push, since_s=scene.now - 0.01)
+    scene.state = replace(scene.state, push=another)
+    while scene.state.scans.stamps_ns[-1] == first_ns:
+        scene.run(TICK_S)
+    assert scene.state.scan_motion.held_since_ns > first_ns
+
+
+def test_scans_from_before_the_stamps_jumped_back_are_not_compared():
+    scene = Scene()
+    scene.run(1.0)
+    scene.stamp -= 100 * NS_PER_S
+    scene.run(1.0)
+    stamps = [view.stamp_ns for view in scene.state.scan_motion.views]
+    assert len(stamps) > 2
+    assert max(stamps) <= scene.stamp
+
+
 @pytest.mark.parametrize(
     "walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"]
 )
@@ -314,7 +340,7 @@ def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
     ranges = np.full(lidar.beams, 2.0, np.float32)
     ranges[::7] = np.nan
     ranges[3::11] = 0.5
-    out = np.empty(round(lidar.beams / directions.beams), np.float32)
+    out = np.empty(directions.size, np.float32)
     reduce_scan(ranges, directions, out)
     assert len(out) == 135
     assert (out == 2.0).all()
@@ -330,7 +356,7 @@ def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
 def test_a_predicted_scan_is_what_is_seen_after_the_motion(moved, name):
     lidar = load_lidar(name)
     directions = get_directions(config("mecanum", beam_angles=lidar.angles))
-    count = round(lidar.beams / directions.beams)
+    count = directions.size
     angles = directions.first + directions.step * np.arange(count)
     walls = ROOM[:4]  # without corners that hide something
     old = seen_from(np.array([0.3, 0.2, 0.1]), angles, walls)
@@ -376,6 +402,7 @@ def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
         rate=10.0,
     )
     scene = Scene(lidar)
+    warm_up(scene.config)
     scene.run(1.5)
     assert scene.arm().granted
     assert scene.run(1.0).cause is None

@@ -9,22 +9,23 @@ from shapely.geometry import LineString, Point
 
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate import shield_kernels
-from nics_drl_bridge.gate.gate import decide
-from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
-from nics_drl_bridge.gate.shield import (
-    CREEP_SPEED,
+from nics_drl_bridge.gate import evidence_kernels, shield_kernels
+from nics_drl_bridge.gate.evidence import (
     MEMORY_S,
     SPACING_S,
     add_view,
     find_movers,
     find_obstacles,
-    get_body,
-    warm_up,
 )
-from nics_drl_bridge.gate.shield_kernels import is_free, mark_entered, place
+from nics_drl_bridge.gate.evidence_kernels import mark_entered
+from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
+from nics_drl_bridge.gate.shield import CREEP_SPEED, warm_up
+from nics_drl_bridge.gate.shield_kernels import follow_arc, is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.robot.braking import TurnBraking
 
 CAR = ShieldConfig(
     latency_s=0.15,
@@ -81,7 +82,7 @@ def test_without_a_shield_nothing_is_cut():
 def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase, monkeypatch):
     fresh = {"free": njit(is_free.py_func), "entered": njit(mark_entered.py_func)}
     monkeypatch.setattr(shield_kernels, "is_free", fresh["free"])
-    monkeypatch.setattr(shield_kernels, "mark_entered", fresh["entered"])
+    monkeypatch.setattr(evidence_kernels, "mark_entered", fresh["entered"])
     warm_up()
     known = {name: list(kernel.signatures) for name, kernel in fresh.items()}
     assert all(known.values())
@@ -101,6 +102,24 @@ def test_the_speed_is_such_that_the_robot_stops_before_what_lies_ahead(distance)
     assert rig.decision.cause is None
     last = [twist[0] for _, twist in rig.published[-20:]]
     assert np.ptp(last) < 0.1 * speed  # and does not jerk
+
+
+def test_a_car_whose_speed_is_reduced_steers_as_fast_as_any_other():
+    def steer(distance):
+        rig = Faced(ranges(distance), wish=(1.0, 0.0, 0.0))
+        rig.settles()
+        rig.wish = np.array([1.0, 0.0, 0.3])
+        before = len(rig.published)
+        rig.run(0.5)
+        steps = [twist[2] for _, twist in rig.published[before:]]
+        return rig.decision.shielded, np.array(steps)
+
+    is_shielded, slowed = steer(0.6)
+    assert is_shielded
+    is_shielded, free = steer(3.0)
+    assert not is_shielded
+    assert free[-1] > 0.25
+    assert slowed == pytest.approx(free)
 
 
 def test_a_robot_stands_before_what_it_must_not_come_nearer_to():
@@ -218,7 +237,7 @@ def test_the_sweep_agrees_with_geometry():
         point = rng.uniform(-1.2, 1.2, 2)
         duration = blind + np.hypot(*twist[:2]) / (2.0 * BRAKE)
         path = LineString(
-            [place(twist, t)[:2] for t in np.linspace(0.0, duration, 400)]
+            [follow_arc(twist, t)[:2] for t in np.linspace(0.0, duration, 400)]
         )
         away = path.distance(Point(point))
         if abs(away - room) < step or np.hypot(*point) <= room:
@@ -300,6 +319,15 @@ def test_a_stop_in_between_does_not_make_it_forget_what_the_robot_was_told():
     told = [told for told, _ in rig.state.recent]
     reach = CAR.latency_s + rig.config.scan_age_s
     assert rig.now - reach - 0.05 < told[0] <= rig.now - reach + 0.02
+
+
+def test_commands_are_kept_for_as_long_as_a_slow_turn_follows_them():
+    slow_turn = replace(CAR, wheelbase=0.0, turn=TurnBraking(0.6, 2.0))
+    rig = Faced(FAR, slow_turn, robot="differential")
+    rig.settles(2.0)
+    reach = 0.6 + rig.config.scan_age_s
+    oldest = rig.state.recent[0][0]
+    assert rig.now - reach - 0.05 < oldest <= rig.now - reach + 0.02
 
 
 def test_what_was_told_before_a_pause_of_the_gate_counts_as_long_as_it_was_in_force():
@@ -446,6 +474,30 @@ def test_the_views_of_the_last_moments_are_kept_apart_from_each_other():
     assert (np.diff(stamps[:-1]) >= SPACING_S * NS_PER_S).all()
     assert MEMORY_S / 2 < (stamps[-1] - stamps[0]) / NS_PER_S <= MEMORY_S
     assert 4 <= len(stamps) <= 6
+
+
+def test_views_from_before_the_stamps_jumped_back_are_dropped():
+    state = begin(GIVEN)
+    for stamp in (100 * NS_PER_S, NS_PER_S, 11 * NS_PER_S // 10):
+        state = replace(state, odometry=Odometry(stamp, np.zeros(3), np.zeros(3)))
+        scan = Scan(stamp, np.full(LIDAR.beams, 1.0, np.float32), (0.0, 0.01))
+        state = replace(state, views=add_view(GIVEN, state, scan))
+    assert [view.stamp_ns for view in state.views] == [NS_PER_S, 11 * NS_PER_S // 10]
+
+
+def test_views_are_forgotten_when_the_gate_is_armed_and_when_odometry_leaps():
+    """Their poses may be those of another place."""
+    rig = Rig(config(shield=CAR))
+    rig.run(1.5)
+    newest = rig.state.views[-1]
+    assert len(rig.state.views) > 2
+    assert rig.arm().granted
+    assert rig.state.views == (newest,)
+    rig.run(0.3)
+    assert len(rig.state.views) > 2
+    rig.odom(stamp_ns=rig.stamp + 1, pose=rig.pose + 50.0)
+    assert rig.rule == "odom_jumped"
+    assert rig.state.views == ()
 
 
 def test_a_view_is_from_where_the_robot_was_when_it_was_scanned():

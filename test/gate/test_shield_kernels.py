@@ -9,7 +9,13 @@ import pytest
 import shapely
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate.shield import get_body
+from nics_drl_bridge.gate.evidence_kernels import (
+    MountedBeams,
+    Tolerance,
+    mark_entered,
+)
+from nics_drl_bridge.gate.footprint import get_body
+from nics_drl_bridge.gate.ground_kernels import Grid, mark_seen
 from nics_drl_bridge.gate.shield_kernels import compute_clearance, fill_grid, is_free
 from nics_drl_bridge.gate.state import ShieldConfig
 
@@ -175,5 +181,42 @@ def test_a_margin_is_kept_around_the_outline():
 def test_a_body_is_kept_as_long_as_its_shield_is():
     shield = ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=LONG)
     assert get_body(shield) is get_body(replace(shield))
-    assert get_body(shield).reach == pytest.approx(np.hypot(0.25, 0.2))
-    assert get_body(replace(shield, outline=())).reach == 0.0
+    assert get_body(shield).farthest_corner == pytest.approx(np.hypot(0.25, 0.2))
+    assert get_body(replace(shield, outline=())).farthest_corner == 0.0
+
+
+DEGREE_BEAMS = MountedBeams(np.deg2rad(-20.0), np.deg2rad(1.0), 0.0, 0.0, 0.0)
+UNKNOWN_AMONG_OTHERS = [(19,), (20,), (21,), (19, 21)]
+
+
+@pytest.mark.parametrize("unknown", UNKNOWN_AMONG_OTHERS)
+def test_an_unknown_beam_among_far_ones_marks_no_ground_as_free(unknown):
+    """A cell of 5 cm at a distance of 1 m is as wide as five of these beams."""
+    grid = Grid(0.975, -0.025, 0.05, 1.0, 0.0)  # a single cell, straight ahead
+
+    def see(ranges):
+        times = np.full((1, 1), -np.inf, np.float32)
+        mark_seen(times, grid, ranges, DEGREE_BEAMS, 10.0, 0.03, 1.0)
+        return times[0, 0]
+
+    ranges = np.full(41, 5.0, np.float32)
+    assert see(ranges) == 1.0
+    ranges[list(unknown)] = np.nan
+    assert see(ranges) == -np.inf
+
+
+@pytest.mark.parametrize("unknown", UNKNOWN_AMONG_OTHERS)
+def test_an_unknown_beam_of_an_old_scan_tells_nothing_about_what_moved(unknown):
+    new = np.full(41, np.nan, np.float32)
+    new[20] = 1.0
+
+    def mark(old):
+        entered = np.zeros(41, np.bool_)
+        tolerance = Tolerance(0.03, 0.0)
+        mark_entered(entered, new, old, DEGREE_BEAMS, np.zeros(3), 10.0, tolerance)
+        return entered[20]
+
+    old = np.full(41, 5.0, np.float32)
+    assert mark(old)
+    old[list(unknown)] = np.nan
+    assert not mark(old)

@@ -7,9 +7,10 @@ import pytest
 from skid_rover import kinematics, limits_in, pillars, rover, rover_model
 
 from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.shield import STEP, get_body, list_stops
+from nics_drl_bridge.gate.shield import STEP, list_stops
 from nics_drl_bridge.gate.shield_kernels import compute_clearance, is_free
 from nics_drl_bridge.gate.stopping import shield_config
 from nics_drl_bridge.interface import Start

@@ -247,3 +247,12 @@ def test_the_settings_of_a_robot_that_drives_are_possible():
 
 def test_commands_that_are_too_old_before_the_next_one_comes_are_warned_of():
     assert "give more than 0.1" in warn_of_age_limit(config(command_age_s=0.05), 0.1)
+
+
+def test_a_lidar_of_a_single_beam_is_no_lidar_for_a_shield():
+    model = builtin_model("differential")
+    single = replace(model, lidar=model.lidar.model_copy(update={"beams": 1}))
+    with pytest.raises(
+        ConfigError, match=r"lidar of 2 beams or more, .* has 1; .* `shield: false`"
+    ):
+        shield_config(single, load_limits("differential", model.robot))

@@ -12,7 +12,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
 from nics_drl_bridge.gate import inputs
-from nics_drl_bridge.gate.gate import estimate_malformed
+from nics_drl_bridge.gate.intake import estimate_malformed
 from nics_drl_bridge.lidar.spec import from_device, load_lidar
 from nics_drl_bridge.nodes import command_gate, conversions, wire
 

@@ -1,0 +1,185 @@
+"""What counts as an obstacle: returns of the newest scan, and where the lidar shows nothing.
+
+Obstacles are rows (P, 3): x, y [m] in the robot's frame, and the speed [m/s] at which each may
+approach. `find_obstacles` collects them in these steps:
+
+1. Compare the newest scan with earlier ones: a beam that ends where an earlier one saw free space
+   ends on a mover, which may approach. All other obstacles are static.
+2. Place an obstacle at the end of each beam that returns.
+3. Place one at the minimum range of each beam that was too close to measure.
+4. Place a wall on the footprint wherever too many beams are unknown.
+5. Add the border of known ground, for a lidar that does not look all around; see `ground`.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.gate import evidence_kernels
+from nics_drl_bridge.gate.evidence_kernels import MountedBeams, Tolerance
+from nics_drl_bridge.gate.footprint import sample_footprint
+from nics_drl_bridge.gate.inputs import Scan
+from nics_drl_bridge.gate.scan_motion import extrapolate_pose
+from nics_drl_bridge.gate.state import (
+    GateConfig,
+    GateState,
+    Ground,
+    Ranges,
+    ShieldConfig,
+    View,
+)
+from nics_drl_bridge.geometry import between
+from nics_drl_bridge.interface import S_PER_NS, Array
+
+Flags = NDArray[np.bool_]
+MEMORY_S = 0.45  # maximum age of a scan that the newest one is compared with [s]
+SPACING_S = 0.09  # minimum time between two such scans [s]
+# A beam ends in space that was free if it ends this far [m], plus this many standard deviations of
+# its range, before the end of an old beam.
+TOLERANCE = 0.03
+DEVIATIONS = 3.0
+
+
+def find_obstacles(
+    config: GateConfig,
+    ranges: Ranges,
+    views: tuple[View, ...],
+    ground: Ground | None = None,
+) -> Array | None:
+    """Returns the obstacles (P, 3) of a scan; None without a shield.
+
+    Args:
+        config: of the gate.
+        ranges: (B,) of the scan [m].
+        views: of recent scans, with this one as the newest; empty without odometry.
+        ground: what is known of the ground; None if the lidar looks all around.
+    """
+    shield = config.shield
+    if shield is None:
+        return None
+    is_mover = np.zeros(len(ranges), np.bool_)
+    if views:
+        is_mover = find_movers(config, shield, views)
+    obstacles = [place(config, shield, ranges, is_mover) for place in EVIDENCE]
+    if ground is not None:
+        obstacles.append(make_static(ground.unseen))
+    return np.concatenate(obstacles)
+
+
+def find_movers(
+    config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]
+) -> Flags:
+    """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
+    newest = views[-1]
+    entered = np.zeros(len(newest.ranges), np.bool_)
+    if shield.obstacle_speed == 0.0:
+        return entered
+    lidar = get_beams(config)
+    constant, proportional = shield.range_noise
+    tolerance = Tolerance(TOLERANCE + DEVIATIONS * constant, DEVIATIONS * proportional)
+    for view in views[:-1]:
+        evidence_kernels.mark_entered(
+            entered,
+            newest.ranges,
+            view.ranges,
+            lidar,
+            between(view.pose, newest.pose),
+            shield.range_max,
+            tolerance,
+        )
+    neighbour_entered = np.zeros_like(entered)
+    neighbour_entered[1:] |= entered[:-1]
+    neighbour_entered[:-1] |= entered[1:]
+    return entered & neighbour_entered
+
+
+def place_returns(
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, is_mover: Flags
+) -> Array:
+    """Returns an obstacle at the end of each beam that returns."""
+    is_return = np.isfinite(ranges)
+    angles = config.beam_angles[is_return]
+    lengths = ranges[is_return].astype(np.float64)
+    speeds = np.where(is_mover[is_return], shield.obstacle_speed, 0.0)
+    return _place_at_ends(config, angles, lengths, speeds)
+
+
+def place_too_close(
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, is_mover: Flags
+) -> Array:
+    """Returns an obstacle at the minimum range of each beam too close to measure (`-inf`)."""
+    is_near = np.isneginf(ranges)
+    angles = config.beam_angles[is_near]
+    lengths = np.full(len(angles), config.range_min)
+    return _place_at_ends(config, angles, lengths, np.zeros(len(angles)))
+
+
+def place_unknown(
+    config: GateConfig, shield: ShieldConfig, ranges: Ranges, is_mover: Flags
+) -> Array:
+    """Returns a wall on the footprint wherever too many beams, or all, are unknown (NaN).
+
+    The beams within `unknown_width` count together. Towards the edge of the lidar's view, and
+    beyond it, fewer beams are expected.
+    """
+    bearings, points = sample_footprint(shield, config.mount, len(ranges))
+    angles = config.beam_angles + config.mount[2]
+    half_width = shield.unknown_width / 2.0
+    known_count = _count_within(bearings, angles[~np.isnan(ranges)], half_width)
+    count = _count_within(bearings, angles, half_width)
+    full_count = shield.unknown_width / (angles[1] - angles[0])
+    expected_count = np.where(count < int(full_count), count, full_count)
+    is_unknown = known_count < (1.0 - shield.unknown_share) * expected_count
+    return make_static(points[is_unknown])
+
+
+EVIDENCE = (place_returns, place_too_close, place_unknown)
+"""What counts as an obstacle in a scan, each as rows (P, 3)."""
+
+
+def _place_at_ends(
+    config: GateConfig, angles: Array, lengths: Array, speeds: Array
+) -> Array:
+    """Returns obstacles (P, 3) at the ends of beams, by their angles in the lidar's frame [rad]."""
+    x, y, heading = config.mount
+    bearings = angles + heading
+    xs = x + lengths * np.cos(bearings)
+    ys = y + lengths * np.sin(bearings)
+    return np.stack([xs, ys, speeds], axis=1)
+
+
+def make_static(points: Array) -> Array:
+    """Returns obstacles (P, 3) that do not approach, at points (P, 2)."""
+    return np.pad(points, ((0, 0), (0, 1)))
+
+
+def _count_within(
+    bearings: Array, angles: Array, half_width: float
+) -> NDArray[np.int64]:
+    """Returns how many angles (B,) lie within half a width of each bearing (M,) [rad]."""
+    angles = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
+    unrolled = np.concatenate([angles - 2.0 * np.pi, angles, angles + 2.0 * np.pi])
+    begin = np.searchsorted(unrolled, bearings - half_width)
+    return np.searchsorted(unrolled, bearings + half_width) - begin
+
+
+def get_beams(config: GateConfig) -> MountedBeams:
+    """Returns the beams of the lidar, and its mount."""
+    angles = config.beam_angles
+    step = float(angles[1] - angles[0])
+    return MountedBeams(float(angles[0]), step, *config.mount)
+
+
+def add_view(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
+    """Returns the earlier views that still count, oldest first, then that of a new scan."""
+    if config.shield is None or state.odometry is None:
+        return ()
+    pose = extrapolate_pose(state.odometry, scan.stamp_ns, MEMORY_S)
+    kept: list[View] = []
+    for view in state.views:
+        age_s = (scan.stamp_ns - view.stamp_ns) * S_PER_NS
+        # The stamps of the lidar may have jumped back since the view.
+        if not 0.0 < age_s <= MEMORY_S:
+            continue
+        if not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S:
+            kept.append(view)
+    return (*kept, View(scan.stamp_ns, pose, scan.ranges))

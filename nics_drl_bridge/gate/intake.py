@@ -1,0 +1,298 @@
+"""Takes the inputs of the gate into its state, or refuses those that can't be used.
+
+`take` goes through these steps for each input:
+
+1. Clear the faults of the input before, which live for one input only.
+2. Refuse it if a row of `REFUSALS` finds it malformed, or if its stamp repeats or jumps. Data that
+   are refused feed no watchdog.
+3. Record it, with all that follows from it: a new scan, for one, shows obstacles and ground.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.gate import estimate as estimates
+from nics_drl_bridge.gate import evidence, frozen, inputs, limits, scan_motion, stops
+from nics_drl_bridge.gate import ground as grounds
+from nics_drl_bridge.gate.state import (
+    GateConfig,
+    GateState,
+    ScanMotion,
+    SensorState,
+    replace,
+)
+from nics_drl_bridge.gate.stops import ODOM, SCAN
+from nics_drl_bridge.geometry import between
+from nics_drl_bridge.interface import S_PER_NS
+
+Taken = tuple[GateState, str]
+"""The state after an input, and the reason why the input is refused, or ""."""
+# maximum speed that the odometry of a mobile robot can show [m/s, rad/s]
+MAX_SPEED = 100.0
+# maximum deviation of the last beam from its declared angle [rad]
+ANGLE_TOLERANCE = 1e-3
+# Downhill or pushed, a robot may exceed its limits by this factor, and by this [m/s], [rad/s].
+EXCESS_FACTOR = 2.0
+EXCESS_SPEED = 0.5
+EXCESS_TURN_RATE = 1.0
+# jump of an odometry pose that may come from imprecision [m], [rad]
+SMALL_JUMP = 0.1
+SMALL_JUMP_TURN = 0.2
+
+
+def take(
+    config: GateConfig, state: GateState, event: inputs.Input, now: float
+) -> Taken:
+    """Takes an input at a steady time [s] into the state, or returns the reason why not."""
+    state = _clear_faults(state)
+    if isinstance(event, inputs.Command):
+        state = stops.watch_source(state, event, now)
+    reason = _find_refusal(config, event)
+    if reason:
+        if isinstance(event, inputs.Command):
+            # An earlier command that waits for its scan must not come into force any more.
+            state = replace(state, malformed=reason, pending=None, pending_s=None)
+        return state, reason
+    if isinstance(event, inputs.Scan):
+        return _take_scan(config, state, event, now)
+    if isinstance(event, inputs.Odometry):
+        return _take_odometry(config, state, event, now)
+    if isinstance(event, inputs.SensorReading):
+        return _take_reading(config, state, event, now)
+    if isinstance(event, inputs.Estimate):
+        track = estimates.track_estimate(config, state, event, now)
+        state = replace(state, estimate=event, estimate_s=now, estimates=track)
+    elif isinstance(event, inputs.Command):
+        state = _take_command(state, event, now)
+    elif isinstance(event, inputs.EStop):
+        stop = replace(
+            state.e_stop,
+            latched=state.e_stop.latched or event.pressed,
+            held=event.pressed,
+            heard_s=now,
+        )
+        state = replace(state, e_stop=stop)
+    elif isinstance(event, inputs.Press):
+        stop = replace(state.e_stop, latched=True, reason=event.reason)
+        state = replace(state, e_stop=stop)
+    return state, ""
+
+
+def _clear_faults(state: GateState) -> GateState:
+    """Returns the state without the faults that an input before has shown."""
+    state = replace(state, jumped="", leap="", mixed="")
+    if not state.estimates.fault:
+        return state
+    return replace(state, estimates=replace(state.estimates, fault=""))
+
+
+def _find_refusal(config: GateConfig, event: inputs.Input) -> str:
+    """Returns the first reason to refuse an input, or ""."""
+    for kind, judge in REFUSALS:
+        reason = judge(config, event) if isinstance(event, kind) else ""
+        if reason:
+            return reason
+    return ""
+
+
+def _take_command(
+    state: GateState, command: inputs.Command, arrival_s: float
+) -> GateState:
+    """Takes a command once its scan has arrived; until then the previous one stays in force."""
+    scans = state.scans
+    if command.stamp_ns not in scans.stamps_ns:
+        since = arrival_s if state.pending_s is None else state.pending_s
+        return replace(
+            state, pending=command, pending_s=since, pending_arrival_s=arrival_s
+        )
+    behind = scans.stamps_ns.index(command.stamp_ns)
+    return replace(
+        state,
+        command=command,
+        command_s=arrival_s,
+        behind_s=scans.times[behind] - scans.late[behind],
+        malformed="",
+        pending=None,
+        pending_s=None,
+    )
+
+
+def _take_scan(
+    config: GateConfig, state: GateState, scan: inputs.Scan, now: float
+) -> Taken:
+    arrivals, fault = stops.account_for_arrival(
+        config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
+    )
+    if fault:
+        return _refuse_stamp(replace(state, scans=arrivals), SCAN, fault)
+    pose = None if state.odometry is None else state.odometry.pose
+    seen, frozen_fault = frozen.watch_pictures(config, state.seen, scan.ranges, pose)
+    views = evidence.add_view(config, state, scan)
+    ground = grounds.update_ground(config, views, state.ground)
+    state = replace(
+        state,
+        scans=arrivals,
+        scan=scan,
+        seen=seen,
+        frozen=frozen_fault,
+        views=views,
+        ground=ground,
+        scan_motion=scan_motion.watch_scan(config, state, scan),
+        obstacles=evidence.find_obstacles(config, scan.ranges, views, ground),
+    )
+    if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
+        state = _take_command(state, state.pending, state.pending_arrival_s)
+    return state, ""
+
+
+def _take_odometry(
+    config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
+) -> Taken:
+    arrivals, fault = stops.account_for_arrival(
+        config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
+    )
+    if fault:
+        return _refuse_stamp(replace(state, odometries=arrivals), ODOM, fault)
+    leap = _find_leap(config, state, odometry, now)
+    if leap:
+        # Later poses are judged relative to this one, and earlier ones say nothing any more.
+        state = replace(
+            state,
+            odometry=odometry,
+            leap=leap,
+            push=None,
+            seen=(),
+            views=(),
+            ground=None,
+            scan_motion=ScanMotion(),
+        )
+        return state, f"odom: {leap}"
+    state = replace(state, odometries=arrivals, odometry=odometry)
+    if not frozen.is_at_rest(config, odometry.twist):
+        state = replace(state, restless_s=now)
+    return state, ""
+
+
+def _take_reading(
+    config: GateConfig, state: GateState, reading: inputs.SensorReading, now: float
+) -> Taken:
+    index = config.sensors.index(reading.name)
+    sensors = list(state.sensors)
+    arrivals, fault = stops.account_for_arrival(
+        config,
+        sensors[index].arrivals,
+        reading.stamp_ns,
+        now,
+        config.scan_age_s,
+        state.armed,
+    )
+    points = sensors[index].points if fault else reading.points
+    sensors[index] = SensorState(arrivals, points)
+    state = replace(state, sensors=tuple(sensors))
+    if fault:
+        return _refuse_stamp(state, reading.name, fault)
+    return state, ""
+
+
+def _refuse_stamp(state: GateState, topic: str, fault: str) -> Taken:
+    """Refuses data whose stamp repeated or jumped."""
+    if fault == stops.JUMPED:
+        state = replace(state, jumped=topic)
+    return state, f"{topic}: its stamp {fault}"
+
+
+def _find_leap(
+    config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
+) -> str:
+    """Returns what is wrong with a pose that the robot can't have driven to; else empty."""
+    before = state.odometry
+    bounds = config.limits
+    if before is None or bounds is None:
+        return ""
+    stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
+    passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
+    path_noise, turn_noise = (frozen.NOISE * std * passed for std in config.odom_std)
+    speed, turn_rate = limits.get_maximum_speeds(bounds)
+    max_speed = EXCESS_FACTOR * speed + EXCESS_SPEED
+    max_turn_rate = EXCESS_FACTOR * turn_rate + EXCESS_TURN_RATE
+    max_path = SMALL_JUMP + max_speed * passed + path_noise
+    max_turn = SMALL_JUMP_TURN + max_turn_rate * passed + turn_noise
+    x, y, heading = between(before.pose, odometry.pose)
+    path = float(np.hypot(x, y))
+    if path <= max_path and abs(heading) <= max_turn:
+        return ""
+    return (
+        f"its pose jumped by {path:.3g} m and {abs(heading):.3g} rad in {passed:.3f} s"
+    )
+
+
+def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
+    """The scan is from another lidar than the declared one, or every range is NaN."""
+    angles = config.beam_angles
+    first, step = scan.angles
+    if scan.ranges.shape != angles.shape:
+        return f"scan: {scan.ranges.size} beams, not {len(angles)}"
+    increment = float(angles[1] - angles[0]) if len(angles) > 1 else step
+    last_off = abs(first - angles[0]) + abs(step - increment) * (len(angles) - 1)
+    if not last_off <= ANGLE_TOLERANCE:
+        return "scan: its angles are not those of the declared lidar"
+    if np.isnan(scan.ranges).all():
+        return "scan: every range is NaN"
+    return ""
+
+
+def check_reading(config: GateConfig, reading: inputs.SensorReading) -> str:
+    """The reading is of an unknown sensor, or not finite."""
+    if reading.name not in config.sensors:
+        return f"{reading.name}: there is no such sensor"
+    if not np.isfinite(reading.points).all():
+        return f"{reading.name}: NaN or inf"
+    return ""
+
+
+def check_odometry(config: GateConfig, odometry: inputs.Odometry) -> str:
+    """The odometry is not finite, or too fast for a mobile robot."""
+    if not (np.isfinite(odometry.pose).all() and np.isfinite(odometry.twist).all()):
+        return "odom: NaN, inf, or no rotation"
+    if np.abs(odometry.twist).max() > MAX_SPEED:
+        return f"odom: faster than {MAX_SPEED:g} m/s or rad/s"
+    return ""
+
+
+def estimate_malformed(config: GateConfig, estimate: inputs.Estimate) -> str:
+    """The estimate is not finite, or its covariance has a negative variance."""
+    parts = (estimate.twist, estimate.pose, estimate.covariance)
+    if not all(np.isfinite(part).all() for part in parts):
+        return "odometry/filtered: NaN or inf"
+    if (np.diag(estimate.covariance) < 0.0).any():
+        return "odometry/filtered: a variance is negative"
+    return ""
+
+
+def check_finite(config: GateConfig, command: inputs.Command) -> str:
+    """The command is not finite."""
+    if not np.isfinite(command.twist).all():
+        return "cmd_vel_raw: NaN or inf"
+    return ""
+
+
+def check_plausible(config: GateConfig, command: inputs.Command) -> str:
+    """The command is so far out of range that the policy must be broken."""
+    bounds = config.limits
+    twist = command.twist
+    if bounds is None or not limits.is_implausible(config.command(twist), bounds):
+        return ""
+    return f"cmd_vel_raw: {twist.tolist()} is far out of range"
+
+
+REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
+    (inputs.Scan, scan_malformed),
+    (inputs.Odometry, check_odometry),
+    (inputs.SensorReading, check_reading),
+    (inputs.Estimate, estimate_malformed),
+    (inputs.Command, check_finite),
+    (inputs.Command, check_plausible),
+)
+"""By the type of the input, in order: what is wrong with it; empty if nothing is."""
