@@ -1,6 +1,5 @@
 """FastSimulator: N worlds x M robots of one SimulatorModel in one set of arrays."""
 
-import warnings
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, TypeVar
@@ -16,10 +15,10 @@ from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.sensor import Render, SensedWorlds, unread
 from nics_drl_bridge.lidar.shapes import place
-from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import allocation, step_kernels
+from nics_drl_bridge.sim.command_range import CommandRange, warn_caller
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.randomisation import (
     Draws,
@@ -59,65 +58,8 @@ OF_ROBOT = (
     "noise",
     "past",
 )
-EVERY = 16  # Commands are checked in the first step after a reset and then at this interval [steps]
-
-
-class OutsideValidityWarning(UserWarning):
-    """Commands lie outside the range that the model's recording covered."""
-
-
-def warn(message: str) -> None:
-    """Issue an OutsideValidityWarning to the caller that steps the simulator."""
-    warnings.warn(message, OutsideValidityWarning, stacklevel=5)
-
-
-class CommandBox:
-    """Range of commands to which a model was fitted, except those whose effect was assumed."""
-
-    def __init__(
-        self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
-    ) -> None:
-        first = len(robot.state)
-        margin = TOLERANCE * (robot.command_high - robot.command_low)
-        self._tell = tell
-        self._names = robot.variable_names[first:]
-        edges = np.stack([model.low[first:], model.high[first:]])
-        for curve in model.inputs:  # the model's box is of commands in effect
-            place = self._names.index(curve.command)
-            edges[:, place] = curve.invert(edges[:, place])
-        self._range = edges[0], edges[1]
-        self._low: Array = self._range[0] - margin
-        self._high: Array = self._range[1] + margin
-        for _, term in model.assumed:
-            assumed = taylor.parse_term(term, model.variables)[first:] > 0
-            self._low[assumed], self._high[assumed] = -np.inf, np.inf
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin an episode: the next step is checked, and one warning may be issued."""
-        self._steps = 0
-        self._armed = True
-
-    def check(self, commands: Array) -> None:
-        """Warn once per episode if commands (..., C) are outside the range."""
-        steps = self._steps
-        self._steps = self._steps + 1
-        if not self._armed or steps % EVERY:
-            return
-        flat = commands.reshape(-1, commands.shape[-1])
-        least = flat.min(axis=0)
-        most = flat.max(axis=0)
-        outside = (least < self._low) | (most > self._high)
-        if outside.any():
-            self._armed, i = False, int(np.argmax(outside))
-            value = least[i] if least[i] < self._low[i] else most[i]
-            fitted = f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only"
-            found = (
-                f"{self._names[i]} is {value:.4g}, but the model was fitted to {fitted}"
-            )
-            self._tell(
-                f"{found}: its motion there is extrapolated; record a drive that covers it."
-            )
+# Commands of a part are checked when its first world has made a multiple of so many steps.
+CHECK_INTERVAL = 16
 
 
 def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
@@ -187,8 +129,8 @@ class FastSimulator:
     of the worlds are stepped in parallel. The randomisation of each episode may be the name of a
     shipped one, or a YAML file. `longest_delay` and `longest_age` are the maximum values that
     `data.delay` of commands (by default the model's) and `data.age` of scan and odometry may be set
-    to [substeps], raised to the randomisation's. `tell` gets a message when commands leave the
-    range of the fit.
+    to [substeps], raised to the randomisation's. `tell` gets one message for each command of the
+    robot that leaves the range of the fit, and never a second one.
     """
 
     def __init__(
@@ -202,7 +144,7 @@ class FastSimulator:
         randomisation: str | Randomisation | None = None,
         longest_delay: int | None = None,
         longest_age: int = 0,
-        tell: Callable[[str], None] = warn,
+        tell: Callable[[str], None] = warn_caller,
     ) -> None:
         delay = model.timing[2] if longest_delay is None else longest_delay
         if (
@@ -243,8 +185,7 @@ class FastSimulator:
         self.readings = unread(model.sensors, worlds, robots)
         # the worlds that each thread steps
         self.parts = allocation.split(worlds, threads)
-        known = model.kinematics, model.robot, tell
-        self._boxes = {part.start: CommandBox(*known) for part in self.parts}
+        self._command_range = CommandRange(model.kinematics, model.robot, tell)
 
     @cached_property
     def _members(self) -> Members:
@@ -364,7 +305,6 @@ class FastSimulator:
         for part in self.parts:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
-                self._boxes[part.start].begin()
                 step_kernels.begin(self.packed[part.start], of_part)
                 self.sense(of_part)
         if self.sampler.count < allocation.STANDING:
@@ -449,5 +389,6 @@ class FastSimulator:
         if checked.shape != expected:
             needed = f"they must be {expected}: worlds, robots, and a robot's commands."
             raise ConfigError(f"commands are {checked.shape}; {needed}")
-        self._boxes[part.start].check(checked)
+        if self.data.steps[part.start] % CHECK_INTERVAL == 0:
+            self._command_range.check(checked)
         return checked
