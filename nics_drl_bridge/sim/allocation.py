@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
@@ -34,6 +35,14 @@ FEWEST_OF_A_CROWD = 8
 STANDING = 32  # Minimum number of obstacles, all of which stand, for sorting them into cells once
 
 
+# Limits of a simulation: robots in one world, each of which is tested against every other, and
+# numbers in the arrays of all worlds, some GB.
+MOST_ROBOTS = 1_000
+MOST_NUMBERS = 2**30
+# Numbers of a robot or an obstacle whose count depends on neither beams, history nor past [1]
+NUMBERS_PER_BODY = 64
+
+
 @dataclass(frozen=True)
 class Sizes:
     """Dimensions of a simulation."""
@@ -50,17 +59,56 @@ class Sizes:
         pairs = self.robots * (self.robots + self.obstacles)
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
 
+    def count_past_rows(self, model: SimulatorModel) -> int:
+        """Return R: a row for the newest period, and one for each that an observation may lag."""
+        return count_periods(self.longest_age, model) + 1
+
+    def count_history_rows(self, model: SimulatorModel) -> int:
+        """Return H: a row for the newest command, and one for each period it may be delayed."""
+        own_delays = make_terms(model.kinematics).late
+        longest = self.longest_delay + int(own_delays.max(initial=0))
+        return count_periods(longest, model) + 1
+
+
+def count_periods(substeps: int, model: SimulatorModel) -> int:
+    """Return the number of control periods that so many substeps begin."""
+    return -(-substeps // model.timing[1])
+
+
+def check_robots(robots: int, source: str) -> None:
+    """Raise ConfigError for more robots than a world may have."""
+    if robots > MOST_ROBOTS:
+        raise ConfigError(
+            f"{source} with {robots:.10g} robots: a world may have {MOST_ROBOTS} robots."
+        )
+
+
+def check_memory(model: SimulatorModel, sizes: Sizes, source: str) -> None:
+    """Raise ConfigError, before anything is allocated, for more worlds than fit in memory."""
+    per_robot = (
+        model.lidar.beams
+        + NUMBERS_PER_BODY
+        + sizes.count_past_rows(model) * PAST
+        + sizes.count_history_rows(model) * len(model.robot.command)
+    )
+    per_world = sizes.robots * per_robot + sizes.obstacles * NUMBERS_PER_BODY
+    if sizes.worlds * per_world <= MOST_NUMBERS:
+        return
+    raise ConfigError(
+        f"{sizes.worlds:.10g} copies of {source} with {sizes.robots} robots, {sizes.obstacles} "
+        f"obstacles, delays of {sizes.longest_delay} and ages of {sizes.longest_age} substeps: "
+        f"{MOST_NUMBERS // per_world} copies of it are the most that fit in memory."
+    )
+
 
 def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     """Allocate the arrays of worlds before their first reset, with the model's parameters."""
-    _, substeps, delay = model.timing
+    _, _, delay = model.timing
     shape = (sizes.worlds, sizes.robots)
     bodies = sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
-    # One row for the newest; an age within a period also needs the end of the previous period.
     terms = make_terms(model.kinematics)
-    longest = sizes.longest_delay + int(terms.late.max(initial=0))
-    rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, longest))
+    sent = sizes.count_history_rows(model)
     return arrays.State(
         pose=np.zeros((*shape, 3)),
         state=np.zeros((*shape, len(model.robot.state))),
@@ -79,7 +127,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
         age=np.zeros(shape, np.int64),
         noise=np.tile(noise, (*shape, 1)),
         velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
-        past=np.zeros((*shape, rows, PAST)),
+        past=np.zeros((*shape, sizes.count_past_rows(model), PAST)),
         marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
     )
 

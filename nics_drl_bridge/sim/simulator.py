@@ -35,13 +35,6 @@ Indices = NDArray[np.int64]
 R = TypeVar("R")
 # Poses of robots (n, M, 3), or a function that returns them for scenes; None: the scenes' poses
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
-# Maximum number of robots in one world; each is tested against every other
-MOST_ROBOTS = 1_000
-# limit of the values in all worlds, some GB: beams of robots, states of obstacles
-MOST_NUMBERS = 2**30
-PER_BODY = 64
-# Beyond the range of commands that was recorded, as a fraction of their limits
-TOLERANCE = 0.05
 # Arrays of the state with a row for each robot.
 OF_ROBOT = (
     "pose",
@@ -75,21 +68,6 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
         drives = f"could drive {step:.3g} m in a step of {model.dt:g} s, across {least:.3g} m"
         fix = "lower the limits of its commands, or generate its model with a shorter step."
         raise ConfigError(f"the robot {robot.name!r} {drives} of world; {fix}")
-
-
-def _check_memory(
-    model: SimulatorModel, world: AnyWorld, worlds: int, robots: int
-) -> None:
-    """Raise ConfigError for more copies of a world than fit in memory, before any allocation."""
-    obstacles = max(
-        sum(group.counts[1] for group in one.obstacles) for one in world.members
-    )
-    each = robots * (model.lidar.beams + PER_BODY) + obstacles * PER_BODY
-    if robots > MOST_ROBOTS or worlds * each > MOST_NUMBERS:
-        raise ConfigError(
-            f"{worlds:.10g} copies of {world.source} with {robots:.10g} robots: a world may have "
-            f"{MOST_ROBOTS} robots, and {max(1, MOST_NUMBERS // each)} copies of it are the most."
-        )
 
 
 class EpisodeSampler:
@@ -157,7 +135,7 @@ class FastSimulator:
                 f"{threads}; a longest_delay of at least the model's {model.timing[2]} substeps "
                 f"and a longest_age of at least 0, not {delay} and {longest_age}."
             )
-        _check_memory(model, world, worlds, robots)
+        allocation.check_robots(robots, world.source)
         if randomisation is not None and not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
         _check_speed(model.kinematics, model.robot, world)
@@ -168,19 +146,20 @@ class FastSimulator:
         if (draws := self.episodes.draws) is not None:
             delay = max(delay, draws.longest_delay)
             longest_age = max(longest_age, draws.longest_age)
-        self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
-        # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
-        self.drawn: dict[str, NDArray[Any]] = {}
-        self.footprint = footprint_shape(model.robot)
         self.sampler = self.episodes.scenes
+        self._sizes = allocation.Sizes(
+            worlds, robots, self.sampler.count, delay, longest_age
+        )
+        allocation.check_memory(model, self._sizes, world.source)
+        self.footprint = footprint_shape(model.robot)
         shapes = (*self.sampler.shapes, self.footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
-        self._sizes = allocation.Sizes(
-            worlds, robots, self.sampler.count, delay, longest_age
-        )
         self.data = allocation.allocate(model, self._sizes)
+        self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
+        # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
+        self.drawn: dict[str, NDArray[Any]] = {}
         # Name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
         self.readings = unread(model.sensors, worlds, robots)
         # the worlds that each thread steps
