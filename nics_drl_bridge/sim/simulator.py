@@ -196,11 +196,15 @@ class FastSimulator:
             step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
 
     def put_bodies(self, bodies: Array) -> None:
-        """Put the obstacles of the first world at (K, 7), in the format of scenes."""
+        """Put the obstacles of the first world at (K, 7), in the format of scenes.
+
+        Many obstacles that stand are sorted afterwards: row k of `data.bodies` then need not be
+        obstacle k, see `moves`.
+        """
         obstacles = self.data.bodies[0, : self.sampler.count]
         obstacles[:] = bodies
         obstacles[:, SHAPE] = self._in_table[bodies[:, SHAPE].astype(np.int64)]
-        self.sort_bodies()
+        self._sort_first_world()
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
         """Put a robot of the first world at a pose (3,) with a state (S,); odometry stays."""
@@ -208,7 +212,10 @@ class FastSimulator:
         self.data.state[0, robot] = state
         body = place(pose, self.footprint.radius, self._in_table[-1])
         self.data.bodies[0, self.sampler.count + robot] = body
-        self.sort_bodies()
+        self._sort_first_world()
+
+    def _sort_first_world(self) -> None:
+        step_kernels.sort_worlds(self.packed[0], 0, 1)
 
     def take_over(
         self, other: "FastSimulator", robots: Indices, obstacles: Indices
