@@ -275,10 +275,7 @@ class FastSimulator:
         call it in parallel for different parts. Raises ConfigError if seeds, starts or a scene do
         not fit.
         """
-        if worlds is None:
-            chosen = np.arange(len(self.data.steps))
-        else:
-            chosen = np.asarray(worlds, np.int64)
+        chosen = self._choose_worlds(worlds)
         scenes, draws = self.episodes.draw(seeds)
         given = starts(scenes) if callable(starts) else starts
         begin = scenes.starts if given is None else np.asarray(given, dtype=np.float64)
@@ -297,6 +294,23 @@ class FastSimulator:
             return scenes
         return Scenes(
             self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member
+        )
+
+    def _choose_worlds(self, worlds: ArrayLike | None) -> Indices:
+        """Return the indices of the worlds to reset; kernels do not check them."""
+        count = len(self.data.steps)
+        if worlds is None:
+            return np.arange(count)
+        given = np.asarray(worlds)
+        whole = given.size == 0 or given.dtype.kind in "iu"
+        if given.ndim == 1 and whole:
+            listed = given.tolist()
+            inside = all(0 <= n < count for n in listed)
+            if inside and len(set(listed)) == len(listed):
+                return given.astype(np.int64)
+        raise ConfigError(
+            f"worlds {np.array2string(given, threshold=10)} must be indices from 0 to {count - 1}, "
+            "each at most once."
         )
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
