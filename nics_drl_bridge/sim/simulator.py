@@ -325,8 +325,10 @@ class FastSimulator:
     def obstacles_of(self, worlds: Indices) -> Array:
         """(n, K, 7) those of some worlds (n,)."""
         bodies = self.data.bodies[worlds, : self.sampler.count]
+        of_obstacles = self._in_table[:-1]
         index = np.zeros(int(self._in_table.max()) + 1)
-        index[self._in_table[:-1]] = np.arange(len(self.sampler.shapes))
+        # Equal shapes share a place in the table; in reverse, because the first of them is meant.
+        index[of_obstacles[::-1]] = np.arange(len(of_obstacles))[::-1]
         bodies[..., SHAPE] = index[bodies[..., SHAPE].astype(np.int64)]
         return bodies
 
