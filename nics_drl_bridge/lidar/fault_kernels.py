@@ -198,19 +198,20 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
+def slice_poses(out, pose, twist, sweep, direction, moving):  # type: ignore[no-untyped-def]
     """Write the poses (G, 3) of the robot at which G equal groups of beams were measured.
 
     Group g has the beams from `g * B // G` to `(g + 1) * B // G`, and the pose of its interval's
     middle, heading unwrapped. The `sweep` [s] ends at `pose`: the newest beam is the last, or beam
     0 for one that turns clockwise. `direction` is a value of SKEW, `twist` (3,) that of the body.
+    The robot has been `moving` for so long [s]; before that it stood where it began.
     """
     count = out.shape[0]
     for g in range(count):
         ago = 0.0
         if direction != AT_ONCE:
             later = count - 1 - g if direction > AT_ONCE else g
-            ago = sweep * (later + 0.5) / count
+            ago = min(sweep * (later + 0.5) / count, moving)
         slice_pose(out[g], pose, twist, ago)
 
 

@@ -261,8 +261,9 @@ def _scan_alone(
     around = fixtures_around(n, members.fixtures)
     groups = 1 if skew == 0.0 else scans.slices.shape[0]
     if groups > 1:
+        moving = (steps * substeps - lag) * motion.dt
         fault_kernels.slice_poses(
-            scans.slices, spot[0, 0], drive, lidar.sweep_time, skew
+            scans.slices, spot[0, 0], drive, lidar.sweep_time, skew, moving
         )
     # a loop, because the large functions below are then compiled only once
     for g in range(groups):
