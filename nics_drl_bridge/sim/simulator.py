@@ -27,6 +27,7 @@ from nics_drl_bridge.sim.randomisation import (
     load_randomisation,
 )
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
+from nics_drl_bridge.sim.sensing_kernels import POSE, TWIST
 from nics_drl_bridge.sim.state import Members
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import run_parts
@@ -207,9 +208,15 @@ class FastSimulator:
         self._sort_first_world()
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
-        """Put a robot of the first world at a pose (3,) with a state (S,); odometry stays."""
+        """Put a robot of the first world at a pose (3,) with a state (S,); odometry stays.
+
+        Late scans are then of the new pose: it is as if the robot had always stood there.
+        """
         self.data.pose[0, robot] = pose
         self.data.state[0, robot] = state
+        past = self.data.past[0, robot]
+        past[:, POSE : POSE + 3] = pose
+        past[:, TWIST : TWIST + 3] = 0.0
         body = place(pose, self.footprint.radius, self._in_table[-1])
         self.data.bodies[0, self.sampler.count + robot] = body
         self._sort_first_world()
@@ -227,6 +234,12 @@ class FastSimulator:
         """
         mine = self.data
         theirs = other.data
+        poses = mine.pose[0].copy()
+        poses[: len(robots)] = theirs.pose[0, robots]
+        states = mine.state[0].copy()
+        states[: len(robots)] = theirs.state[0, robots]
+        for m, (pose, state) in enumerate(zip(poses, states, strict=True)):
+            self.put_robot(m, pose, state)
         for name in OF_ROBOT:
             getattr(mine, name)[0, : len(robots)] = getattr(theirs, name)[0, robots]
         for name in ("steps", "seeds", "member"):
@@ -234,10 +247,6 @@ class FastSimulator:
         kept = obstacles >= 0
         for name in ("velocity", "marks"):
             getattr(mine, name)[0, kept] = getattr(theirs, name)[0, obstacles[kept]]
-        for m, (pose, state) in enumerate(
-            zip(mine.pose[0].copy(), mine.state[0], strict=True)
-        ):
-            self.put_robot(m, pose, state)
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("_members", "packed", "_renders")
