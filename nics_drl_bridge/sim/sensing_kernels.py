@@ -22,6 +22,9 @@ TWIST = 3
 ODOM = 6
 MEASURED = 9
 PAST = 12
+# Obstacles of a late scan are moved back by their velocity for so long at most [s]: a pedestrian
+# changes it in about this time, and would else be moved back through walls.
+FURTHEST_BACK = 1.0
 
 
 @kernel
@@ -290,7 +293,12 @@ def _gather(
     motion: Dynamics,
     scratch: Scratch,
 ) -> int:
-    """Copy the bodies around `spot`, as they were `lag` substeps ago; return their number."""
+    """Copy the bodies around `spot`, as they were `lag` substeps ago; return their number.
+
+    Robots are interpolated in the past. Of obstacles no past is kept: they are moved back by their
+    present velocity, which is exact within the period, and beyond it for those that keep their
+    velocity. The extrapolation ends at `FURTHEST_BACK`.
+    """
     scans = scratch.scans
     cells = scratch.cells
     bodies = state.bodies
@@ -303,7 +311,7 @@ def _gather(
     if in_cells:
         several = around(n, spot[0], spot[1], reach, cells)
     count = 0
-    ago = lag * motion.dt
+    ago = min(lag * motion.dt, FURTHEST_BACK)
     for i in range(several):
         k = cells.found[i] if in_cells else i
         radius = bodies[n, k, RADIUS]
