@@ -405,7 +405,7 @@ def drift_carefully(
     for m in range(pose.shape[1]):
         if collided[n, m] != 0:
             continue
-        ahead, aside, turn = drift_of(n, m, state, motion.dt * motion.substeps)
+        ahead, aside, turn = drift_of(n, m, state, motion)
         if ahead == 0.0 and aside == 0.0 and turn == 0.0:
             continue
         stop = 1.0

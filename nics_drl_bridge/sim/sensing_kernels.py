@@ -1,7 +1,9 @@
 """Compiled inner loops of the simulator: odometry, drift of the motion, and scans.
 
 Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the last R periods' ends, step
-i in row i % R: true pose, true twist, pose by odometry, measured twist, interpolated linearly.
+i in row i % R: true pose, true twist, pose by odometry, measured twist, interpolated linearly. The
+true twist is the model's at the end of the period: a robot that a wall holds has the twist with
+which it drives against the wall, as its wheels turn.
 """
 
 import math
@@ -143,8 +145,14 @@ def measure(
 
 
 @kernel
-def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
-    """Draw drift ahead, aside [m], at most std sqrt(3 period), and turn [rad]; move the state."""
+def drift_of(
+    n: int, m: int, state: State, motion: Dynamics
+) -> tuple[float, float, float]:
+    """Draw drift ahead, aside [m], at most std sqrt(3 period), and turn [rad]; move the state.
+
+    The state stays within the bounds of the model.
+    """
+    period = motion.dt * motion.substeps
     std = state.noise
     counter = state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
@@ -165,7 +173,10 @@ def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float,
             elif i == 2:
                 turn = draw
             else:
-                state.state[n, m, i - 3] += draw
+                moved = state.state[n, m, i - 3] + draw
+                low = motion.terms.low[i - 3]
+                high = motion.terms.high[i - 3]
+                state.state[n, m, i - 3] = min(max(moved, low), high)
     return ahead, aside, turn
 
 
