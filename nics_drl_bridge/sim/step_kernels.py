@@ -260,25 +260,34 @@ def _begin_period(
     """Keep the poses of worlds [begin, end) before the period, and steer what moves by itself."""
     pose = state.pose
     before = scratch.scans.before
-    speeds = scratch.nearby.speeds
     for n in range(begin, end):
         for m in range(pose.shape[1]):
             lane = (n - begin) * pose.shape[1] + m
-            row = state.steps[n] % state.past.shape[2]
             before[lane, 0] = pose[n, m, 0]
             before[lane, 1] = pose[n, m, 1]
             before[lane, 2] = pose[n, m, 2]
-            if state.steps[n] == 0:
-                sensing.begin(n, m, state)
-            if members.moves:
-                twist = state.past[n, m, row, sensing.TWIST : sensing.TWIST + 2]
-                c = math.cos(pose[n, m, 2])
-                s = math.sin(pose[n, m, 2])
-                speeds[m, 0] = c * twist[0] - s * twist[1]
-                speeds[m, 1] = s * twist[0] + c * twist[1]
+        _begin_world(n, state, members, motion, scratch.nearby.speeds)
+
+
+@kernel(inline=True)
+def _begin_world(
+    n: int, state: State, members: Members, motion: Dynamics, speeds: Array
+) -> None:
+    """Record the start of world n's episode, if it begins, and steer what moves by itself."""
+    pose = state.pose
+    row = state.steps[n] % state.past.shape[2]
+    for m in range(pose.shape[1]):
+        if state.steps[n] == 0:
+            sensing.begin(n, m, state)
         if members.moves:
-            scene = surroundings_of(n, members)
-            obstacles.steer(n, state, scene, motion.dt * motion.substeps, speeds)
+            twist = state.past[n, m, row, sensing.TWIST : sensing.TWIST + 2]
+            c = math.cos(pose[n, m, 2])
+            s = math.sin(pose[n, m, 2])
+            speeds[m, 0] = c * twist[0] - s * twist[1]
+            speeds[m, 1] = s * twist[0] + c * twist[1]
+    if members.moves:
+        scene = surroundings_of(n, members)
+        obstacles.steer(n, state, scene, motion.dt * motion.substeps, speeds)
 
 
 @kernel(inline=True)
@@ -350,8 +359,9 @@ def begin(packed: Any, chosen: records.Integers) -> None:
 def begin_period(packed: Any) -> None:
     """Begin a period of worlds whose robots another engine moves."""
     part = packed.content
-    count = part.state.pose.shape[0]
-    _begin_period(0, count, part.state, part.members, part.motion, part.scratch)
+    speeds = part.scratch.nearby.speeds
+    for n in range(part.state.pose.shape[0]):
+        _begin_world(n, part.state, part.members, part.motion, speeds)
 
 
 @kernel(allocates=True)
