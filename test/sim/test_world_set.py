@@ -182,11 +182,11 @@ def test_a_broken_member_is_named(folder):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("name: s\nworlds: []\n", "holds no world"),
+        ("name: s\nworlds: []\n", "contains no world"),
         ("name: s\nworlds: [nowhere]\n", "unknown world 'nowhere'"),
         ("name: s\nworlds: [none/*.yaml]\n", "no world file"),
         ("name: s\nworlds: [gone.yaml]\n", "no such file"),
-        ("name: s\nworlds: [circles]\nwithout: [circles]\n", "holds no world"),
+        ("name: s\nworlds: [circles]\nwithout: [circles]\n", "contains no world"),
         ("name: s\nworlds: [circles]\nwithin: [1]\n", "unknown key 'within'"),
     ],
 )
@@ -283,6 +283,6 @@ def test_what_worlds_share_is_stored_once():
     rooms = WorldSet(
         "rooms", (load_world("room"), load_world("room"), load_world("circles"))
     )
-    fixtures = FastSimulator(MODEL, rooms)._members.fixtures
+    fixtures = FastSimulator(MODEL, rooms)._world_set.fixtures
     assert fixtures.maps[0].tolist() == fixtures.maps[1].tolist()
     assert fixtures.squares.size == fixtures.maps[0, 1] * fixtures.maps[0, 2]
