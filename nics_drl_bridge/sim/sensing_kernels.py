@@ -23,6 +23,7 @@ from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim.state import (
+    BODY_COLUMNS,
     ODOM,
     ODOM_ANGULAR,
     ODOM_LINEAR,
@@ -123,10 +124,11 @@ def measure_odometry(
             odom[i] = row[ODOM + i]
             odom_twist[i] = row[ODOM_TWIST + i]
         return
+    past = data.past[n, m]
     lag = limit_lag(data.age[n, m], steps, rows, substeps)
-    odom[0], odom[1], odom[2] = interpolate_past(n, m, ODOM, lag, data, substeps)
+    odom[0], odom[1], odom[2] = interpolate_past(past, ODOM, lag, steps, substeps)
     odom_twist[0], odom_twist[1], odom_twist[2] = interpolate_past(
-        n, m, ODOM_TWIST, lag, data, substeps
+        past, ODOM_TWIST, lag, steps, substeps
     )
 
 
@@ -149,25 +151,25 @@ def limit_lag(age: int, steps: int, rows: int, substeps: int) -> int:
 
 @kernel
 def interpolate_past(
-    n: int, m: int, column: int, lag: int, data: State, substeps: int
+    past: Array, column: int, lag: int, steps: int, substeps: int
 ) -> tuple[float, float, float]:
-    """Return three columns of the past of robot m of world n, `lag` substeps ago.
+    """Return what a robot recorded `lag` substeps before the end of period `steps`.
 
-    `column` is `POSE`, `TRUE_TWIST`, `ODOM` or `ODOM_TWIST`.
+    `past` (R, PAST_COLUMNS) is its ring buffer; `column` is the first of the three columns that are
+    returned: `POSE`, `TRUE_TWIST`, `ODOM` or `ODOM_TWIST`.
     """
-    past = data.past[n, m]
     rows = past.shape[0]
-    newer = data.steps[n] - lag // substeps
+    newer = steps - lag // substeps
     fraction = (lag % substeps) / substeps
-    new = past[newer % rows]
-    x = new[column]
-    y = new[column + 1]
-    z = new[column + 2]
+    new = newer % rows
+    x = past[new, column]
+    y = past[new, column + 1]
+    z = past[new, column + 2]
     if fraction > 0.0:
-        old = past[(newer - 1) % rows]
-        x += fraction * (old[column] - x)
-        y += fraction * (old[column + 1] - y)
-        change = old[column + 2] - z
+        old = (newer - 1) % rows
+        x += fraction * (past[old, column] - x)
+        y += fraction * (past[old, column + 1] - y)
+        change = past[old, column + 2] - z
         if column in (POSE, ODOM):
             z = wrap(z + fraction * wrap(change))
         else:
@@ -256,17 +258,18 @@ def _scan_from_past(
     skew = data.faults[n, m, fault_kernels.SKEW]
     pose = scans.pose[0, 0]
     twist = scans.twist
-    lag = limit_lag(data.age[n, m], steps, data.past.shape[2], substeps)
-    pose[0], pose[1], pose[2] = interpolate_past(n, m, POSE, lag, data, substeps)
+    past = data.past[n, m]
+    lag = limit_lag(data.age[n, m], steps, past.shape[0], substeps)
+    pose[0], pose[1], pose[2] = interpolate_past(past, POSE, lag, steps, substeps)
     twist[0], twist[1], twist[2] = interpolate_past(
-        n, m, TRUE_TWIST, lag, data, substeps
+        past, TRUE_TWIST, lag, steps, substeps
     )
     reach = lidar.range_max + math.hypot(lidar.mount[0], lidar.mount[1])
     if skew != 0.0:
         reach += math.hypot(twist[0], twist[1]) * lidar.sweep_time
     count = _gather_bodies(n, m, lag, reach, data, world_set, motion, scratch)
     # this robot as the only one of an only world, which has the bodies that were gathered
-    bodies = scans.bodies[:count].reshape((1, count, data.bodies.shape[2]))
+    bodies = scans.bodies[:count].reshape((1, count, BODY_COLUMNS))
     listed = scans.no_cells
     listed = BodyCells(
         listed.first, listed.then, listed.ordered, listed.frame, listed.found[:count]
@@ -339,12 +342,13 @@ def _gather_bodies(
         if k == obstacle_count + m or radius <= 0.0:
             continue
         body = scans.bodies[count]
-        for j in range(data.bodies.shape[2]):
+        for j in range(BODY_COLUMNS):
             body[j] = data.bodies[n, k, j]
         has_turned = False
         if lag > 0 and k >= obstacle_count:
+            past = data.past[n, k - obstacle_count]
             body[X], body[Y], body[HEADING] = interpolate_past(
-                n, k - obstacle_count, POSE, lag, data, motion.substeps
+                past, POSE, lag, data.steps[n], motion.substeps
             )
             has_turned = True
         elif lag > 0:

@@ -41,6 +41,8 @@ ODOM = 6  # pose by odometry
 ODOM_TWIST = 9  # measured twist
 PAST_COLUMNS = 12
 
+BODY_COLUMNS = 7  # of `State.bodies`, see `lidar.exact_kernels`
+
 # Rows of `Lanes.pose`, as `robot.kernels.run` takes them.
 LANE_X = 0
 LANE_Y = 1
@@ -60,7 +62,7 @@ class State(NamedTuple):
     pose: Array  # (N, M, 3) true pose of `base_link` in `map`
     state: Array  # (N, M, S) true state of the robot's model
     history: Array  # (N, M, H, C) commands in effect, newest first
-    # (N, K + M, 7) obstacles, then robots; columns as in `lidar.exact_kernels`
+    # (N, K + M, BODY_COLUMNS) obstacles, then robots; columns as in `lidar.exact_kernels`
     bodies: Array
     odom: Array  # (N, M, 3) pose by odometry, which drifts; it begins at the start pose
     twist: Array  # (N, M, 3) measured body twist

@@ -304,7 +304,7 @@ def move_freely(
         substep = next_change
 
 
-@kernel
+@kernel(inline=True)
 def _fill_lanes(
     first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
 ) -> None:
@@ -331,7 +331,7 @@ def _fill_lanes(
                 lanes.change[c, lane] = delay % motion.substeps
 
 
-@kernel
+@kernel(inline=True)
 def _apply_commands(
     substep: int,
     first_world: int,
@@ -416,7 +416,7 @@ def _move_world(
     drift_carefully(n, data, scene, motion, nearby, single)
 
 
-@kernel
+@kernel(inline=True)
 def _take_free_motion(n: int, m: int, lane: int, data: State, lanes: Lanes) -> None:
     """Copy pose and state of a robot from its lane."""
     data.pose[n, m, 0] = lanes.pose[LANE_X, lane]
