@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -65,6 +66,14 @@ DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
 
 
+class Timing(NamedTuple):
+    """Times of a simulator in whole substeps, the steps of the model's kinematics."""
+
+    dt: float  # length of a substep [s]
+    substeps: int  # in a control period
+    delay: int  # common latency of the commands [substeps]
+
+
 @dataclass(frozen=True)
 class SimulatorModel:
     """All that a fast simulator needs to know about a robot."""
@@ -103,11 +112,11 @@ class SimulatorModel:
             raise ModelError(f"control_period {period} s {reason}")
 
     @property
-    def timing(self) -> tuple[float, int, int]:
-        """Step [s], steps per control period, delay of commands [steps]."""
+    def timing(self) -> Timing:
+        """Length of a substep, substeps in a control period, delay of the commands."""
         dt = self.kinematics.dt
         delay = max(0, round(self.calibration.command_latency_s / dt))
-        return dt, round(self.control_period / dt), delay
+        return Timing(dt, round(self.control_period / dt), delay)
 
     @cached_property
     def text(self) -> str:

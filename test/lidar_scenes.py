@@ -154,11 +154,16 @@ def by_plane_geometry(spec: LidarSpec, scene: Scene) -> tuple[np.ndarray, np.nda
     return ranges, clear
 
 
-def slice_poses(pose, twist, sweep_time: float, slices: int, skew: str) -> np.ndarray:
-    """Poses (G, 3) of a robot during a sweep that ends at `pose`, with a body twist (3,)."""
+def slice_poses(
+    pose, twist, sweep_time: float, slices: int, skew: str, moving: float = np.inf
+) -> np.ndarray:
+    """Poses (G, 3) of a robot during a sweep that ends at `pose`, with a body twist (3,).
+
+    It has been `moving` for so long [s].
+    """
     out = np.empty((slices, 3))
     fault_kernels.slice_poses(
-        out, np.asarray(pose), np.asarray(twist), sweep_time, SKEW[skew]
+        out, np.asarray(pose), np.asarray(twist), sweep_time, SKEW[skew], moving
     )
     out[:, 2] = geometry.wrap_angle(out[:, 2])
     return out

@@ -136,7 +136,7 @@ def watch(
     seen = []
     scene = surroundings_of(motions, half, walls, grid)
     still = np.zeros((len(places) - count, 2))
-    kernels.begin(0, state, scene.movers.plans)
+    kernels.reset_marks(0, state, scene.movers.plans)
     where = [bodies[0, :, :2].copy()]
     headings = [bodies[0, :count, 2].copy()]
     for t in range(steps):

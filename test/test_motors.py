@@ -27,7 +27,8 @@ from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_roll
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import build_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
-from nics_drl_bridge.sim.simulator import CommandBox, FastSimulator
+from nics_drl_bridge.sim.command_range import CommandRange
+from nics_drl_bridge.sim.simulator import FastSimulator
 
 CAR = build_robot(
     {
@@ -330,11 +331,11 @@ def test_a_written_car_stands_still_at_a_throttle_in_its_dead_zone(model, tmp_pa
 
 def test_a_warning_is_of_the_command_that_was_sent(model):
     said: list[str] = []
-    box = CommandBox(motors(), CAR, said.append)
-    box.check(np.array([[0.85, 0.0]]))  # in effect 0.68: more than 0.8 does no more
+    checked = CommandRange(motors(), CAR, said.append)
+    checked.check(np.array([[0.85, 0.0]]))  # in effect 0.68: more than 0.8 does no more
     assert not said
     slow = replace(motors(), high=np.array([2.0, 1.0, 0.3, 1.0]))
-    CommandBox(slow, CAR, said.append).check(np.array([[0.6, 0.0]]))
+    CommandRange(slow, CAR, said.append).check(np.array([[0.6, 0.0]]))
     assert "throttle is 0.6, but the model was fitted to -inf to 0.42 only" in said[0]
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 
 # Columns of a row of faults; `faults.LidarFaults` explains them.
@@ -182,7 +183,7 @@ def _drop(ranges, share, far, by):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
+def slice_pose(out: Array, pose: Array, twist: Array, ago: float) -> None:
     """Write the pose (3,) `ago` [s] earlier on the arc of a twist (3,); heading unwrapped."""
     turn = -twist[2] * ago
     half = 0.5 * turn
@@ -198,19 +199,33 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
+def slice_poses(
+    out: Array,
+    pose: Array,
+    twist: Array,
+    sweep: float,
+    direction: float,
+    moving: float,
+) -> None:
     """Write the poses (G, 3) of the robot at which G equal groups of beams were measured.
 
-    Group g has the beams from `g * B // G` to `(g + 1) * B // G`, and the pose of its interval's
-    middle, heading unwrapped. The `sweep` [s] ends at `pose`: the newest beam is the last, or beam
-    0 for one that turns clockwise. `direction` is a value of SKEW, `twist` (3,) that of the body.
+    Group g has the beams from `g * B // G` to `(g + 1) * B // G`, and the pose at the middle of its
+    interval.
+
+    Args:
+        out: (G, 3) the poses, headings unwrapped.
+        pose: (3,) at the end of the sweep, when the newest beam is measured.
+        twist: (3,) of the body during the sweep.
+        sweep: duration of the sweep [s].
+        direction: a value of SKEW; the newest beam is the last, or beam 0 if it turns clockwise.
+        moving: for how long the robot has been moving [s]; before that it stood where it began.
     """
     count = out.shape[0]
     for g in range(count):
         ago = 0.0
         if direction != AT_ONCE:
             later = count - 1 - g if direction > AT_ONCE else g
-            ago = sweep * (later + 0.5) / count
+            ago = min(sweep * (later + 0.5) / count, moving)
         slice_pose(out[g], pose, twist, ago)
 
 

@@ -94,7 +94,7 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
     rate = number(node, "odom_rate")
-    dt = model.timing[0]
+    dt = model.timing.dt
     odom = 1.0 / rate if rate else model.control_period
     scan = 1.0 / (number(node, "scan_rate") or model.lidar.rate)
     step = common_step(dt, (odom, scan)) * dt
@@ -124,9 +124,9 @@ def timed_model(
         model = replace(
             model, calibration=replace(model.calibration, command_latency_s=latency)
         )
-    dt = model.timing[0]
+    dt = model.timing.dt
     steps = round(time.step_ns / NS_PER_S / dt)
-    if steps == model.timing[1]:
+    if steps == model.timing.substeps:
         return model
     return replace(model, control_period=steps * dt)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
@@ -17,11 +18,10 @@ from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
-from nics_drl_bridge.sim import state as arrays
+from nics_drl_bridge.sim import state as records
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
-from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import FIRST, MARK, PLAN
 from nics_drl_bridge.sim.world import World
 
@@ -32,6 +32,14 @@ CROWD = 4096
 # Minimum number of robots: for fewer, testing all bodies takes less time
 FEWEST_OF_A_CROWD = 8
 STANDING = 32  # Minimum number of obstacles, all of which stand, for sorting them into cells once
+
+
+# Limits of a simulation: robots in one world, each of which is tested against every other, and
+# numbers in the arrays of all worlds, some GB.
+MOST_ROBOTS = 1_000
+MOST_NUMBERS = 2**30
+# Numbers of a robot or an obstacle whose count depends on neither beams, history nor past [1]
+NUMBERS_PER_BODY = 64
 
 
 @dataclass(frozen=True)
@@ -50,21 +58,60 @@ class Sizes:
         pairs = self.robots * (self.robots + self.obstacles)
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
 
+    def count_past_rows(self, model: SimulatorModel) -> int:
+        """Return R: a row for the newest period, and one for each that an observation may lag."""
+        return count_periods(self.longest_age, model) + 1
 
-def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
+    def count_history_rows(self, model: SimulatorModel) -> int:
+        """Return H: a row for the newest command, and one for each period it may be delayed."""
+        own_delays = make_terms(model.kinematics).late
+        longest = self.longest_delay + int(own_delays.max(initial=0))
+        return count_periods(longest, model) + 1
+
+
+def count_periods(substeps: int, model: SimulatorModel) -> int:
+    """Return the number of control periods that so many substeps begin."""
+    return -(-substeps // model.timing.substeps)
+
+
+def check_robots(robots: int, source: str) -> None:
+    """Raise ConfigError for more robots than a world may have."""
+    if robots > MOST_ROBOTS:
+        raise ConfigError(
+            f"{source} with {robots:.10g} robots: a world may have {MOST_ROBOTS} robots."
+        )
+
+
+def check_memory(model: SimulatorModel, sizes: Sizes, source: str) -> None:
+    """Raise ConfigError, before anything is allocated, for more worlds than fit in memory."""
+    per_robot = (
+        model.lidar.beams
+        + NUMBERS_PER_BODY
+        + sizes.count_past_rows(model) * records.PAST_COLUMNS
+        + sizes.count_history_rows(model) * len(model.robot.command)
+    )
+    per_world = sizes.robots * per_robot + sizes.obstacles * NUMBERS_PER_BODY
+    if sizes.worlds * per_world <= MOST_NUMBERS:
+        return
+    raise ConfigError(
+        f"{sizes.worlds:.10g} copies of {source} with {sizes.robots} robots, {sizes.obstacles} "
+        f"obstacles, delays of {sizes.longest_delay} and ages of {sizes.longest_age} substeps: "
+        f"{MOST_NUMBERS // per_world} copies of it are the most that fit in memory."
+    )
+
+
+def allocate_state(model: SimulatorModel, sizes: Sizes) -> records.State:
     """Allocate the arrays of worlds before their first reset, with the model's parameters."""
-    _, substeps, delay = model.timing
     shape = (sizes.worlds, sizes.robots)
     bodies = sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
-    # One row for the newest; an age within a period also needs the end of the previous period.
     terms = make_terms(model.kinematics)
-    longest = sizes.longest_delay + int(terms.late.max(initial=0))
-    rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, longest))
-    return arrays.State(
+    history = (*shape, sizes.count_history_rows(model), len(model.robot.command))
+    past = (*shape, sizes.count_past_rows(model), records.PAST_COLUMNS)
+    return records.State(
         pose=np.zeros((*shape, 3)),
         state=np.zeros((*shape, len(model.robot.state))),
-        history=np.zeros((*shape, sent, len(model.robot.command))),
+        history=np.zeros(history),
         bodies=np.zeros((sizes.worlds, bodies, BODY)),
         odom=np.zeros((*shape, 3)),
         twist=np.zeros((*shape, 3)),
@@ -75,11 +122,11 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
         member=np.zeros(sizes.worlds, np.int64),
         faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
         coefficient=np.tile(terms.coefficient, (*shape, 1)),
-        delay=np.full(shape, delay, np.int64),
+        delay=np.full(shape, model.timing.delay, np.int64),
         age=np.zeros(shape, np.int64),
         noise=np.tile(noise, (*shape, 1)),
         velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
-        past=np.zeros((*shape, rows, PAST)),
+        past=np.zeros(past),
         marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
     )
 
@@ -90,135 +137,144 @@ def split(worlds: int, threads: int) -> tuple[slice, ...]:
     return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
 
 
-def members_of(
+def stack_members(
     worlds: Sequence[World],
     motions: Sequence[Sequence[Motion | None]],
     outlines: OutlineArrays,
     sizes: Sizes,
     member: NDArray[np.int64],
-) -> arrays.Members:
-    """Stack P worlds, of up to K obstacles that move by `motions` (P, K), for N copies.
+) -> records.WorldSetArrays:
+    """Stack the surroundings of the members of a world set.
 
-    `member` (N,) is read as the kernels run.
+    Args:
+        worlds: the P members.
+        motions: (P, K) of their obstacles.
+        outlines: of all shapes.
+        sizes: of the simulation.
+        member: (N,) the member that each world is a copy of; it changes as episodes begin.
     """
-    grids = _shared([world.grid for world in worlds])
-    distances, places = joined([map_field(grid).distances for grid in grids])
+    grids = _share_equal_maps([world.grid for world in worlds])
+    distances, map_places = joined([map_field(grid).distances for grid in grids])
     moves = any(motion is not None for each in motions for motion in each)
-    stands = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
-    plans, waypoints = _plans(motions if moves else [() for _ in worlds])
-    field = np.array([world.extent for world in worlds])
-    return arrays.Members(
+    standing = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
+    plans, waypoints = _stack_plans(motions if moves else [() for _ in worlds])
+    bounds = np.array([world.extent for world in worlds])
+    return records.WorldSetArrays(
         stack_fixtures([world.all_walls() for world in worlds], grids, member),
         distances,
-        places,
+        map_places,
         outlines,
         sizes.crowded,
-        stands,
+        standing,
         moves,
         plans,
         waypoints,
-        field,
+        bounds,
     )
 
 
-def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
-    """The same object for maps with equal content, which are then baked and stored once."""
-    once: dict[Any, GridMap] = {}
-    found: list[GridMap | None] = []
+def _share_equal_maps(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
+    """Return one object for all maps of equal content, which is then baked and stored once."""
+    distinct: dict[Any, GridMap] = {}
+    shared: list[GridMap | None] = []
     for grid in grids:
         if grid is None:
-            found.append(None)
-        else:
-            about = (
-                grid.cells.shape,
-                grid.resolution,
-                grid.origin,
-                hash_bytes(grid.cells.tobytes()),
-            )
-            found.append(once.setdefault(about, grid))
-    return found
+            shared.append(None)
+            continue
+        content = (
+            grid.cells.shape,
+            grid.resolution,
+            grid.origin,
+            hash_bytes(grid.cells.tobytes()),
+        )
+        shared.append(distinct.setdefault(content, grid))
+    return shared
 
 
-def map_field(grid: GridMap | None) -> arrays.MapField:
+def map_field(grid: GridMap | None) -> records.MapField:
     """Return a static map for the kernels."""
     if grid is None:
-        return arrays.NO_FIELD
-    return arrays.MapField(
+        return records.NO_FIELD
+    return records.MapField(
         np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist()
     )
 
 
-def cells_of(sizes: Sizes, members: arrays.Members) -> BodyCells:
+def allocate_cells(sizes: Sizes, world_set: records.WorldSetArrays) -> BodyCells:
     """Allocate the cells of all worlds, none if testing all bodies takes less time."""
-    worlds = sizes.worlds if members.crowded or members.standing else 0
-    return body_cells(worlds, sizes.robots + sizes.obstacles, members.standing)
+    worlds = sizes.worlds if world_set.crowded or world_set.standing else 0
+    return body_cells(worlds, sizes.robots + sizes.obstacles, world_set.standing)
 
 
-def _plans(
+def _stack_plans(
     motions: Sequence[Sequence[Motion | None]],
-) -> tuple[arrays.Array, arrays.Array]:
-    each = [plan_arrays(one) for one in motions]
-    plans = np.zeros((len(each), max(map(len, motions)), PLAN))
+) -> tuple[records.Array, records.Array]:
+    """Return the plans (P, K, PLAN) and waypoints (Q, 2) of the motions (P, K) of all members."""
+    plans = np.zeros((len(motions), max(map(len, motions)), PLAN))
+    waypoints = []
     first = 0
-    for into, (rows, waypoints) in zip(plans, each, strict=True):
-        into[: len(rows)] = rows
-        into[:, FIRST] += first
-        first += len(waypoints)
-    return plans, np.concatenate([waypoints for _, waypoints in each])
+    for plan, motions_of_member in zip(plans, motions, strict=True):
+        rows, waypoints_of_member = plan_arrays(motions_of_member)
+        plan[: len(rows)] = rows
+        plan[:, FIRST] += first
+        first += len(waypoints_of_member)
+        waypoints.append(waypoints_of_member)
+    return plans, np.concatenate(waypoints)
 
 
-def part_of(
-    state: arrays.State,
-    members: arrays.Members,
+def allocate_part(
+    data: records.State,
+    world_set: records.WorldSetArrays,
     model: SimulatorModel,
     scanner: Scanner,
     sizes: Sizes,
     cells: BodyCells,
     part: slice,
-) -> arrays.Part:
+) -> records.Part:
     """Return the kernels' arguments for one part of the worlds, with its own scratch memory."""
-    dt, substeps, _ = model.timing
-    motion = arrays.Dynamics(
-        make_terms(model.kinematics), SERIES, float(dt), int(substeps)
+    timing = model.timing
+    motion = records.Dynamics(
+        make_terms(model.kinematics), SERIES, float(timing.dt), int(timing.substeps)
     )
-    own = _scratch(model, scanner, sizes, cells, part.stop - part.start)
-    return arrays.Part(state, members, scanner.arguments, motion, own)
+    scratch = _allocate_scratch(model, scanner, sizes, cells, part.stop - part.start)
+    return records.Part(data, world_set, scanner.arguments, motion, scratch)
 
 
-def _scratch(
+def _allocate_scratch(
     model: SimulatorModel, scanner: Scanner, sizes: Sizes, cells: BodyCells, worlds: int
-) -> arrays.Scratch:
+) -> records.Scratch:
+    """Allocate the memory of a thread that steps so many worlds."""
     kinematics = model.kinematics
     robots = sizes.robots
-    count = sizes.obstacles
-    bodies = count + robots
+    obstacles = sizes.obstacles
+    bodies = obstacles + robots
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
     corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
     x, dq = allocate_scratch(kinematics)
     commands = len(kinematics.variables) - kinematics.state_size
-    return arrays.Scratch(
-        lanes=arrays.Lanes(
-            pose=np.zeros((6, lanes)),
+    return records.Scratch(
+        lanes=records.Lanes(
+            pose=np.zeros((records.LANE_ROWS, lanes)),
             x=np.ones((len(kinematics.variables) + 1, lanes)),
             dq=np.zeros((len(kinematics.dofs), lanes)),
-            late=np.zeros((commands, lanes), np.int64),
+            change=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
-        single=arrays.Single(
+        single=records.Single(
             x=x,
             dq=dq,
             trial=np.zeros(BODY),
             spare=np.zeros((corners, 2)),
-            start=np.zeros((count, 3)),
-            began=np.zeros((count, 3)),
+            origin=np.zeros((obstacles, 3)),
+            period_start=np.zeros((obstacles, 3)),
             flights=np.zeros((bodies, FLIGHT)),
             events=np.zeros((robots, EVENT)),
         ),
-        nearby=arrays.Nearby(
+        nearby=records.Nearby(
             near=np.zeros((robots, 1 + SEVERAL), np.int64),
             meets=np.zeros(robots, np.int64),
-            way=np.zeros(robots),
+            path=np.zeros(robots),
             reach=np.zeros(bodies),
             speeds=np.zeros((robots, 2)),
         ),
@@ -226,16 +282,16 @@ def _scratch(
             then=cells.then.copy() if cells.ordered else cells.then,
             found=cells.found.copy(),
         ),
-        scans=arrays.Scans(
-            before=np.zeros((lanes, 3)),
+        scans=records.Scans(
+            start_poses=np.zeros((lanes, 3)),
             waiting=np.zeros(worlds, np.int64),
-            seen=np.zeros((bodies + 1, BODY)),
-            spot=np.zeros((1, 1, 3)),
-            slices=np.zeros((SLICES, 3)),
-            part=np.zeros((1, 1, model.lidar.beams), np.float32),
-            drive=np.zeros(3),
-            none=np.zeros(1, np.int64),
-            every=body_cells(0, bodies + 1),
-            lookup=scan_kernels.scan_lanes(),
+            bodies=np.zeros((bodies + 1, BODY)),
+            pose=np.zeros((1, 1, 3)),
+            slice_poses=np.zeros((SLICES, 3)),
+            slice_ranges=np.zeros((1, 1, model.lidar.beams), np.float32),
+            twist=np.zeros(3),
+            only_world=np.zeros(1, np.int64),
+            no_cells=body_cells(0, bodies + 1),
+            lanes=scan_kernels.scan_lanes(),
         ),
     )

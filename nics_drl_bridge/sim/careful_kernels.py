@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.robot import kernels as robot
@@ -26,8 +27,9 @@ from nics_drl_bridge.sim.impact_kernels import (
     VY,
     Moving,
 )
-from nics_drl_bridge.sim.sensing_kernels import drift_of
 from nics_drl_bridge.sim.state import (
+    DRIFT_STATE,
+    DRIFT_X,
     Array,
     Dynamics,
     Nearby,
@@ -42,22 +44,22 @@ MOST_MOVES = 1000
 
 
 @kernel
-def rates_at(
-    n: int, m: int, j: int, state: State, motion: Dynamics, single: Single
+def compute_rates(
+    n: int, m: int, j: int, data: State, motion: Dynamics, single: Single
 ) -> None:
     """Write to `single.dq` the rates of robot m in substep j, by the command then in effect."""
-    size = state.state.shape[2]
-    sent = state.history.shape[2]
+    size = data.state.shape[2]
+    sent = data.history.shape[2]
     for s in range(size):
-        single.x[s] = state.state[n, m, s]
-    for c in range(state.history.shape[3]):
-        delay = state.delay[n, m] + motion.terms.late[c]
+        single.x[s] = data.state[n, m, s]
+    for c in range(data.history.shape[3]):
+        delay = data.delay[n, m] + motion.terms.late[c]
         row = robot.find_delayed_command(j, delay, motion.substeps, sent)
-        single.x[size + c] = state.history[n, m, row, c]
+        single.x[size + c] = data.history[n, m, row, c]
     robot.rates(
         single.dq,
         single.x,
-        robot.replace_coefficients(motion.terms, state.coefficient[n, m]),
+        robot.replace_coefficients(motion.terms, data.coefficient[n, m]),
     )
 
 
@@ -241,14 +243,14 @@ def _arrive(
     n: int,
     any_moves: bool,
     motion: Dynamics,
-    state: State,
+    data: State,
     nearby: Nearby,
     single: Single,
     moving: Moving,
 ) -> None:
-    bodies = state.bodies[n]
-    velocity = state.velocity[n]
-    start = single.start
+    bodies = data.bodies[n]
+    velocity = data.velocity[n]
+    origin = single.origin
     for m in range(nearby.meets.shape[0]):
         if nearby.meets[m] != contacts.FREE:
             me = velocity.shape[0] + m
@@ -267,10 +269,10 @@ def _arrive(
     for k in range(velocity.shape[0] if any_moves else 0):
         stop = single.flights[k, STOP]
         if stop < motion.dt:
-            start[k, 0] = bodies[k, X] + velocity[k, 0] * stop
-            start[k, 1] = bodies[k, Y] + velocity[k, 1] * stop
-            start[k, 2] = robot.wrap(bodies[k, HEADING] + velocity[k, 2] * stop)
-            contacts.put_body(state.bodies, n, k, start[k])
+            origin[k, 0] = bodies[k, X] + velocity[k, 0] * stop
+            origin[k, 1] = bodies[k, Y] + velocity[k, 1] * stop
+            origin[k, 2] = robot.wrap(bodies[k, HEADING] + velocity[k, 2] * stop)
+            contacts.put_body(data.bodies, n, k, origin[k])
             velocity[k, :] = 0.0
 
 
@@ -278,7 +280,7 @@ def _arrive(
 def move_carefully(
     n: int,
     any_moves: bool,
-    state: State,
+    data: State,
     scene: Surroundings,
     motion: Dynamics,
     nearby: Nearby,
@@ -293,30 +295,30 @@ def move_carefully(
     moves.
     """
     events = single.events
-    touched = state.collided[n]
+    touched = data.collided[n]
     dt = motion.dt
-    first = state.velocity.shape[1]
+    first = data.velocity.shape[1]
     meets = nearby.meets
     moving = Moving(
-        state.bodies[n], single.flights, first, scene.outlines, motion.series
+        data.bodies[n], single.flights, first, scene.outlines, motion.series
     )
     for m in range(meets.shape[0]):
         single.flights[first + m, :] = 0.0
         if meets[m] != contacts.FREE:
-            contacts.put_body(state.bodies, n, first + m, state.pose[n, m])
+            contacts.put_body(data.bodies, n, first + m, data.pose[n, m])
             _check_overlap(m, scene, nearby, single, touched, moving)
     for j in range(motion.substeps):
         if any_moves:
             contacts.move_obstacles(
-                state.bodies, single.start, state.velocity, n, j * dt
+                data.bodies, single.origin, data.velocity, n, j * dt
             )
         for k in range(first):
             for i in range(3):
-                single.flights[k, VX + i] = state.velocity[n, k, i]
+                single.flights[k, VX + i] = data.velocity[n, k, i]
             single.flights[k, STOP] = dt
         for m in range(meets.shape[0]):
             if meets[m] != contacts.FREE:
-                rates_at(n, m, j, state, motion, single)
+                compute_rates(n, m, j, data, motion, single)
                 flight = single.flights[first + m]
                 dq = single.dq
                 flight[VX], flight[VY], flight[TURN], flight[STOP] = (
@@ -326,24 +328,24 @@ def move_carefully(
                     dt,
                 )
                 flight[impact.FROM] = flight[impact.HOLDS] = 0.0
-                for s in range(state.state.shape[2]):
-                    now = state.state[n, m, s]
+                for s in range(data.state.shape[2]):
+                    now = data.state[n, m, s]
                     bounds = robot.get_bounds(motion.terms, s)
-                    state.state[n, m, s] = robot.advance_state(
+                    data.state[n, m, s] = robot.advance_state(
                         now, dq[3 + s], dt, bounds
                     )
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)
-        _arrive(n, any_moves, motion, state, nearby, single, moving)
+        _arrive(n, any_moves, motion, data, nearby, single, moving)
     if any_moves:
         period = motion.substeps * dt
-        contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)
-        _average_velocities(n, period, state, single)
+        contacts.move_obstacles(data.bodies, single.origin, data.velocity, n, period)
+        _average_velocities(n, period, data, single)
     for m in range(meets.shape[0]):
         if meets[m] != contacts.FREE:
             for i in range(3):
-                state.pose[n, m, i] = state.bodies[n, first + m, i]
+                data.pose[n, m, i] = data.bodies[n, first + m, i]
 
 
 @kernel
@@ -371,41 +373,41 @@ def _check_overlap(
 
 
 @kernel
-def _average_velocities(n: int, period: float, state: State, single: Single) -> None:
-    bodies = state.bodies
-    velocity = state.velocity
-    start = single.start
-    began = single.began
+def _average_velocities(n: int, period: float, data: State, single: Single) -> None:
+    bodies = data.bodies
+    velocity = data.velocity
+    origin = single.origin
+    start = single.period_start
     for k in range(velocity.shape[1]):
-        stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]
-        if stopped or start[k, 2] != began[k, 2]:
+        stopped = origin[k, 0] != start[k, 0] or origin[k, 1] != start[k, 1]
+        if stopped or origin[k, 2] != start[k, 2]:
             for i in range(2):
-                velocity[n, k, i] = (bodies[n, k, i] - began[k, i]) / period
-            velocity[n, k, 2] = robot.wrap(bodies[n, k, HEADING] - began[k, 2]) / period
+                velocity[n, k, i] = (bodies[n, k, i] - start[k, i]) / period
+            velocity[n, k, 2] = robot.wrap(bodies[n, k, HEADING] - start[k, 2]) / period
 
 
 @kernel
 def drift_carefully(
     n: int,
-    state: State,
+    data: State,
     scene: Surroundings,
     motion: Dynamics,
     nearby: Nearby,
     single: Single,
 ) -> None:
     """Let the robots of one world drift, one after the other, up to their contacts."""
-    pose = state.pose
-    collided = state.collided
+    pose = data.pose
+    collided = data.collided
     meets = nearby.meets
     flights = single.flights
     events = single.events
-    first = state.velocity.shape[1]
-    moving = Moving(state.bodies[n], flights, first, scene.outlines, motion.series)
+    first = data.velocity.shape[1]
+    moving = Moving(data.bodies[n], flights, first, scene.outlines, motion.series)
     stood = False
     for m in range(pose.shape[1]):
         if collided[n, m] != 0:
             continue
-        ahead, aside, turn = drift_of(n, m, state, motion.dt * motion.substeps)
+        ahead, aside, turn = draw_drift(n, m, data, motion)
         if ahead == 0.0 and aside == 0.0 and turn == 0.0:
             continue
         stop = 1.0
@@ -414,7 +416,7 @@ def drift_carefully(
             if not stood:
                 flights[:] = 0.0
                 stood = True
-            contacts.put_body(state.bodies, n, first + m, pose[n, m])
+            contacts.put_body(data.bodies, n, first + m, pose[n, m])
             flight[VX] = ahead
             flight[VY] = aside
             flight[TURN] = turn
@@ -444,4 +446,41 @@ def drift_carefully(
             robot.wrap(pose[n, m, 2] + turn * stop),
         )
         if meets[m] != contacts.FREE:
-            contacts.put_body(state.bodies, n, first + m, pose[n, m])
+            contacts.put_body(data.bodies, n, first + m, pose[n, m])
+
+
+@kernel
+def draw_drift(
+    n: int, m: int, data: State, motion: Dynamics
+) -> tuple[float, float, float]:
+    """Draw the drift of robot m in a period: ahead, left [m] and turn [rad]; move its state.
+
+    The drift grows with root time. Draws are uniform, up to sqrt(3) standard deviations, because
+    that is cheap; over some periods they add up to a normal distribution. The state stays within
+    the bounds of the model.
+    """
+    noise = data.noise[n, m]
+    seed = data.seeds[n]
+    counter = data.steps[n] * data.pose.shape[1] + m
+    count = noise.shape[0] - DRIFT_X
+    period = motion.dt * motion.substeps
+    scale = math.sqrt(12.0 * period)
+    ahead = left = turn = 0.0
+    for i in range(count):
+        std = noise[DRIFT_X + i]
+        if std <= 0.0:
+            continue
+        drawn = random.uniform(seed, random.DRIFT_STREAM, counter * count + i) - 0.5
+        drift = scale * std * drawn
+        if i == 0:
+            ahead = drift
+        elif i == 1:
+            left = drift
+        elif i == 2:
+            turn = drift
+        else:
+            s = DRIFT_X + i - DRIFT_STATE
+            low = motion.terms.low[s]
+            high = motion.terms.high[s]
+            data.state[n, m, s] = min(max(data.state[n, m, s] + drift, low), high)
+    return ahead, left, turn

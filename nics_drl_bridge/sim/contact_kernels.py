@@ -25,14 +25,18 @@ SEVERAL = 32
 
 
 @kernel
-def reaches(
-    n: int, state: State, scene: Surroundings, nearby: Nearby, period: float
+def compute_reaches(
+    n: int, data: State, scene: Surroundings, nearby: Nearby, period: float
 ) -> tuple[float, bool]:
-    """Write how far bodies reach in a period [s]; return longest path, if obstacles move."""
+    """Write to `nearby.reach` how far each body may reach in a period [s].
+
+    Returns:
+        Longest path of a body [m], and True if an obstacle moves.
+    """
     reach = nearby.reach
-    way = nearby.way
-    bodies = state.bodies
-    velocity = state.velocity
+    path = nearby.path
+    bodies = data.bodies
+    velocity = data.velocity
     longest = 0.0
     moving = False
     obstacles = velocity.shape[1]
@@ -45,9 +49,9 @@ def reaches(
             reach[k] += moved
             longest = max(longest, moved)
             moving = True
-    for m in range(way.shape[0]):
-        reach[obstacles + m] = bodies[n, obstacles + m, RADIUS] + way[m]
-        longest = max(longest, way[m])
+    for m in range(path.shape[0]):
+        reach[obstacles + m] = bodies[n, obstacles + m, RADIUS] + path[m]
+        longest = max(longest, path[m])
     return longest, moving
 
 

@@ -10,7 +10,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.sim import contact_kernels, step_kernels
+from nics_drl_bridge.sim import contact_kernels, covariance_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator, Starts
 from nics_drl_bridge.sim.world import room_at
@@ -159,7 +159,7 @@ def propagate(
     poses = (
         np.asarray(each, np.float64).reshape(len(out), 3) for each in (before, after)
     )
-    step_kernels.propagate(out, *poses, added)
+    covariance_kernels.propagate(out, *poses, added)
     return out
 
 
@@ -188,8 +188,8 @@ class DrivenSimulator(FastSimulator):
 
     def in_force(self, time: float) -> Array:
         """Commands (M, C) in force `time` [s] after the beginning, by the drawn latency alone."""
-        dt, _, own = self.model.timing
-        late = (self.data.delay[0] - own) * dt - time
+        timing = self.model.timing
+        late = (self.data.delay[0] - timing.delay) * timing.dt - time
         rows = np.ceil(np.maximum(late, 0.0) / self.model.control_period - 1e-6).astype(
             np.int64
         )

@@ -40,12 +40,12 @@ def _share(seed, counter):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def begin(n: int, state: State, plans: Array) -> None:
-    """Begin an episode of world n: draws the speed of each obstacle."""
-    seed = state.seeds[n]
-    bodies = state.bodies
+def reset_marks(n: int, data: State, plans: Array) -> None:
+    """Reset the memory of the obstacles of world n for an episode; draw their speeds."""
+    seed = data.seeds[n]
+    bodies = data.bodies
     for k in range(plans.shape[0]):
-        mark = state.marks[n, k]
+        mark = data.marks[n, k]
         row = plans[k]
         mark[:] = 0.0
         if row[at.KIND] == at.STILL:
@@ -60,21 +60,21 @@ def begin(n: int, state: State, plans: Array) -> None:
 
 @kernel
 def steer(
-    n: int, state: State, scene: Surroundings, period: float, speeds: Array
+    n: int, data: State, scene: Surroundings, period: float, speeds: Array
 ) -> None:
     """Set the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
 
     An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
     """
-    velocity = state.velocity[n]
-    seed = state.seeds[n]
-    step = state.steps[n]
+    velocity = data.velocity[n]
+    seed = data.seeds[n]
+    step = data.steps[n]
     movers = scene.movers
     count = velocity.shape[0]
     plans = movers.plans
-    bodies = state.bodies[n]
+    bodies = data.bodies[n]
     traffic = at.Traffic(
-        bodies, count, speeds, plans, scene.walls, movers.field, scene.grid, period
+        bodies, count, speeds, plans, scene.walls, movers.bounds, scene.grid, period
     )
     draws = (step + 1) * MOST
     # walkers first: they react to the velocities of the last period
@@ -82,11 +82,11 @@ def steer(
         velocity[k, :] = 0.0
         if plans[k, at.KIND] == at.PEDESTRIAN and bodies[k, RADIUS] > 0.0:
             velocity[k, 0], velocity[k, 1] = _walk(
-                state.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
+                data.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
             )
     for k in range(count):
         kind = plans[k, at.KIND]
-        mark = state.marks[n, k]
+        mark = data.marks[n, k]
         body = bodies[k]
         if kind == at.STILL or body[RADIUS] <= 0.0:
             continue

@@ -198,7 +198,7 @@ class Draws:
     """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's."""
 
     coefficient: (
-        Array  # (n, M, T) kept terms, in the order of `robot.kernels.term_arrays`
+        Array  # (n, M, T) of the kept terms, in the order of `robot.kernels.Terms`
     )
     response: Array  # (n, M) factor on the time constants, which is in `coefficient`
     delay: Integers  # (n, M) from a command to its effect, including the model's [substeps]
@@ -238,7 +238,7 @@ class Sampler:
         # (T,) terms of the state's
         self._rates = np.nonzero(model.kinematics.coefficients)[0] >= 3
         self._timing = _latencies(randomisation, model)
-        self._step = model.timing[0]
+        self._step = model.timing.dt
         self._noise = _levels(randomisation, model, where)
         self._faults = _faults(randomisation, model.lidar, where)
         self._choices = {

@@ -1,7 +1,15 @@
-"""Compiled inner loops of the simulator: odometry, drift of the motion, and scans.
+"""Compiled sensing of the simulator: odometry and scans, both of which may be late.
 
-Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the last R periods' ends, step
-i in row i % R: true pose, true twist, pose by odometry, measured twist, interpolated linearly.
+At the end of each period:
+
+1. `measure_odometry` moves the pose by odometry by the displacement that the wheels measured, and
+   by noise; it records true pose and twist beside it in the ring buffer `State.past`.
+2. `scan_or_wait` scans at once from a world with a late or skewed scan. The other worlds wait for
+   `scan_together`, which is faster per scan.
+3. `distort_scans` applies the faults of each robot's lidar.
+
+An observation is `State.age` substeps old. Poses and twists between the ends of two periods are
+interpolated linearly. No observation is older than its episode.
 """
 
 import math
@@ -14,105 +22,83 @@ from nics_drl_bridge.lidar.cell_kernels import BodyCells, around
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
 from nics_drl_bridge.robot.kernels import move, wrap
-from nics_drl_bridge.sim.state import Array, Dynamics, Members, Scratch, State
+from nics_drl_bridge.sim.state import (
+    BODY_COLUMNS,
+    ODOM,
+    ODOM_ANGULAR,
+    ODOM_LINEAR,
+    ODOM_TWIST,
+    POSE,
+    TRUE_TWIST,
+    Array,
+    Dynamics,
+    Scratch,
+    State,
+    WorldSetArrays,
+)
 
-# Columns of `past`
-POSE = 0
-TWIST = 3
-ODOM = 6
-MEASURED = 9
-PAST = 12
+# Obstacles of a late scan are moved back by their velocity for so long at most [s]: a pedestrian
+# changes it in about this time, and would otherwise be moved back through walls.
+FURTHEST_BACK = 1.0
 
 
 @kernel
-def begin(n: int, m: int, state: State) -> None:
-    """Record the true state of a robot at the start of an episode."""
-    past = state.past
-    pose = state.pose
-    odom = state.odom
-    twist = state.twist
+def record_start(n: int, m: int, data: State) -> None:
+    """Record robot m of world n, which stands still, as the start of an episode."""
+    start = data.past[n, m, 0]
     for i in range(3):
-        past[n, m, 0, POSE + i] = pose[n, m, i]
-        past[n, m, 0, TWIST + i] = 0.0
-        past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = (
-            odom[n, m, i],
-            twist[n, m, i],
-        )
+        start[POSE + i] = data.pose[n, m, i]
+        start[TRUE_TWIST + i] = 0.0
+        start[ODOM + i] = data.odom[n, m, i]
+        start[ODOM_TWIST + i] = data.twist[n, m, i]
 
 
 @kernel
-def lag_of(age: int, steps: int, rows: int, substeps: int) -> int:
-    """Age of an observation [substeps], limited to the present episode and the ring buffer."""
-    return max(min(age, min(steps, rows - 1) * substeps), 0)
-
-
-@kernel
-def at_lag(
-    past: Array, n: int, m: int, column: int, lag: int, steps: int, substeps: int
-) -> tuple[float, float, float]:
-    """Return three columns of `past`, `lag` substeps before the end of period `steps`."""
-    rows = past.shape[2]
-    new = (steps - lag // substeps) % rows
-    share = (lag % substeps) / substeps
-    x = past[n, m, new, column]
-    y = past[n, m, new, column + 1]
-    z = past[n, m, new, column + 2]
-    if share > 0.0:
-        old = (steps - lag // substeps - 1) % rows
-        x += share * (past[n, m, old, column] - x)
-        y += share * (past[n, m, old, column + 1] - y)
-        turn = past[n, m, old, column + 2] - z
-        z = wrap(z + share * wrap(turn)) if column in (POSE, ODOM) else z + share * turn
-    return x, y, z
-
-
-@kernel
-def _odometry_noise(n: int, m: int, axis: int, state: State) -> float:
-    std = state.noise[n, m, axis // 2]
-    if std <= 0.0:
-        return 0.0
-    counter = 3 * (state.steps[n] * state.pose.shape[1] + m) + axis
-    noise: float = std * random.normal(state.seeds[n], random.ODOMETRY_STREAM, counter)
-    return noise
-
-
-@kernel
-def measure(
+def measure_odometry(
     n: int,
     m: int,
-    state: State,
-    pose: Array,
-    before: Array,
-    now: Array,
+    data: State,
+    start: Array,
+    end: Array,
+    twist: Array,
     motion: Dynamics,
 ) -> None:
-    """Measure a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
+    """Measure the odometry of robot m of world n, at the end of a period.
 
-    From the pose (3,) `before`, poses (N, M, 3) by the wheels, and rates (3 + S,) at the end.
+    The pose by odometry drifts, because its displacement has noise; the twist has the same noise.
+
+    Args:
+        n: the world.
+        m: the robot.
+        data: the state, whose `past`, `odom` and `twist` are written.
+        start: (3,) pose by the wheels at the start of the period.
+        end: (3,) pose by the wheels at the end of the period.
+        twist: (3,) or more; body twist by the wheels at the end of the period.
+        motion: length of the period.
     """
-    steps = state.steps[n]
-    rows = state.past.shape[2]
+    steps = data.steps[n]
+    rows = data.past.shape[2]
     substeps = motion.substeps
-    this = steps % rows
-    last = state.past[n, m, this - 1 if this > 0 else rows - 1]
-    noise_x = _odometry_noise(n, m, 0, state)
-    noise_y = _odometry_noise(n, m, 1, state)
-    noise_turn = _odometry_noise(n, m, 2, state)
-    c = math.cos(before[2])
-    s = math.sin(before[2])
-    dx = pose[n, m, 0] - before[0]
-    dy = pose[n, m, 1] - before[1]
+    new = steps % rows
+    last = data.past[n, m, new - 1 if new > 0 else rows - 1]
+    noise_x = _draw_odometry_noise(n, m, 0, data)
+    noise_y = _draw_odometry_noise(n, m, 1, data)
+    noise_turn = _draw_odometry_noise(n, m, 2, data)
+    # the displacement in the robot's frame at the start of the period
+    c = math.cos(start[2])
+    s = math.sin(start[2])
+    dx = end[0] - start[0]
+    dy = end[1] - start[1]
     ahead = c * dx + s * dy
-    aside = c * dy - s * dx
-    turned = pose[n, m, 2] - before[2]
-    x = last[ODOM]
-    y = last[ODOM + 1]
+    left = c * dy - s * dx
+    turn = end[2] - start[2]
+    # the same displacement from the last pose by odometry
     heading = last[ODOM + 2]
     c = math.cos(heading)
     s = math.sin(heading)
-    x = x + (c * ahead - s * aside)
-    y = y + (s * ahead + c * aside)
-    heading = heading + turned
+    x = last[ODOM] + (c * ahead - s * left)
+    y = last[ODOM + 1] + (s * ahead + c * left)
+    heading = heading + turn
     if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
         period = motion.dt * substeps
         c = math.cos(heading)
@@ -120,212 +106,261 @@ def measure(
         turn = noise_turn * period
         x, y, _, _ = move(x, y, c, s, noise_x, noise_y, turn, period, motion.series)
         heading = wrap(heading + turn)
-    row = state.past[n, m, this]
-    row[ODOM], row[ODOM + 1], row[ODOM + 2] = x, y, wrap(heading)
-    row[MEASURED], row[MEASURED + 1] = now[0] + noise_x, now[1] + noise_y
-    row[MEASURED + 2] = now[2] + noise_turn
+    row = data.past[n, m, new]
+    row[ODOM] = x
+    row[ODOM + 1] = y
+    row[ODOM + 2] = wrap(heading)
+    row[ODOM_TWIST] = twist[0] + noise_x
+    row[ODOM_TWIST + 1] = twist[1] + noise_y
+    row[ODOM_TWIST + 2] = twist[2] + noise_turn
     for i in range(3):
-        row[POSE + i], row[TWIST + i] = pose[n, m, i], now[i]
-    odom = state.odom[n, m]
-    twist = state.twist[n, m]
-    if state.age[n, m] == 0:  # dividing for each robot takes a thirtieth of a step
+        row[POSE + i] = end[i]
+        row[TRUE_TWIST + i] = twist[i]
+    odom = data.odom[n, m]
+    odom_twist = data.twist[n, m]
+    # Without this branch, the division by `substeps` takes a thirtieth of a step.
+    if data.age[n, m] == 0:
         for i in range(3):
-            odom[i], twist[i] = row[ODOM + i], row[MEASURED + i]
+            odom[i] = row[ODOM + i]
+            odom_twist[i] = row[ODOM_TWIST + i]
         return
-    lag = lag_of(state.age[n, m], steps, rows, substeps)
-    odom[0], odom[1], odom[2] = at_lag(state.past, n, m, ODOM, lag, steps, substeps)
-    twist[0], twist[1], twist[2] = at_lag(
-        state.past, n, m, MEASURED, lag, steps, substeps
+    past = data.past[n, m]
+    lag = limit_lag(data.age[n, m], steps, rows, substeps)
+    odom[0], odom[1], odom[2] = interpolate_past(past, ODOM, lag, steps, substeps)
+    odom_twist[0], odom_twist[1], odom_twist[2] = interpolate_past(
+        past, ODOM_TWIST, lag, steps, substeps
     )
 
 
 @kernel
-def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
-    """Draw drift ahead, aside [m], at most std sqrt(3 period), and turn [rad]; move the state."""
-    std = state.noise
-    counter = state.steps[n] * state.pose.shape[1] + m
-    # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
-    count = std.shape[2] - 2
-    scale = math.sqrt(12.0 * period)
-    ahead = aside = turn = 0.0
-    for i in range(count):
-        if std[n, m, 2 + i] > 0.0:
-            share = (
-                random.uniform(state.seeds[n], random.DRIFT_STREAM, counter * count + i)
-                - 0.5
-            )
-            draw = scale * std[n, m, 2 + i] * share
-            if i == 0:
-                ahead = draw
-            elif i == 1:
-                aside = draw
-            elif i == 2:
-                turn = draw
-            else:
-                state.state[n, m, i - 3] += draw
-    return ahead, aside, turn
+def _draw_odometry_noise(n: int, m: int, axis: int, data: State) -> float:
+    """Draw the noise of the measured twist: ahead (axis 0), left (1) or of the turn rate (2)."""
+    std = data.noise[n, m, ODOM_ANGULAR if axis == 2 else ODOM_LINEAR]
+    if std <= 0.0:
+        return 0.0
+    counter = 3 * (data.steps[n] * data.pose.shape[1] + m) + axis
+    noise: float = std * random.normal(data.seeds[n], random.ODOMETRY_STREAM, counter)
+    return noise
+
+
+@kernel
+def limit_lag(age: int, steps: int, rows: int, substeps: int) -> int:
+    """Return an age [substeps], limited to the episode so far and to the ring buffer."""
+    return max(min(age, min(steps, rows - 1) * substeps), 0)
+
+
+@kernel
+def interpolate_past(
+    past: Array, column: int, lag: int, steps: int, substeps: int
+) -> tuple[float, float, float]:
+    """Return what a robot recorded `lag` substeps before the end of period `steps`.
+
+    `past` (R, PAST_COLUMNS) is its ring buffer; `column` is the first of the three columns that are
+    returned: `POSE`, `TRUE_TWIST`, `ODOM` or `ODOM_TWIST`.
+    """
+    rows = past.shape[0]
+    newer = steps - lag // substeps
+    fraction = (lag % substeps) / substeps
+    new = newer % rows
+    x = past[new, column]
+    y = past[new, column + 1]
+    z = past[new, column + 2]
+    if fraction > 0.0:
+        old = (newer - 1) % rows
+        x += fraction * (past[old, column] - x)
+        y += fraction * (past[old, column + 1] - y)
+        change = past[old, column + 2] - z
+        if column in (POSE, ODOM):
+            z = wrap(z + fraction * wrap(change))
+        else:
+            z += fraction * change
+    return x, y, z
 
 
 @kernel(inline=True)
 def scan_or_wait(
     n: int,
-    waiting: int,
-    state: State,
-    members: Members,
+    waiting_count: int,
+    data: State,
+    world_set: WorldSetArrays,
     lidar: LidarArrays,
     motion: Dynamics,
     scratch: Scratch,
 ) -> int:
-    """Scan world n, unless `scan_together` can; return how many worlds now wait for it."""
-    alone = False
-    for m in range(state.age.shape[1]):  # a scan that is not of a robot's present pose
-        alone = (
-            alone
-            or state.age[n, m] > 0
-            or state.faults[n, m, fault_kernels.SKEW] != 0.0
-        )
-    if alone:
-        for m in range(state.pose.shape[1]):
-            _scan_alone(n, m, state, members, lidar, motion, scratch)
-        return waiting
-    scratch.scans.waiting[waiting] = n
-    return waiting + 1
+    """Scan world n, unless `scan_together` can; return how many worlds now wait for that."""
+    any_late = False
+    for m in range(data.age.shape[1]):
+        is_skewed = data.faults[n, m, fault_kernels.SKEW] != 0.0
+        any_late = any_late or data.age[n, m] > 0 or is_skewed
+    if any_late:
+        for m in range(data.pose.shape[1]):
+            _scan_from_past(n, m, data, world_set, lidar, motion, scratch)
+        return waiting_count
+    scratch.scans.waiting[waiting_count] = n
+    return waiting_count + 1
 
 
 @kernel
 def scan_together(
-    waiting: int, state: State, members: Members, lidar: LidarArrays, scratch: Scratch
+    waiting_count: int,
+    data: State,
+    world_set: WorldSetArrays,
+    lidar: LidarArrays,
+    scratch: Scratch,
 ) -> None:
-    """Scan the first `waiting` worlds of the list in the scratch memory, as they stand."""
+    """Scan the worlds that wait, as they stand."""
     scans = scratch.scans
-    chosen = scans.waiting[:waiting]
-    first = state.velocity.shape[1]
     scan_kernels.scan_worlds(
-        state.ranges,
-        state.pose,
-        chosen,
-        state.bodies,
-        first,
-        members.fixtures,
+        data.ranges,
+        data.pose,
+        scans.waiting[:waiting_count],
+        data.bodies,
+        data.velocity.shape[1],
+        world_set.fixtures,
         lidar,
         scratch.cells,
-        scans.lookup,
+        scans.lanes,
     )
 
 
 @kernel
-def distort(low: int, high: int, state: State, lidar: LidarArrays) -> None:
-    """Apply the faults of each robot's device to the scans of the worlds [low, high)."""
+def distort_scans(
+    first_world: int, end_world: int, data: State, lidar: LidarArrays
+) -> None:
+    """Apply the faults of each robot's lidar to the scans of worlds [first_world, end_world)."""
     limits = lidar.range_min, lidar.range_max
-    for n in range(low, high):
-        for m in range(state.ranges.shape[1]):
-            counter = state.steps[n] * state.ranges.shape[1] + m
+    robots = data.ranges.shape[1]
+    for n in range(first_world, end_world):
+        for m in range(robots):
+            counter = data.steps[n] * robots + m
             fault_kernels.distort(
-                state.ranges[n, m], limits, state.faults[n, m], state.seeds[n], counter
+                data.ranges[n, m], limits, data.faults[n, m], data.seeds[n], counter
             )
 
 
 @kernel
-def _scan_alone(
+def _scan_from_past(
     n: int,
     m: int,
-    state: State,
-    members: Members,
+    data: State,
+    world_set: WorldSetArrays,
     lidar: LidarArrays,
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
+    """Scan from where robot m of world n was when its reported scan was taken.
+
+    With skew, each group of beams is scanned from its own pose during the sweep.
+    """
     scans = scratch.scans
-    beams = state.ranges.shape[2]
-    spot = scans.spot
-    drive = scans.drive
-    skew = state.faults[n, m, fault_kernels.SKEW]
-    past = state.past
-    steps = state.steps[n]
+    steps = data.steps[n]
     substeps = motion.substeps
-    here = spot[0, 0]
-    lag = lag_of(state.age[n, m], steps, past.shape[2], substeps)
-    here[0], here[1], here[2] = at_lag(past, n, m, POSE, lag, steps, substeps)
-    drive[0], drive[1], drive[2] = at_lag(past, n, m, TWIST, lag, steps, substeps)
+    skew = data.faults[n, m, fault_kernels.SKEW]
+    pose = scans.pose[0, 0]
+    twist = scans.twist
+    past = data.past[n, m]
+    lag = limit_lag(data.age[n, m], steps, past.shape[0], substeps)
+    pose[0], pose[1], pose[2] = interpolate_past(past, POSE, lag, steps, substeps)
+    twist[0], twist[1], twist[2] = interpolate_past(
+        past, TRUE_TWIST, lag, steps, substeps
+    )
     reach = lidar.range_max + math.hypot(lidar.mount[0], lidar.mount[1])
     if skew != 0.0:
-        reach += math.hypot(drive[0], drive[1]) * lidar.sweep_time
-    count = _gather(n, m, lag, reach, state, members, motion, scratch)
-    seen = scans.seen[:count].reshape((1, count, 7))
-    every = scans.every
-    every = BodyCells(
-        every.first, every.then, every.ordered, every.frame, every.found[:count]
+        reach += math.hypot(twist[0], twist[1]) * lidar.sweep_time
+    count = _gather_bodies(n, m, lag, reach, data, world_set, motion, scratch)
+    # this robot as the only one of an only world, which has the bodies that were gathered
+    bodies = scans.bodies[:count].reshape((1, count, BODY_COLUMNS))
+    listed = scans.no_cells
+    listed = BodyCells(
+        listed.first, listed.then, listed.ordered, listed.frame, listed.found[:count]
     )
-    begin = (n * state.ranges.shape[1] + m) * beams
-    scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
-    around = fixtures_around(n, members.fixtures)
-    groups = 1 if skew == 0.0 else scans.slices.shape[0]
+    beams = data.ranges.shape[2]
+    first_range = (n * data.ranges.shape[1] + m) * beams
+    ranges = data.ranges.reshape(-1)[first_range : first_range + beams]
+    ranges = ranges.reshape((1, 1, beams))
+    fixtures = fixtures_around(n, world_set.fixtures)
+    groups = 1 if skew == 0.0 else scans.slice_poses.shape[0]
     if groups > 1:
+        moving = (steps * substeps - lag) * motion.dt
         fault_kernels.slice_poses(
-            scans.slices, spot[0, 0], drive, lidar.sweep_time, skew
+            scans.slice_poses, pose, twist, lidar.sweep_time, skew, moving
         )
-    # a loop, because the large functions below are then compiled only once
-    for g in range(groups):
-        out = scan if groups == 1 else scans.part
-        for i in range(3 if groups > 1 else 0):
-            spot[0, 0, i] = scans.slices[g, i]
+    # One call for both cases, because `scan_worlds` is large and compiled for each call.
+    for group in range(groups):
+        out = ranges if groups == 1 else scans.slice_ranges
+        if groups > 1:
+            for i in range(3):
+                pose[i] = scans.slice_poses[group, i]
         scan_kernels.scan_worlds(
-            out, spot, scans.none, seen, -1, around, lidar, every, scans.lookup
+            out,
+            scans.pose,
+            scans.only_world,
+            bodies,
+            -1,
+            fixtures,
+            lidar,
+            listed,
+            scans.lanes,
         )
-        for i in range(
-            g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0
-        ):
-            scan[0, 0, i] = scans.part[0, 0, i]
+        if groups > 1:
+            for i in range(group * beams // groups, (group + 1) * beams // groups):
+                ranges[0, 0, i] = scans.slice_ranges[0, 0, i]
 
 
 @kernel
-def _gather(
+def _gather_bodies(
     n: int,
     m: int,
     lag: int,
     reach: float,
-    state: State,
-    members: Members,
+    data: State,
+    world_set: WorldSetArrays,
     motion: Dynamics,
     scratch: Scratch,
 ) -> int:
-    """Copy the bodies around `spot`, as they were `lag` substeps ago; return their number."""
+    """Copy the bodies around `scans.pose`, as they were `lag` substeps ago; return their number.
+
+    Robots are interpolated in the past. Of obstacles no past is kept: they are moved back by their
+    present velocity. That is exact within the period, and beyond it while they keep their velocity;
+    the extrapolation ends at `FURTHEST_BACK`.
+    """
     scans = scratch.scans
     cells = scratch.cells
-    bodies = state.bodies
-    velocity = state.velocity
-    spot = scans.spot[0, 0]
-    first = velocity.shape[1]
-    several = bodies.shape[1]
-    # the cells of a crowd hold the present positions
-    in_cells = members.standing or (members.crowded and lag == 0)
+    velocity = data.velocity
+    pose = scans.pose[0, 0]
+    obstacle_count = velocity.shape[1]
+    candidates = data.bodies.shape[1]
+    # The cells of a crowd hold the present positions.
+    in_cells = world_set.standing or (world_set.crowded and lag == 0)
     if in_cells:
-        several = around(n, spot[0], spot[1], reach, cells)
+        candidates = around(n, pose[0], pose[1], reach, cells)
     count = 0
-    ago = lag * motion.dt
-    for i in range(several):
+    ago = min(lag * motion.dt, FURTHEST_BACK)
+    for i in range(candidates):
         k = cells.found[i] if in_cells else i
-        radius = bodies[n, k, RADIUS]
-        if k == first + m or radius <= 0.0:
+        radius = data.bodies[n, k, RADIUS]
+        if k == obstacle_count + m or radius <= 0.0:
             continue
-        body = scans.seen[count]
-        for j in range(7):
-            body[j] = bodies[n, k, j]
-        turned = False
-        if lag > 0 and k >= first:
-            body[X], body[Y], body[HEADING] = at_lag(
-                state.past, n, k - first, POSE, lag, state.steps[n], motion.substeps
+        body = scans.bodies[count]
+        for j in range(BODY_COLUMNS):
+            body[j] = data.bodies[n, k, j]
+        has_turned = False
+        if lag > 0 and k >= obstacle_count:
+            past = data.past[n, k - obstacle_count]
+            body[X], body[Y], body[HEADING] = interpolate_past(
+                past, POSE, lag, data.steps[n], motion.substeps
             )
-            turned = True
+            has_turned = True
         elif lag > 0:
             body[X] -= velocity[n, k, 0] * ago
             body[Y] -= velocity[n, k, 1] * ago
-            turned = velocity[n, k, 2] != 0.0
             body[HEADING] -= velocity[n, k, 2] * ago
-        if turned:
-            body[COS], body[SIN] = math.cos(body[HEADING]), math.sin(body[HEADING])
-        dx = body[X] - spot[0]
-        dy = body[Y] - spot[1]
+            has_turned = velocity[n, k, 2] != 0.0
+        if has_turned:
+            body[COS] = math.cos(body[HEADING])
+            body[SIN] = math.sin(body[HEADING])
+        dx = body[X] - pose[0]
+        dy = body[Y] - pose[1]
         if dx * dx + dy * dy <= (reach + radius) * (reach + radius):
             count += 1
     return count

@@ -1,7 +1,12 @@
-"""Everything that the simulator's kernels take, by name: NamedTuples of arrays.
+"""The records that the simulator's kernels take: NamedTuples of arrays.
 
-N worlds, n of them in one part, M robots, S state, C command, T kinematic terms, H periods of
-command history, K obstacles, W walls, B beams, L lanes, R periods of the past.
+A simulation runs N worlds. Each is a copy of one of the P members of a world set and holds M
+robots and K obstacles. `State` changes from period to period, `WorldSetArrays` and `Dynamics` do
+not, and `Scratch` is memory that a kernel writes before it reads it. One thread steps one `Part` of
+the worlds.
+
+Further dimensions: S state, C commands, T kinematic terms, H periods of command history, R periods
+of the past, W walls, B beams, L lanes, G groups of beams, n some of the worlds.
 """
 
 from typing import NamedTuple
@@ -19,34 +24,63 @@ from nics_drl_bridge.robot.kernels import Terms
 
 Integers = NDArray[np.int64]
 
+# Columns of `State.noise`: standard deviations of the odometry's linear velocity [m/s] and turn
+# rate [rad/s]; then of the drift of x, y [m/sqrt(s)], heading [rad/sqrt(s)], each state variable.
+ODOM_LINEAR = 0
+ODOM_ANGULAR = 1
+DRIFT_X = 2
+DRIFT_Y = 3
+DRIFT_HEADING = 4
+DRIFT_STATE = 5
+
+# Columns of `State.past`. The true twist is the model's at the end of a period: for a robot that is
+# held by a wall, the twist with which it drives against the wall, as its wheels turn.
+POSE = 0  # true pose: x, y, heading
+TRUE_TWIST = 3
+ODOM = 6  # pose by odometry
+ODOM_TWIST = 9  # measured twist
+PAST_COLUMNS = 12
+
+BODY_COLUMNS = 7  # of `State.bodies`, see `lidar.exact_kernels`
+
+# Rows of `Lanes.pose`, as `robot.kernels.run` takes them.
+LANE_X = 0
+LANE_Y = 1
+LANE_COS = 2
+LANE_SIN = 3
+LANE_HEADING = 4  # unwrapped
+LANE_PATH = 5  # upper bound on the length of the path in the period [m]
+LANE_ROWS = 6
+
 
 class State(NamedTuple):
-    """All that changes in a simulation. A reset keeps the parameters of each robot."""
+    """All that changes in a simulation; `FastSimulator.data`.
+
+    A reset keeps what belongs to each robot: faults, coefficient, delay, age and noise.
+    """
 
     pose: Array  # (N, M, 3) true pose of `base_link` in `map`
-    state: Array  # (N, M, S) true state
+    state: Array  # (N, M, S) true state of the robot's model
     history: Array  # (N, M, H, C) commands in effect, newest first
-    bodies: Array  # (N, K + M, 7) obstacles, then robots, columns as in `lidar.exact_kernels`
+    # (N, K + M, BODY_COLUMNS) obstacles, then robots; columns as in `lidar.exact_kernels`
+    bodies: Array
     odom: Array  # (N, M, 3) pose by odometry, which drifts; it begins at the start pose
     twist: Array  # (N, M, 3) measured body twist
     ranges: NDArray[np.float32]  # (N, M, B) scan, REP-117
     collided: NDArray[np.uint8]  # (N, M) 1 once a robot has touched something
     steps: Integers  # (N,) control periods since the reset
     seeds: Integers  # (N,) of the episode
-    member: Integers  # (N,) world of a set in which the episode is
-    faults: (
-        Array  # (N, M, P) of each robot's lidar, columns as in `lidar.fault_kernels`
-    )
-    coefficient: Array  # (N, M, T), in the order of `robot.kernels.term_arrays`
+    member: Integers  # (N,) member of the world set that the episode takes place in
+    # (N, M, PARAMETERS) of each robot's lidar; columns as in `lidar.fault_kernels`
+    faults: Array
+    coefficient: Array  # (N, M, T) of each robot's terms, see `robot.kernels.Terms`
     delay: Integers  # (N, M) common latency of the commands [substeps], at most `longest_delay`
     age: Integers  # (N, M) of scan and odometry when reported [substeps], at most `longest_age`
-    # (N, M, 2 + 3 + S) std of odometry [m/s, rad/s]; after a second, of x, y, heading, state
-    noise: Array
-    velocity: (
-        Array  # (N, K, 3) of the obstacles in `map`, for a period [m/s, m/s, rad/s]
-    )
-    past: Array  # (N, M, R, 12) of the last periods, see `sensing_kernels`
-    marks: Array  # (N, K, F) memory of moving obstacles, columns as in `separation_kernels`
+    noise: Array  # (N, M, 2 + 3 + S) standard deviations, columns `ODOM_LINEAR` to `DRIFT_STATE`
+    # (N, K, 3) velocity of the obstacles in `map` in this period [m/s, m/s, rad/s]
+    velocity: Array
+    past: Array  # (N, M, R, PAST_COLUMNS) ring buffer: the end of period i is in row i % R
+    marks: Array  # (N, K, MARK) memory of moving obstacles, columns as in `separation_kernels`
 
 
 class MapField(NamedTuple):
@@ -64,12 +98,12 @@ NO_FIELD = MapField(np.zeros((0, 0), np.float32), 0.0, 0.0, 1.0, 0.0, 1.0)
 
 
 class Movers(NamedTuple):
-    """Motion of the obstacles."""
+    """Motion of the obstacles of one world."""
 
-    moves: bool  # True if any obstacle moves
-    plans: Array  # (K, P) see `obstacles.plan_arrays`
+    moves: bool  # True if an obstacle of any member moves
+    plans: Array  # (K, PLAN) motions, columns as in `separation_kernels`
     waypoints: Array  # (Q, 2) of all patrols [m]
-    field: Array  # (4,) minimum x, y and maximum x, y of the field [m]
+    bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
 
 
 class Surroundings(NamedTuple):
@@ -83,19 +117,22 @@ class Surroundings(NamedTuple):
     movers: Movers
 
 
-class Members(NamedTuple):
-    """The surroundings of P worlds, one after the other; see `step_kernels.surroundings_of`."""
+class WorldSetArrays(NamedTuple):
+    """The surroundings of the P members of a world set, stacked.
+
+    `step_kernels.surroundings_of` returns those of one world.
+    """
 
     fixtures: Fixtures
-    distances: NDArray[np.float32]  # of all maps, see `MapField`
-    fields: Integers  # (P, 3) first distance, rows and columns of each map
+    distances: NDArray[np.float32]  # of all maps one after the other, see `MapField`
+    map_places: Integers  # (P, 3) first distance, rows and columns of each map
     outlines: OutlineArrays
-    crowded: bool  # `crowded`, `standing`, `moves`: as in `Surroundings` and `Movers`
+    crowded: bool  # `crowded`, `standing`: as in `Surroundings`
     standing: bool
-    moves: bool
-    plans: Array  # (P, K, L)
-    waypoints: Array  # (Q, 2) of all patrols in all worlds [m]
-    field: Array  # (P, 4)
+    moves: bool  # True if an obstacle of any member moves
+    plans: Array  # (P, K, PLAN)
+    waypoints: Array  # (Q, 2) of all patrols of all members [m]
+    bounds: Array  # (P, 4) as in `Movers`
 
 
 class Dynamics(NamedTuple):
@@ -104,30 +141,31 @@ class Dynamics(NamedTuple):
     terms: (
         Terms  # with the model's coefficients; those of a robot are `State.coefficient`
     )
-    series: Array  # see `robot.kernels`
+    series: Array  # `robot.kernels.SERIES`
     dt: float  # length of a substep [s]
     substeps: int  # in a control period
 
 
 class Lanes(NamedTuple):
-    """Robots side by side, see `robot.kernels.run`."""
+    """Robots moved side by side, one per column; see `robot.kernels.run`."""
 
-    pose: Array  # (6, L)
-    x: Array  # (V + 1, L)
-    dq: Array  # (D, L)
+    pose: Array  # (LANE_ROWS, L) rows `LANE_X` to `LANE_PATH`
+    x: Array  # (S + C + 1, L)
+    dq: Array  # (3 + S, L)
     coefficient: Array  # (T, L)
-    late: Integers  # (C, L) substep at which a command of each changes
+    change: Integers  # (C, L) substep of the period at which each command changes
 
 
 class Single(NamedTuple):
-    """Scratch memory of one world whose robots move carefully."""
+    """Scratch memory of one world whose robots move carefully, see `careful_kernels`."""
 
-    x: Array  # of one robot, see `robot.kernels.scratch`
-    dq: Array
+    x: Array  # (S + C + 1,) of one robot, see `robot.kernels.allocate_scratch`
+    dq: Array  # (3 + S,) rates of one robot
     trial: Array  # (7,) a body
     spare: Array  # (V, 2) corners
-    start: Array  # (K, 3) poses of the obstacles, as if they had always moved by their velocity
-    began: Array  # (K, 3) their poses at the start of the period
+    # (K, 3) poses from which the obstacles move by their velocity; a stop shifts them
+    origin: Array
+    period_start: Array  # (K, 3) poses of the obstacles at the start of the period
     flights: Array  # (K + M, FLIGHT) see `impact_kernels`
     events: Array  # (M, EVENT) see `impact_kernels`
 
@@ -136,25 +174,27 @@ class Nearby(NamedTuple):
     """Bodies and walls that the robots of one world may meet in the period."""
 
     near: Integers  # (M, 1 + SEVERAL) number and indices of the bodies near each robot
-    meets: Integers  # (M,) flags of `contact_kernels`
-    way: Array  # (M,) upper bound on the length of each robot's path [m]
+    meets: Integers  # (M,) bit flags of `contact_kernels`
+    path: Array  # (M,) upper bound on the length of each robot's path [m]
     reach: Array  # (K + M,) how far each body may reach from its present centre [m]
-    speeds: Array  # (M, 2) velocity in `map` [m/s]
+    speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
 
 
 class Scans(NamedTuple):
     """Scratch memory of the scans."""
 
-    before: Array  # (L, 3) poses at the start of the period
+    start_poses: Array  # (L, 3) poses of the robots at the start of the period
     waiting: Integers  # (n,) worlds that are scanned together
-    seen: Array  # (K + M + 1, 7) bodies around one robot
-    spot: Array  # (1, 1, 3) pose of one robot
-    slices: Array  # (G, 3) poses during a sweep
-    part: NDArray[np.float32]  # (1, 1, B) scan of a slice
-    drive: Array  # (3,) twist of one robot
-    none: Integers  # (1,) index of the only world of one robot
-    every: BodyCells  # of no worlds: all bodies that are seen
-    lookup: ScanLanes  # of the lidar
+    bodies: Array  # (K + M + 1, 7) bodies that one robot may see, as they were
+    pose: Array  # (1, 1, 3) pose that one robot scans from
+    twist: Array  # (3,) twist of that robot during the sweep
+    slice_poses: Array  # (G, 3) poses during a sweep
+    slice_ranges: NDArray[np.float32]  # (1, 1, B) scan from one of these poses
+    only_world: (
+        Integers  # (1,) zero: index of the only world in the arrays of one robot
+    )
+    no_cells: BodyCells  # of no worlds: all bodies are searched
+    lanes: ScanLanes  # of the look-up of bodies
 
 
 class Scratch(NamedTuple):
@@ -163,15 +203,15 @@ class Scratch(NamedTuple):
     lanes: Lanes
     single: Single
     nearby: Nearby
-    cells: BodyCells  # those of all parts, with places of its own for what is found
+    cells: BodyCells  # the cells of all worlds, with a list of found bodies per thread
     scans: Scans
 
 
 class Part(NamedTuple):
     """Everything that the kernels need to step the worlds of one part."""
 
-    state: State
-    members: Members
+    data: State
+    world_set: WorldSetArrays
     lidar: LidarArrays
     motion: Dynamics
     scratch: Scratch

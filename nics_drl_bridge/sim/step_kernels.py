@@ -1,10 +1,21 @@
-"""Compiled inner loops of the simulator: motion, and the step of some worlds.
+"""Compiled step of the simulator: the worlds of a part, by one control period.
 
-`_step` is one control period: queue the commands, steer what moves by itself, move all robots as if
-nothing were there, redo those that meet something carefully, measure odometry, scan.
+`step_worlds` queues the commands, then takes as many worlds at a time as its lanes hold robots:
+
+1. `_begin_period_of_block` keeps the robots' poses, and chooses the velocities of the obstacles.
+2. `move_freely` moves all robots of the block side by side, as if nothing stood in their way.
+3. `_move_world` moves the obstacles; robots that may meet something are moved once more, carefully.
+4. `_measure_world` measures the odometry.
+5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
+
+`begin_episodes` resets worlds whose robots and obstacles are in place. `begin_period` and
+`end_period` are steps 1, 4 and 5 for worlds whose robots another engine moves.
 
 A world is bit-identical in any batch, part or thread: nothing is summed over worlds, and random
 numbers depend on the world's own seed and counter alone.
+
+Shared arguments: `packed` is a `state.Part`, packed by `packing_kernels.pack`; n is a world, m a
+robot in it; the robot's lane is `first_lane` + m.
 """
 
 import math
@@ -26,111 +37,264 @@ from nics_drl_bridge.robot.kernels import (
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
-from nics_drl_bridge.sim import state as records
 from nics_drl_bridge.sim.careful_kernels import (
+    compute_rates,
     drift_carefully,
     move_carefully,
-    rates_at,
 )
 from nics_drl_bridge.sim.state import (
+    DRIFT_X,
+    DRIFT_Y,
+    LANE_COS,
+    LANE_HEADING,
+    LANE_PATH,
+    LANE_SIN,
+    LANE_X,
+    LANE_Y,
+    POSE,
+    TRUE_TWIST,
     Array,
     Dynamics,
+    Integers,
     Lanes,
-    Members,
+    MapField,
+    Movers,
     Scratch,
     State,
     Surroundings,
+    WorldSetArrays,
 )
 
-# Robots that are scanned together, and their scans then distorted: these stay in the L2 cache.
-TOGETHER = 48
+# Number of robots that are scanned, and whose scans are then distorted: the scans stay in the L2
+# cache in between.
+SCANNED_TOGETHER = 48
 
 
-@kernel(view=True)
-def surroundings_of(n: int, members: Members) -> Surroundings:
-    """Return all that stands in world n of the simulation."""
-    p = members.fixtures.member[n]
-    frame = members.fixtures.frames[p]
-    distances = cells_of(members.distances, members.fields[p])
-    grid = records.MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
-    movers = records.Movers(
-        members.moves, members.plans[p], members.waypoints, members.field[p]
+@kernel(allocates=True)
+def step_worlds(packed: Any, commands: Array, first_world: int) -> None:
+    """Step n worlds of a part, from `first_world` on, under commands (n, M, C) for one period."""
+    part = packed.content
+    _step_unpacked(
+        part.data,
+        part.world_set,
+        part.lidar,
+        part.motion,
+        part.scratch,
+        commands,
+        first_world,
     )
-    return Surroundings(
-        walls_of(n, members.fixtures),
-        grid,
-        members.outlines,
-        members.crowded,
-        members.standing,
-        movers,
+
+
+@kernel(allocates=True)
+def begin_episodes(packed: Any, chosen: Integers) -> None:
+    """Begin episodes in the worlds `chosen` (n,), where everything is in place and stands still."""
+    part = packed.content
+    data = part.data
+    waiting = part.scratch.scans.waiting
+    for i in range(chosen.shape[0]):
+        waiting[i] = chosen[i]
+        scene = get_surroundings(chosen[i], part.world_set)
+        if part.world_set.moves:
+            obstacles.reset_marks(chosen[i], data, scene.movers.plans)
+        _sort_bodies(chosen[i], data, scene, part.scratch)
+    sensing.scan_together(
+        chosen.shape[0], data, part.world_set, part.lidar, part.scratch
     )
+    for n in chosen:
+        sensing.distort_scans(n, n + 1, data, part.lidar)
+
+
+@kernel(allocates=True)
+def sort_worlds(packed: Any, first_world: int, end_world: int) -> None:
+    """Sort the bodies of worlds [first_world, end_world) of a part into cells, as they stand."""
+    part = packed.content
+    for n in range(first_world, end_world):
+        scene = get_surroundings(n, part.world_set)
+        _sort_bodies(n, part.data, scene, part.scratch)
+
+
+@kernel(allocates=True)
+def begin_period(packed: Any) -> None:
+    """Begin a period of worlds whose robots another engine moves."""
+    part = packed.content
+    speeds = part.scratch.nearby.speeds
+    for n in range(part.data.pose.shape[0]):
+        _begin_period_of_world(n, part.data, part.world_set, part.motion, speeds)
+
+
+@kernel(allocates=True)
+def end_period(
+    packed: Any,
+    true_twist: Array,
+    wheel_start: Array,
+    wheel_end: Array,
+    wheel_twist: Array,
+) -> None:
+    """Measure what the robots sense at the end of a period in which another engine moved them.
+
+    Args:
+        packed: the part, whose robots and obstacles stand where the period ends.
+        true_twist: (N, M, 3) body twist at the end of the period.
+        wheel_start: (N, M, 3) pose by the wheels alone at the start of the period.
+        wheel_end: (N, M, 3) pose by the wheels alone at the end.
+        wheel_twist: (N, M, 3) body twist by the wheels at the end.
+    """
+    part = packed.content
+    data = part.data
+    world_set = part.world_set
+    motion = part.motion
+    scratch = part.scratch
+    first_robot = data.velocity.shape[1]
+    waiting_count = 0
+    for n in range(data.pose.shape[0]):
+        data.steps[n] += 1
+        past = data.past[n, :, data.steps[n] % data.past.shape[2]]
+        for m in range(data.pose.shape[1]):
+            contacts.put_body(data.bodies, n, first_robot + m, data.pose[n, m])
+            sensing.measure_odometry(
+                n,
+                m,
+                data,
+                wheel_start[n, m],
+                wheel_end[n, m],
+                wheel_twist[n, m],
+                motion,
+            )
+            # The lidar is where the robot truly is, not where the wheels say.
+            for i in range(3):
+                past[m, POSE + i] = data.pose[n, m, i]
+                past[m, TRUE_TWIST + i] = true_twist[n, m, i]
+        _sort_bodies(n, data, get_surroundings(n, world_set), scratch)
+        waiting_count = sensing.scan_or_wait(
+            n, waiting_count, data, world_set, part.lidar, motion, scratch
+        )
+    sensing.scan_together(waiting_count, data, world_set, part.lidar, scratch)
+    sensing.distort_scans(0, data.pose.shape[0], data, part.lidar)
 
 
 @kernel
-def _queue_commands(history: Array, commands: Array, begin: int, curves: Array) -> None:
-    """Put commands (n, M, C), by their input curves, in front of the latest ones (N, M, H, C)."""
+def _step_unpacked(
+    data: State,
+    world_set: WorldSetArrays,
+    lidar: LidarArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+    commands: Array,
+    first_world: int,
+) -> None:
+    """Step some worlds, see `step_worlds`.
+
+    Scans of several worlds are made together, because one lidar's scan is too short to keep the
+    processor busy. A separate function from `step_worlds`, where numba would count references to
+    the part's arrays, which took longer than the step.
+    """
+    robots = data.pose.shape[1]
+    end_world = first_world + commands.shape[0]
+    _queue_commands(data.history, commands, first_world, motion.terms.curves)
+    worlds_per_block = scratch.lanes.pose.shape[1] // robots
+    for block_begin in range(first_world, end_world, worlds_per_block):
+        block_end = min(block_begin + worlds_per_block, end_world)
+        _begin_period_of_block(block_begin, block_end, data, world_set, motion, scratch)
+        move_freely(block_begin, block_end, data, motion, scratch.lanes)
+        waiting_count = np.int64(0)
+        first_to_distort = block_begin
+        for n in range(block_begin, block_end):
+            data.steps[n] += 1
+            first_lane = (n - block_begin) * robots
+            scene = get_surroundings(n, world_set)
+            _move_world(n, first_lane, data, scene, motion, scratch)
+            _measure_world(n, first_lane, data, scene, motion, scratch)
+            waiting_count = sensing.scan_or_wait(
+                n, waiting_count, data, world_set, lidar, motion, scratch
+            )
+            is_last = n + 1 == block_end
+            if is_last or (n + 1 - first_to_distort) * robots >= SCANNED_TOGETHER:
+                sensing.scan_together(waiting_count, data, world_set, lidar, scratch)
+                sensing.distort_scans(first_to_distort, n + 1, data, lidar)
+                waiting_count = np.int64(0)
+                first_to_distort = n + 1
+
+
+@kernel
+def _queue_commands(
+    history: Array, commands: Array, first_world: int, curves: Array
+) -> None:
+    """Put the effects of commands (n, M, C) in front of the earlier ones, history (N, M, H, C)."""
     for i in range(commands.shape[0]):
         for m in range(commands.shape[1]):
-            for h in range(history.shape[2] - 1, 0, -1):
+            queue = history[first_world + i, m]
+            for h in range(queue.shape[0] - 1, 0, -1):
                 for c in range(commands.shape[2]):
-                    history[begin + i, m, h, c] = history[begin + i, m, h - 1, c]
+                    queue[h, c] = queue[h - 1, c]
             for c in range(commands.shape[2]):
-                history[begin + i, m, 0, c] = apply_curve(commands[i, m, c], curves[c])
+                queue[0, c] = apply_curve(commands[i, m, c], curves[c])
+
+
+@kernel(inline=True)
+def _begin_period_of_block(
+    first_world: int,
+    end_world: int,
+    data: State,
+    world_set: WorldSetArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> None:
+    """Keep the robots' poses in worlds [first_world, end_world), and steer the obstacles."""
+    robots = data.pose.shape[1]
+    start_poses = scratch.scans.start_poses
+    for n in range(first_world, end_world):
+        for m in range(robots):
+            lane = (n - first_world) * robots + m
+            for i in range(3):
+                start_poses[lane, i] = data.pose[n, m, i]
+        _begin_period_of_world(n, data, world_set, motion, scratch.nearby.speeds)
+
+
+@kernel(inline=True)
+def _begin_period_of_world(
+    n: int, data: State, world_set: WorldSetArrays, motion: Dynamics, speeds: Array
+) -> None:
+    """Record the start of an episode that begins; choose the velocities of the obstacles.
+
+    `speeds` (M, 2) is scratch memory for the velocities of the robots in `map`.
+    """
+    robots = data.pose.shape[1]
+    if data.steps[n] == 0:
+        for m in range(robots):
+            sensing.record_start(n, m, data)
+    if world_set.moves:
+        row = data.steps[n] % data.past.shape[2]
+        for m in range(robots):
+            vx = data.past[n, m, row, TRUE_TWIST]
+            vy = data.past[n, m, row, TRUE_TWIST + 1]
+            c = math.cos(data.pose[n, m, 2])
+            s = math.sin(data.pose[n, m, 2])
+            speeds[m, 0] = c * vx - s * vy
+            speeds[m, 1] = s * vx + c * vy
+        scene = get_surroundings(n, world_set)
+        obstacles.steer(n, data, scene, motion.dt * motion.substeps, speeds)
 
 
 @kernel
 def move_freely(
-    begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes
+    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
 ) -> None:
-    """Move the robots of worlds [begin, end) for one period, as if nothing stood in their way.
+    """Move the robots of worlds [first_world, end_world) for one period, as if nothing stood there.
 
-    The result stands in the lanes: robot m of world n is in lane (n - begin) M + m. A command takes
-    effect after its delay, so that the period is integrated from one change to the next.
+    The result is in the lanes: robot m of world n is in lane (n - first_world) M + m. The period is
+    integrated from one change of a command to the next.
     """
-    robots = state.pose.shape[1]
-    size = state.state.shape[2]
-    substeps = motion.substeps
-    history = state.history
-    lane_pose = lanes.pose
-    x = lanes.x
-    change = lanes.late
-    for n in range(begin, end):
-        for m in range(robots):
-            lane = (n - begin) * robots + m
-            heading = state.pose[n, m, 2]
-            lane_pose[0, lane] = state.pose[n, m, 0]
-            lane_pose[1, lane] = state.pose[n, m, 1]
-            lane_pose[2, lane] = math.cos(heading)
-            lane_pose[3, lane] = math.sin(heading)
-            lane_pose[4, lane] = heading
-            lane_pose[5, lane] = 0.0
-            for s in range(size):
-                x[s, lane] = state.state[n, m, s]
-            for t in range(lanes.coefficient.shape[0]):
-                lanes.coefficient[t, lane] = state.coefficient[n, m, t]
-            # Each command changes once in a period, at this substep.
-            for c in range(change.shape[0]):
-                change[c, lane] = (state.delay[n, m] + motion.terms.late[c]) % substeps
+    _fill_lanes(first_world, end_world, data, motion, lanes)
     terms = replace_coefficients(motion.terms, lanes.coefficient)
-    lane_count = (end - begin) * robots
+    lane_count = (end_world - first_world) * data.pose.shape[1]
     substep = 0
-    while substep < substeps:
-        next_change = substeps
-        for c in range(change.shape[0]):
-            for lane in range(lane_count):
-                if change[c, lane] > substep:
-                    next_change = min(next_change, change[c, lane])
-                if change[c, lane] == substep or substep == 0:
-                    n = begin + lane // robots
-                    m = lane % robots
-                    delay = state.delay[n, m] + motion.terms.late[c]
-                    row = find_delayed_command(
-                        substep, delay, substeps, history.shape[2]
-                    )
-                    x[size + c, lane] = history[n, m, row, c]
+    while substep < motion.substeps:
+        next_change = _apply_commands(
+            substep, first_world, lane_count, data, motion, lanes
+        )
         run(
-            lane_pose,
-            x,
+            lanes.pose,
+            lanes.x,
             lanes.dq,
             terms,
             motion.series,
@@ -140,11 +304,71 @@ def move_freely(
         substep = next_change
 
 
+@kernel(inline=True)
+def _fill_lanes(
+    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
+) -> None:
+    """Copy poses, states and coefficients of robots to the lanes; note when commands change."""
+    robots = data.pose.shape[1]
+    pose = lanes.pose
+    for n in range(first_world, end_world):
+        for m in range(robots):
+            lane = (n - first_world) * robots + m
+            heading = data.pose[n, m, 2]
+            pose[LANE_X, lane] = data.pose[n, m, 0]
+            pose[LANE_Y, lane] = data.pose[n, m, 1]
+            pose[LANE_COS, lane] = math.cos(heading)
+            pose[LANE_SIN, lane] = math.sin(heading)
+            pose[LANE_HEADING, lane] = heading
+            pose[LANE_PATH, lane] = 0.0
+            for s in range(data.state.shape[2]):
+                lanes.x[s, lane] = data.state[n, m, s]
+            for t in range(lanes.coefficient.shape[0]):
+                lanes.coefficient[t, lane] = data.coefficient[n, m, t]
+            # Each command changes once in a period, at this substep.
+            for c in range(lanes.change.shape[0]):
+                delay = data.delay[n, m] + motion.terms.late[c]
+                lanes.change[c, lane] = delay % motion.substeps
+
+
+@kernel(inline=True)
+def _apply_commands(
+    substep: int,
+    first_world: int,
+    lane_count: int,
+    data: State,
+    motion: Dynamics,
+    lanes: Lanes,
+) -> int:
+    """Put the commands that take effect at a substep into the lanes; return the next such substep.
+
+    It is the end of the period if no command of any lane changes before.
+    """
+    robots = data.pose.shape[1]
+    size = data.state.shape[2]
+    substeps = motion.substeps
+    change = lanes.change
+    next_change = substeps
+    for c in range(change.shape[0]):
+        for lane in range(lane_count):
+            if change[c, lane] > substep:
+                next_change = min(next_change, change[c, lane])
+            if change[c, lane] == substep or substep == 0:
+                n = first_world + lane // robots
+                m = lane % robots
+                delay = data.delay[n, m] + motion.terms.late[c]
+                row = find_delayed_command(
+                    substep, delay, substeps, data.history.shape[2]
+                )
+                lanes.x[size + c, lane] = data.history[n, m, row, c]
+    return next_change
+
+
 @kernel
 def _move_world(
     n: int,
     first_lane: int,
-    state: State,
+    data: State,
     scene: Surroundings,
     motion: Dynamics,
     scratch: Scratch,
@@ -157,249 +381,106 @@ def _move_world(
     lanes = scratch.lanes
     nearby = scratch.nearby
     single = scratch.single
-    pose = state.pose
+    robots = data.pose.shape[1]
     period = motion.dt * motion.substeps
-    robots = pose.shape[1]
-    obstacle_count = state.velocity.shape[1]
     for m in range(robots):
-        drift = math.sqrt(3.0 * period) * (state.noise[n, m, 2] + state.noise[n, m, 3])
-        nearby.way[m] = lanes.pose[5, first_lane + m] + drift
-    longest, obstacles_move = contacts.reaches(n, state, scene, nearby, period)
+        drift_std = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
+        longest_drift = math.sqrt(3.0 * period) * drift_std
+        nearby.path[m] = lanes.pose[LANE_PATH, first_lane + m] + longest_drift
+    longest_path, obstacles_move = contacts.compute_reaches(
+        n, data, scene, nearby, period
+    )
     if scene.crowded:
-        cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
-        scratch.cells.frame[n, cells.MOVED] = longest
+        cells.sort(n, data.bodies[n], data.bodies.shape[1], scratch.cells)
+        scratch.cells.frame[n, cells.MOVED] = longest_path
     any_meets = False
     for m in range(robots):
         nearby.meets[m] = contacts.find_near(
-            n, m, state.bodies, scene, nearby, scratch.cells
+            n, m, data.bodies, scene, nearby, scratch.cells
         )
         any_meets = any_meets or nearby.meets[m] != contacts.FREE
     for m in range(robots):
         if nearby.meets[m] == contacts.FREE:
-            lane = first_lane + m
-            pose[n, m, 0] = lanes.pose[0, lane]
-            pose[n, m, 1] = lanes.pose[1, lane]
-            pose[n, m, 2] = lanes.pose[4, lane]
-            for s in range(state.state.shape[2]):
-                state.state[n, m, s] = lanes.x[s, lane]
+            _take_free_motion(n, m, first_lane + m, data, lanes)
     if obstacles_move:
-        for k in range(obstacle_count):
+        for k in range(data.velocity.shape[1]):
             for i in range(3):
-                single.start[k, i] = single.began[k, i] = state.bodies[n, k, i]
+                single.origin[k, i] = data.bodies[n, k, i]
+                single.period_start[k, i] = data.bodies[n, k, i]
     if any_meets:
-        move_carefully(n, obstacles_move, state, scene, motion, nearby, single)
+        move_carefully(n, obstacles_move, data, scene, motion, nearby, single)
     elif obstacles_move:
-        contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)
+        contacts.move_obstacles(data.bodies, single.origin, data.velocity, n, period)
     for m in range(robots):
-        pose[n, m, 2] = wrap(pose[n, m, 2])
-    drift_carefully(n, state, scene, motion, nearby, single)
-
-
-@kernel(allocates=True)
-def step_worlds(packed: Any, commands: Array, begin: int) -> None:
-    """Step n worlds of a part, from world `begin` on, under commands (n, M, C) for one period."""
-    part = packed.content
-    _step(
-        part.state, part.members, part.lidar, part.motion, part.scratch, commands, begin
-    )
-
-
-@kernel
-def _step(
-    state: State,
-    members: Members,
-    lidar: LidarArrays,
-    motion: Dynamics,
-    scratch: Scratch,
-    commands: Array,
-    begin: int,
-) -> None:
-    """Step some worlds, see `step_worlds`.
-
-    Worlds go through the period in blocks, as many as the lanes hold robots. Scans of several
-    worlds are made together, because one lidar's scan is too short to keep the processor busy.
-    A separate function from `step_worlds`: numba would count references to the part's arrays here,
-    which took longer than the step.
-    """
-    robots = state.pose.shape[1]
-    end = begin + commands.shape[0]
-    _queue_commands(state.history, commands, begin, motion.terms.curves)
-    worlds_per_block = scratch.lanes.pose.shape[1] // robots
-    for block_begin in range(begin, end, worlds_per_block):
-        block_end = min(block_begin + worlds_per_block, end)
-        _begin_period(block_begin, block_end, state, members, motion, scratch)
-        move_freely(block_begin, block_end, state, motion, scratch.lanes)
-        worlds_to_scan = np.int64(0)
-        first_to_distort = block_begin
-        for n in range(block_begin, block_end):
-            state.steps[n] += 1
-            first_lane = (n - block_begin) * robots
-            scene = surroundings_of(n, members)
-            _move_world(n, first_lane, state, scene, motion, scratch)
-            _measure(n, first_lane, state, scene, motion, scratch)
-            worlds_to_scan = sensing.scan_or_wait(
-                n, worlds_to_scan, state, members, lidar, motion, scratch
-            )
-            is_last = n + 1 == block_end
-            if is_last or (n + 1 - first_to_distort) * robots >= TOGETHER:
-                sensing.scan_together(worlds_to_scan, state, members, lidar, scratch)
-                sensing.distort(first_to_distort, n + 1, state, lidar)
-                worlds_to_scan = np.int64(0)
-                first_to_distort = n + 1
+        data.pose[n, m, 2] = wrap(data.pose[n, m, 2])
+    drift_carefully(n, data, scene, motion, nearby, single)
 
 
 @kernel(inline=True)
-def _begin_period(
-    begin: int,
-    end: int,
-    state: State,
-    members: Members,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> None:
-    """Keep the poses of worlds [begin, end) before the period, and steer what moves by itself."""
-    pose = state.pose
-    before = scratch.scans.before
-    speeds = scratch.nearby.speeds
-    for n in range(begin, end):
-        for m in range(pose.shape[1]):
-            lane = (n - begin) * pose.shape[1] + m
-            row = state.steps[n] % state.past.shape[2]
-            before[lane, 0] = pose[n, m, 0]
-            before[lane, 1] = pose[n, m, 1]
-            before[lane, 2] = pose[n, m, 2]
-            if state.steps[n] == 0:
-                sensing.begin(n, m, state)
-            if members.moves:
-                twist = state.past[n, m, row, sensing.TWIST : sensing.TWIST + 2]
-                c = math.cos(pose[n, m, 2])
-                s = math.sin(pose[n, m, 2])
-                speeds[m, 0] = c * twist[0] - s * twist[1]
-                speeds[m, 1] = s * twist[0] + c * twist[1]
-        if members.moves:
-            scene = surroundings_of(n, members)
-            obstacles.steer(n, state, scene, motion.dt * motion.substeps, speeds)
+def _take_free_motion(n: int, m: int, lane: int, data: State, lanes: Lanes) -> None:
+    """Copy pose and state of a robot from its lane."""
+    data.pose[n, m, 0] = lanes.pose[LANE_X, lane]
+    data.pose[n, m, 1] = lanes.pose[LANE_Y, lane]
+    data.pose[n, m, 2] = lanes.pose[LANE_HEADING, lane]
+    for s in range(data.state.shape[2]):
+        data.state[n, m, s] = lanes.x[s, lane]
 
 
 @kernel(inline=True)
-def _measure(
+def _measure_world(
     n: int,
     first_lane: int,
-    state: State,
+    data: State,
     scene: Surroundings,
     motion: Dynamics,
     scratch: Scratch,
 ) -> None:
     """Put the robots' bodies at their present poses, and measure their odometry."""
     frame = scratch.cells.frame
-    pose = state.pose
-    obstacle_count = state.velocity.shape[1]
-    for m in range(pose.shape[1]):
-        contacts.put_body(state.bodies, n, obstacle_count + m, pose[n, m])
-        rates_at(n, m, motion.substeps - 1, state, motion, scratch.single)
-        before = scratch.scans.before[first_lane + m]
-        sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
+    first_robot = data.velocity.shape[1]
+    for m in range(data.pose.shape[1]):
+        pose = data.pose[n, m]
+        start = scratch.scans.start_poses[first_lane + m]
+        contacts.put_body(data.bodies, n, first_robot + m, pose)
+        compute_rates(n, m, motion.substeps - 1, data, motion, scratch.single)
+        sensing.measure_odometry(n, m, data, start, pose, scratch.single.dq, motion)
         # The cells must know how far any body may be from where it was sorted.
         if scene.crowded:
-            dx = pose[n, m, 0] - before[0]
-            dy = pose[n, m, 1] - before[1]
-            frame[n, cells.MOVED] = max(
-                frame[n, cells.MOVED], math.sqrt(dx * dx + dy * dy)
-            )
+            dx = pose[0] - start[0]
+            dy = pose[1] - start[1]
+            moved = math.sqrt(dx * dx + dy * dy)
+            frame[n, cells.MOVED] = max(frame[n, cells.MOVED], moved)
 
 
 @kernel
-def sort(n: int, state: State, scene: Surroundings, scratch: Scratch) -> None:
-    """Sort the bodies of a world into its cells, if it has any."""
+def _sort_bodies(n: int, data: State, scene: Surroundings, scratch: Scratch) -> None:
+    """Sort the bodies of world n into its cells, or its standing obstacles by cells."""
     if scene.crowded:
-        cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
+        cells.sort(n, data.bodies[n], data.bodies.shape[1], scratch.cells)
     elif scene.standing:
-        first = state.velocity.shape[1]
-        spare = scratch.scans.seen
-        cells.put_in_order(n, state.bodies[n], first, spare, scratch.cells)
+        obstacle_count = data.velocity.shape[1]
+        spare = scratch.scans.bodies
+        cells.put_in_order(n, data.bodies[n], obstacle_count, spare, scratch.cells)
 
 
-@kernel(allocates=True)
-def sort_worlds(packed: Any, begin: int, end: int) -> None:
-    """Sort the bodies of the worlds [begin, end) of a part into cells, as they stand."""
-    part = packed.content
-    for n in range(begin, end):
-        sort(n, part.state, surroundings_of(n, part.members), part.scratch)
-
-
-@kernel(allocates=True)
-def begin(packed: Any, chosen: records.Integers) -> None:
-    """Begin episodes in the worlds `chosen` (n,), where everything is in place and stands still."""
-    part = packed.content
-    state = part.state
-    waiting = part.scratch.scans.waiting
-    for i in range(chosen.shape[0]):
-        waiting[i] = chosen[i]
-        scene = surroundings_of(chosen[i], part.members)
-        if part.members.moves:
-            obstacles.begin(chosen[i], state, scene.movers.plans)
-        sort(chosen[i], state, scene, part.scratch)
-    sensing.scan_together(
-        chosen.shape[0], state, part.members, part.lidar, part.scratch
+@kernel(view=True)
+def get_surroundings(n: int, world_set: WorldSetArrays) -> Surroundings:
+    """Return all that stands in world n, by the member of the world set that it is a copy of."""
+    member = world_set.fixtures.member[n]
+    frame = world_set.fixtures.frames[member]
+    distances = cells_of(world_set.distances, world_set.map_places[member])
+    grid = MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
+    movers = Movers(
+        world_set.moves,
+        world_set.plans[member],
+        world_set.waypoints,
+        world_set.bounds[member],
     )
-    for n in chosen:
-        sensing.distort(n, n + 1, state, part.lidar)
-
-
-@kernel(allocates=True)
-def begin_period(packed: Any) -> None:
-    """Begin a period of worlds whose robots another engine moves."""
-    part = packed.content
-    count = part.state.pose.shape[0]
-    _begin_period(0, count, part.state, part.members, part.motion, part.scratch)
-
-
-@kernel(allocates=True)
-def end_period(
-    packed: Any, true: Array, before: Array, wheels: Array, counted: Array
-) -> None:
-    """Measure what the robots sense at the end of a period in which another engine moved them.
-
-    Robots and obstacles stand where the period ends. The arguments are (N, M, 3): the true twist at
-    the end, the pose by the wheels alone before and after, and the twist by the wheels at the end.
-    """
-    part = packed.content
-    state = part.state
-    members = part.members
-    motion = part.motion
-    scratch = part.scratch
-    first = state.velocity.shape[1]
-    waiting = 0
-    for n in range(state.pose.shape[0]):
-        state.steps[n] += 1
-        row = state.past[n, :, state.steps[n] % state.past.shape[2]]
-        for m in range(state.pose.shape[1]):
-            contacts.put_body(state.bodies, n, first + m, state.pose[n, m])
-            sensing.measure(n, m, state, wheels, before[n, m], counted[n, m], motion)
-            for i in range(3):  # the pose by the wheels is not where the lidar is
-                row[m, sensing.POSE + i] = state.pose[n, m, i]
-                row[m, sensing.TWIST + i] = true[n, m, i]
-        sort(n, state, surroundings_of(n, members), scratch)
-        waiting = sensing.scan_or_wait(
-            n, waiting, state, members, part.lidar, motion, scratch
-        )
-    sensing.scan_together(waiting, state, members, part.lidar, scratch)
-    sensing.distort(0, state.pose.shape[0], state, part.lidar)
-
-
-@kernel
-def propagate(covariance: Array, before: Array, after: Array, added: Array) -> None:
-    """Propagate covariances in place, see `device.propagate`: P' = F P F^T + Q."""
-    for m in range(covariance.shape[0]):
-        p = covariance[m]
-        # F differs from the identity only in its last column.
-        turned = before[m, 1] - after[m, 1], after[m, 0] - before[m, 0]
-        for i in range(2):
-            for j in range(3):
-                p[i, j] += turned[i] * p[2, j]
-        for j in range(2):
-            for i in range(3):
-                p[i, j] += turned[j] * p[i, 2]
-        for i in range(3):
-            for j in range(3):
-                p[i, j] += added[i, j]
+    return Surroundings(
+        walls_of(n, world_set.fixtures),
+        grid,
+        world_set.outlines,
+        world_set.crowded,
+        world_set.standing,
+        movers,
+    )

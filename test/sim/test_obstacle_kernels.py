@@ -257,7 +257,7 @@ def in_batch(seeds, motions=tuple(MIXED), steps=200):
     still = np.zeros((1, 2))
     state = state_of(bodies, marks, velocity, seeds)
     for n in range(worlds):
-        kernels.begin(n, state, scene.movers.plans)
+        kernels.reset_marks(n, state, scene.movers.plans)
     for t in range(steps):
         state.steps[:] = t
         for n in range(worlds):

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -12,15 +11,11 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.robot.spec import load_robot
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.sim.allocation import SLICES
-from nics_drl_bridge.sim.simulator import (
-    EVERY,
-    CommandBox,
-    FastSimulator,
-    OutsideValidityWarning,
-)
+from nics_drl_bridge.sim.command_range import OutsideValidityWarning
+from nics_drl_bridge.sim.randomisation import Randomisation
+from nics_drl_bridge.sim.simulator import CHECK_INTERVAL, FastSimulator
 from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import load_world
 
@@ -342,55 +337,116 @@ def test_a_simulator_of_nothing_is_refused(worlds, robots):
         FastSimulator(direct_model(), field(), worlds, robots)
 
 
-@pytest.mark.parametrize(("worlds", "robots"), [(10**9, 1), (1, 10**9), (10**6, 500)])
-def test_more_copies_or_robots_than_fit_are_refused_before_any_is_made(worlds, robots):
+def test_more_robots_than_fit_in_a_world_are_refused():
+    with pytest.raises(ConfigError, match="a world may have 1000 robots"):
+        FastSimulator(direct_model(), field(), 1, 10**9)
+
+
+@pytest.mark.parametrize(
+    ("worlds", "robots", "options"),
+    [
+        (10**9, 1, {}),
+        (10**6, 500, {}),
+        (10**4, 1, {"longest_age": 10**6}),
+        (10**4, 1, {"longest_delay": 10**6}),
+    ],
+)
+def test_more_copies_than_fit_in_memory_are_refused_before_any_is_made(
+    worlds, robots, options
+):
     with pytest.raises(ConfigError, match="copies of it are the most"):
-        FastSimulator(direct_model(), field(), worlds, robots)
+        FastSimulator(direct_model(), field(), worlds, robots, **options)
 
 
-@pytest.fixture
-def model():
-    spec = load_robot("ackermann")
-    return TaylorModel(
-        spec.variable_names,
-        spec.dof_names,
-        spec.dof_units,
-        np.eye(4, dtype=np.int64),
-        np.zeros((5, 4)),
-        0.01,
-        np.array([0.0, -0.4, 0.1, -0.4]),
-        np.array([1.0, -0.4, 0.8, -0.4]),
+def test_obstacles_that_are_spare_or_drawn_count_for_memory():
+    model = direct_model()
+    copies = 300_000
+    refused = "300000 copies of .* are the most"
+    spare = field(40.0).with_spare((Circle(radius=0.1),) * 100)
+    with pytest.raises(ConfigError, match=refused):
+        FastSimulator(model, spare, copies)
+    many = Randomisation(name="many", obstacles={"count": (0, 100)})
+    with pytest.raises(ConfigError, match=refused):
+        FastSimulator(model, field(40.0, count=1), copies, randomisation=many)
+
+
+@pytest.mark.parametrize(
+    "worlds",
+    [[0, 0, 1], [1, -1], [0, 3], [[0], [1]], [0.5, 1.5], [True, False]],
+)
+def test_worlds_that_cannot_be_reset_are_refused(worlds):
+    simulator = FastSimulator(direct_model(), field(), 3)
+    simulator.reset([0, 1, 2])
+    before = simulator.data.pose.copy()
+    with pytest.raises(ConfigError, match="indices from 0 to 2, each at most once"):
+        simulator.reset(np.arange(len(worlds)), worlds=worlds)
+    assert np.array_equal(simulator.data.pose, before)
+
+
+def test_no_world_may_be_reset():
+    simulator = FastSimulator(direct_model(), field(), 3)
+    simulator.reset([0, 1, 2])
+    assert len(simulator.reset([], worlds=[])) == 0
+
+
+def narrow_model():
+    """A model that was fitted to slow drives only."""
+    model = direct_model()
+    fitted = replace(model.kinematics, low=np.full(3, -0.5), high=np.full(3, 0.5))
+    return replace(model, kinematics=fitted)
+
+
+FAST = np.array([[[1.0, 0.0, 0.0]]])
+
+
+def test_each_command_outside_the_fit_is_reported_once_whatever_is_reset():
+    told: list[str] = []
+    simulator = FastSimulator(
+        narrow_model(), field(40.0), 4, threads=2, tell=told.append
     )
+    simulator.reset(range(4))
+    for worlds in ([3], [0], [0, 1, 2, 3]):
+        for _ in range(CHECK_INTERVAL + 1):
+            simulator.step(np.tile(FAST, (4, 1, 1)))
+        simulator.reset(worlds, worlds=worlds)
+    assert [each.split()[0] for each in told] == ["forward"]
+    simulator.step(np.tile([[[1.0, 0.0, -1.0]]], (4, 1, 1)))
+    assert [each.split()[0] for each in told] == ["forward", "turn"]
 
 
-def box(model):
-    return CommandBox(model, load_robot("ackermann"))
+def test_commands_outside_the_fit_are_found_in_any_part_of_the_worlds():
+    told: list[str] = []
+    simulator = FastSimulator(
+        narrow_model(), field(40.0), 4, threads=2, tell=told.append
+    )
+    simulator.reset(range(4))
+    for part in simulator.parts:
+        commands = FAST * (part.start > 0)
+        simulator.step_part(part, np.tile(commands, (2, 1, 1)))
+    assert len(told) == 1
 
 
-def test_a_command_outside_the_drive_warns_once_per_episode(model):
-    checked = box(model)
-    for _ in range(2):
-        checked.begin()
-        with pytest.warns(
-            OutsideValidityWarning, match=r"speed_command is 1, .* 0.1 to 0.8"
-        ):
-            checked.check(np.array([[[1.0, -0.4]]]))
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            for _ in range(3 * EVERY):
-                checked.check(np.array([[[1.0, -0.4]]]))
+def test_the_warning_names_the_line_that_steps():
+    simulator = FastSimulator(narrow_model(), field(40.0))
+    simulator.reset([0])
+    with pytest.warns(OutsideValidityWarning) as warned:
+        simulator.step(FAST)
+    assert warned[0].filename == __file__
 
 
-def test_commands_of_the_drive_do_not_warn(model):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        box(model).check(np.array([[[0.1, -0.4]], [[0.84, -0.36]]]))
+def test_equal_shapes_come_back_as_the_first_of_them():
+    disc = Circle(radius=RADIUS)
+    world = field(8.0, count=2).with_spare((disc, disc))
+    simulator = FastSimulator(direct_model(), world)
+    scenes = simulator.reset([0])
+    assert np.array_equal(scenes.bodies, simulator.obstacles)
 
 
-def test_what_was_assumed_does_not_warn(model):
-    assumed = replace(model, assumed=(("d_steering", "steering_command"),))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        box(assumed).check(np.array([[[0.5, 0.5]]]))
-    with pytest.warns(OutsideValidityWarning, match="steering_command"):
-        box(model).check(np.array([[[0.5, 0.5]]]))
+def test_putting_a_robot_or_obstacles_leaves_the_order_of_other_worlds_alone():
+    simulator = FastSimulator(direct_model(), field(30.0, count=40), 2)
+    simulator.reset([0, 1])
+    simulator.data.bodies[1, 0, :2] = simulator.data.bodies[1, 39, :2] + 0.01
+    before = simulator.data.bodies[1].copy()
+    simulator.put_robot(0, np.zeros(3), np.zeros(0))
+    simulator.put_bodies(simulator.obstacles[0])
+    assert np.array_equal(simulator.data.bodies[1], before)

@@ -7,6 +7,7 @@ import hashlib
 
 import numpy as np
 import pytest
+from lidar_scenes import scan_skewed, slice_poses
 from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
 
 from nics_drl_bridge import geometry
@@ -17,6 +18,7 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim import allocation as sizes
+from nics_drl_bridge.sim.allocation import SLICES
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
@@ -230,6 +232,85 @@ def test_a_late_scan_shows_a_moving_obstacle_where_it_was():
     still(simulator, 4)
     ahead = simulator.data.ranges[0, 0, 36]
     assert ahead == pytest.approx(1.0 + 0.4 * (0.4 - 0.15) - RADIUS, abs=2e-3)
+
+
+def test_a_late_scan_moves_an_obstacle_back_for_a_second_at_most():
+    simulator = one_obstacle(longest_age=200)
+    simulator.data.age[:] = 200
+    still(simulator, 25)
+    simulator.data.velocity[0, 0, 0] = -0.4
+    still(simulator, 1)
+    ahead = simulator.data.ranges[0, 0, 36]
+    assert ahead == pytest.approx(1.0 - 0.04 + 0.4 - RADIUS, abs=2e-3)
+
+
+@pytest.mark.parametrize("age", [0, 5])
+def test_a_skewed_sweep_does_not_begin_before_the_episode(age):
+    spec = lidar(beams=180, rate=2.0, faults={"skew": "counter_clockwise"})
+    world = field(2.0)
+    simulator = FastSimulator(direct_model(sensor=spec), world, longest_age=5)
+    simulator.data.age[:] = age
+
+    def scan_from(pose):
+        return simulator._scanner.scan(pose, np.zeros((0, 7)), world.all_walls())[0]
+
+    simulator.reset([0], starts=np.array([[[-0.75, 0.0, 0.0]]]))
+    for steps in (1, 2):
+        simulator.step([[[1.0, 0.0, 0.0]]])
+        driven = steps * PERIOD - age / 100
+        pose = [-0.75 + driven, 0.0, 0.0]
+        speed = driven / PERIOD if steps == 1 else 1.0
+        poses = slice_poses(
+            pose,
+            [speed, 0.0, 0.0],
+            spec.sweep_time,
+            SLICES,
+            "counter_clockwise",
+            driven,
+        )
+        assert (poses[:, 0] >= -0.75 - 1e-9).all()
+        expected = scan_skewed(scan_from, poses)
+        assert simulator.data.ranges[0, 0] == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_robot_that_was_put_elsewhere_is_seen_and_sees_from_there_at_once():
+    simulator = FastSimulator(direct_model(), field(4.0), 1, 2, longest_age=30)
+    simulator.data.age[:] = 25
+    simulator.reset([0], starts=np.array([[[-1.0, 0.0, 0.0], [-1.0, 1.5, 0.0]]]))
+    for _ in range(6):
+        simulator.step(np.tile([0.1, 0.0, 0.0], (1, 2, 1)))
+    simulator.put_robot(0, np.array([1.0, 0.0, 0.0]), np.zeros(0))
+    still(simulator, 1)
+    assert simulator.data.ranges[0, 0, 36] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_simulator_that_takes_over_keeps_the_past():
+    one, other = (
+        FastSimulator(direct_model(), field(4.0, 2), 1, 2, longest_age=30)
+        for _ in range(2)
+    )
+    one.reset([0])
+    for _ in range(6):
+        one.step(np.tile([0.1, 0.0, 0.0], (1, 2, 1)))
+    other.reset([1])
+    other.take_over(one, np.arange(2), np.arange(2))
+    assert np.array_equal(other.data.past, one.data.past)
+    assert np.array_equal(other.data.pose, one.data.pose)
+
+
+def test_the_state_drifts_within_the_bounds_of_the_model():
+    model = builtin_model("ackermann")
+    bounded = dataclasses.replace(model.kinematics, bounded=True)
+    model = dataclasses.replace(model, kinematics=bounded)
+    low, high = bounded.state_box
+    simulator = FastSimulator(model, field(60.0), 20)
+    simulator.data.noise[..., 5:] = 0.5
+    simulator.reset(range(20))
+    for _ in range(40):
+        simulator.step(np.tile(model.robot.command_high, (20, 1, 1)))
+        state = simulator.data.state
+        assert (state >= low).all()
+        assert (state <= high).all()
 
 
 def box_model(corners):

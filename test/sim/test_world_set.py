@@ -283,6 +283,6 @@ def test_what_worlds_share_is_stored_once():
     rooms = WorldSet(
         "rooms", (load_world("room"), load_world("room"), load_world("circles"))
     )
-    fixtures = FastSimulator(MODEL, rooms)._members.fixtures
+    fixtures = FastSimulator(MODEL, rooms)._world_set.fixtures
     assert fixtures.maps[0].tolist() == fixtures.maps[1].tolist()
     assert fixtures.squares.size == fixtures.maps[0, 1] * fixtures.maps[0, 2]
