@@ -104,10 +104,16 @@ def readjusted(
 def by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed so that vx = 1 speed; lateral motion is noise unless commanded."""
+    """Scales an inferred speed so that vx = 1 speed, and drops lateral motion that is noise.
+
+    Lateral motion is noise unless it is commanded or a state measures it.
+    """
     coefficients = model.coefficients.copy()
     limits = model.limits.copy()
-    if not spec.moves_sideways:
+    low = model.low.copy()
+    high = model.high.copy()
+    slips = any(variable.twist == "vy" for variable in spec.state)
+    if not (spec.moves_sideways or slips):
         coefficients[1] = 0.0
     responses = list(calibration.responses)
     i = speed_index(spec)
@@ -118,9 +124,13 @@ def by_definition(
             coefficients = coefficients / scale ** model.powers[:, i]
             coefficients[3 + i] *= scale
             limits[i] *= scale
+            low[i] *= scale
+            high[i] *= scale
             responses[i] = replace(responses[i], gain=responses[i].gain * scale)
             coefficients[0, alone] = 1.0
-    model = replace(model, coefficients=coefficients, limits=limits)
+    model = replace(
+        model, coefficients=coefficients, limits=limits, low=low, high=high
+    )
     return model, replace(calibration, responses=tuple(responses))
 
 
@@ -322,7 +332,8 @@ def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
             continue
         if model.coefficients[0, alone] == 1.0:
             free[0, alone] = False
-        else:  # the scale of this state is arbitrary, so its gain is fixed
+        elif command is not None:
+            # the scale of this state is arbitrary, so its gain is fixed
             free[3 + i, command] = False
         if lag_is_measured(calibration):
             free[3 + i, alone] = False
