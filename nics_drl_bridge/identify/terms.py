@@ -80,10 +80,12 @@ def library(powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()) -> Mask
             allowed[d] &= (reversed_ == is_reversed(name, odd)) | (order <= 1)
     if spec.state:  # commands act through the state
         allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
-    if not spec.state or odd is not None:  # without a command, the robot comes to rest
-        pushed = [is_reversed(name, odd or ()) for name in held]
-        rest = [is_reversed(name, odd or ()) not in pushed for name in spec.dof_names]
+    if odd is not None:  # without a command, the robot comes to rest
+        pushed = [is_reversed(name, odd) for name in held]
+        rest = [is_reversed(name, odd) not in pushed for name in spec.dof_names]
         allowed[rest] &= order > 0
+    elif not (spec.state or held):
+        allowed &= order > 0
     for i, variable in enumerate(spec.state):
         alone = (order == 1) & (powers[:, i] == 1)
         if variable.twist:

@@ -19,6 +19,7 @@ from nics_drl_bridge.identify.identify import (
 )
 from nics_drl_bridge.identify.terms import (
     by_textbook,
+    library,
     linear_fit,
     mirrored,
     shared,
@@ -196,6 +197,17 @@ def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
     turning = model.rates([0.0, 0.0, 0.0, 0.25, 0.5])
     assert turning[3] == 0.0
     assert turning[5] > 1.0
+
+
+def test_a_wheel_that_was_held_drives_and_turns_as_a_constant():
+    two = {"kind": "differential_wheels", "footprint_radius": 0.3, "state": []}
+    limits = dict.fromkeys(("left_wheel", "right_wheel"), (-9.0, 9.0))
+    spec = build_robot(two, limits)
+    assert mirrored(spec) is None  # a mirror exchanges the wheels
+    powers = taylor.list_exponents(2, 1)
+    constant = (powers == 0).all(axis=1)
+    assert not library(powers, spec)[:, constant].any()
+    assert library(powers, spec, held=("left_wheel",))[:, constant].all()
 
 
 def test_wheels_that_always_move_together_share_what_they_do():
