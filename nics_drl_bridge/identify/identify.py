@@ -145,6 +145,7 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
     """Finds the period of bursts, the clock offset, the latency of commands, and lags."""
     training = findings.training
     spec = drive.spec
+    timings.check_state_is_known(drive.recording, spec)
     derived = motions.by_motion(spec, drive.recording)
     followed = replace(training, spec=motions.surrogate(spec)) if derived else training
     found = timings.timing_of(followed)

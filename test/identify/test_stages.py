@@ -7,12 +7,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from identify.drives import drive
-from nics_drl_bridge.errors import FitError
+from identify.drives import drive, slipping_car
+from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.identify import drive as prepared
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.identify import STAGES, Findings, begun, identify, run
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
 NAMES = tuple(stage.__name__ for stage in STAGES)
 ADDED = {
@@ -141,6 +141,14 @@ def test_without_a_stage_that_others_need_the_row_says_which(inferred, name, sen
     driven, found = inferred
     with pytest.raises(FitError, match=sentence):
         rest(driven, found, name)
+
+
+def test_a_state_that_nothing_determines_is_one_sentence_beside_a_motion_too():
+    spec, recording = slipping_car(duration=4.0)
+    arm = StateVariable(name="arm", unit="rad", min=-1.0, max=1.0)
+    armed = spec.model_copy(update={"state": (*spec.state, arm), "textbook": None})
+    with pytest.raises(RecordingError, match="'arm' of robot .* follows no command"):
+        identify(recording, armed)
 
 
 def test_the_bursts_of_a_drive_are_found_once(differential, monkeypatch):
