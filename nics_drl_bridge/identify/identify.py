@@ -151,15 +151,12 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
     found = timings.timing_of(followed)
     if not derived:
         found = followers.apart(training, found)
-    names = [c.name for c in spec.command]
-    responses = (
-        Response(v.name, v.follows, float(found.lags[names.index(v.follows)]))
-        for v in spec.state
-        if derived and v.follows and v.twist is None
-    )
+    responses: tuple[Response, ...] = ()
+    if derived:
+        responses, found = _select_followers(spec, found)
     calibration = replace(
         findings.calibration,
-        responses=tuple(responses),
+        responses=responses,
         uncertainty=found.sigma,
         inputs=followers.late_inputs(spec, found),
         limits=followers.limits_of(spec, found),
@@ -168,6 +165,24 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
     )
     return replace(findings, timing=found, calibration=calibration)
+
+
+def _select_followers(
+    spec: RobotSpec, timing: timings.TimingEstimate
+) -> tuple[tuple[Response, ...], timings.TimingEstimate]:
+    """Returns the states that follow a command, with their lags, from the lag of each command.
+
+    The timing that is returned has the lags of these states alone, in their order.
+    """
+    names = [c.name for c in spec.command]
+    states = [v for v in spec.state if v.follows and v.twist is None]
+    rows = [names.index(str(v.follows)) for v in states]
+    own = replace(timing, lags=timing.lags[rows], lag_sigma=timing.lag_sigma[rows])
+    responses = (
+        Response(v.name, str(v.follows), float(lag))
+        for v, lag in zip(states, own.lags, strict=True)
+    )
+    return tuple(responses), own
 
 
 def mounting(drive: Drive, findings: Findings) -> Findings:

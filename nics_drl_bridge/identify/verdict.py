@@ -229,7 +229,7 @@ def about_responses(
     """Yields sentences on unmeasured states and the wheels."""
     moved = moved_commands(drive.recording.command)
     names = [c.name for c, m in zip(drive.spec.command, moved, strict=True) if m]
-    for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=False):
+    for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=True):
         state = response.state
         command = response.command
         if command not in names:

@@ -9,9 +9,13 @@ import pytest
 
 from identify.drives import drive, slipping_car
 from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify import drive as prepared
+from nics_drl_bridge.identify.calibration import Response
+from nics_drl_bridge.identify.clocks import nominal_timing
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.identify import STAGES, Findings, begun, identify, run
+from nics_drl_bridge.identify.verdict import about_responses
 from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
 NAMES = tuple(stage.__name__ for stage in STAGES)
@@ -149,6 +153,28 @@ def test_a_state_that_nothing_determines_is_one_sentence_beside_a_motion_too():
     armed = spec.model_copy(update={"state": (*spec.state, arm), "textbook": None})
     with pytest.raises(RecordingError, match="'arm' of robot .* follows no command"):
         identify(recording, armed)
+
+
+def test_a_follower_beside_a_motion_has_the_lag_and_the_error_of_its_own_command(
+    monkeypatch,
+):
+    spec, recording = slipping_car(duration=4.0)
+    data = spec.model_dump()
+    angle = {"name": "angle", "unit": "rad", "min": -1.0, "max": 1.0}
+    data["state"] = [data["state"][0], angle | {"follows": "steering"}]
+    data["textbook"] = None
+    followed = RobotSpec.model_validate(data)
+    timing = replace(
+        nominal_timing(Drive(recording, spec)),
+        lags=np.array([0.3, 0.1]),  # of throttle and steering
+        lag_sigma=np.array([0.03, 0.01]),
+    )
+    monkeypatch.setattr(clocks, "timing_of", lambda drive: timing)
+    driven = Drive(recording, followed)
+    found = run(STAGES[: NAMES.index("mounting")], driven)
+    assert found.calibration.responses == (Response("angle", "steering", 0.1),)
+    (sentence,) = about_responses(driven, found.calibration, found.timing)
+    assert "follow steering with a lag of 0.1000 s (+- 0.0100 s)" in sentence
 
 
 def test_the_bursts_of_a_drive_are_found_once(differential, monkeypatch):
