@@ -248,7 +248,7 @@ def inputs_of(
             np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3)
         )
         rows[f"{name}.drag"] = (0.1 * size, 0.1 * size, 0.0, size)
-        for place in _drivers(drive.spec):
+        for place in list_driving_commands(drive.spec):
             effect = np.abs(samples.x[:, len(drive.spec.state) + place] * value)
             size = float(
                 np.percentile(np.abs(rates[name]), STRONG) / max(effect.mean(), 1e-3)
@@ -310,7 +310,7 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     spec = drive.spec
     command = samples.x[:, len(spec.state) :]
     found = []
-    for place in _drivers(spec):
+    for place in list_driving_commands(spec):
         reach = command[:, place]
         if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
             low = float(reach.min())
@@ -321,7 +321,7 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     return tuple(found)
 
 
-def _drivers(spec: RobotSpec) -> tuple[int, ...]:
+def list_driving_commands(spec: RobotSpec) -> tuple[int, ...]:
     """Returns the indices of the commands that drive a robot ahead, according to its textbook."""
     given = structure_of(spec)
     return () if given is None else tuple(np.flatnonzero(given[0][0]).tolist())
@@ -330,7 +330,7 @@ def _drivers(spec: RobotSpec) -> tuple[int, ...]:
 def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
     """Returns a form in which each command that drives the robot has a dead zone."""
     bent = {c.command: c for c in form.curves}
-    for place in _drivers(drive.spec):
+    for place in list_driving_commands(drive.spec):
         name = drive.spec.command[place].name
         reach = samples.x[:, len(drive.spec.state) + place]
         low = min(float(reach.min()), 0.0)

@@ -27,7 +27,13 @@ from nics_drl_bridge.identify.by_recording import about_recordings
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
+from nics_drl_bridge.identify.forms import (
+    CLEAR,
+    curve_of,
+    likely_delay,
+    list_driving_commands,
+    reached,
+)
 from nics_drl_bridge.identify.gyro import turned_by_gyro
 from nics_drl_bridge.identify.judgement import (
     bands_of,
@@ -833,25 +839,34 @@ class Identified:
     @property
     def dead_zone(self) -> float:
         """Maximum of the driving command at which the robot stays at rest; 0 if none."""
-        # A state with dry friction starts to move when the command's effect exceeds the friction.
-        model = self.model
-        states = self.model.state_size
-        dead = {curve.command: curve.dead for curve in model.inputs}
-        zones = [0.0, *dead.values()]
-        for i, place in enumerate(states + model.drivers):
-            alone = np.arange(len(model.variables)) == place
-            gain = abs(
-                model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum()
-            )
-            if model.friction[i] * gain > 0.0:
-                zone = dead.get(model.variables[place], 0.0)
-                zones.append(zone + float(model.friction[i] / gain))
-        return max(zones)
+        spec = self.drive.spec
+        driving = {spec.command[place].name for place in list_driving_commands(spec)}
+        if not driving:  # no textbook says what each command moves
+            driving = {c.name for c in spec.command if not c.turns and c.unit != "rad"}
+        return _find_dead_zone(self.model, driving)
 
     @property
     def alpha(self) -> fitting.Alpha:
         """Threshold of the pruning; `auto` for the knee of the accuracy curve."""
         return self.drive.settings.alpha
+
+
+def _find_dead_zone(model: TaylorModel, driving: set[str]) -> float:
+    """Returns the largest command of those that drive at which no state starts to move.
+
+    A state with dry friction starts when the effect of its command exceeds the friction.
+    """
+    dead = {c.command: c.dead for c in model.inputs if c.command in driving}
+    zones = [0.0, *dead.values()]
+    for i, place in enumerate(model.state_size + model.drivers):
+        if model.variables[place] not in driving:
+            continue
+        alone = np.arange(len(model.variables)) == place
+        gain = abs(model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum())
+        if model.friction[i] * gain > 0.0:
+            zone = dead.get(model.variables[place], 0.0)
+            zones.append(zone + float(model.friction[i] / gain))
+    return max(zones)
 
 
 @one_blas_thread

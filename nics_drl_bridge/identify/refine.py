@@ -128,9 +128,7 @@ def by_definition(
             high[i] *= scale
             responses[i] = replace(responses[i], gain=responses[i].gain * scale)
             coefficients[0, alone] = 1.0
-    model = replace(
-        model, coefficients=coefficients, limits=limits, low=low, high=high
-    )
+    model = replace(model, coefficients=coefficients, limits=limits, low=low, high=high)
     return model, replace(calibration, responses=tuple(responses))
 
 

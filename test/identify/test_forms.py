@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,14 @@ from nics_drl_bridge.identify.forms import (
     with_back,
     with_dead,
 )
-from nics_drl_bridge.identify.identify import STAGES, Findings, aligned, inputs, run
+from nics_drl_bridge.identify.identify import (
+    STAGES,
+    Findings,
+    Identified,
+    aligned,
+    inputs,
+    run,
+)
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -206,3 +214,30 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
     assert within.inputs[0].most == pytest.approx(0.8 * sent.max())
     assert within.inputs[0].least == -np.inf
     assert within.limits[0].tolist() == [-np.inf, 0.5 * asked.max()]
+
+
+def test_the_dead_zone_of_a_steering_is_none_of_the_drive():
+    spec, _ = slipping_car(duration=1.0)
+    size = len(spec.variable_names)
+    powers = np.eye(size, dtype=np.int64)
+    model = TaylorModel(
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers,
+        np.zeros((len(spec.dof_names), size)),
+        0.01,
+        np.zeros(size),
+        np.ones(size),
+        inputs=(
+            InputCurve(command="throttle", dead=0.1),
+            InputCurve(command="steering", dead=0.3),
+        ),
+    )
+    found = SimpleNamespace(model=model, drive=SimpleNamespace(spec=spec))
+    assert Identified.dead_zone.fget(found) == 0.1
+    model.coefficients[3, spec.variable_names.index("throttle")] = 9.0
+    model.coefficients[5, spec.variable_names.index("steering")] = 9.0
+    rubbing = replace(model, friction=np.array([0.9, 0.0, 9.0]))
+    found.model = rubbing
+    assert Identified.dead_zone.fget(found) == pytest.approx(0.2)
