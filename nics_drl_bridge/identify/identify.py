@@ -120,10 +120,14 @@ class Findings:
 Stage = Callable[[Drive, Findings], Findings]
 
 
+class StageOrderError(RuntimeError):
+    """A stage needs what a stage after it, or a missing one, finds: a fault of the program."""
+
+
 def known(found: T | None, name: str, stage: str) -> T:
-    """Returns a finding that a later stage needs. Raises FitError if it is missing."""
+    """Returns a finding that a later stage needs. Raises StageOrderError if it is missing."""
     if found is None:
-        raise FitError(
+        raise StageOrderError(
             f"{name} is missing; put the stage {stage!r} before those that need it."
         )
     return found
@@ -400,8 +404,8 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
             found = draft.refined(book, linear.model, pull=best.pull)
         else:
             found = None
-        if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(
-            base.found
+        if found is None or verdict.is_worse(
+            draft.error_of(found), draft.error_of(base.found)
         ):
             return draft.base(other=book), best.order == 0  # the search may diverge
         return found, True
@@ -620,17 +624,11 @@ def _why_replaced(drive: Drive, findings: Findings) -> Iterator[str]:
         yield verdict.Gap(f"{coarse}.")
 
 
-def _left_out(
-    drive: Drive, findings: Findings, order: int | None = None
-) -> dict[float, Array]:
-    """Returns errors (W,) by horizon [s] on left-out parts; with an order, reusing the findings."""
+def _left_out(drive: Drive, findings: Findings, order: int) -> dict[float, Array]:
+    """Returns errors (W,) of an order by horizon [s], on parts that its fits did not see."""
     training = findings.training
-    stages = STAGES[: STAGES.index(complete)]
     pose = training.recording.pose
-    settings = replace(drive.settings, train_until_s=np.inf)
-    if order is not None:
-        stages = (fit, prune, refine)
-        settings = replace(settings, order=order)
+    settings = replace(drive.settings, order=order, train_until_s=np.inf)
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
     for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
         others = np.ones(len(pose.t), dtype=np.bool_)
@@ -639,9 +637,7 @@ def _left_out(
             settings
         )
         try:
-            found = run(
-                stages, rest, replace(findings, training=rest) if order else None
-            )
+            found = run((fit, prune, refine), rest, replace(findings, training=rest))
         except (FitError, RecordingError):
             return {}
         part = training.part(replace(training.recording, pose=pose.rows(block)))
@@ -658,7 +654,8 @@ def _left_out(
                 ends = open_loop.predict(
                     _fitted(found)[1], found.calibration, part, chosen
                 )
-                errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
+                far = np.hypot(*(ends - chosen.end)[:, :2].T)
+                errors_at.append(np.where(np.isnan(far), np.inf, far))
     return {h: np.concatenate(each) for h, each in errors.items() if each}
 
 
@@ -678,8 +675,8 @@ def refit(drive: Drive, findings: Findings) -> Findings:
             )
             for each in (final, findings)
         )
-        worse = (
-            error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
+        worse = verdict.is_worse(
+            error.mean_position_error_m, before.mean_position_error_m
         )
     except (FitError, RecordingError):
         worse = True

@@ -161,10 +161,14 @@ class Shooting:
     def errors(
         self, model: TaylorModel, values: Array, inside: Mask | None = None
     ) -> tuple[Array, Array]:
-        """Returns prediction errors (W, H, 3), and the lengths (W, H) of paths; may be NaN."""
+        """Returns prediction errors (W, H, 3), and the lengths (W, H) of paths.
+
+        Both are NaN where a horizon does not fit; errors of diverged predictions are infinite.
+        """
         first, steps = self.starts(inside)
         error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
         error[..., 2] = geometry.wrap_angle(error[..., 2])
+        error[np.isnan(error)] = np.inf
         error[steps == 0] = np.nan
         return error, np.where(steps > 0, self.paths(first, steps), np.nan)
 

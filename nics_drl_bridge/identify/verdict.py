@@ -397,6 +397,11 @@ def tried(
         return None
 
 
+def is_worse(error_m: float, reference_m: float) -> bool:
+    """True if an error [m] clearly exceeds a reference [m], or is not a number."""
+    return bool(np.isnan(error_m)) or error_m > WORSE * reference_m
+
+
 def ran_away(tried: OpenLoop | None) -> bool:
     """True if predictions end farther away than the robot drove."""
     return tried is not None and not tried.mean_position_error_m <= tried.mean_path_m

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from identify.drives import drive, slipping_car
-from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify import drive as prepared
-from nics_drl_bridge.identify.calibration import Response
+from nics_drl_bridge.identify import identify as stages
+from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.clocks import nominal_timing
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.identify import STAGES, Findings, begun, identify, run
+from nics_drl_bridge.identify.identify import (
+    STAGES,
+    Findings,
+    StageOrderError,
+    begun,
+    identify,
+    run,
+)
 from nics_drl_bridge.identify.verdict import about_responses
 from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
@@ -45,6 +54,13 @@ ADDED = {
     "refit": {"refit"},
 }
 SETTINGS = Settings(train_until_s=14.0, assume=True)
+
+
+@dataclass(frozen=True)
+class HasQuality:
+    """What a refit takes from a model."""
+
+    quality: None = None
 
 
 def rest(drive: Drive, found: Findings, name: str) -> Findings:
@@ -143,7 +159,7 @@ def inferred(car) -> tuple[Drive, Findings]:
 )
 def test_without_a_stage_that_others_need_the_row_says_which(inferred, name, sentence):
     driven, found = inferred
-    with pytest.raises(FitError, match=sentence):
+    with pytest.raises(StageOrderError, match=sentence):
         rest(driven, found, name)
 
 
@@ -151,7 +167,7 @@ def test_a_state_that_nothing_determines_is_one_sentence_beside_a_motion_too():
     spec, recording = slipping_car(duration=4.0)
     arm = StateVariable(name="arm", unit="rad", min=-1.0, max=1.0)
     armed = spec.model_copy(update={"state": (*spec.state, arm), "textbook": None})
-    with pytest.raises(RecordingError, match="'arm' of robot .* follows no command"):
+    with pytest.raises(RecordingError, match=r"'arm' of robot .* follows no command"):
         identify(recording, armed)
 
 
@@ -175,6 +191,39 @@ def test_a_follower_beside_a_motion_has_the_lag_and_the_error_of_its_own_command
     assert found.calibration.responses == (Response("angle", "steering", 0.1),)
     (sentence,) = about_responses(driven, found.calibration, found.timing)
     assert "follow steering with a lag of 0.1000 s (+- 0.0100 s)" in sentence
+
+
+@pytest.fixture(scope="module")
+def judged(car) -> tuple[Drive, Findings]:
+    """A noisy drive as it stands before the last stage, without its model."""
+    driven = Drive(drive(car, duration=6.0), car, Settings(train_until_s=4.0))
+    noisy = Calibration(position_noise_m=0.01)
+    return driven, replace(begun(driven), calibration=noisy)
+
+
+@pytest.mark.parametrize(
+    ("error", "kept"), [(1.2, True), (1.3, False), (np.nan, False)]
+)
+def test_a_refit_is_kept_unless_it_predicts_worse_or_not_at_all(
+    judged, monkeypatch, error, kept
+):
+    errors = [SimpleNamespace(mean_position_error_m=each) for each in (error, 1.0)]
+    monkeypatch.setattr(stages, "run", lambda row, driven, found: found)
+    monkeypatch.setattr(stages, "_fitted", lambda found: (None, HasQuality()))
+    monkeypatch.setattr(stages, "_notes", lambda driven, found: ())
+    monkeypatch.setattr(stages, "_sentences", lambda found: ())
+    monkeypatch.setattr(
+        stages.open_loop, "open_loop_error", lambda *given: errors.pop(0)
+    )
+    assert (stages.refit(*judged).refit is not None) == kept
+
+
+def test_a_stage_in_the_wrong_place_is_not_taken_for_a_drive_that_can_not_be_fitted(
+    judged, monkeypatch
+):
+    monkeypatch.setattr(stages, "fit", lambda driven, found: found)
+    with pytest.raises(StageOrderError, match="put the stage 'fit' before"):
+        stages._left_out(*judged, order=2)
 
 
 def test_the_bursts_of_a_drive_are_found_once(differential, monkeypatch):
