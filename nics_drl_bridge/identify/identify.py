@@ -43,7 +43,7 @@ from nics_drl_bridge.identify.judgement import (
 )
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.refine import refined
+from nics_drl_bridge.identify.refine import TOO_SHORT, refined
 from nics_drl_bridge.identify.repair import (
     check_axes,
     check_commands,
@@ -450,13 +450,20 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         model=model,
         base=base,
         refinement=(
-            f"Coefficients and latency were refined by the open-loop errors over up to "
-            f"{max(shooting.HORIZONS_S):g} s.",
+            _about_refinement(draft.problem.longest_horizon_s),
             *sums,
             *hypotheses.about_forms(base, findings.trials, drive.settings.order),
             *about_options(drive, best.order, kept_order),
         ),
     )
+
+
+def _about_refinement(horizon_s: float) -> str:
+    """States the longest horizon of a motion's refinement [s]; 0 if none fitted into the drive."""
+    if horizon_s == 0.0:
+        return TOO_SHORT
+    by = f"the open-loop errors over up to {horizon_s:g} s"
+    return f"Coefficients and latency were refined by {by}."
 
 
 def about_options(drive: Drive, order: int, kept_order: bool) -> Iterator[str]:
@@ -466,7 +473,8 @@ def about_options(drive: Drive, order: int, kept_order: bool) -> Iterator[str]:
         why = "where the state is the motion, predictions of parts of the drive weight the terms"
         yield f"alpha = {settings.alpha:g} was not used: {why}."
     if settings.order != "auto" and not kept_order:
-        why = "predictions with its terms diverged, so only the textbook's terms were kept"
+        off = f"more than {verdict.WORSE:g} times as far off as the textbook's, or diverge"
+        why = f"predictions with its terms are {off}, so only the textbook's were kept"
         yield f"order = {order} was not used: {why}."
 
 

@@ -45,6 +45,10 @@ LEAST_SCALE = 0.05
 WITHIN = 12.0**-0.5
 # maximum fraction of its distance by which a state approaches its command in one step
 FASTEST = 0.99
+TOO_SHORT = (
+    "The training part is too short to refine the model by its errors over seconds; record a "
+    "longer drive."
+)
 # terms are removed while the error rises by less than this fraction in total
 WORTH = 0.1
 
@@ -55,17 +59,19 @@ def refined(
     """Refines a linear fit by its predictions, removes terms; returns a sentence on the result."""
     model, calibration = by_definition(linear.add_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
-    why = (
-        "The training part is too short to refine the model by its errors over seconds"
-    )
-    note = f"{why}; record a longer drive."
+    note = TOO_SHORT
     if problem is not None:
         try:
             best = simplify(problem, refine(problem, model, calibration))
             best = without_doubtful_rotation(problem, best, calibration)
             errors = replace(best.model, std_errors=best.std_errors).named_errors
-            by = "Coefficients and calibration were refined by the open-loop errors over up to 5 s"
-            note = f"{by}: {best.error:.4f} m (root mean square) is left on the training part."
+            what = "Coefficients"
+            if best.calibration != calibration:
+                what += " and calibration"
+            by = f"{what} were refined by the open-loop errors over up to {problem.horizon_s:g} s"
+            parts = f"of x, y and heading times {HEADING_ARM_M:g} m"
+            left = f"the root mean square {parts} left on the training part"
+            note = f"{by}: {left} is {best.error:.4f} m."
             return merged(best.model, linear, errors), best.calibration, note
         except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
             why = "The predictions of the fitted model diverge on the training part"
@@ -155,6 +161,7 @@ class Problem:
     """Prediction problem of a refinement: windows of one drive, the same for every trial model."""
 
     drive: Drive
+    horizon_s: float  # the longest horizon that fits into the drive
     chosen: tuple[open_loop.Windows, ...]  # for each horizon, without jumps of the pose
     # courses of X over them if the state was measured, else empty
     courses: tuple[open_loop.Course, ...]
@@ -166,18 +173,20 @@ def problem_of(
     """Selects the windows of a training part to predict; None if it is too short."""
     until = drive.settings.train_until_s
     chosen = []
+    longest = 0.0
     for horizon in HORIZONS_S:
         found = open_loop.windows(drive, calibration, 0.0, until, horizon, SPACING_S)
         if len(found.start_t) >= MIN_WINDOWS:
             error = open_loop.predict(model, calibration, drive, found) - found.end
             chosen.append(_without_outliers(found, error))
+            longest = horizon
     if not chosen:
         return None
     measured = drive.recording.state is not None
     courses = (
         open_loop.course_of(model, calibration, drive, w) for w in chosen if measured
     )
-    return Problem(drive, tuple(chosen), tuple(courses))
+    return Problem(drive, longest, tuple(chosen), tuple(courses))
 
 
 def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Windows:
@@ -360,7 +369,8 @@ class Refined:
     calibration: (
         Calibration  # with refined offset (or latency), rotation, lags and gains
     )
-    error: float  # root mean square of the open-loop errors on the training part [m]
+    # root mean square of the components of `prediction_errors` on the training part [m]
+    error: float
     std_errors: Array  # (D, K) of the refined coefficients; NaN for the others
 
 

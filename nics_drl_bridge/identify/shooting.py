@@ -112,6 +112,13 @@ class Shooting:
         some = whole.any(axis=1)
         return first[some], np.where(whole, steps, 0)[some]
 
+    @property
+    def longest_horizon_s(self) -> float:
+        """The longest horizon that fits into the drive; 0 if none does [s]."""
+        _, steps = self.starts()
+        horizons = zip(self.horizons, steps.T, strict=True)
+        return max((horizon for horizon, each in horizons if each.any()), default=0.0)
+
     def moved(self, first: Rows, steps: Rows) -> Array:
         """Returns the measured poses (W, H, 3) at windows' horizons, relative to the starts."""
         pose = self.samples.q[:, :3]

@@ -37,7 +37,10 @@ BACKWARDS = 0.3  # angle [rad] from half a turn, below which a body faces backwa
 GAP_STEPS = 3.0
 # maximum number of gaps to report individually: the longest, in order of time
 GAPS_TOLD = 12
-LINEAR = "Predictions by terms of a higher order diverged, so the model has only those of order 1."
+LINEAR = (
+    "Predictions by terms of a higher order ended farther away than the robot drove, so the model "
+    "has only those of order 1."
+)
 EARLY = "The robot moves"  # start of a note on motion before its commands
 # fraction of a state's range between two rows that is sampled too coarsely
 COARSE = 2.0 / 3.0

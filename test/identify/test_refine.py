@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.identify.calibration import Calibration, Response
-from nics_drl_bridge.identify.refine import by_definition, free_coefficients
+from identify.drives import drive
+from nics_drl_bridge.identify.calibration import Calibration, Response, align
+from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.fit import fit
+from nics_drl_bridge.identify.refine import (
+    TOO_SHORT,
+    by_definition,
+    free_coefficients,
+    refined,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -81,3 +89,19 @@ def test_lateral_motion_is_kept_where_a_state_measures_it(car):
     slides = car.model_copy(update={"state": (speed, slip)})
     kept, _ = by_definition(model_of(car, terms), Calibration(), slides)
     assert kept.coefficients[1].any()
+
+
+@pytest.mark.parametrize("length_s", [0.8, 4.0])
+def test_a_sentence_names_the_horizon_that_fits_and_what_was_refined(car, length_s):
+    settings = Settings(order=1, train_until_s=length_s)
+    recording = drive(car, duration=length_s + 0.2, noise=(1e-3, 1e-3))
+    driven = Drive(recording, car, settings)
+    calibration = Calibration(position_noise_m=1e-3)
+    linear = fit(align(driven, calibration), car, order=1).model
+    _, after, sentence = refined(linear, calibration, driven)
+    assert after == calibration
+    if length_s < 1.0:
+        assert sentence == TOO_SHORT
+    else:
+        assert sentence.startswith("Coefficients were refined by the open-loop errors")
+        assert "over up to 1 s: the root mean square of x, y and heading" in sentence
