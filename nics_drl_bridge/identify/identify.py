@@ -600,7 +600,7 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
         *_why_replaced(drive, findings),
         *drive.recording.repairs,
         *findings.repairs,
-        *verdict.about_gaps(drive),
+        *verdict.about_gaps(findings.whole),
         *_sentences(findings),
         *findings.refinement,
         *verdict.mirror_note(
