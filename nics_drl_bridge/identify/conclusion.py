@@ -43,7 +43,7 @@ def conclude(identified: Identified) -> Conclusion:
     assessment = identified.assessment
     wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
     strange = tuple(str(note) for note in identified.notes if isinstance(note, Doubt))
-    replaced = identified.findings.replaced
+    replaced = identified.findings.replacement
     about = (
         *wrong,
         *strange,

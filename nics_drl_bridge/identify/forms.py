@@ -16,7 +16,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.motion import as_smooth, half_width
 from nics_drl_bridge.identify.signals import taken
-from nics_drl_bridge.identify.terms import linear_fit, sided
+from nics_drl_bridge.identify.terms import fit_motion_terms, tells_lever_from_wheels
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -261,7 +261,7 @@ def inputs_of(
             rows[f"{name}.{word}"] = (size, 0.3 * size, 0.1 * size, 10.0 * size)
     if not drive.spec.state:  # the remaining error of the mounting
         reach = 2.0 * drive.spec.footprint_radius
-        aside = reach if sided(drive.spec) else 0.0
+        aside = reach if tells_lever_from_wheels(drive.spec) else 0.0
         rows["x"] = (0.0, LEVER_SCALE_M, -reach, reach)
         rows["y"] = (0.0, LEVER_SCALE_M, -aside, aside)
         rows["heading"] = (0.0, TURN_SCALE, -np.pi, np.pi)
@@ -444,5 +444,7 @@ def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
     x = np.concatenate([samples.x[:, :states], command], axis=1)
     return float(
-        (1.0 - linear_fit(replace(samples, x=x), spec, DELAY_ORDER).r2[free]).sum()
+        (
+            1.0 - fit_motion_terms(replace(samples, x=x), spec, DELAY_ORDER).r2[free]
+        ).sum()
     )

@@ -40,7 +40,9 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     ranges = zip(model.variables, model.low, model.high, strict=True)
     around = list(stages(spec, identified))
     notes = identified.notes or ("Nothing had to be corrected.",)
-    linear = not identified.findings.width and not identified.findings.replaced
+    linear = (
+        not identified.findings.motion_width_s and not identified.findings.replacement
+    )
     of = f" of {identified.fit.regression.terms_total}" if linear else ""
     listed = partial(
         fill, width=WIDTH - 2, initial_indent="- ", subsequent_indent="    "
@@ -190,7 +192,10 @@ def with_error(value: float, error: float | None) -> str:
 
 def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
     """Describes the pruned linear fit if the terms come from it, unlike those of a motion."""
-    if identified.findings.width is not None or identified.findings.replaced:
+    if (
+        identified.findings.motion_width_s is not None
+        or identified.findings.replacement
+    ):
         return {}
     fit = identified.fit
     model = identified.model
@@ -331,7 +336,7 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     clocks = "pose and commands are on one clock" if one_clock else untold
     both = "clock_offset_s" in sigma
     latency = "only its sum with the clock offset is known" if both else untold
-    if identified.findings.width is not None and not both:
+    if identified.findings.motion_width_s is not None and not both:
         latency = "it can't be separated from the lags"
     few = "the drive shows too few directions of motion"
     hidden = (few, few) if mounting is None else mounting.hidden
@@ -363,7 +368,7 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
             )
             remark = "below its uncertainty: taken as zero" if zero else ""
             values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
-    if identified.findings.replaced:
+    if identified.findings.replacement:
         for key in TEXTBOOK_VALUES:
             name, value, unit, _ = rows[key]
             values[key] = CalibratedValue(

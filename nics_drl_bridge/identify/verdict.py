@@ -390,7 +390,7 @@ def mirror_note(
         return
 
 
-def tried(
+def try_model(
     model: TaylorModel, calibration: Calibration, drive: Drive, t: float
 ) -> OpenLoop | None:
     """Tries a model on a drive from t [s] on; None if the rest is too short."""
@@ -405,9 +405,9 @@ def is_worse(error_m: float, reference_m: float) -> bool:
     return bool(np.isnan(error_m)) or error_m > WORSE * reference_m
 
 
-def ran_away(tried: OpenLoop | None) -> bool:
+def runs_away(errors: OpenLoop | None) -> bool:
     """True if predictions end farther away than the robot drove."""
-    return tried is not None and not tried.mean_position_error_m <= tried.mean_path_m
+    return errors is not None and not errors.mean_position_error_m <= errors.mean_path_m
 
 
 def untried(

@@ -79,8 +79,8 @@ def fit_pictures(
     spec: RobotSpec, identified: Identified, paths: bool = True
 ) -> dict[str, bytes]:
     """Returns the pictures of a fit that the recording allows, by name, each a PNG."""
-    by_motion = identified.findings.width is not None or bool(
-        identified.findings.replaced
+    by_motion = identified.findings.motion_width_s is not None or bool(
+        identified.findings.replacement
     )
     # then pruning did not choose its terms
     pictures = {} if by_motion else {"accuracy": draw_accuracy(identified)}

@@ -198,13 +198,13 @@ def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(
     commanded, tmp_path
 ):
     spec, recording, found = commanded
-    assert found.findings.replaced
+    assert found.findings.replacement
     told = conclude(found)
     assert "the model written is the textbook" in " ".join(told.doubts)
     (at,) = [at for at in found.judgement if at.horizon_s == 5.0]
     assert at.model.position_m < 0.03
     model, again = generate(recording, spec, mount_lidar(spec), (), alpha="auto")
-    assert again.findings.replaced
+    assert again.findings.replacement
     save_model(model, tmp_path / "model")
     opened = load_model(tmp_path / "model")
     assert opened.kinematics.named.terms == model.kinematics.named.terms

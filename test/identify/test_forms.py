@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from identify.drives import slipping_car
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
     Form,
     curve_of,
@@ -24,10 +25,8 @@ from nics_drl_bridge.identify.forms import (
 )
 from nics_drl_bridge.identify.identify import (
     STAGES,
-    Findings,
     Identified,
-    aligned,
-    inputs,
+    find_input_curves,
     run,
 )
 from nics_drl_bridge.recording.recording import Samples
@@ -43,12 +42,12 @@ def found() -> Findings:
     spec, recording = slipping_car()
     drive = Drive(recording, spec)
     drive = replace(drive, settings=Settings(train_until_s=drive.duration_s))
-    return run(STAGES[: STAGES.index(inputs)], drive)
+    return run(STAGES[: STAGES.index(find_input_curves)], drive)
 
 
 @pytest.fixture(scope="module")
 def samples(found) -> Samples:
-    return aligned(found.training, found)
+    return resample_drive(found.training, found)
 
 
 def form_inputs(found, samples, form):

@@ -11,9 +11,9 @@ from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.refine import (
     TOO_SHORT,
-    by_definition,
-    free_coefficients,
-    refined,
+    apply_definitions,
+    refine_by_predictions,
+    select_free_coefficients,
 )
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -59,7 +59,7 @@ def test_a_state_without_a_term_of_its_command_alone_keeps_its_other_terms_free(
             "d_steering": {"steering": -8.0, "steering_command": 8.0},
         },
     )
-    free = free_coefficients(model, FOLLOWS)
+    free = select_free_coefficients(model, FOLLOWS)
     assert free[3].tolist() == (model.coefficients[3] != 0.0).tolist()
     assert free[4, model.term_names.index("steering")]
     assert not free[4, model.term_names.index("steering_command")]
@@ -73,7 +73,7 @@ def test_the_range_of_a_speed_is_scaled_with_the_speed(car):
         "d_steering": {"steering": -8.0, "steering_command": 8.0},
     }
     model = model_of(car, terms)
-    scaled, calibration = by_definition(model, FOLLOWS, car)
+    scaled, calibration = apply_definitions(model, FOLLOWS, car)
     assert calibration.responses[0].gain == 0.5
     assert scaled.low.tolist() == [-0.5, -1.0, -1.0, -1.0]
     assert scaled.high.tolist() == [0.5, 1.0, 1.0, 1.0]
@@ -82,12 +82,12 @@ def test_the_range_of_a_speed_is_scaled_with_the_speed(car):
 
 def test_lateral_motion_is_kept_where_a_state_measures_it(car):
     terms = {"vx": {"speed": 1.0}, "vy": {"steering": 0.3}}
-    kept, _ = by_definition(model_of(car, terms), Calibration(), car)
+    kept, _ = apply_definitions(model_of(car, terms), Calibration(), car)
     assert not kept.coefficients[1].any()
     speed, steering = car.state
     slip = steering.model_copy(update={"twist": "vy", "follows": None, "unit": "m/s"})
     slides = car.model_copy(update={"state": (speed, slip)})
-    kept, _ = by_definition(model_of(car, terms), Calibration(), slides)
+    kept, _ = apply_definitions(model_of(car, terms), Calibration(), slides)
     assert kept.coefficients[1].any()
 
 
@@ -98,7 +98,7 @@ def test_a_sentence_names_the_horizon_that_fits_and_what_was_refined(car, length
     driven = Drive(recording, car, settings)
     calibration = Calibration(position_noise_m=1e-3)
     linear = fit(align(driven, calibration), car, order=1).model
-    _, after, sentence = refined(linear, calibration, driven)
+    _, after, sentence = refine_by_predictions(linear, calibration, driven)
     assert after == calibration
     if length_s < 1.0:
         assert sentence == TOO_SHORT

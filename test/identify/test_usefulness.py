@@ -104,7 +104,7 @@ def no_textbook(monkeypatch):
 def test_the_textbook_takes_the_place_of_a_useless_model(name, request):
     spec = request.getfixturevalue(name)
     found = identify(coarse(spec, every=30), spec, alpha="auto")
-    assert found.findings.replaced in found.notes
+    assert found.findings.replacement in found.notes
     assert why_useless(found, spec) == ""
     assert any(gap.endswith(TOO_COARSE) for gap in found.gaps)
 
