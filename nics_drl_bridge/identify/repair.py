@@ -168,11 +168,11 @@ def _without_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
         return recording
     same = np.append(False, (pose.values[1:] == pose.values[:-1]).all(axis=1))
     last = int(np.flatnonzero(~same)[-1])  # that moved
-    if same[:last].any() or pose.t[-1] - pose.t[last] < HELD_S:
+    if last == 0 or same[:last].any() or pose.t[-1] - pose.t[last] < HELD_S:
         return recording
     asked = np.abs(command.values[:, list(list_driving_commands(drive.spec))])
     held = (command.t > pose.t[last]) & (command.t < pose.t[-1])
-    if not held.any() or (asked[held].mean(axis=0) < ASKS * asked.max(axis=0)).all():
+    if not held.any() or (asked[held].mean(axis=0) <= ASKS * asked.max(axis=0)).all():
         return recording
     begin, end = pose.t[[last, -1]] - pose.t[0]
     finding = f"The pose keeps one value from {begin:.1f} s to its end, {end:.1f} s"
