@@ -122,7 +122,9 @@ def identify(
     drive = Drive(turned_by_gyro(check(recording, spec)), spec)
     until = train_until if train_until is not None else recording.learn_until_s
     until = LEARNT_SHARE * drive.duration_s if until is None else until
-    settings = Settings(order, alpha, until, assume, strict)
+    settings = Settings(
+        order=order, alpha=alpha, train_until_s=until, assume=assume, strict=strict
+    )
     trial = run(list_stages(), replace(drive, settings=settings))
     return _make_result(trial, trial.final or trial)
 
@@ -770,3 +772,4 @@ def cut(recording: Recording, until: float) -> Recording:
 
 
 STAGES = list_stages()
+"""All stages, to run a part of them: `run(STAGES[:4], drive)`."""

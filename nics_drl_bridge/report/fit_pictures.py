@@ -17,7 +17,7 @@ from nics_drl_bridge.identify.drive import pose_residual
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
-from nics_drl_bridge.identify.report import CalibratedValue, estimates
+from nics_drl_bridge.identify.report import CalibratedValue, collect_estimates
 from nics_drl_bridge.identify.signals import (
     DIFFERENCE,
     held,
@@ -313,7 +313,7 @@ def _predict_rates(identified: Identified, chosen: Windows) -> Array:
 def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """Returns the pictures of a calibration that the recording allows, by name, each a PNG."""
     drawn = {
-        "mounting": draw_mounting(identified, estimates(identified)),
+        "mounting": draw_mounting(identified, collect_estimates(identified)),
         "inputs": draw_inputs(spec, identified),
         "noise": draw_noise(identified),
     }

@@ -22,7 +22,7 @@ from nics_drl_bridge.identify.acceptance import (
 )
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import with_error
+from nics_drl_bridge.identify.report import format_with_error
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 RADIUS_M = 0.2
@@ -166,7 +166,7 @@ def test_in_one_stretch_the_noise_is_that_of_a_single_window():
     ],
 )
 def test_a_coefficient_is_printed_so_that_it_can_be_used(value, error, text):
-    assert with_error(value, error) == text
+    assert format_with_error(value, error) == text
 
 
 @pytest.mark.slow
