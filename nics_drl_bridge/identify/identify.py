@@ -225,12 +225,12 @@ class Identified:
         spec = self.drive.spec
         findings = self.findings
         mistaken = any(isinstance(note, verdict.Mistake) for note in self.notes)
-        unfit = mistaken or bool(verdict.missed(self.fit, spec))
+        unfit = mistaken or bool(verdict.list_missed(self.fit, spec))
         textbook = bool(findings.replacement)
         ratings = [
             acceptance.rate(self.judgement, spec.footprint_radius, textbook),
             acceptance.rate_unseen(
-                verdict.time_without_pose(self.drive), self.drive.duration_s
+                verdict.measure_time_without_pose(self.drive), self.drive.duration_s
             ),
         ]
         if unfit:
@@ -602,7 +602,7 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
     yardstick = findings.yardstick or textbook_of(whole, calibration)
     bands = _find_bands(drive, findings)
     judgement = judged(model, calibration, whole, bands, yardstick)
-    rated = verdict.with_quality(model, fit, unseen, held_out, judgement, drive.spec)
+    rated = verdict.add_quality(model, fit, unseen, held_out, judgement, drive.spec)
     if model is fit.model:
         fit = replace(fit, model=rated)
     notes = list_plain_calibration_notes(findings)
@@ -685,7 +685,7 @@ def _try_textbook(drive: Drive, findings: Findings) -> Findings | None:
         refinement=(),
         trials=(),
         assumptions=(),
-        replacement=verdict.replaced_by_textbook(lost),
+        replacement=verdict.describe_replacement(lost),
     )
     return judge_model(drive, start)
 
@@ -713,7 +713,7 @@ def refit_model(drive: Drive, findings: Findings) -> Findings:
         return findings
     final = _fit_whole_drive(drive, findings)
     driven = drive.recording.driven_s
-    sentence = verdict.refitted(driven(until), driven(), worse=final is None)
+    sentence = verdict.describe_refit(driven(until), driven(), worse=final is None)
     if final is None:
         findings = replace(findings, refinement=(*findings.refinement, sentence))
         return replace(findings, notes=collect_notes(drive, findings))

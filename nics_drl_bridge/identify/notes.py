@@ -26,21 +26,21 @@ def collect_notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
         beaten = list(shortfall(findings.judgement))
     doubts: Iterator[str] = iter(())
     if findings.motion_width_s is None:
-        doubts = verdict.doubts_of_fit(fit, calibration.is_exact)
-    levels = verdict.levels_of(findings.training.recording.command, spec)
+        doubts = verdict.list_doubts_of_fit(fit, calibration.is_exact)
+    levels = verdict.count_levels(findings.training.recording.command, spec)
     return (
         *about_recordings(model, calibration, findings.whole),
         *beaten,
         *_explain_replacement(drive, findings),
         *drive.recording.repairs,
         *findings.repairs,
-        *verdict.about_gaps(findings.whole),
+        *verdict.describe_gaps(findings.whole),
         *collect_calibration_notes(findings),
         *findings.refinement,
-        *verdict.mirror_note(require_samples(findings), spec, calibration),
-        *verdict.unlearnt(fit, calibration, spec, levels),
+        *verdict.describe_mirror_image(require_samples(findings), spec, calibration),
+        *verdict.describe_unlearnt(fit, calibration, spec, levels),
         *doubts,
-        *verdict.untried(drive, findings.held_out, findings.judgement),
+        *verdict.describe_untried(drive, findings.held_out, findings.judgement),
         *findings.assumptions,
     )
 
@@ -53,15 +53,15 @@ def collect_calibration_notes(findings: Findings) -> tuple[str, ...]:
         # The latency is that of the fitted textbook, as are mounting and lags, which it explains.
         calibration = replace(calibration, command_latency_s=findings.timing.latency)
         return (
-            *verdict.about_stamps(training),
-            *verdict.about_clocks(training, calibration, findings.timing),
+            *verdict.describe_stamps(training),
+            *verdict.describe_clocks(training, calibration, findings.timing),
         )
     return (
-        *verdict.about_stamps(training),
-        *verdict.about_clocks(training, calibration, findings.timing),
+        *verdict.describe_stamps(training),
+        *verdict.describe_clocks(training, calibration, findings.timing),
         *followers.about_sums(calibration),
-        *verdict.about_mounting(training, calibration, findings.mounting),
-        *verdict.about_responses(training, calibration, findings.timing),
+        *verdict.describe_mounting(training, calibration, findings.mounting),
+        *verdict.describe_responses(training, calibration, findings.timing),
     )
 
 
@@ -76,5 +76,5 @@ def _explain_replacement(drive: Drive, findings: Findings) -> Iterator[str]:
         return
     whole = findings.whole
     unmoved = require_fit(findings).unmoved
-    if coarse := verdict.coarsest_state(whole.recording, whole.spec, unmoved):
+    if coarse := verdict.describe_coarsest_state(whole.recording, whole.spec, unmoved):
         yield verdict.Gap(f"{coarse}.")

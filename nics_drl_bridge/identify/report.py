@@ -11,7 +11,12 @@ from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import Curve
-from nics_drl_bridge.identify.verdict import FAR_OFF, Doubt, Mistake, coarsest_state
+from nics_drl_bridge.identify.verdict import (
+    FAR_OFF,
+    Doubt,
+    Mistake,
+    describe_coarsest_state,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
@@ -429,7 +434,7 @@ def _name_suspect(identified: Identified, spec: RobotSpec) -> str:
     unmoved = identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
-    if coarse := coarsest_state(recording, spec, unmoved):
+    if coarse := describe_coarsest_state(recording, spec, unmoved):
         return coarse
     if still := ", ".join(c.name for c in spec.command if c.name in unmoved):
         reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"

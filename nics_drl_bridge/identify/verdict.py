@@ -61,7 +61,7 @@ class Mistake(str):
     """A sentence on a wrong mapping; the model is only valid with that mapping."""
 
 
-def about_stamps(drive: Drive) -> Iterator[str]:
+def describe_stamps(drive: Drive) -> Iterator[str]:
     """Yields sentences on the stamps and the noise of the poses."""
     if (bursts := drive.bursts) is not None:
         finding = f"Poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
@@ -72,7 +72,7 @@ def about_stamps(drive: Drive) -> Iterator[str]:
         yield Gap(f"The noise of the pose was not measured; {fix}.")
 
 
-def time_without_pose(drive: Drive) -> float:
+def measure_time_without_pose(drive: Drive) -> float:
     """Returns the time in long gaps of the pose [s]."""
     t = drive.dated.t
     spans = [float(t[row + 1] - t[row]) for row in _gap_rows(drive)]
@@ -91,7 +91,7 @@ def _gap_rows(drive: Drive) -> list[int]:
     return [int(row) for row in rows[np.argsort(-span[rows], kind="stable")]]
 
 
-def about_gaps(drive: Drive) -> Iterator[str]:
+def describe_gaps(drive: Drive) -> Iterator[str]:
     """Yields a sentence per gap in the pose: when, how long, how far the pose moved across it."""
     t = drive.dated.t
     pose = drive.dated.values
@@ -113,7 +113,7 @@ def about_gaps(drive: Drive) -> Iterator[str]:
         )
 
 
-def coarsest_state(
+def describe_coarsest_state(
     recording: Recording, spec: RobotSpec, unmoved: Sequence[str]
 ) -> str:
     """Names the measured state that changes by most of its range between rows; "" if none."""
@@ -135,7 +135,7 @@ def coarsest_state(
     return f"{finding} apart, so record at a higher rate"
 
 
-def about_clocks(
+def describe_clocks(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
     """Yields sentences on clock offset and latency."""
@@ -176,7 +176,7 @@ def about_clocks(
         yield f"Commands take effect {latency:.4f} s (+- {spread:.4f} s) after their stamps."
 
 
-def about_mounting(
+def describe_mounting(
     drive: Drive, calibration: Calibration, mounting: Mounting | None
 ) -> Iterator[str]:
     """Yields sentences on the position and rotation of the tracked body on the robot."""
@@ -226,7 +226,7 @@ def faces_backwards(calibration: Calibration) -> bool:
     return bool(abs(geometry.wrap_angle(calibration.rotation_rad - np.pi)) < BACKWARDS)
 
 
-def about_responses(
+def describe_responses(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
     """Yields sentences on unmeasured states and the wheels."""
@@ -269,7 +269,7 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
             )
 
 
-def missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
+def list_missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the variables that never moved, except sideways slip if it can't be commanded."""
     slips = [v.name for v in spec.state if v.twist == "vy" and not spec.moves_sideways]
     return tuple(
@@ -282,13 +282,13 @@ def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
     return [c.name for c in spec.command if c.name in names]
 
 
-def levels_of(command: Stream, spec: RobotSpec) -> dict[str, int]:
+def count_levels(command: Stream, spec: RobotSpec) -> dict[str, int]:
     """Returns the number of different values of each command as recorded."""
     columns = zip(spec.command, command.values.T, strict=True)
     return {c.name: len(np.unique(np.round(values, 9))) for c, values in columns}
 
 
-def unlearnt(
+def describe_unlearnt(
     linear: Fit, calibration: Calibration, spec: RobotSpec, levels: dict[str, int]
 ) -> Iterator[str]:
     """Yields sentences on inputs not moved, alone or at many levels, and dependent states.
@@ -298,7 +298,7 @@ def unlearnt(
     """
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
-    if unmoved := ", ".join(missed(linear, spec)):
+    if unmoved := ", ".join(list_missed(linear, spec)):
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it is only valid for this drive's constant value.")
     still = _commands(excitation.unmoved, spec)
@@ -330,7 +330,7 @@ def unlearnt(
         )
 
 
-def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
+def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
     """Yields each reason to doubt a linear fit."""
     dofs = linear.model.dofs
     for dof, outliers, condition in zip(
@@ -357,7 +357,7 @@ def _list(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
-def mirror_note(
+def describe_mirror_image(
     samples: Samples, spec: RobotSpec, calibration: Calibration
 ) -> Iterator[str]:
     """Yields a sentence if the robot turns against its command, and which sign explains it."""
@@ -410,7 +410,7 @@ def runs_away(errors: OpenLoop | None) -> bool:
     return errors is not None and not errors.mean_position_error_m <= errors.mean_path_m
 
 
-def untried(
+def describe_untried(
     drive: Drive, held_out: OpenLoop | None, judgement: tuple[HorizonErrors, ...]
 ) -> Iterator[str]:
     """Yields a sentence if a drive is too short to try a model on unseen data, or on 5 s."""
@@ -425,7 +425,7 @@ def untried(
         )
 
 
-def with_quality(
+def add_quality(
     model: TaylorModel,
     linear: Fit,
     unseen: Samples | None,
@@ -462,7 +462,7 @@ def with_quality(
     )
 
 
-def replaced_by_textbook(lost: HorizonErrors) -> str:
+def describe_replacement(lost: HorizonErrors) -> str:
     """Formats a sentence on a model that lost to its textbook and was replaced by it."""
     if lost.textbook is None:
         return ""
@@ -472,7 +472,7 @@ def replaced_by_textbook(lost: HorizonErrors) -> str:
     return f"{finding}: the model written is the textbook, fitted to the training part."
 
 
-def refitted(until: float, duration: float, worse: bool) -> str:
+def describe_refit(until: float, duration: float, worse: bool) -> str:
     """States how much of a drive a model covers, and what its errors refer to."""
     if worse:
         why = (

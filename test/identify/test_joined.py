@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.joined import join_recordings
 from nics_drl_bridge.identify.report import format_report
 from nics_drl_bridge.identify.shooting import Shooting
-from nics_drl_bridge.identify.verdict import about_gaps, time_without_pose
+from nics_drl_bridge.identify.verdict import describe_gaps, measure_time_without_pose
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import build_robot
 
@@ -69,8 +69,8 @@ TURNING = driven("turning.csv", 0.0, 1.5, seed=1)
 
 def test_the_time_between_two_recordings_is_no_gap_in_the_pose():
     drive = Drive(join_recordings([STRAIGHT, TURNING], ROBOT), ROBOT)
-    assert time_without_pose(drive) == 0.0
-    assert list(about_gaps(drive)) == []
+    assert measure_time_without_pose(drive) == 0.0
+    assert list(describe_gaps(drive)) == []
 
 
 @pytest.fixture(scope="module")

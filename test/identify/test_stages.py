@@ -23,7 +23,7 @@ from nics_drl_bridge.identify.identify import (
     run,
     start_findings,
 )
-from nics_drl_bridge.identify.verdict import about_responses
+from nics_drl_bridge.identify.verdict import describe_responses
 from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
 NAMES = tuple(stage.__name__ for stage in STAGES)
@@ -197,7 +197,7 @@ def test_a_follower_beside_a_motion_has_the_lag_and_the_error_of_its_own_command
     driven = Drive(recording, followed)
     found = run(STAGES[: NAMES.index("find_mounting")], driven)
     assert found.calibration.responses == (Response("angle", "steering", 0.1),)
-    (sentence,) = about_responses(driven, found.calibration, found.timing)
+    (sentence,) = describe_responses(driven, found.calibration, found.timing)
     assert "follow steering with a lag of 0.1000 s (+- 0.0100 s)" in sentence
 
 

@@ -13,7 +13,7 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.identify.report import explain_uselessness, is_useless
-from nics_drl_bridge.identify.verdict import coarsest_state
+from nics_drl_bridge.identify.verdict import describe_coarsest_state
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -110,13 +110,18 @@ def test_the_textbook_takes_the_place_of_a_useless_model(name, request):
 
 
 def test_only_rows_that_are_too_far_apart_are_named(differential):
-    assert coarsest_state(coarse(differential, every=5), differential, ()) == ""
+    assert (
+        describe_coarsest_state(coarse(differential, every=5), differential, ()) == ""
+    )
     far = coarse(differential, every=30)
-    named = coarsest_state(far, differential, ())
+    named = describe_coarsest_state(far, differential, ())
     assert named.split()[0] in {v.name for v in differential.state}
     assert f"{named}.".endswith(TOO_COARSE)
-    assert coarsest_state(far, differential, [v.name for v in differential.state]) == ""
-    assert coarsest_state(replace(far, state=None), differential, ()) == ""
+    assert (
+        describe_coarsest_state(far, differential, [v.name for v in differential.state])
+        == ""
+    )
+    assert describe_coarsest_state(replace(far, state=None), differential, ()) == ""
 
 
 @pytest.mark.slow
