@@ -448,16 +448,17 @@ def fit_terms(drive: Drive, findings: Findings) -> Findings:
         require(responses, "the response of each state", "find_responses")
     samples = align(findings.training, calibration)
     samples = followers.unlimited(samples, calibration, spec)
-    trials = findings.trials
-    inferred = drive.recording.state is None and not calibration.is_exact
-    # a refit reuses the trials
-    if settings.order == "auto" and inferred and not trials:
+    is_inferred = drive.recording.state is None and not calibration.is_exact
+    trials = findings.trials  # a refit reuses them
+    if settings.order == "auto" and is_inferred and not trials:
         trials = _try_orders(drive, findings)
-    order = fitting.ORDER if settings.order == "auto" else settings.order
-    order = hypotheses.chosen(list(trials)).order if trials else order
+    if trials:
+        order = hypotheses.chosen(list(trials)).order
+    else:
+        order = fitting.ORDER if settings.order == "auto" else settings.order
     centred = "lever_arm_y_m" in calibration.uncertainty
     library = None
-    if inferred:
+    if is_inferred:
         library = partial(select_terms_through_state, centred=centred)
     try:
         regression = fitting.regress(
