@@ -221,7 +221,7 @@ def test_a_recording_of_another_robot_is_refused(car, mecanum):
 def test_streams_that_do_not_overlap_are_refused(car):
     recording = drive(car, duration=20.0)
     moved = replace(recording.command, t=recording.command.t + 500.0)
-    with pytest.raises(RecordingError, match="are from the same drive"):
+    with pytest.raises(RecordingError, match="from the same drive"):
         align(Drive(replace(recording, command=moved, state=None), car), Calibration())
 
 

@@ -19,7 +19,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 CAUSES = {
     "an axis is reversed": "one of x, y and heading is reversed",
-    "commands are swapped": "are swapped: each moves the robot as the other should",
+    "commands are swapped": "are swapped: each moves the robot like the other should",
     "a unit is wrong": "must be in|positions must be in|write `unit: ",
     "a scale is wrong": "the scale of this command, or that of the pose, is wrong",
     "an encoder counts backwards": "its encoder counts backwards",

@@ -115,7 +115,7 @@ def test_titles_stay_within_their_pictures(exact, disturbed, monkeypatch):
         figures.append(figure)
         return render_png(figure, *rest)
 
-    monkeypatch.setattr(fit_pictures, "png", drawn)
+    monkeypatch.setattr(fit_pictures, "render_png", drawn)
     for spec, identified in (disturbed, (exact[0], with_half_a_lever(exact[1])[0])):
         draw_calibration(spec, identified)
     axes = [each for figure in figures for each in figure.axes]
