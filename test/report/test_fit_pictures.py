@@ -93,7 +93,9 @@ def test_the_report_names_errors_pruning_and_validity(found):
 
 def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
     spec, identified = found
-    by_motion = replace(identified, findings=replace(identified.findings, width=0.1))
+    by_motion = replace(
+        identified, findings=replace(identified.findings, motion_width_s=0.1)
+    )
     text = format_report("here", by_motion)
     for part in (
         "Eq. 2",
